@@ -1,0 +1,84 @@
+"""Every failure perchctl reports, as one exception tree.
+
+Each class carries the exit code of the process; `EXIT_CODES` is the table that
+`fly --help` and the README print. A message says what was found, what is
+allowed and what to do, in one sentence.
+"""
+
+from __future__ import annotations
+
+
+class PerchError(Exception):
+    """Base of all reported failures; `exit_code` becomes the process's."""
+
+    exit_code = 1
+    meaning = "other failure"
+
+
+class UsageError(PerchError):
+    exit_code = 2
+    meaning = "wrong usage of the command line"
+
+
+class ConnectionFailed(PerchError):
+    exit_code = 10
+    meaning = "no connection to the vehicle"
+
+
+class NotFound(PerchError):
+    exit_code = 20
+    meaning = "file, profile, camera or firmware variable not found"
+
+
+class InvalidValue(PerchError):
+    exit_code = 30
+    meaning = "invalid value in a profile, file or option"
+
+
+class TimedOut(PerchError):
+    exit_code = 40
+    meaning = "time-out before the flight"
+
+
+class TargetNotFound(PerchError):
+    exit_code = 50
+    meaning = "target not found, landed"
+
+
+class AttemptsUsedUp(PerchError):
+    exit_code = 51
+    meaning = "attempts or perching time used up, landed"
+
+
+class SafetyAbort(PerchError):
+    exit_code = 52
+    meaning = "safety abort"
+
+
+class EmergencyStopped(PerchError):
+    exit_code = 53
+    meaning = "emergency stop, motors cut"
+
+
+class Interrupted(PerchError):
+    exit_code = 130
+    meaning = "Ctrl-C, landed (in the air) or left (on the ground)"
+
+
+ERROR_CLASSES: tuple[type[PerchError], ...] = (
+    PerchError,
+    UsageError,
+    ConnectionFailed,
+    NotFound,
+    InvalidValue,
+    TimedOut,
+    TargetNotFound,
+    AttemptsUsedUp,
+    SafetyAbort,
+    EmergencyStopped,
+    Interrupted,
+)
+
+EXIT_CODES: dict[int, str] = {0: "perched (or the command did what was asked)"} | {
+    cls.exit_code: cls.meaning for cls in ERROR_CLASSES
+}
