@@ -1,0 +1,97 @@
+"""Frames and rotations: the laws every other module cites.
+
+Conventions (the README's page "Frames and signs" says the same):
+
+- ``T_a_b`` is a 4x4 homogeneous matrix that maps coordinates in b into a, so
+  inner letters cancel: ``T_world_body @ T_body_cam @ T_cam_target``.
+- world and body: x forward, y left, z up. level: body with roll and pitch
+  taken out. cam: OpenCV (x right, y down, z along the view).
+- Roll, pitch and yaw are right-handed rotations about body x, y, z:
+  ``R_world_body = Rz(yaw) Ry(pitch) Rx(roll)``. Positive pitch is nose
+  *down*; a Crazyflie's own `stateEstimate.pitch` is nose up and is negated in
+  `perchctl.link` only.
+- target: origin in the target's centre, x as in OpenCV's marker frame, z away
+  from the drone (into the ceiling): OpenCV's marker frame turned by 180 deg
+  about x (`R_MARKER_TARGET`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+GRAVITY_MPS2 = 9.81
+
+R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
+"""Maps target axes into OpenCV's marker axes (and back: it is its own inverse)."""
+
+
+def wrap_rad(angle_rad: float) -> float:
+    """The same angle in (-pi, pi]."""
+    return -((-angle_rad + math.pi) % (2.0 * math.pi) - math.pi)
+
+
+def rot_z(yaw_rad: float) -> Array:
+    """Rotation about z, shape (3, 3)."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rotation_from_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
+    """``Rz(yaw) Ry(pitch) Rx(roll)``, shape (3, 3)."""
+    cr, sr = math.cos(roll_rad), math.sin(roll_rad)
+    cp, sp = math.cos(pitch_rad), math.sin(pitch_rad)
+    cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rpy_from_rotation(R: Array) -> tuple[float, float, float]:
+    """Inverse of `rotation_from_rpy` away from pitch = +-90 deg."""
+    return (
+        math.atan2(R[2, 1], R[2, 2]),
+        math.asin(max(-1.0, min(1.0, -float(R[2, 0])))),
+        math.atan2(R[1, 0], R[0, 0]),
+    )
+
+
+def yaw_of(R: Array) -> float:
+    """Heading of the rotated x axis in the xy plane, in (-pi, pi]."""
+    return math.atan2(R[1, 0], R[0, 0])
+
+
+def make_T(R: Array, t_m: Array | tuple[float, float, float]) -> Array:
+    """Homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t_m
+    return T
+
+
+def invert_T(T_a_b: Array) -> Array:
+    """``T_b_a`` of a rigid ``T_a_b``."""
+    R = T_a_b[:3, :3]
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3] = R.T
+    T_b_a[:3, 3] = -R.T @ T_a_b[:3, 3]
+    return T_b_a
+
+
+def circular_mean(weights: Array, angles_rad: Array) -> float:
+    """Weighted mean of angles on the circle, in (-pi, pi]; weights sum to one.
+
+    Linear in the difference from the first angle, so that it equals the plain
+    weighted sum wherever no wrap is crossed (the paper's equation 8).
+    """
+    ref = float(angles_rad[0])
+    deltas = [wrap_rad(float(a) - ref) for a in angles_rad]
+    return wrap_rad(ref + float(np.dot(weights, deltas)))

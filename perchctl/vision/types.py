@@ -1,0 +1,185 @@
+"""The values that walk down the vision hallway, one frozen dataclass a room."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+
+MarkerName = Literal["large", "small"]
+MARKERS: tuple[MarkerName, MarkerName] = ("large", "small")
+
+
+class Stage(Enum):
+    """What is seen of the target (paper, section II-A.2)."""
+
+    NONE = "none"
+    LARGE = "large"  # stage 1, equation 5
+    BOTH = "both"  # stage 2, equation 8
+    SMALL = "small"  # stage 3, equation 12
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """A calibrated camera.
+
+    Attributes:
+        size_px: width, height.
+        K: camera matrix (3, 3), px.
+        dist: distortion coefficients in OpenCV's order, shape (n,).
+        model: ``plumb_bob`` (5), ``rational_polynomial`` (8) or ``fisheye`` (4).
+    """
+
+    size_px: tuple[int, int]
+    K: Array
+    dist: Array
+    model: str = "plumb_bob"
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture. `t_s` is the time of exposure on the loop's clock, as far as
+    known: time of arrival less the profile's `camera.latency_s`.
+
+    `image` is grey, uint8, shape (height, width).
+    """
+
+    index: int
+    t_s: float
+    image: NDArray[np.uint8]
+    t_arrival_s: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """One marker's corners in the image: (4, 2) px, TL TR BR BL as cv2.aruco
+    orders them; pixel (0, 0) is the centre of the top-left pixel.
+
+    `sigma_px` is the spread of the corners, from the line fit's residuals, or a
+    default where no line could be fitted.
+    """
+
+    marker: MarkerName
+    corners_px: Array
+    sigma_px: float
+    refined: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    frame_index: int
+    t_s: float
+    large: Detection | None = None
+    small: Detection | None = None
+    full_frame: bool = True  # False: found in the predicted window
+    mirrored: bool = False  # the small marker decoded as its mirror image
+
+    def get(self, marker: MarkerName) -> Detection | None:
+        return self.large if marker == "large" else self.small
+
+
+@dataclass(frozen=True, eq=False)
+class Attitude:
+    """The vehicle's attitude (and position) at a frame's time, world axes.
+
+    Signs as in `perchctl.geometry`: right-handed, pitch positive nose down.
+    """
+
+    t_s: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPose:
+    """A pose from one frame. `source` is ``large``, ``small`` or ``joint``.
+
+    Attributes:
+        rvec_rad, tvec_m: OpenCV camera frame, cv2.aruco's marker axes, (3,).
+        e_m: target relative to the gear in the level frame, (3,).
+        e_yaw_rad: heading of the target's x axis in the level frame.
+        sigma_m: standard deviation of `e_m`, (3,); sigma_yaw_rad likewise.
+        reprojection_px: RMS over the corners used.
+    """
+
+    source: Literal["large", "small", "joint"]
+    t_s: float
+    rvec_rad: Array
+    tvec_m: Array
+    e_m: Array
+    e_yaw_rad: float
+    sigma_m: Array
+    sigma_yaw_rad: float
+    reprojection_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerTrack:
+    """A marker's Kalman filter between two frames (paper, section II-A.1).
+
+    State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI,
+    indexed by the names in `perchctl.vision.filter`. `unseen` counts the frames
+    since the last measurement.
+    """
+
+    t_s: float
+    x: Array
+    P: Array
+    unseen: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class TargetPose:
+    """The merged pose of the target at a frame's time, in the level frame,
+    relative to the gear: the paper's e = (e_x, e_y, e_z, e_psi).
+
+    Attributes:
+        e_m: (3,) m; e_yaw_rad: in (-pi, pi].
+        velocity_mps: filter's velocity of `e_m` (`kalman.frame: level`) or of the
+            target in the world (`kalman.frame: world`), in level axes, (3,).
+        measured: True where this very frame held a detection of the target;
+            False while the filter coasts.
+        unseen: frames since the last detection.
+        world_m, world_yaw_rad: the target in the world of the vehicle's state
+            estimate; None without an attitude.
+    """
+
+    t_s: float
+    stage: Stage
+    e_m: Array
+    e_yaw_rad: float
+    velocity_mps: Array
+    measured: bool
+    unseen: int
+    sigma_m: Array
+    sigma_yaw_rad: float
+    world_m: Array | None = None
+    world_yaw_rad: float | None = None
+    world_velocity_mps: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PipelineState:
+    """All the memory of the pipeline; `PipelineState()` is a fresh start."""
+
+    tracks: dict[str, MarkerTrack] = field(default_factory=dict)
+    last: Detections | None = None
+    disagreeing_frames: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PipelineOutput:
+    """Everything one frame gave, for the planner and the log."""
+
+    detections: Detections
+    poses: dict[str, MarkerPose]
+    target: TargetPose | None
+    stage: Stage  # by this frame's detections
+    disagreeing_frames: int = 0  # frames in a row in which the two markers contradict
