@@ -1,0 +1,98 @@
+"""Reading camera calibrations: the ROS camera_info YAML that perchctl ships and writes,
+and OpenCV's own FileStorage files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.vision.types import CameraModel
+
+MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,), "equidistant": (4,)}
+
+
+def load_calibration(path: Path) -> CameraModel:
+    """Read a camera model. Errors: NotFound (no file), InvalidValue (wrong content)."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise NotFound(f"calibration file {path} does not exist") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidValue(f"{path}: cannot be read as a calibration: {error}") from None
+    values = _opencv_values(path) if "!!opencv-matrix" in text else _yaml_values(path, text)
+    return _checked(path, values)
+
+
+def _yaml_values(path: Path, text: str) -> dict[str, Any]:
+    try:
+        raw = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InvalidValue(f"{path}: not YAML ({error.__class__.__name__})") from None
+    if not isinstance(raw, dict):
+        raise InvalidValue(f"{path}: must hold camera_info keys (image_width, camera_matrix, ...)")
+    try:
+        return {
+            "size": (int(raw["image_width"]), int(raw["image_height"])),
+            "K": np.array(raw["camera_matrix"]["data"], dtype=float),
+            "dist": np.array(raw["distortion_coefficients"]["data"], dtype=float),
+            "model": str(raw.get("distortion_model", "plumb_bob")),
+        }
+    except KeyError as error:
+        raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"{path}: a value is not a number: {error}") from None
+
+
+def _opencv_values(path: Path) -> dict[str, Any]:
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError):
+        raise InvalidValue(f"{path}: not a readable OpenCV FileStorage file") from None
+    try:
+        K = storage.getNode("camera_matrix").mat()
+        dist = storage.getNode("distortion_coefficients").mat()
+        if K is None or dist is None:
+            raise InvalidValue(
+                f"{path}: camera_matrix and distortion_coefficients are needed in an OpenCV file"
+            )
+        size = (
+            int(storage.getNode("image_width").real()),
+            int(storage.getNode("image_height").real()),
+        )
+        return {"size": size, "K": K, "dist": dist, "model": "plumb_bob"}
+    finally:
+        storage.release()
+
+
+def _checked(path: Path, values: dict[str, Any]) -> CameraModel:
+    size, model = values["size"], values["model"]
+    if model not in MODELS:
+        raise InvalidValue(
+            f"{path}: distortion_model {model!r} is unknown; allowed are {', '.join(MODELS)}"
+        )
+    if values["K"].size != 9:
+        raise InvalidValue(f"{path}: camera_matrix needs 9 numbers, found {values['K'].size}")
+    K = values["K"].reshape(3, 3)
+    dist = values["dist"].ravel()
+    if not (np.isfinite(K).all() and np.isfinite(dist).all()):
+        raise InvalidValue(f"{path}: camera_matrix or distortion holds NaN or infinity")
+    if size[0] <= 0 or size[1] <= 0:
+        raise InvalidValue(f"{path}: image_width and image_height must be positive, found {size}")
+    if model == "plumb_bob" and dist.size == 8:
+        model = "rational_polynomial"
+    if dist.size not in MODELS[model]:
+        raise InvalidValue(
+            f"{path}: {model} needs {' or '.join(map(str, MODELS[model]))} distortion "
+            f"coefficients, found {dist.size}"
+        )
+    if not (0 < K[0, 2] < size[0] and 0 < K[1, 2] < size[1] and K[0, 0] > 0 and K[1, 1] > 0):
+        raise InvalidValue(
+            f"{path}: camera_matrix does not fit a {size[0]}x{size[1]} picture: focal lengths "
+            f"must be positive and the centre inside the picture"
+        )
+    return CameraModel(size, K, dist, "fisheye" if model == "equidistant" else model)

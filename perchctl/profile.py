@@ -1,0 +1,470 @@
+"""Profiles: one YAML file says everything a flight depends on, checked here and only here.
+
+`load_profile(name_or_path)` reads the file, follows `extends`, and returns a
+frozen `Profile`. Every fault is one `InvalidValue` sentence of the form
+``file: key: what is wrong``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.geometry import Array, make_T, rotation_from_rpy
+from perchctl.locations import data_file, data_folder, listing
+from perchctl.target.dictionaries import check_marker_id
+
+Vector3 = tuple[float, float, float]
+
+
+def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    if pair[0] > pair[1]:
+        raise ValueError(f"the lower bound {pair[0]} is above the upper bound {pair[1]}")
+    return pair
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Mounting(Section):
+    """Where the camera sits: its position in body axes and its turn from them.
+
+    With ``rpy_deg: [0, 0, 0]`` the camera looks up, the image's right is the
+    vehicle's forward and the image's bottom its left. `rpy_deg` are rotations
+    about body x, y, z (``Rz Ry Rx``, right-handed): ``[0, 0, 90]`` turns the
+    image's right to the vehicle's left.
+    """
+
+    position_m: Vector3 = (0.0, 0.0, 0.01)
+    rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+
+    @property
+    def T_body_cam(self) -> Array:
+        roll, pitch, yaw = (float(a) for a in np.radians(self.rpy_deg))
+        return make_T(rotation_from_rpy(roll, pitch, yaw), self.position_m)
+
+
+class CameraConfig(Section):
+    source: str = "sim:"
+    calibration: str = "example_640x480.yaml"
+    latency_s: float = Field(0.07, ge=0, le=1)
+    T_body_cam: Mounting = Mounting()
+    start_timeout_s: float = Field(8.0, gt=0, le=60)
+    mirrored: bool = False  # flip the picture before use
+
+
+class VehicleConfig(Section):
+    gear_body_m: Vector3 = (0.0, 0.0, 0.03)
+
+
+class MarkerConfig(Section):
+    dictionary: str
+    id: int = Field(ge=0)
+    side_m: float = Field(ge=0.004, le=2.0)
+
+    @model_validator(mode="after")
+    def _id_in_dictionary(self) -> MarkerConfig:
+        check_marker_id(self.dictionary, self.id)
+        return self
+
+
+class TargetConfig(Section):
+    large: MarkerConfig = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
+    small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
+
+    @model_validator(mode="after")
+    def _small_inside_large(self) -> TargetConfig:
+        if self.small.side_m >= self.large.side_m / 2:
+            raise ValueError(
+                f"the small marker ({self.small.side_m} m) must be less than half of the "
+                f"large one ({self.large.side_m} m); sizes are in metres, as printed"
+            )
+        return self
+
+
+class DetectorConfig(Section):
+    refinement: Literal["none", "subpix", "line"] = "line"
+    window: bool = True  # search around the last pose first
+    correction_bits_large: int = Field(0, ge=0, le=3)
+    correction_bits_small: int = Field(1, ge=0, le=3)
+
+
+class PoseConfig(Section):
+    solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = "sqpnp"
+    refine: bool = True
+    max_reprojection_px: float = Field(3.0, gt=0)
+
+
+class KalmanConfig(Section):
+    """The paper's filter. k1 and k2 are variances in cm^2 and deg^2, as the paper's
+    error vector is in centimetres and degrees."""
+
+    k1: float = Field(0.04, gt=0)
+    k2: float = Field(0.004, gt=0)
+    alpha: float = Field(0.85, gt=0, le=1)
+    n_max: int = Field(8, ge=0, le=100)
+    frame: Literal["level", "world"] = "world"
+
+
+class WeightsConfig(Section):
+    x: float = Field(0.275, ge=0, le=1)
+    y: float = Field(0.306, ge=0, le=1)
+    z: float = Field(0.728, ge=0, le=1)
+    yaw: float = Field(0.469, ge=0, le=1)
+
+
+class MergeConfig(Section):
+    method: Literal["weights", "joint"] = "joint"
+    weights: WeightsConfig = WeightsConfig()
+    stages: Literal["seen", "range"] = "seen"  # range: by z2 and z3, equations 4, 6, 11
+    z1_m: float = Field(1.15, gt=0)
+    z2_m: float = Field(0.25, gt=0)
+    z3_m: float = Field(0.12, gt=0)
+    disagreement_m: float = Field(0.03, gt=0)
+    disagreement_frames: int = Field(15, ge=1)
+
+    @model_validator(mode="after")
+    def _ranges_in_order(self) -> MergeConfig:
+        if not self.z3_m < self.z2_m < self.z1_m:
+            raise ValueError("z3_m < z2_m < z1_m must hold (metres)")
+        return self
+
+
+class SearchConfig(Section):
+    """Phase 2. Waits `wait_s`, climbs `step_m`, tries again; never above `max_height_m`."""
+
+    attempts: int = Field(6, ge=1, le=100)
+    wait_s: float = Field(1.5, gt=0, le=60)
+    step_m: float = Field(0.12, ge=0, le=1)
+    max_height_m: float = Field(1.3, gt=0, le=20)
+    yaw_step_deg: float = Field(60.0, ge=0, le=180)  # the picture is wider than high
+    confirm_frames: int = Field(3, ge=1, le=100)
+
+
+class EstimateConfig(Section):
+    """Phase 3. The pose must stay within `spread_m` for `dwell_s`."""
+
+    dwell_s: float = Field(0.4, ge=0, le=10)
+    spread_m: float = Field(0.05, gt=0, le=1)
+    timeout_s: float = Field(4.0, gt=0, le=60)
+
+
+class AlignConfig(Section):
+    """Phase 4. Errors must stay within tolerance for `dwell_s`."""
+
+    xy_m: float = Field(0.04, gt=0, le=1)
+    yaw_deg: float = Field(5.0, gt=0, le=180)
+    dwell_s: float = Field(0.4, ge=0, le=10)
+    timeout_s: float = Field(20.0, gt=0, le=120)
+    speed_mps: float = Field(0.4, gt=0, le=2)
+    yaw_rate_dps: float = Field(60.0, gt=0, le=360)
+
+
+class AscendConfig(Section):
+    """Phase 5. Climbs to `standoff_m` under the target and settles there.
+
+    Falls back to ALIGN outside the cone `cone_base_m + cone_slope * distance`.
+    `standoff_m` is between gear and target; the small marker must be in view there.
+    """
+
+    speed_mps: float = Field(0.25, gt=0, le=1)
+    near_speed_mps: float = Field(0.12, gt=0, le=1)
+    near_m: float = Field(0.35, gt=0, le=2)
+    cone_base_m: float = Field(0.05, gt=0, le=1)
+    cone_slope: float = Field(0.2, ge=0, le=2)
+    standoff_m: float = Field(0.08, gt=0.01, le=0.5)
+    settle_xy_m: float = Field(0.004, gt=0, le=0.1)
+    settle_z_m: float = Field(0.02, gt=0, le=0.1)
+    settle_yaw_deg: float = Field(3.0, gt=0, le=90)
+    settle_speed_mps: float = Field(0.04, gt=0, le=1)
+    settle_dwell_s: float = Field(0.3, ge=0, le=10)
+    settle_timeout_s: float = Field(10.0, gt=0, le=60)
+    fresh_s: float = Field(0.25, gt=0, le=2)
+    timeout_s: float = Field(40.0, gt=0, le=300)
+
+
+class PerchConfig(Section):
+    """Phase 6. `position` presses with a setpoint `press_m` above the contact;
+    `raw` raises the thrust with stabilised position control off, as the paper does."""
+
+    mode: Literal["position", "raw"] = "position"
+    thrust: int = Field(60000, ge=1000, le=65535)
+    press_m: float = Field(0.25, gt=0, le=1)
+    climb_mps: float = Field(0.2, gt=0, le=1)
+    contact_dwell_s: float = Field(0.25, gt=0, le=5)
+    contact_z_m: float = Field(0.05, gt=0, le=0.3)
+    contact_speed_mps: float = Field(0.06, gt=0, le=1)
+    contact_acc_g: float = Field(0.12, gt=0, le=1)
+    contact_thrust_ratio: float = Field(1.03, gt=1, le=2)
+    timeout_s: float = Field(3.0, gt=0, le=20)
+
+
+class CompleteConfig(Section):
+    """Phase 7. Thrust is released in `steps` over `release_s`; the magnet must hold
+    with the thrust below `hold_ratio` of the hover thrust before the motors stop."""
+
+    steps: int = Field(5, ge=1, le=50)
+    release_s: float = Field(0.8, gt=0, le=10)
+    release_drop_m: float = Field(0.25, gt=0, le=1)
+    hold_ratio: float = Field(0.6, gt=0, lt=1)
+    hold_dwell_s: float = Field(0.3, ge=0, le=5)
+    release_timeout_s: float = Field(4.0, gt=0, le=30)
+    slip_m: float = Field(0.03, gt=0, le=0.3)
+    slip_acc_g: float = Field(0.5, gt=0, lt=1)
+    watch_s: float = Field(2.5, gt=0, le=60)
+
+
+class RecoverConfig(Section):
+    """After a miss or a slip: descend, steady, back to phase 3."""
+
+    descend_m: float = Field(0.10, gt=0, le=1)
+    speed_mps: float = Field(0.4, gt=0, le=1)
+    dwell_s: float = Field(0.5, ge=0, le=10)
+    steady_mps: float = Field(0.1, gt=0, le=1)
+    timeout_s: float = Field(6.0, gt=0, le=60)
+
+
+class LandingConfig(Section):
+    """`undershoot_m` below the ground of the estimate, so that a drifted height still
+    ends on the floor."""
+
+    speed_mps: float = Field(0.35, gt=0, le=1)
+    undershoot_m: float = Field(0.05, ge=0, le=1)
+    timeout_s: float = Field(20.0, gt=0, le=120)
+
+
+class PlannerConfig(Section):
+    takeoff_height_m: float = Field(0.5, ge=0.2, le=5)
+    takeoff_duration_s: float = Field(2.5, gt=0.5, le=20)
+    approach_xy_m: tuple[float, float] | None = None  # fly here after take-off
+    approach_timeout_s: float = Field(15.0, gt=0, le=120)
+    search: SearchConfig = SearchConfig()
+    estimate: EstimateConfig = EstimateConfig()
+    align: AlignConfig = AlignConfig()
+    ascend: AscendConfig = AscendConfig()
+    perch: PerchConfig = PerchConfig()
+    complete: CompleteConfig = CompleteConfig()
+    recover: RecoverConfig = RecoverConfig()
+    landing: LandingConfig = LandingConfig()
+    attempts: int = Field(3, ge=1, le=50)
+    perching_time_s: float = Field(120.0, gt=0, le=1200)
+    trim_per_s: float = Field(0.4, ge=0, le=5)  # integral of the position error
+    trim_limit_m: float = Field(0.08, ge=0, le=0.5)
+
+
+class SafetyConfig(Section):
+    """Limits and reaction times; `*_hold_s` stays where it is, `*_land_s` lands."""
+
+    min_rest_v: float = Field(3.6, ge=0, le=5)
+    min_load_v: float = Field(3.0, ge=0, le=5)
+    battery_debounce_s: float = Field(1.5, ge=0, le=30)
+    battery_stale_s: float = Field(90.0, gt=0, le=600)  # grace for a reading that stands still
+    telemetry_hold_s: float = Field(0.3, gt=0, le=5)
+    telemetry_land_s: float = Field(1.0, gt=0, le=10)
+    camera_hold_s: float = Field(0.5, gt=0, le=10)
+    camera_land_s: float = Field(3.0, gt=0, le=60)
+    max_frame_age_s: float = Field(0.4, gt=0, le=5)
+    jump_m: float = Field(0.25, gt=0, le=5)
+    jump_hold_s: float = Field(0.5, ge=0, le=0.5)
+    max_height_m: float = Field(3.0, gt=0, le=20)
+    fence_radius_m: float = Field(2.0, gt=0, le=50)
+    max_tilt_deg: float = Field(55.0, gt=0, le=180)
+    tilt_debounce_s: float = Field(0.2, ge=0, le=2)
+    loop_late_hold_s: float = Field(0.25, gt=0, le=5)
+    loop_late_land_s: float = Field(1.0, gt=0, le=10)
+    estimator_wait_s: float = Field(6.0, gt=0, le=60)
+    estimator_variance_m2: float = Field(0.01, gt=0, le=10)
+    land_on_log_error: bool = False
+
+
+class LinkConfig(Section):
+    uri: str = "sim://"
+    connect_timeout_s: float = Field(15.0, gt=0, le=120)
+    parameters: dict[str, int | float] = Field(default_factory=dict)
+    telemetry_period_s: float = Field(0.01, ge=0.01, le=0.1)
+    loop_hz: float = Field(50.0, ge=5, le=200)
+
+
+class SimulationConfig(Section):
+    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.draw`)."""
+
+    start_offset_m: float = Field(0.5, ge=0, le=5)
+    target_yaw_deg: Range = (-180.0, 180.0)
+    ceiling_z_m: Range = (1.8, 2.6)
+    mass_kg: Range = (0.038, 0.042)
+    battery_rest_v: Range = (3.7, 4.2)
+    camera_latency_s: Range = (0.03, 0.12)
+    camera_jitter_s: float = Field(0.008, ge=0, le=0.2)
+    camera_rate_hz: float = Field(30.0, gt=0, le=200)
+    camera_drop_rate: float = Field(0.1, ge=0, lt=1)
+    camera_burst_frames: tuple[int, int] | None = (8, 20)
+    camera_noise_sigma: Range = (4.0, 8.0)
+    camera_exposure_s: float = Field(0.008, ge=0, le=0.05)
+    camera_defocus_px: float = Field(0.6, ge=0, le=10)
+    mount_error_deg: float = Field(1.0, ge=0, le=20)
+    mount_error_m: float = Field(0.001, ge=0, le=0.05)
+    estimate_noise_m: float = Field(0.002, ge=0, le=0.2)
+    estimate_tilt_bias_deg: float = Field(0.3, ge=0, le=10)
+    drift_mps: float = Field(0.01, ge=0, le=0.2)
+    draught_mps: Range = (0.0, 0.3)
+    magnet_force_n: float = Field(1.2, ge=0, le=20)
+    first_contact_fails: float = Field(0.1, ge=0, le=1)
+    no_target: bool = False
+
+
+class LogConfig(Section):
+    directory: str = "perchctl-logs"
+    plot: bool = True
+
+
+class Profile(Section):
+    """One flight's resolved configuration."""
+
+    name: str = "unnamed"
+    description: str = ""
+    camera: CameraConfig = CameraConfig()
+    vehicle: VehicleConfig = VehicleConfig()
+    target: TargetConfig = TargetConfig()
+    detector: DetectorConfig = DetectorConfig()
+    pose: PoseConfig = PoseConfig()
+    kalman: KalmanConfig = KalmanConfig()
+    merge: MergeConfig = MergeConfig()
+    planner: PlannerConfig = PlannerConfig()
+    safety: SafetyConfig = SafetyConfig()
+    link: LinkConfig = LinkConfig()
+    simulation: SimulationConfig = SimulationConfig()
+    log: LogConfig = LogConfig()
+
+    @model_validator(mode="after")
+    def _heights_fit(self) -> Profile:
+        if self.planner.search.max_height_m > self.safety.max_height_m:
+            raise ValueError(
+                f"planner.search.max_height_m ({self.planner.search.max_height_m}) must not "
+                f"exceed safety.max_height_m ({self.safety.max_height_m})"
+            )
+        if self.planner.takeoff_height_m > self.planner.search.max_height_m:
+            raise ValueError(
+                f"planner.takeoff_height_m ({self.planner.takeoff_height_m}) must not exceed "
+                f"planner.search.max_height_m ({self.planner.search.max_height_m})"
+            )
+        return self
+
+
+def find_profile(name: str) -> Path:
+    """The file of a profile given by path or by name; NotFound names the choices."""
+    if "/" in name or name.endswith((".yaml", ".yml")):
+        path = Path(name).expanduser()
+        if path.is_file():
+            return path
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise NotFound(f"profile file {name} {what}; shipped profiles are {_choices()}")
+    found = data_file("profiles", name)
+    if found is None:
+        raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
+    return found
+
+
+def load_profile(name: str) -> Profile:
+    """Read, resolve `extends` and check a profile. Errors: NotFound, InvalidValue."""
+    path = find_profile(name)
+    values = _resolved(path, seen=())
+    values.setdefault("name", path.stem)
+    try:
+        return Profile.model_validate(values)
+    except ValidationError as error:
+        raise InvalidValue(_one_sentence(path, error)) from None
+
+
+def find_calibration(name: str, profile_path: Path | None = None) -> Path:
+    """A calibration file by path, beside the profile, or by name from `calib/`."""
+    candidates = [Path(name).expanduser()]
+    if profile_path is not None:
+        candidates.append(profile_path.parent / name)
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    found = data_file("calib", name)
+    if found is None:
+        raise NotFound(
+            f"calibration file {name} not found; give a path, or one of "
+            f"{', '.join(listing('calib')) or 'none (' + str(data_folder('calib')) + ' is empty)'}"
+        )
+    return found
+
+
+def _choices() -> str:
+    return ", ".join(listing("profiles"))
+
+
+def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
+    if path in seen:
+        raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
+    values = _read_yaml(path)
+    base_name = values.pop("extends", None)
+    if base_name is None:
+        return values
+    if not isinstance(base_name, str):
+        raise InvalidValue(f"{path}: extends: must be the name or path of a profile")
+    beside = path.parent / base_name
+    base = beside if beside.is_file() else find_profile(base_name)
+    return _merged(_resolved(base, (*seen, path)), values)
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise InvalidValue(f"{path}: line {line}: not YAML: {error.problem}") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InvalidValue(
+            f"{path}: not a text file in YAML ({error.__class__.__name__})"
+        ) from None
+    except OSError as error:
+        raise NotFound(f"{path}: cannot be read: {error.strerror}") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise InvalidValue(f"{path}: must hold keys and values, found {type(values).__name__}")
+    return values
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    result = dict(base)
+    for key, value in over.items():
+        old = result.get(key)
+        both = isinstance(old, dict) and isinstance(value, dict)
+        result[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def _one_sentence(path: Path, error: ValidationError) -> str:
+    faults = error.errors(include_url=False)
+    first = faults[0]
+    key = ".".join(str(part) for part in first["loc"]) or "profile"
+    if first["type"] == "extra_forbidden":
+        text = f"this key is unknown; allowed here are {', '.join(_keys_at(first['loc'][:-1]))}"
+    elif first["type"] == "value_error":
+        text = str(first["ctx"]["error"])
+    else:
+        text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {first['input']!r}"
+        if key.endswith("_m") and first["type"] == "less_than_equal":
+            text += " (metres: were millimetres or centimetres meant?)"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return f"{path}: {key}: {text}{more}"
+
+
+def _keys_at(loc: tuple[int | str, ...]) -> list[str]:
+    model: Any = Profile
+    for part in loc:
+        model = model.model_fields[part].annotation
+    return list(model.model_fields)

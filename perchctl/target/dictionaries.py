@@ -1,0 +1,45 @@
+"""ArUco dictionaries by name, and the ids they hold."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from typing import Any
+
+import cv2
+
+
+@cache
+def dictionary_names() -> tuple[str, ...]:
+    """All predefined dictionaries of the installed OpenCV, sorted."""
+    return tuple(sorted(n for n in dir(cv2.aruco) if re.fullmatch(r"DICT_[A-Z0-9_]+", n)))
+
+
+@cache
+def predefined(name: str) -> Any:
+    """The cv2.aruco dictionary of that name; ValueError names the choices."""
+    if name not in dictionary_names():
+        raise ValueError(
+            f"dictionary {name!r} is unknown; allowed are {', '.join(dictionary_names())}"
+        )
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
+def id_count(name: str) -> int:
+    """How many ids the dictionary holds (0 .. count - 1)."""
+    return int(predefined(name).bytesList.shape[0])
+
+
+def check_marker_id(name: str, marker_id: int) -> None:
+    """Raises ValueError when the id is outside its dictionary, with what would hold it."""
+    count = id_count(name)
+    if marker_id < count:
+        return
+    hint = ""
+    match = re.fullmatch(r"(DICT_\d+X\d+)_\d+", name)
+    if match:
+        family = [n for n in dictionary_names() if n.startswith(match.group(1) + "_")]
+        larger = sorted((id_count(n), n) for n in family if id_count(n) > marker_id)
+        if larger:
+            hint = f"; {larger[0][1]} holds it"
+    raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}{hint}")
