@@ -1,0 +1,281 @@
+"""The flight loop: newest frame, telemetry, pipeline, planner, link, log; one thread.
+
+Time comes from a `Clock`, so the same loop flies in real time through cflib and in
+lockstep with a simulated vehicle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from perchctl.camera.health import HealthState, check_frame
+from perchctl.camera.source import FrameSource, check_size
+from perchctl.errors import Interrupted
+from perchctl.link.protocol import Link
+from perchctl.mission import planner
+from perchctl.mission.history import History, attitude_at, extended
+from perchctl.mission.preflight import Readiness, refuse, still_waiting_for
+from perchctl.mission.state import Observation, Operator, Outcome, Phase, PlannerState
+from perchctl.mission.types import FLYING, LOCKED, Command, Idle, Land, Telemetry
+from perchctl.pipeline import PipelineSetup
+from perchctl.pipeline import step as pipeline_step
+from perchctl.profile import Profile
+from perchctl.vision.types import Frame, PipelineOutput, PipelineState, TargetPose
+
+
+class Clock(Protocol):
+    def now(self) -> float:
+        """Seconds, monotonic."""
+
+    def wait_until(self, t_s: float) -> None:
+        """Return at `t_s`, or at once when it is past."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tick:
+    """All that one turn of the loop knew and did, for the log and the display."""
+
+    t_s: float
+    telemetry: Telemetry
+    output: PipelineOutput | None
+    target: TargetPose | None
+    state: PlannerState
+    command: Command
+    loop_late_s: float
+    camera_age_s: float
+    telemetry_age_s: float
+
+
+class Watcher(Protocol):
+    """Something that looks on: flight log, panel, live page. Must not raise."""
+
+    def tick(self, tick: Tick) -> None: ...
+
+    def event(self, t_s: float, text: str) -> None: ...
+
+    @property
+    def problem(self) -> str | None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class FlightParts:
+    link: Link
+    source: FrameSource
+    clock: Clock
+    profile: Profile
+    pipeline: PipelineSetup
+    watchers: tuple[Watcher, ...] = ()
+    operator: Callable[[], Operator] = lambda: Operator.NONE
+
+
+@dataclass(frozen=True)
+class FlightReport:
+    """How the flight ended. `row` names the transition that decided it."""
+
+    phase: Phase
+    outcome: Outcome
+    reason: str
+    attempts: int
+    duration_s: float
+    locked: bool
+    history: tuple[tuple[float, str, str], ...] = ()
+
+
+@dataclass(eq=False)
+class _Senses:
+    """The loop's working memory of what it sees; belongs to this module only."""
+
+    history: History = field(default_factory=History)
+    health: HealthState = field(default_factory=HealthState)
+    pipeline: PipelineState = field(default_factory=PipelineState)
+    output: PipelineOutput | None = None
+    target: TargetPose | None = None
+    last_good_frame_s: float = -math.inf
+    camera_problem: str | None = None
+    frames: int = 0
+
+
+def fly(parts: FlightParts) -> FlightReport:
+    """Connect is done: wait until ready, fly the mission, return how it ended.
+
+    Whatever is raised on the way, the vehicle is landed first. Errors:
+    `SafetyAbort` and `TimedOut` before take-off, `Interrupted` before take-off,
+    and anything unforeseen after the rescue.
+    """
+    senses = _Senses()
+    try:
+        _wait_until_ready(parts, senses)
+        return _mission(parts, senses)
+    except BaseException:
+        rescue(parts.link, parts.clock, parts.profile)
+        raise
+
+
+def rescue(link: Link, clock: Clock, profile: Profile) -> None:
+    """Land whatever still flies and wait for it, bounded; the last resort of every
+    error path. The landing needs no further packet once it is under way."""
+    landing = profile.planner.landing
+    newest: Telemetry | None = None
+    end_s = clock.now() + landing.timeout_s
+    ordered = False
+    while clock.now() < end_s:
+        samples = link.telemetry()
+        newest = samples[-1] if samples else newest
+        if newest is None or not newest.has(FLYING):
+            return
+        if not ordered:
+            duration_s = max(1.0, newest.position_m[2] / landing.speed_mps)
+            link.send(Land(-landing.undershoot_m, duration_s))
+            ordered = True
+        clock.wait_until(clock.now() + 0.1)
+
+
+def _wait_until_ready(parts: FlightParts, senses: _Senses) -> None:
+    readiness = Readiness(started_s=parts.clock.now())
+    while True:
+        now_s = parts.clock.now()
+        if parts.operator() is not Operator.NONE:
+            raise Interrupted("Ctrl-C before take-off: nothing was started")
+        _sense(parts, senses, now_s)
+        newest = senses.history.newest
+        refuse(newest, parts.profile)
+        waiting = still_waiting_for(
+            readiness, newest, senses.frames > 0, senses.camera_problem, now_s, parts.profile
+        )
+        if not waiting:
+            return
+        parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
+
+
+def _mission(parts: FlightParts, senses: _Senses) -> FlightReport:
+    period_s = 1.0 / parts.profile.link.loop_hz
+    clock = parts.clock
+    due_s = clock.now()
+    state: PlannerState | None = None
+    passed: list[tuple[float, str, str]] = []
+    while True:
+        now_s = clock.now()
+        late_s = max(0.0, now_s - due_s)
+        fresh_output = _sense(parts, senses, now_s)
+        obs = _observe(parts, senses, now_s, late_s, fresh_output)
+        if state is None:
+            state = planner.start(obs)
+            passed.append((now_s, state.phase.value, state.reason))
+            _tell(parts, now_s, f"{state.phase.value}: {state.reason}")
+        before = state
+        state, command = planner.step(state, obs, parts.profile)
+        if not isinstance(command, Idle):
+            parts.link.send(command)
+        if state.phase is not before.phase:
+            passed.append((now_s, state.phase.value, state.reason))
+            _tell(parts, now_s, f"{state.phase.value}: {state.reason}")
+        elif state.hold and state.hold != before.hold and not before.hold:
+            _tell(parts, now_s, f"holding: {state.hold}")
+        tick = Tick(
+            now_s,
+            obs.telemetry,
+            senses.output if fresh_output else None,
+            obs.target,
+            state,
+            command,
+            late_s,
+            obs.camera_age_s,
+            now_s - obs.telemetry.t_s,
+        )
+        for watcher in parts.watchers:
+            watcher.tick(tick)
+        if planner.is_over(state):
+            return _report(state, now_s, obs.telemetry, tuple(passed))
+        due_s += period_s
+        if due_s < now_s:
+            due_s = now_s + period_s  # never try to catch up with a burst of old ticks
+        clock.wait_until(due_s)
+
+
+def _sense(parts: FlightParts, senses: _Senses, now_s: float) -> bool:
+    """Take in telemetry and at most one frame; True when a good frame was processed."""
+    safety = parts.profile.safety
+    senses.history = extended(senses.history, parts.link.telemetry(), safety)
+    frame = parts.source.newest(now_s)
+    problem = parts.source.problem(now_s)
+    if frame is None:
+        if problem is not None:
+            senses.camera_problem = problem
+        return False
+    if senses.frames == 0:
+        check_size(frame.image, parts.pipeline.camera.size_px)
+    senses.camera_problem = problem or _rejection(senses, frame, now_s, safety.max_frame_age_s)
+    if senses.camera_problem is not None:
+        return False
+    attitude = attitude_at(senses.history, frame.t_s)
+    senses.pipeline, senses.output = pipeline_step(senses.pipeline, frame, attitude, parts.pipeline)
+    senses.target = senses.output.target
+    senses.last_good_frame_s = now_s
+    senses.frames += 1
+    return True
+
+
+def _rejection(senses: _Senses, frame: Frame, now_s: float, max_age_s: float) -> str | None:
+    """Why this frame is no measurement: too old, frozen, or no picture at all."""
+    senses.health, verdict = check_frame(senses.health, frame)
+    if verdict is not None:
+        return verdict
+    age_s = now_s - frame.t_s
+    if age_s > max_age_s:
+        return f"the picture is {age_s:.1f} s late"
+    return None
+
+
+def _observe(
+    parts: FlightParts, senses: _Senses, now_s: float, late_s: float, new_frame: bool
+) -> Observation:
+    newest = senses.history.newest
+    assert newest is not None
+    changed_s = senses.history.battery_changed_s
+    target = senses.target
+    camera_age_s = now_s - senses.last_good_frame_s
+    if camera_age_s > parts.profile.safety.camera_hold_s:
+        target = None  # the filter coasts by frames; without any, its word is stale
+    return Observation(
+        t_s=now_s,
+        telemetry=newest,
+        target=target,
+        new_frame=new_frame,
+        camera_age_s=camera_age_s,
+        camera_problem=senses.camera_problem,
+        link_problem=parts.link.alive(now_s),
+        battery_age_s=0.0 if changed_s is None else now_s - changed_s,
+        jumped=senses.history.jumped,
+        loop_late_s=late_s,
+        disagreeing_frames=senses.output.disagreeing_frames if senses.output else 0,
+        operator=parts.operator(),
+        log_problem=next((w.problem for w in parts.watchers if w.problem), None),
+    )
+
+
+def _report(
+    state: PlannerState,
+    now_s: float,
+    telemetry: Telemetry,
+    passed: tuple[tuple[float, str, str], ...],
+) -> FlightReport:
+    reason = next((r for _, phase, r in reversed(passed) if phase == "LANDING"), state.reason)
+    if state.phase is not Phase.LANDED:
+        reason = state.reason
+    return FlightReport(
+        phase=state.phase,
+        outcome=state.outcome or Outcome.SAFETY,
+        reason=reason,
+        attempts=state.attempts + int(state.phase is Phase.PERCHED),
+        duration_s=now_s - state.started_s,
+        locked=telemetry.has(LOCKED),
+        history=passed,
+    )
+
+
+def _tell(parts: FlightParts, t_s: float, text: str) -> None:
+    for watcher in parts.watchers:
+        watcher.event(t_s, text)

@@ -1,0 +1,85 @@
+"""Setpoints: where the body has to go, and how fast the setpoint may walk there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from perchctl.geometry import rot_z, wrap_rad
+from perchctl.mission.types import PositionSetpoint
+from perchctl.mission.view import View
+
+FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
+
+
+def hold_here(v: View) -> PositionSetpoint:
+    """The present position and heading of the estimate."""
+    x, y, z = v.obs.telemetry.position_m
+    return PositionSetpoint(x, y, z, v.obs.telemetry.yaw_rad)
+
+
+def under_target_xy(v: View, yaw_rad: float) -> tuple[float, float]:
+    """Where the body has to be so that the gear is under the target at that heading."""
+    target = v.target_world_m
+    assert target is not None
+    gear = rot_z(yaw_rad) @ v.profile.vehicle.gear_body_m
+    return float(target[0] - gear[0]), float(target[1] - gear[1])
+
+
+def walk(
+    old: PositionSetpoint,
+    goal: PositionSetpoint,
+    dt_s: float,
+    *,
+    xy_mps: float,
+    up_mps: float,
+    down_mps: float,
+    yaw_rate_radps: float,
+) -> PositionSetpoint:
+    """The setpoint one tick later: towards the goal, at limited speeds."""
+    dx, dy = goal.x_m - old.x_m, goal.y_m - old.y_m
+    distance = math.hypot(dx, dy)
+    part = 1.0 if distance <= xy_mps * dt_s else xy_mps * dt_s / distance
+    dz = max(-down_mps * dt_s, min(up_mps * dt_s, goal.z_m - old.z_m))
+    dyaw = wrap_rad(goal.yaw_rad - old.yaw_rad)
+    dyaw = max(-yaw_rate_radps * dt_s, min(yaw_rate_radps * dt_s, dyaw))
+    return PositionSetpoint(
+        old.x_m + part * dx, old.y_m + part * dy, old.z_m + dz, wrap_rad(old.yaw_rad + dyaw)
+    )
+
+
+def trimmed(v: View, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
+    """Integral of the gear's position error, world axes, limited.
+
+    The onboard position loop answers a steady draught with a steady offset; this
+    slow integral takes it away. It rests while the error is large, so that a
+    journey does not wind it up.
+    """
+    planner = v.profile.planner
+    ex = goal_xy[0] - v.obs.telemetry.position_m[0]
+    ey = goal_xy[1] - v.obs.telemetry.position_m[1]
+    tx, ty = v.state.trim_m
+    if math.hypot(ex, ey) < 0.06:
+        tx += planner.trim_per_s * ex * dt_s
+        ty += planner.trim_per_s * ey * dt_s
+    size = math.hypot(tx, ty)
+    if size > planner.trim_limit_m:
+        tx, ty = tx * planner.trim_limit_m / size, ty * planner.trim_limit_m / size
+    return tx, ty
+
+
+def limited(v: View, setpoint: PositionSetpoint) -> PositionSetpoint:
+    """The setpoint inside the fence and under the height limit (fault 36)."""
+    ground, safety = v.state.ground_m, v.profile.safety
+    if ground is None:
+        return setpoint
+    dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]
+    distance = math.hypot(dx, dy)
+    if distance > safety.fence_radius_m:
+        dx, dy = dx * safety.fence_radius_m / distance, dy * safety.fence_radius_m / distance
+    return replace(
+        setpoint,
+        x_m=ground[0] + dx,
+        y_m=ground[1] + dy,
+        z_m=min(setpoint.z_m, ground[2] + safety.max_height_m),
+    )

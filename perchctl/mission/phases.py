@@ -1,0 +1,286 @@
+"""The mission as one ordered table: first match wins, safety rows on top.
+
+The README's diagram and `perchctl fly --help` are drawn from `TABLE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from perchctl.mission.state import FLYING_PHASES, Operator, Outcome, Phase, Severity
+from perchctl.mission.types import CRASHED, LOCKED, TUMBLED
+from perchctl.mission.view import View
+
+Guard = Callable[[View], bool]
+P, S, O = Phase, Severity, Outcome  # noqa: E741 - column names of the table below
+
+AIR = FLYING_PHASES | {P.LANDING}
+BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
+BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """From any of `phases`, when `when` holds, to `to`; `reason` is told to the user."""
+
+    name: str
+    phases: frozenset[Phase]
+    when: Guard
+    to: Phase
+    reason: str | Callable[[View], str]
+    severity: Severity = Severity.CONTINUE
+    outcome: Outcome | None = None
+    counts_attempt: bool = False
+
+    def explain(self, view: View) -> str:
+        return self.reason if isinstance(self.reason, str) else self.reason(view)
+
+
+def _only(*phases: Phase) -> frozenset[Phase]:
+    return frozenset(phases)
+
+
+def _left_jump_hold(v: View) -> bool:
+    jump = v.state.jump_s
+    return jump is not None and v.obs.t_s - jump >= v.profile.safety.jump_hold_s
+
+
+def _fence_broken(v: View) -> bool:
+    if v.state.ground_m is None:
+        return False
+    x, y, _ = v.obs.telemetry.position_m
+    dx, dy = x - v.state.ground_m[0], y - v.state.ground_m[1]
+    return (dx * dx + dy * dy) ** 0.5 > v.profile.safety.fence_radius_m
+
+
+def _searched_out(v: View) -> bool:
+    return v.state.searches >= v.profile.planner.search.attempts
+
+
+def _attempts_used(v: View) -> bool:
+    return v.state.attempts >= v.profile.planner.attempts
+
+
+def _settling_too_long(v: View) -> bool:
+    ascend = v.profile.planner.ascend
+    return v.held("near_standoff") > ascend.settle_timeout_s
+
+
+TABLE: tuple[Row, ...] = (
+    # --- safety, gravest first -------------------------------------------
+    Row(
+        "operator-stop", AIR, lambda v: v.obs.operator >= Operator.STOP, P.ABORTED,
+        "second Ctrl-C: emergency stop", S.STOP, O.EMERGENCY,
+    ),
+    Row(
+        "locked", AIR, lambda v: v.obs.telemetry.has(LOCKED), P.ABORTED,
+        "the supervisor has locked the vehicle: inspect and restart it", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "tumbled", AIR, lambda v: v.obs.telemetry.has(TUMBLED), P.ABORTED,
+        "the vehicle has tumbled: inspect and restart it", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "crashed", AIR, lambda v: v.obs.telemetry.has(CRASHED), P.ABORTED,
+        "the supervisor reports a crash: inspect and restart the vehicle", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "tilted", AIR,
+        lambda v: v.held("tilted") >= v.profile.safety.tilt_debounce_s
+        and not v.state.motors_stopped,
+        P.ABORTED, "tilted beyond the limit: motors cut", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "operator-land", FLYING_PHASES, lambda v: v.obs.operator >= Operator.LAND, P.LANDING,
+        "Ctrl-C: landing", S.LAND, O.OPERATOR,
+    ),
+    Row(
+        "link-lost", FLYING_PHASES, lambda v: v.obs.link_problem is not None, P.LANDING,
+        lambda v: f"link lost: {v.obs.link_problem}", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "telemetry-stale", FLYING_PHASES,
+        lambda v: v.telemetry_age_s > v.profile.safety.telemetry_land_s, P.LANDING,
+        lambda v: f"no telemetry for {v.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "estimator-jump", FLYING_PHASES, _left_jump_hold, P.LANDING,
+        "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "battery-low", BEFORE_CONTACT,
+        lambda v: v.held("battery_low") >= v.profile.safety.battery_debounce_s, P.LANDING,
+        lambda v: f"battery at {v.obs.telemetry.battery_v:.2f} V under load", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "battery-unknown", BEFORE_CONTACT,
+        lambda v: v.obs.battery_age_s > v.profile.safety.battery_stale_s, P.LANDING,
+        "the battery's reading stands still", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "height-limit", BEFORE_CONTACT,
+        lambda v: v.height_m > v.profile.safety.max_height_m, P.LANDING,
+        lambda v: f"height {v.height_m:.2f} m is above the limit", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "fence", BEFORE_CONTACT, _fence_broken, P.LANDING,
+        "outside the fence", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "camera-gone", BY_CAMERA,
+        lambda v: v.obs.camera_age_s > v.profile.safety.camera_land_s, P.LANDING,
+        lambda v: v.obs.camera_problem or f"no picture for {v.obs.camera_age_s:.1f} s",
+        S.LAND, O.SAFETY,
+    ),
+    Row(
+        "loop-late", FLYING_PHASES,
+        lambda v: v.obs.loop_late_s > v.profile.safety.loop_late_land_s, P.LANDING,
+        lambda v: f"the control loop was {v.obs.loop_late_s:.1f} s late", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "markers-disagree", BY_CAMERA,
+        lambda v: v.obs.disagreeing_frames >= v.profile.merge.disagreement_frames, P.LANDING,
+        "large and small marker contradict each other: check the printed sizes in the "
+        "profile and the camera's calibration",
+        S.LAND, O.SAFETY,
+    ),
+    Row(
+        "log-lost", BEFORE_CONTACT,
+        lambda v: v.profile.safety.land_on_log_error and v.obs.log_problem is not None,
+        P.LANDING, lambda v: f"flight log: {v.obs.log_problem}", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "time-over", BEFORE_CONTACT,
+        lambda v: v.obs.t_s - v.state.started_s > v.profile.planner.perching_time_s, P.LANDING,
+        "the perching time is over", S.LAND, O.ATTEMPTS_USED_UP,
+    ),
+    # --- phase 1: approach ---------------------------------------------------
+    Row(
+        "approached", _only(P.APPROACH), lambda v: v.held("at_takeoff_height") >= 0.3, P.SEARCH,
+        "hovering in the perching area",
+    ),
+    Row(
+        "approach-timeout", _only(P.APPROACH),
+        lambda v: v.in_phase_s > v.profile.planner.approach_timeout_s, P.LANDING,
+        lambda v: f"take-off reached only {v.height_m:.2f} m", S.LAND, O.SAFETY,
+    ),
+    # --- phase 2: search -----------------------------------------------------
+    Row(
+        "found", _only(P.SEARCH),
+        lambda v: v.state.confirmed >= v.profile.planner.search.confirm_frames, P.ESTIMATE,
+        "target seen",
+    ),
+    Row(
+        "searched-out", _only(P.SEARCH), _searched_out, P.LANDING,
+        "target not found in the allowed attempts", S.LAND, O.TARGET_NOT_FOUND,
+    ),
+    # --- phase 3: estimate ---------------------------------------------------
+    Row(
+        "estimate-lost", _only(P.ESTIMATE),
+        lambda v: not v.tracked or v.in_phase_s > v.profile.planner.estimate.timeout_s, P.SEARCH,
+        "the target's pose does not settle", S.HOLD,
+    ),
+    Row(
+        "estimated", _only(P.ESTIMATE),
+        lambda v: v.held("estimated") >= v.profile.planner.estimate.dwell_s, P.ALIGN,
+        "pose is steady",
+    ),
+    # --- phase 4: align ------------------------------------------------------
+    Row(
+        "align-lost", _only(P.ALIGN), lambda v: not v.tracked, P.SEARCH,
+        "target lost in alignment", S.HOLD,
+    ),
+    Row(
+        "align-timeout", _only(P.ALIGN),
+        lambda v: v.in_phase_s > v.profile.planner.align.timeout_s, P.RECOVER,
+        "alignment took too long", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "aligned", _only(P.ALIGN),
+        lambda v: v.held("aligned") >= v.profile.planner.align.dwell_s, P.ASCEND,
+        "aligned in position and heading",
+    ),
+    # --- phase 5: ascend -----------------------------------------------------
+    Row(
+        "ascend-lost", _only(P.ASCEND), lambda v: not v.tracked, P.RECOVER,
+        "target lost in ascent", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "outside-cone", _only(P.ASCEND),
+        lambda v: v.error_xy_m > v.cone_m, P.ALIGN,
+        "drifted out of the cone", S.HOLD,
+    ),
+    Row(
+        "ascend-timeout", _only(P.ASCEND),
+        lambda v: v.in_phase_s > v.profile.planner.ascend.timeout_s or _settling_too_long(v),
+        P.RECOVER, "does not settle under the target", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "settled", _only(P.ASCEND),
+        lambda v: v.held("settled") >= v.profile.planner.ascend.settle_dwell_s, P.PERCH,
+        "settled at the stand-off",
+    ),
+    # --- phase 6: perch ------------------------------------------------------
+    Row(
+        "contact", _only(P.PERCH),
+        lambda v: v.held("contact") >= v.profile.planner.perch.contact_dwell_s, P.COMPLETE,
+        "contact proven by position, acceleration and thrust",
+    ),
+    Row(
+        "no-contact", _only(P.PERCH),
+        lambda v: v.in_phase_s > v.profile.planner.perch.timeout_s, P.RECOVER,
+        "no proof of contact", S.BACK_OFF, counts_attempt=True,
+    ),
+    # --- phase 7: completion -------------------------------------------------
+    Row(
+        "slipped", _only(P.COMPLETE), lambda v: v.held("slipping") >= 0.03, P.RECOVER,
+        lambda v: "slipped while hanging" if v.state.motors_stopped else "the magnet does not hold",
+        S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "not-released", _only(P.COMPLETE),
+        lambda v: not v.state.motors_stopped
+        and v.in_phase_s > v.profile.planner.complete.release_timeout_s,
+        P.RECOVER, "the thrust could not be released", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "perched", _only(P.COMPLETE),
+        lambda v: v.state.motors_stopped
+        and v.held("down") >= 0.1
+        and v.in_phase_s >= v.profile.planner.complete.watch_s,
+        P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
+    ),
+    # --- the failed attempt --------------------------------------------------
+    Row(
+        "attempts-used", _only(P.RECOVER),
+        lambda v: _attempts_used(v) and v.in_phase_s > 0.5, P.LANDING,
+        "all perching attempts are used up", S.LAND, O.ATTEMPTS_USED_UP,
+    ),
+    Row(
+        "recovered", _only(P.RECOVER),
+        lambda v: v.held("steady") >= v.profile.planner.recover.dwell_s
+        and v.in_phase_s >= v.profile.planner.recover.dwell_s,
+        P.ESTIMATE, "steady again, trying once more",
+    ),
+    Row(
+        "recover-timeout", _only(P.RECOVER),
+        lambda v: v.in_phase_s > v.profile.planner.recover.timeout_s, P.LANDING,
+        "the vehicle does not become steady", S.LAND, O.SAFETY,
+    ),
+    # --- landing ---------------------------------------------------------------
+    Row("landed", _only(P.LANDING), lambda v: v.held("down") >= 0.1, P.LANDED, "motors off"),
+    Row(
+        "landing-timeout", _only(P.LANDING),
+        lambda v: v.in_phase_s > v.profile.planner.landing.timeout_s, P.ABORTED,
+        "the landing was not confirmed in time", S.LAND, O.SAFETY,
+    ),
+)  # fmt: skip
+
+
+def first_match(view: View, table: tuple[Row, ...] = TABLE) -> Row | None:
+    """The first row that applies to the view's phase, or None to stay."""
+    for row in table:
+        if view.state.phase in row.phases and row.when(view):
+            return row
+    return None

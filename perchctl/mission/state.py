@@ -1,0 +1,150 @@
+"""The planner's values: what it observes each tick and what it remembers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+
+from perchctl.geometry import Array
+from perchctl.mission.types import PositionSetpoint, Telemetry
+from perchctl.vision.types import TargetPose
+
+
+class Phase(Enum):
+    """The paper's seven phases, the two ways down, and the terminals."""
+
+    APPROACH = "APPROACH"
+    SEARCH = "SEARCH"
+    ESTIMATE = "ESTIMATE"
+    ALIGN = "ALIGN"
+    ASCEND = "ASCEND"
+    PERCH = "PERCH"
+    COMPLETE = "COMPLETE"
+    RECOVER = "RECOVER"
+    LANDING = "LANDING"
+    PERCHED = "PERCHED"
+    LANDED = "LANDED"
+    ABORTED = "ABORTED"
+
+
+SEVEN = (
+    Phase.APPROACH,
+    Phase.SEARCH,
+    Phase.ESTIMATE,
+    Phase.ALIGN,
+    Phase.ASCEND,
+    Phase.PERCH,
+    Phase.COMPLETE,
+)
+FLYING_PHASES = frozenset({*SEVEN, Phase.RECOVER})
+TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
+
+
+class Severity(IntEnum):
+    """How grave a row is; within a flight it only rises."""
+
+    CONTINUE = 0
+    HOLD = 1
+    BACK_OFF = 2
+    LAND = 3
+    STOP = 4
+
+
+class Outcome(Enum):
+    """Why the flight ended, each with one exit code."""
+
+    PERCHED = "perched"
+    TARGET_NOT_FOUND = "target not found"
+    ATTEMPTS_USED_UP = "attempts used up"
+    SAFETY = "safety abort"
+    EMERGENCY = "emergency stop"
+    OPERATOR = "operator"
+
+
+class Operator(IntEnum):
+    """The person's word; it only rises (Ctrl-C once, twice)."""
+
+    NONE = 0
+    LAND = 1
+    STOP = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Everything one tick knows. Times on the loop's clock; ages in seconds.
+
+    Attributes:
+        telemetry: the newest sample; its age is `t_s - telemetry.t_s`.
+        target: the pipeline's newest merged pose, None when nothing is tracked.
+        new_frame: a good frame was processed in this tick.
+        camera_age_s: since the last good frame arrived.
+        camera_problem, link_problem: None, or one sentence.
+        jumped: the state estimate moved farther than any flight could.
+        loop_late_s: how late this tick began.
+        disagreeing_frames: frames in a row in which the markers contradicted.
+        log_problem: the flight log cannot be written.
+    """
+
+    t_s: float
+    telemetry: Telemetry
+    target: TargetPose | None = None
+    new_frame: bool = False
+    camera_age_s: float = 0.0
+    camera_problem: str | None = None
+    link_problem: str | None = None
+    battery_age_s: float = 0.0
+    jumped: bool = False
+    loop_late_s: float = 0.0
+    disagreeing_frames: int = 0
+    operator: Operator = Operator.NONE
+    log_problem: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """Where the target stands in the world of the state estimate, and how that
+    world drifts against it; `t_s` is the exposure it was last measured at."""
+
+    t_s: float
+    world_m: Array
+    yaw_rad: float
+    velocity_mps: Array
+
+    def at(self, t_s: float) -> Array:
+        """Predicted position at `t_s`, shape (3,)."""
+        return self.world_m + self.velocity_mps * (t_s - self.t_s)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannerState:
+    """The planner's whole memory; `since` holds the time at which each named
+    condition became true and has been so without a break."""
+
+    phase: Phase = Phase.APPROACH
+    entered_s: float = 0.0
+    started_s: float = 0.0
+    t_s: float = 0.0
+    reason: str = "start"
+    row: str = ""
+    severity: Severity = Severity.CONTINUE
+    outcome: Outcome | None = None
+    since: dict[str, float] = field(default_factory=dict)
+    attempts: int = 0
+    searches: int = 0
+    search_step_s: float = 0.0
+    confirmed: int = 0
+    anchor: Anchor | None = None
+    anchor_spread_m: float = 0.0
+    small_seen_s: float = -1e9
+    ground_m: tuple[float, float, float] | None = None
+    entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    entry_yaw_rad: float = 0.0
+    setpoint: PositionSetpoint | None = None
+    trim_m: tuple[float, float] = (0.0, 0.0)
+    hover_thrust: float = 0.0
+    contact_z_m: float | None = None
+    ordered_s: float | None = None  # last order of a take-off, landing or motor stop
+    orders: int = 0
+    motors_stopped: bool = False
+    jump_s: float | None = None
+    hold: str = ""  # why the vehicle is held in place, empty when it is not
