@@ -1,0 +1,129 @@
+"""The lockstep sibling of the cflib link: same protocol, no wall clock.
+
+`MockLink` flies a `SimulatedVehicle`; `ScriptedLink` plays back a list of
+telemetry and remembers what it was told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from perchctl.errors import ConnectionFailed
+from perchctl.link.telemetry import NEEDED, VARIANCE_BLOCK, telemetry_from
+from perchctl.mission import types as say
+from perchctl.mission.types import FLYING, Command, Telemetry
+from perchctl.sim.firmware import commands as cf
+
+if TYPE_CHECKING:
+    from perchctl.sim.vehicle import SimulatedVehicle
+
+TELEMETRY_DELAY_S = 0.01
+SETTLE_S = 1.0
+
+
+class MockLink:
+    """The simulated vehicle in lockstep; `advance_to` is the flight's clock."""
+
+    def __init__(self, vehicle: SimulatedVehicle, telemetry_period_s: float = 0.01) -> None:
+        self.vehicle = vehicle
+        self._period_s = telemetry_period_s
+        self._samples: deque[Telemetry] = deque()
+        self._next_sample_s = 0.0
+
+    @property
+    def now_s(self) -> float:
+        return self.vehicle.firmware.t_s
+
+    def advance_to(self, t_s: float) -> None:
+        """Let the vehicle live until `t_s`, sampling its telemetry on the way."""
+        while self._next_sample_s <= t_s:
+            self.vehicle.advance_to(self._next_sample_s)
+            self._samples.append(self._sample())
+            self._next_sample_s += self._period_s
+        self.vehicle.advance_to(t_s)
+
+    def connect(self) -> None:
+        self.advance_to(self.now_s + SETTLE_S)
+        firmware = self.vehicle.firmware
+        firmware.low_level(cf.RawSetpoint(0.0, 0.0, 0.0, 0))
+        firmware.notify_setpoint_stop()
+        self.advance_to(self.now_s + 0.1)
+
+    def telemetry(self) -> list[Telemetry]:
+        arrived = []
+        while self._samples and self._samples[0].t_s <= self.now_s - TELEMETRY_DELAY_S + 1e-9:
+            arrived.append(self._samples.popleft())
+        return arrived
+
+    def send(self, command: Command) -> None:
+        firmware = self.vehicle.firmware
+        match command:
+            case say.Idle():
+                pass
+            case say.PositionSetpoint(x, y, z, yaw):
+                firmware.low_level(cf.PositionCommand(x, y, z, math.degrees(yaw)))
+            case say.RawThrust(thrust):
+                firmware.low_level(cf.RawSetpoint(0.0, 0.0, 0.0, thrust))
+            case say.TakeOff(height, duration):
+                firmware.high_level(cf.HlTakeoff(height, duration))
+            case say.Land(height, duration):
+                firmware.notify_setpoint_stop()
+                firmware.high_level(cf.HlLand(height, duration))
+            case say.StopMotors():
+                firmware.low_level(cf.StopCommand())
+                firmware.notify_setpoint_stop()
+            case say.EmergencyStop():
+                firmware.emergency_stop()
+
+    def alive(self, now_s: float) -> str | None:
+        return None
+
+    def close(self) -> None:
+        """As the real one: waits, bounded, until nothing flies any more."""
+        end_s = self.now_s + 6.0
+        while self.vehicle.firmware.supervisor_info & FLYING and self.now_s < end_s:
+            self.advance_to(self.now_s + 0.1)
+
+    def _sample(self) -> Telemetry:
+        firmware = self.vehicle.firmware
+        values = {name: firmware.log_value(name) for name in (*NEEDED, *VARIANCE_BLOCK)}
+        return telemetry_from(values, firmware.t_s)
+
+
+class ScriptedLink:
+    """Plays telemetry by time and records commands: for tests of the flight loop."""
+
+    def __init__(
+        self, telemetry: Iterable[Telemetry], *, refuse: str = "", dies_at_s: float = math.inf
+    ) -> None:
+        self._script = deque(telemetry)
+        self._refuse = refuse
+        self._dies_at_s = dies_at_s
+        self.now_s = 0.0
+        self.sent: list[tuple[float, Command]] = []
+        self.closed = False
+
+    def advance_to(self, t_s: float) -> None:
+        self.now_s = t_s
+
+    def connect(self) -> None:
+        if self._refuse:
+            raise ConnectionFailed(self._refuse)
+
+    def telemetry(self) -> list[Telemetry]:
+        arrived = []
+        while self._script and self._script[0].t_s <= self.now_s:
+            arrived.append(self._script.popleft())
+        return arrived
+
+    def send(self, command: Command) -> None:
+        self.sent.append((self.now_s, command))
+
+    def alive(self, now_s: float) -> str | None:
+        return "the script ended the link" if now_s >= self._dies_at_s else None
+
+    def close(self) -> None:
+        self.closed = True

@@ -1,0 +1,30 @@
+"""The small door through which the flight reaches a vehicle."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from perchctl.mission.types import Command, Telemetry
+
+
+class Link(Protocol):
+    """A vehicle: simulated in lockstep, or behind cflib.
+
+    All methods are called from the flight loop's thread. Errors are
+    `perchctl.errors.ConnectionFailed`, `NotFound` or `TimedOut`.
+    """
+
+    def connect(self) -> None:
+        """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
+
+    def telemetry(self) -> list[Telemetry]:
+        """Samples that arrived since the last call, oldest first."""
+
+    def send(self, command: Command) -> None:
+        """Hand one command to the vehicle. Never blocks for long."""
+
+    def alive(self, now_s: float) -> str | None:
+        """None while the link works, otherwise one sentence that says why not."""
+
+    def close(self) -> None:
+        """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""

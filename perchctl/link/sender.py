@@ -1,0 +1,74 @@
+"""A thread that hands commands to a blocking library, so the flight loop never blocks.
+
+Setpoints coalesce (only the newest counts); orders keep their place. `stuck_s`
+is the heartbeat: for how long the present hand-over has been hanging.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from perchctl.mission.types import Command, PositionSetpoint, RawThrust
+
+_STREAMED = (PositionSetpoint, RawThrust)
+
+
+class Sender:
+    def __init__(self, hand_over: Callable[[Command], None]) -> None:
+        self._hand_over = hand_over
+        self._queue: deque[Command] = deque()
+        self._ready = threading.Condition()
+        self._busy_since_s: float | None = None
+        self._running = True
+        self.problem: str | None = None
+        self._thread = threading.Thread(target=self._run, name="perchctl-sender", daemon=True)
+        self._thread.start()
+
+    def put(self, command: Command) -> None:
+        with self._ready:
+            if self._queue and isinstance(self._queue[-1], _STREAMED):
+                self._queue.pop()
+            self._queue.append(command)
+            self._ready.notify()
+
+    def stuck_s(self) -> float:
+        """Seconds for which one command has been in the library's hands; 0 when idle."""
+        since = self._busy_since_s
+        return 0.0 if since is None else time.monotonic() - since
+
+    def drain(self, timeout_s: float) -> bool:
+        """Wait until everything is handed over; False when that takes too long."""
+        end_s = time.monotonic() + timeout_s
+        with self._ready:
+            while self._queue or self._busy_since_s is not None:
+                left_s = end_s - time.monotonic()
+                if left_s <= 0:
+                    return False
+                self._ready.wait(left_s)
+        return True
+
+    def stop(self) -> None:
+        with self._ready:
+            self._running = False
+            self._ready.notify_all()
+        self._thread.join(timeout=1.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._ready:
+                while self._running and not self._queue:
+                    self._ready.wait()
+                if not self._running:
+                    return
+                command = self._queue.popleft()
+                self._busy_since_s = time.monotonic()
+            try:
+                self._hand_over(command)
+            except Exception as error:  # the library's, whatever it is: reported by alive()
+                self.problem = f"a command could not be sent: {error}"
+            with self._ready:
+                self._busy_since_s = None
+                self._ready.notify_all()

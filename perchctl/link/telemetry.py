@@ -1,0 +1,69 @@
+"""A Crazyflie's log variables, and their one conversion into `Telemetry`.
+
+Here, and only here, degrees become radians and the Crazyflie's nose-up pitch
+becomes the right-handed nose-down one (firmware facts, "Signs and units").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from perchctl.mission.types import Telemetry
+
+STATE_BLOCK: dict[str, str] = {
+    "stateEstimate.x": "float",
+    "stateEstimate.y": "float",
+    "stateEstimate.z": "float",
+    "stateEstimate.vx": "float",
+    "stateEstimate.vy": "float",
+    "stateEstimate.vz": "float",
+}
+"""24 of the 26 bytes that a log block holds."""
+
+ATTITUDE_BLOCK: dict[str, str] = {
+    "stateEstimate.roll": "float",
+    "stateEstimate.pitch": "float",
+    "stateEstimate.yaw": "float",
+    "acc.z": "float",
+    "stabilizer.thrust": "float",
+    "supervisor.info": "uint16_t",
+}
+"""22 bytes."""
+
+SLOW_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
+VARIANCE_BLOCK: dict[str, str] = {
+    "kalman.varPX": "float",
+    "kalman.varPY": "float",
+    "kalman.varPZ": "float",
+}
+"""Only where the Kalman estimator runs; a firmware without it is not refused."""
+
+NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK, *SLOW_BLOCK)
+
+
+def telemetry_from(values: Mapping[str, float], t_s: float) -> Telemetry:
+    """Telemetry from log values by name; KeyError when a needed one is missing."""
+    variances = [values[name] for name in VARIANCE_BLOCK if name in values]
+    return Telemetry(
+        t_s=t_s,
+        position_m=(
+            values["stateEstimate.x"],
+            values["stateEstimate.y"],
+            values["stateEstimate.z"],
+        ),
+        velocity_mps=(
+            values["stateEstimate.vx"],
+            values["stateEstimate.vy"],
+            values["stateEstimate.vz"],
+        ),
+        roll_rad=math.radians(values["stateEstimate.roll"]),
+        pitch_rad=-math.radians(values["stateEstimate.pitch"]),
+        yaw_rad=math.radians(values["stateEstimate.yaw"]),
+        acc_z_g=values["acc.z"],
+        thrust=values["stabilizer.thrust"],
+        battery_v=values["pm.vbat"],
+        supervisor=int(values["supervisor.info"]),
+        battery_state=int(values["pm.state"]),
+        position_variance_m2=max(variances) if variances else None,
+    )
