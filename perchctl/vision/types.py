@@ -78,6 +78,7 @@ class Detections:
     small: Detection | None = None
     full_frame: bool = True  # False: found in the predicted window
     mirrored: bool = False  # the small marker decoded as its mirror image
+    velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
 
     def get(self, marker: MarkerName) -> Detection | None:
         return self.large if marker == "large" else self.small
@@ -172,6 +173,8 @@ class PipelineState:
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
     last: Detections | None = None
     disagreeing_frames: int = 0
+    in_world: bool = False  # the tracks' frame: world of the state estimate, or level
+    normal_cam: Array | None = None  # the target's last normal, camera axes, (3,)
 
 
 @dataclass(frozen=True, eq=False)
