@@ -1,0 +1,147 @@
+"""Recorded frames: ``video:FILE`` and ``images:DIR``. Every frame, none dropped."""
+
+from __future__ import annotations
+
+import glob
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.camera.source import to_grey
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.vision.types import Frame
+
+DEFAULT_RATE_HZ = 30.0
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})
+
+
+class _Recording:
+    """What the two recordings share; `_read` gives the next picture and its time, or None."""
+
+    live = False
+
+    def __init__(self, name: str, latency_s: float) -> None:
+        self._name = name
+        self._latency_s = latency_s
+        self._index = 0
+        self._ahead = self._read()  # one picture ahead: tells the size and the end in time
+        if self._ahead is None:
+            raise InvalidValue(f"{name} holds no readable frame; is it a picture or video file?")
+        image = self._ahead[0]
+        self._size_px = (image.shape[1], image.shape[0])
+
+    @property
+    def finished(self) -> bool:
+        return self._ahead is None
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        return self._size_px
+
+    def newest(self, now_s: float) -> Frame | None:
+        """The next frame, with the recording's own time; None at the end."""
+        if self._ahead is None:
+            return None
+        image, t_s = self._ahead
+        frame = Frame(self._index, t_s, image, t_s + self._latency_s)
+        self._index += 1
+        self._ahead = self._read()
+        return frame
+
+    def problem(self, now_s: float) -> str | None:
+        return None
+
+    def describe(self) -> str:
+        return "{} ({}x{} px)".format(self._name, *self._size_px)
+
+    def close(self) -> None:
+        self._ahead = None
+
+    def _read(self) -> tuple[NDArray[np.uint8], float] | None:
+        raise NotImplementedError
+
+
+class VideoSource(_Recording):
+    """A video file; times from the container where they rise, else from its rate."""
+
+    def __init__(self, path: Path, latency_s: float = 0.0) -> None:
+        if not path.is_file():
+            raise NotFound(f"video file {path} was not found")
+        self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS)) if self._capture.isOpened() else 0.0
+        self._period_s = 1.0 / rate_hz if 0.1 < rate_hz < 1000.0 else 1.0 / DEFAULT_RATE_HZ
+        self._last_s = -self._period_s
+        super().__init__(f"video:{path}", latency_s)
+
+    def _read(self) -> tuple[NDArray[np.uint8], float] | None:
+        ok, image = self._capture.read()
+        if not ok:
+            self._capture.release()
+            return None
+        t_s = float(self._capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000.0
+        if not t_s > self._last_s:
+            t_s = self._last_s + self._period_s
+        self._last_s = t_s
+        return to_grey(image), t_s
+
+    def close(self) -> None:
+        super().close()
+        self._capture.release()
+
+
+class ImagesSource(_Recording):
+    """The pictures of a folder or a glob, in natural order (2 before 10), at `rate_hz`."""
+
+    def __init__(
+        self, where: str, latency_s: float = 0.0, rate_hz: float = DEFAULT_RATE_HZ
+    ) -> None:
+        self._paths = image_files(where)
+        self._rate_hz = rate_hz
+        self._next = 0
+        super().__init__(f"images:{where}", latency_s)
+
+    @property
+    def paths(self) -> list[Path]:
+        """All files, in the order of their frames' indices."""
+        return self._paths
+
+    def _read(self) -> tuple[NDArray[np.uint8], float] | None:
+        if self._next >= len(self._paths):
+            return None
+        path, t_s = self._paths[self._next], self._next / self._rate_hz
+        self._next += 1
+        return read_grey(path), t_s
+
+
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """A picture file as grey; raises InvalidValue if it is none."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InvalidValue(f"{path} cannot be read as a picture; remove or replace it")
+    return to_grey(image)
+
+
+def image_files(where: str) -> list[Path]:
+    """Picture files of a folder or glob, naturally sorted; raises NotFound if there are none."""
+    folder = Path(where)
+    if folder.is_file():
+        found = [folder]
+    elif folder.is_dir():
+        found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    else:
+        names = (Path(name) for name in glob.glob(where))
+        found = [p for p in names if p.is_file() and p.suffix.lower() in IMAGE_SUFFIXES]
+        if not found:
+            raise NotFound(f"{where} is neither a folder nor a pattern that names pictures")
+    if not found:
+        allowed = " ".join(sorted(IMAGE_SUFFIXES))
+        raise NotFound(f"folder {where} holds no pictures ({allowed})")
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", path.name)
+    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]

@@ -1,0 +1,80 @@
+"""From the profile's `camera.source` to an open frame source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from perchctl.camera.device import DeviceSource
+from perchctl.camera.files import ImagesSource, VideoSource
+from perchctl.camera.mjpeg import MjpegSource
+from perchctl.camera.source import Clock, FrameSource, LiveSource
+from perchctl.errors import InvalidValue, NotFound, TimedOut
+
+ALLOWED = "camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, sim:"
+
+FIRST_FRAME_WITHIN_S = 8.0
+
+
+def is_live(spec: str) -> bool:
+    """Whether the source runs in real time (cameras and streams), else it is a recording."""
+    return not spec.startswith(("video:", "images:"))
+
+
+def open_source(
+    spec: str,
+    latency_s: float,
+    size_px: tuple[int, int] | None,
+    clock: Clock,
+    timeout_s: float = FIRST_FRAME_WITHIN_S,
+) -> FrameSource:
+    """Open the source and wait for its first frame.
+
+    Args:
+        spec: one of `ALLOWED`; ``sim:`` belongs to the simulated vehicle, which
+            resolves it to its own stream before this function is asked.
+        latency_s: time from exposure to arrival, taken off live frames' times.
+        size_px: wanted width and height (asked of ``camera:N`` only).
+        clock: the loop's clock, s.
+        timeout_s: how long the first frame of a live source may take.
+
+    Raises:
+        NotFound: no such camera, file or stream. InvalidValue: unknown scheme or
+        unreadable content. TimedOut: no first frame in time.
+    """
+    scheme, _, rest = spec.partition(":")
+    if scheme == "video" and rest:
+        return VideoSource(Path(rest).expanduser(), latency_s)
+    if scheme == "images" and rest:
+        return ImagesSource(str(Path(rest).expanduser()), latency_s)
+    if scheme == "camera":
+        if not (rest.isascii() and rest.isdigit()):
+            raise InvalidValue(f"camera source {spec!r} lacks a camera number, as in camera:0")
+        return _started(DeviceSource(int(rest), latency_s, size_px, clock), timeout_s)
+    if scheme in ("http", "https") and rest.strip("/"):
+        stream = MjpegSource(spec, latency_s, clock)
+        try:
+            return _started(stream, timeout_s)
+        except TimedOut as error:
+            if stream.not_found:
+                raise NotFound(str(error)) from None
+            raise
+    if spec == "sim:":
+        raise InvalidValue(
+            "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "
+            f"other sources are {ALLOWED}"
+        )
+    raise InvalidValue(f"camera source {spec!r} is unknown; allowed are {ALLOWED}")
+
+
+def _started(source: LiveSource, timeout_s: float) -> FrameSource:
+    if source.wait_first(timeout_s):
+        return source
+    problem = source.problem(float("-inf"))
+    described = source.describe()
+    source.close()
+    if problem is not None:
+        raise TimedOut(f"no first frame: {problem}")
+    raise TimedOut(
+        f"{described}: no first frame within {timeout_s:g} s; is the camera powered, and its "
+        f"receiver on the right channel?"
+    )

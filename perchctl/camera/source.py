@@ -1,0 +1,154 @@
+"""What every frame source offers, and what live and recorded ones share."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.errors import InvalidValue
+from perchctl.vision.types import CameraModel, Frame
+
+Grey = NDArray[np.uint8]
+Clock = Callable[[], float]
+
+SILENT_AFTER_S = 1.0
+"""A live source without a new frame for so long counts as gone."""
+CLOSE_WITHIN_S = 3.0
+
+
+class FrameSource(Protocol):
+    """A source of frames.
+
+    A live source keeps only the newest frame and stamps it when it arrives; a
+    recorded one gives every frame once, at the pace it is asked, with the times
+    of the recording.
+    """
+
+    @property
+    def live(self) -> bool: ...
+
+    @property
+    def finished(self) -> bool:
+        """No frame will come any more (recordings; a live source never finishes)."""
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        """Width and height of the frames, once the first has come."""
+
+    def newest(self, now_s: float) -> Frame | None:
+        """The newest frame, or None if there is none since the last call."""
+
+    def problem(self, now_s: float) -> str | None:
+        """One sentence if the source is gone, else None."""
+
+    def describe(self) -> str: ...
+
+    def close(self) -> None: ...
+
+
+def to_grey(image: Any) -> Grey:
+    """Grey, 8 bit, contiguous; from an array of grey, BGR or BGRA, 8 or 16 bits."""
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[:, :, 0]
+    if image.ndim == 3:
+        code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
+        image = cv2.cvtColor(image, code)
+    return np.ascontiguousarray(image, np.uint8)
+
+
+def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str) -> None:
+    """Raises InvalidValue when frames and calibration differ in size.
+
+    Frames are not scaled to fit: cropped and scaled modes of a camera look the
+    same by their size's ratio, but need different calibrations.
+    """
+    if size_px is None or size_px == camera.size_px:
+        return
+    raise InvalidValue(
+        f"{source} delivers frames of {size_px[0]}x{size_px[1]} px, but the calibration was made "
+        f"at {camera.size_px[0]}x{camera.size_px[1]} px; set the camera to that size or "
+        f"calibrate it at this one"
+    )
+
+
+class LiveSource:
+    """Newest-frame slot between a grabbing thread and the loop.
+
+    A subclass runs `_start(target)`; its thread calls `_put` for each picture,
+    looks at `_stop` and ends with `_fail` when the camera is lost.
+    """
+
+    live = True
+    finished = False
+
+    def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
+        self._name = name
+        self._latency_s = latency_s
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._first = threading.Event()  # set by the first frame, or by failing before it
+        self._thread: threading.Thread | None = None
+        self._newest: Frame | None = None
+        self._count = 0
+        self._last_arrival_s = clock()
+        self._failure: str | None = None
+        self._size_px: tuple[int, int] | None = None
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        return self._size_px
+
+    def newest(self, now_s: float) -> Frame | None:
+        with self._lock:
+            frame, self._newest = self._newest, None
+        return frame
+
+    def problem(self, now_s: float) -> str | None:
+        with self._lock:
+            if self._failure is not None:
+                return self._failure
+            silent_s = now_s - self._last_arrival_s
+        if silent_s > SILENT_AFTER_S:
+            return f"{self._name} has delivered no frame for {silent_s:.1f} s"
+        return None
+
+    def describe(self) -> str:
+        size = "no frame yet" if self._size_px is None else "{}x{} px".format(*self._size_px)
+        return f"{self._name} ({size})"
+
+    def wait_first(self, timeout_s: float) -> bool:
+        """Wait until the first frame is there; False when it fails or stays away so long."""
+        self._first.wait(timeout_s)
+        return self._count > 0
+
+    def close(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(CLOSE_WITHIN_S)
+
+    def _start(self, target: Callable[[], None]) -> None:
+        self._thread = threading.Thread(target=target, name=self._name, daemon=True)
+        self._thread.start()
+
+    def _put(self, image: Any) -> None:
+        t_s = self._clock()
+        grey = to_grey(image)
+        with self._lock:
+            self._newest = Frame(self._count, t_s - self._latency_s, grey, t_s)
+            self._count += 1
+            self._last_arrival_s = t_s
+            self._size_px = (grey.shape[1], grey.shape[0])
+        self._first.set()
+
+    def _fail(self, sentence: str) -> None:
+        with self._lock:
+            self._failure = sentence
+        self._first.set()

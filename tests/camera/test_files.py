@@ -1,0 +1,139 @@
+"""Recorded sources, the spec's parser, and errors that name what was found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.camera.files import ImagesSource, VideoSource
+from perchctl.camera.open import is_live, open_source
+from perchctl.camera.source import FrameSource, check_size, to_grey
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.vision.types import CameraModel, Frame
+
+
+def clock() -> float:
+    return 0.0
+
+
+def drain(source: FrameSource) -> list[Frame]:
+    frames = []
+    while not source.finished:
+        frame = source.newest(0.0)
+        assert frame is not None, "a recording has a frame until it is finished"
+        frames.append(frame)
+    assert source.newest(0.0) is None
+    return frames
+
+
+def write_images(folder: Path, count: int, suffix: str = ".png") -> None:
+    for k in range(count):
+        cv2.imwrite(str(folder / f"shot_{k}{suffix}"), np.full((24, 32), 10 * k, np.uint8))
+
+
+def test_images_come_all_and_in_natural_order(tmp_path: Path) -> None:
+    write_images(tmp_path, 12)
+    (tmp_path / "notes.txt").write_text("no picture")
+    source = open_source(f"images:{tmp_path}", 0.07, None, clock)
+    assert source.size_px == (32, 24)
+    assert not source.live
+    frames = drain(source)
+    assert [int(f.image[0, 0]) for f in frames] == [10 * k for k in range(12)]
+    assert [f.index for f in frames] == list(range(12))
+    assert frames[3].t_s == pytest.approx(0.1)
+    assert frames[3].t_arrival_s == pytest.approx(0.17)
+    assert source.problem(1e6) is None
+
+
+def test_images_by_pattern_and_single(tmp_path: Path) -> None:
+    write_images(tmp_path, 12)
+    assert len(drain(open_source(f"images:{tmp_path}/shot_1*.png", 0.0, None, clock))) == 3
+    assert len(drain(ImagesSource(str(tmp_path / "shot_5.png")))) == 1
+
+
+def test_images_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(NotFound, match="neither a folder nor a pattern"):
+        open_source(f"images:{tmp_path}/nowhere", 0.0, None, clock)
+    with pytest.raises(NotFound, match="holds no pictures"):
+        open_source(f"images:{tmp_path}", 0.0, None, clock)
+
+
+def test_a_broken_image_is_named(tmp_path: Path) -> None:
+    write_images(tmp_path, 2)
+    (tmp_path / "shot_1.png").write_bytes(b"not a picture")
+    source = ImagesSource(str(tmp_path))
+    with pytest.raises(InvalidValue, match=r"shot_1\.png"):
+        drain(source)
+
+
+def write_video(path: Path, count: int, rate_hz: float) -> None:
+    writer = cv2.VideoWriter(
+        str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), rate_hz, (64, 48)
+    )
+    for k in range(count):
+        writer.write(np.full((48, 64, 3), 10 * k, np.uint8))
+    writer.release()
+
+
+def test_a_video_gives_every_frame_with_its_time(tmp_path: Path) -> None:
+    write_video(tmp_path / "flight.avi", 20, 25.0)
+    source = open_source(f"video:{tmp_path}/flight.avi", 0.0, None, clock)
+    assert source.size_px == (64, 48)
+    frames = drain(source)
+    assert len(frames) == 20
+    assert all(f.image.shape == (48, 64) for f in frames)
+    assert all(abs(int(f.image[20, 30]) - 10 * k) <= 3 for k, f in enumerate(frames))
+    assert [f.t_s - frames[0].t_s for f in frames] == pytest.approx([k / 25 for k in range(20)])
+    source.close()
+    assert source.finished
+
+
+def test_videos_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(NotFound, match=r"flight\.avi was not found"):
+        VideoSource(tmp_path / "flight.avi")
+    (tmp_path / "flight.avi").write_bytes(b"no video at all")
+    with pytest.raises(InvalidValue, match="no readable frame"):
+        VideoSource(tmp_path / "flight.avi")
+
+
+@pytest.mark.parametrize("spec", ["webcam", "ftp://x", "video:", "images:", "http://", ""])
+def test_unknown_schemes_say_what_is_allowed(spec: str) -> None:
+    with pytest.raises(InvalidValue, match=r"allowed are camera:N, video:FILE, images:DIR"):
+        open_source(spec, 0.0, None, clock)
+
+
+@pytest.mark.parametrize("spec", ["camera:", "camera:x", "camera:-1"])
+def test_a_camera_needs_a_number(spec: str) -> None:
+    with pytest.raises(InvalidValue, match="camera:0"):
+        open_source(spec, 0.0, None, clock)
+
+
+def test_the_simulated_camera_belongs_to_the_simulated_vehicle() -> None:
+    with pytest.raises(InvalidValue, match="sim://"):
+        open_source("sim:", 0.0, None, clock)
+
+
+def test_which_sources_are_live() -> None:
+    live = ("camera:0", "http://a/b", "sim:", "video:x", "images:x")
+    assert [is_live(s) for s in live] == [True, True, True, False, False]
+
+
+def test_the_wrong_size_names_both() -> None:
+    camera = CameraModel((640, 480), np.eye(3), np.zeros(5))
+    check_size((640, 480), camera, "camera:0")
+    with pytest.raises(InvalidValue, match=r"720x576.*640x480"):
+        check_size((720, 576), camera, "camera:0")
+
+
+def test_grey_from_every_kind_of_array() -> None:
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
+    colour = np.repeat(grey[:, :, None], 3, axis=2)
+    alpha = np.concatenate([colour, np.full((3, 4, 1), 255, np.uint8)], axis=2)
+    for image in (grey, grey[:, :, None], colour, alpha, grey.astype(np.uint16) << 8):
+        out = to_grey(image)
+        assert out.dtype == np.uint8
+        assert out.flags.c_contiguous
+        assert np.array_equal(out, grey)

@@ -1,0 +1,128 @@
+"""Verdicts on frames: what the simulated camera gives is usable, what a dead link gives is not."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from perchctl.camera.health import HealthLimits, HealthState, Verdict, assess, content
+from perchctl.geometry import make_T, rotation_from_rpy
+from perchctl.profile import TargetConfig
+from perchctl.sim.renderer import Renderer
+from perchctl.sim.scenario import Scenario
+from perchctl.vision.types import CameraModel, Frame
+
+LIMITS = HealthLimits()
+SHAPE = (480, 640)
+
+
+def frame(image: NDArray[np.uint8], t_s: float = 0.0) -> Frame:
+    return Frame(0, t_s, image, t_s)
+
+
+def noisy(level: float, sigma: float, seed: int = 0) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(seed)
+    return np.clip(np.rint(rng.normal(level, sigma, SHAPE)), 0, 255).astype(np.uint8)
+
+
+def snow(seed: int, band_px: float) -> NDArray[np.uint8]:
+    """An analogue receiver's snow: lines unrelated, bandwidth limited along them."""
+    rng = np.random.default_rng(seed)
+    white = rng.standard_normal(SHAPE).astype(np.float32)
+    if band_px:
+        white = cv2.GaussianBlur(white, (0, 0), sigmaX=band_px, sigmaY=1e-3)
+    return np.clip(110.0 + 60.0 * white / white.std(), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def renderers() -> list[Renderer]:
+    K = np.array([[380.0, 0, 320], [0, 380, 240], [0, 0, 1]])
+    camera = CameraModel((640, 480), K, np.array([-0.17, 0.04, 0, 0, 0]))
+    scenes = [
+        Scenario(camera_noise_sigma=sigma, no_target=bare, extra={"analogue": analogue})
+        for sigma, bare, analogue in (
+            (5.0, False, 0.0),
+            (20.0, False, 0.0),
+            (0.0, True, 0.0),
+            (20.0, True, 0.0),
+            (10.0, False, 1.0),
+        )
+    ]
+    return [Renderer(scene, camera, TargetConfig()) for scene in scenes]
+
+
+@pytest.mark.parametrize("below_m", [0.03, 0.08, 0.2, 0.5, 1.2, 2.1])
+def test_pictures_of_the_ceiling_are_usable(renderers: list[Renderer], below_m: float) -> None:
+    for renderer in renderers:
+        pose = make_T(rotation_from_rpy(0.1, -0.05, 0.7), (0.02, 0.01, 2.2 - below_m))
+        assert content(renderer.render([pose]), LIMITS) == "ok"
+
+
+@pytest.mark.parametrize("band_px", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize("quality", [None, 50])
+def test_snow(band_px: float, quality: int | None) -> None:
+    image = snow(1, band_px)
+    if quality is not None:
+        packed = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+        image = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), np.uint8)
+    assert content(image, LIMITS) == "snow"
+
+
+@pytest.mark.parametrize(("level", "kind"), [(0, "dark"), (24, "dark"), (41, "uniform")])
+def test_blank_screens(level: int, kind: str) -> None:
+    assert content(np.full(SHAPE, level, np.uint8), LIMITS) == kind
+    assert content(noisy(level, 0.6), LIMITS) == kind
+
+
+def test_a_covered_lens_is_dark() -> None:
+    assert content(noisy(8, 6.0), LIMITS) == "dark"
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.floats(2.0, 20.0), st.floats(60.0, 200.0))
+def test_sensor_noise_alone_is_not_snow(seed: int, sigma: float, level: float) -> None:
+    assert content(noisy(level, sigma, seed), LIMITS) == "ok"
+
+
+def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[Verdict]:
+    state, verdicts = HealthState(), []
+    for k, image in enumerate(images):
+        state, verdict = assess(state, frame(image, k / 30.0), live)
+        verdicts.append(verdict)
+    return verdicts
+
+
+def test_a_frozen_picture_first_repeats_then_is_frozen() -> None:
+    a, b = noisy(120, 5.0, 1), noisy(120, 5.0, 2)
+    verdicts = judge([a, b] + [b.copy() for _ in range(20)])
+    assert [v.usable for v in verdicts[:2]] == [True, True]
+    assert not any(v.usable for v in verdicts[2:])
+    assert verdicts[2].kind == "repeated"
+    assert verdicts[-1].kind == "frozen"
+    assert verdicts[-1].repeats == 20
+    assert verdicts[-1].unchanged_s == pytest.approx(20 / 30.0)
+    first_frozen = next(k for k, v in enumerate(verdicts) if v.kind == "frozen")
+    assert first_frozen == 1 + 12, "0.4 s at 30 Hz"
+
+
+def test_one_changed_pixel_ends_the_freeze() -> None:
+    a = noisy(120, 5.0, 1)
+    b = a.copy()
+    b[240, 320] ^= 1
+    verdicts = judge([a] * 30 + [b] + [a])
+    assert verdicts[29].kind == "frozen"
+    assert [v.kind for v in verdicts[30:]] == ["ok", "ok"]
+
+
+def test_recordings_may_repeat() -> None:
+    assert all(v.usable for v in judge([noisy(120, 5.0)] * 30, live=False))
+
+
+def test_every_verdict_says_what_it_means() -> None:
+    state, verdict = assess(HealthState(), frame(snow(3, 0.5)))
+    assert "no signal" in verdict.text
+    assert state.repeats == 0
