@@ -1,0 +1,224 @@
+"""The nested target as geometry: which squares are black, at any resolution.
+
+Drawing axes: origin in the target's centre, x right and y up *as printed and
+read from the printed side*, metres. They are OpenCV's marker axes. The sheet
+hangs face down on the ceiling; the upward camera reads it un-mirrored.
+
+Everything that is drawn (a bitmap for the simulator, rectangles for a PDF)
+comes from one raster on a non-uniform grid, whose lines are the edges of the
+cells of both markers and of the white ring around the small one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.profile import MarkerConfig, TargetConfig
+from perchctl.target.dictionaries import predefined
+
+BORDER_BITS = 1
+"""Width of a marker's black border in cells."""
+
+RING_MIN_PER_LARGE_SIDE = 1 / 150
+"""The white ring around the small marker is at least 1 mm on a 150 mm marker: without
+one the small marker is never found (measured for ids whose centre is black)."""
+
+SAMPLED_MARGIN = 0.13
+"""Share of a cell, at each of its sides, that cv2.aruco does not look at."""
+MAX_WHITE_IN_BLACK_CELL = 0.3
+"""White that the small marker and its ring may bring into a black cell of the large
+one; half is where it reads as white, and the detector samples a cell coarsely."""
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """A black rectangle in drawing axes, metres; x0 < x1, y0 < y1."""
+
+    x0_m: float
+    y0_m: float
+    x1_m: float
+    y1_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class TargetDrawing:
+    """A nested target.
+
+    Attributes:
+        edges_m: lines of the grid, ascending, shape (n + 1,); the same for x and y.
+        black: shape (n, n); row 0 is the top of the print (largest y).
+        sheet_side_m: side of the white sheet, one cell of white around the marker.
+        ring_m: white around the small marker that is made for it.
+    """
+
+    edges_m: Array
+    black: NDArray[np.bool_]
+    large_side_m: float
+    small_side_m: float
+    sheet_side_m: float
+    ring_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Bitmap:
+    """A picture of the sheet: `image` uint8 (n, n), row 0 at the top of the print.
+
+    The drawing's origin is at column and row `center_px`; a point (x, y) is at
+    column ``center_px + x * px_per_m``, row ``center_px - y * px_per_m``.
+    """
+
+    image: NDArray[np.uint8]
+    px_per_m: float
+    center_px: float
+
+
+def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
+    """Black cells of a marker with its border, shape (n, n), row 0 at the top."""
+    dictionary = predefined(marker.dictionary)
+    n = int(dictionary.markerSize) + 2 * BORDER_BITS
+    picture = cv2.aruco.generateImageMarker(dictionary, marker.id, n, borderBits=BORDER_BITS)
+    return np.asarray(picture) < 128
+
+
+def marker_corners_m(side_m: float) -> Array:
+    """Corners in OpenCV's marker axes, TL TR BR BL, shape (4, 3)."""
+    h = side_m / 2.0
+    return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
+
+
+def draw_target(target: TargetConfig) -> TargetDrawing:
+    """The drawing of both markers; sizes are taken from the configuration.
+
+    The white ring is one cell of the small marker wide, or as wide as the large
+    marker's black cells under it allow. Where the large marker's own centre is
+    white already (id 997 of DICT_4X4_1000) the ring changes nothing. With a 4x4
+    dictionary any two ids stay readable up to a small side of 0.18 of the large.
+    """
+    large, small = marker_cells(target.large), marker_cells(target.small)
+    large_side, small_side = target.large.side_m, target.small.side_m
+    least = RING_MIN_PER_LARGE_SIDE * large_side
+    for ring in np.linspace(max(small_side / len(small), least), least, 16):
+        edges, black = _nested(large, small, large_side, small_side, float(ring))
+        if _white_in_black_cells(large, large_side, edges, black) <= MAX_WHITE_IN_BLACK_CELL:
+            break
+    sheet = large_side + 2.0 * large_side / len(large)
+    return TargetDrawing(edges, black, large_side, small_side, sheet, float(ring))
+
+
+def _nested(
+    large: NDArray[np.bool_],
+    small: NDArray[np.bool_],
+    large_side_m: float,
+    small_side_m: float,
+    ring_m: float,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Edges and black squares of the small marker in a white hole of the large one."""
+    hole = small_side_m / 2.0 + ring_m
+    large_edges = np.linspace(-large_side_m / 2, large_side_m / 2, len(large) + 1)
+    small_edges = np.linspace(-small_side_m / 2, small_side_m / 2, len(small) + 1)
+    edges = _merged(np.concatenate([large_edges, small_edges, [-hole, hole]]))
+    middle = (edges[:-1] + edges[1:]) / 2.0
+    xs, ys = np.meshgrid(middle, -middle)  # rows run from the top of the print down
+    black = _lookup(large, large_side_m, xs, ys)
+    black &= ~((np.abs(xs) < hole) & (np.abs(ys) < hole))
+    black |= _lookup(small, small_side_m, xs, ys)
+    return edges, black
+
+
+def _white_in_black_cells(
+    large: NDArray[np.bool_], large_side_m: float, edges_m: Array, black: NDArray[np.bool_]
+) -> float:
+    """The largest share of white in what is looked at of a black cell, 0..1."""
+    n = len(large)
+    w = overlap(edges_m, n / large_side_m, n, 1.0 - 2.0 * SAMPLED_MARGIN)
+    ink = w @ black.astype(np.float64) @ w.T
+    return float((1.0 - ink)[large].max())
+
+
+def _merged(edges_m: Array) -> Array:
+    """Sorted edges without the doubles that differ by rounding only."""
+    edges = np.sort(edges_m)
+    keep = np.concatenate([[True], np.diff(edges) > 1e-9])
+    return edges[keep]
+
+
+def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> NDArray[np.bool_]:
+    n = len(cells)
+    col = np.floor((xs / side_m + 0.5) * n).astype(int)
+    row = np.floor((0.5 - ys / side_m) * n).astype(int)
+    inside = (col >= 0) & (col < n) & (row >= 0) & (row < n)
+    return inside & cells[np.clip(row, 0, n - 1), np.clip(col, 0, n - 1)]
+
+
+def overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
+    """Share of each pixel's window that lies in each interval of `edges_m`, (size_px, n).
+
+    Pixel i is centred at ``(i - (size_px - 1) / 2) / px_per_m``; its window is
+    `window_px` wide: 1 is the pixel itself.
+    """
+    centers = (np.arange(size_px) - (size_px - 1) / 2.0)[:, None]
+    e = edges_m[None, :] * px_per_m
+    below = np.clip(e, centers - window_px / 2.0, centers + window_px / 2.0)
+    return np.diff(below, axis=1) / window_px
+
+
+def ink_coverage(
+    drawing: TargetDrawing, px_per_m: float, size_px: int, window_px: float = 1.0
+) -> Array:
+    """Exact share of black in the windows of size_px x size_px pixels around the centre, 0..1."""
+    w = overlap(drawing.edges_m, px_per_m, size_px, window_px)
+    # The grid is symmetric about 0, so the same weights serve rows from the top.
+    return w @ drawing.black.astype(np.float64) @ w.T
+
+
+def sheet_coverage(
+    drawing: TargetDrawing, px_per_m: float, size_px: int, window_px: float = 1.0
+) -> Array:
+    """Exact share of the sheet in each pixel's window, 0..1, shape (size_px, size_px)."""
+    half = drawing.sheet_side_m / 2.0
+    w = overlap(np.array([-half, half]), px_per_m, size_px, window_px)
+    return w @ w.T
+
+
+def draw_bitmap(drawing: TargetDrawing, px_per_m: float) -> Bitmap:
+    """The whole sheet, black 0 on white 255, each pixel the exact mean of its area."""
+    size = max(1, int(np.ceil(drawing.sheet_side_m * px_per_m - 1e-9)))
+    ink = ink_coverage(drawing, px_per_m, size)
+    image = np.rint(255.0 * (1.0 - ink)).astype(np.uint8)
+    return Bitmap(image, px_per_m, (size - 1) / 2.0)
+
+
+def black_rectangles(drawing: TargetDrawing) -> list[Rectangle]:
+    """The black area as few, large, non-overlapping rectangles (for a PDF).
+
+    Few and large, because viewers draw hair lines between rectangles that touch.
+    """
+    left = drawing.black.copy()
+    edges = drawing.edges_m
+    n = len(left)
+    found = []
+    for row in range(n):
+        for col in range(n):
+            if not left[row, col]:
+                continue
+            right = col
+            while right + 1 < n and left[row, right + 1]:
+                right += 1
+            bottom = row
+            while bottom + 1 < n and left[bottom + 1, col : right + 1].all():
+                bottom += 1
+            left[row : bottom + 1, col : right + 1] = False
+            found.append(
+                Rectangle(
+                    float(edges[col]),
+                    float(-edges[bottom + 1]),
+                    float(edges[right + 1]),
+                    float(-edges[row]),
+                )
+            )
+    return found
