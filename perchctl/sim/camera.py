@@ -1,0 +1,119 @@
+"""The simulated camera: when frames are exposed, which are lost, when the rest arrives."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from perchctl.geometry import Array, make_T
+from perchctl.sim.renderer import Renderer
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.surfaces import Picture
+
+SCHEDULE_STREAM = 411
+
+POSES_PER_EXPOSURE = 3
+JITTER_LIMIT_SIGMAS = 2.5
+
+
+class BodyState(Protocol):
+    """The part of the world's true state that the camera needs."""
+
+    @property
+    def position_m(self) -> Array: ...
+    @property
+    def R_world_body(self) -> Array: ...
+
+
+@dataclass(frozen=True, eq=False)
+class DeliveredFrame:
+    """A frame that has arrived; `t_exposure_s` is the middle of its exposure."""
+
+    t_arrival_s: float
+    t_exposure_s: float
+    image: Picture
+    index: int  # of the exposure: gaps are lost frames
+
+
+class SimCamera:
+    """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes.
+
+    Each exposure draws the same random numbers whether or not it is lost, and a
+    frame's noise hangs on its index, so neither faults nor the steps of
+    `advance` change any other frame.
+
+    - lost: with `camera_drop_rate`, and `camera_burst` = (start, n): the n
+      exposures from start on; these are not rendered;
+    - late: `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`, cut at
+      2.5 sigma), never before the exposure's end, never overtaking;
+    - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
+    - gone: nothing arrives at or after `camera_gone_at_s`.
+    """
+
+    def __init__(self, scenario: Scenario, renderer: Renderer) -> None:
+        self.scenario = scenario
+        self.renderer = renderer
+        self._T_body_cam = np.array(scenario.T_body_cam_true, np.float64)
+        self._rng = np.random.default_rng([scenario.seed, SCHEDULE_STREAM])
+        self._half_s = max(scenario.camera_exposure_s, 0.0) / 2.0
+        self._first_s = self._half_s + float(self._rng.random()) / scenario.camera_rate_hz
+        self._index = 0
+        self._burst_left = scenario.camera_burst[1] if scenario.camera_burst else 0
+        self._last_arrival_s = -np.inf
+        self._last_image: Picture | None = None
+        self._t_s = -np.inf
+        self._under_way: deque[DeliveredFrame] = deque()
+
+    def advance(self, t_s: float, pose_at: Callable[[float], BodyState]) -> None:
+        """Take all exposures that end at or before `t_s`.
+
+        `pose_at` is asked for times within the exposures that ended since the last
+        call: with calls every control period, no older than one exposure and period.
+        """
+        self._t_s = t_s
+        while True:
+            middle_s = self._first_s + self._index / self.scenario.camera_rate_hz
+            if middle_s + self._half_s > t_s + 1e-9:
+                return
+            self._expose(middle_s, pose_at)
+            self._index += 1
+
+    def take(self) -> list[DeliveredFrame]:
+        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        out = []
+        while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
+            out.append(self._under_way.popleft())
+        return out
+
+    def _expose(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> None:
+        s = self.scenario
+        dropped = float(self._rng.random()) < s.camera_drop_rate
+        jitter = float(np.clip(self._rng.normal(), -JITTER_LIMIT_SIGMAS, JITTER_LIMIT_SIGMAS))
+        if s.camera_burst is not None and middle_s >= s.camera_burst[0] and self._burst_left > 0:
+            self._burst_left -= 1
+            dropped = True
+        delay_s = max(s.camera_latency_s + jitter * s.camera_jitter_s, self._half_s)
+        arrival_s = max(middle_s + delay_s, self._last_arrival_s)
+        if dropped or (s.camera_gone_at_s is not None and arrival_s >= s.camera_gone_at_s):
+            return
+        self._last_arrival_s = arrival_s
+        frozen = s.camera_freeze_at_s is not None and middle_s >= s.camera_freeze_at_s
+        if self._last_image is None or not frozen:
+            self._last_image = self.renderer.render(
+                [self._T_world_cam(pose_at(t)) for t in self._sample_times(middle_s)],
+                frame_index=self._index,
+            )
+        self._under_way.append(DeliveredFrame(arrival_s, middle_s, self._last_image, self._index))
+
+    def _sample_times(self, middle_s: float) -> list[float]:
+        if self._half_s == 0.0:
+            return [middle_s]
+        steps = np.linspace(-self._half_s, self._half_s, POSES_PER_EXPOSURE)
+        return [middle_s + float(step) for step in steps]
+
+    def _T_world_cam(self, state: BodyState) -> Array:
+        return make_T(state.R_world_body, state.position_m) @ self._T_body_cam

@@ -1,0 +1,105 @@
+"""CRTP on the wire: the header byte, the ports and the number types.
+
+One packet is a header ``port << 4 | 0x0C | channel`` and at most 30 bytes (firmware
+facts, "Link").
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+MAX_DATA = 30
+
+
+class Port(IntEnum):
+    CONSOLE = 0
+    PARAM = 2
+    COMMANDER = 3
+    MEM = 4
+    LOG = 5
+    LOCALIZATION = 6
+    COMMANDER_GENERIC = 7
+    HIGH_LEVEL = 8
+    SUPERVISOR = 9
+    PLATFORM = 13
+    LINK = 15
+
+
+class Status(IntEnum):
+    """What the firmware answers: the numbers of C's errno."""
+
+    OK = 0
+    ENOENT = 2
+    E2BIG = 7
+    ENOEXEC = 8
+    ENOMEM = 12
+    EACCES = 13
+    EEXIST = 17
+
+
+class Packet(NamedTuple):
+    port: int
+    channel: int
+    data: bytes
+
+    def encode(self) -> bytes:
+        return bytes((self.port << 4 | 0x0C | self.channel,)) + self.data
+
+    @staticmethod
+    def decode(datagram: bytes) -> Packet | None:
+        """None for what cannot be a packet: empty or too long."""
+        if not 1 <= len(datagram) <= 1 + MAX_DATA:
+            return None
+        return Packet(datagram[0] >> 4, datagram[0] & 0x03, datagram[1:])
+
+
+@dataclass(frozen=True)
+class Number:
+    """A C number type: its codes in the two tables and its `struct` letter."""
+
+    ctype: str
+    letter: str
+    log_code: int | None
+    param_code: int | None
+
+    @property
+    def size(self) -> int:
+        return struct.calcsize("<" + self.letter)
+
+    def pack(self, value: float) -> bytes:
+        """As C stores it: integers truncated and wrapped, floats rounded."""
+        if self.letter in "efd":
+            return _pack_float(self.letter, value)
+        bits = 8 * self.size
+        whole = int(value) & ((1 << bits) - 1) if math.isfinite(value) else 0
+        return whole.to_bytes(self.size, "little")
+
+    def unpack(self, data: bytes) -> float:
+        """Raises struct.error when `data` has another length."""
+        return float(struct.unpack("<" + self.letter, data)[0])
+
+
+def _pack_float(letter: str, value: float) -> bytes:
+    try:
+        return struct.pack("<" + letter, value)
+    except OverflowError:
+        return struct.pack("<" + letter, math.copysign(math.inf, value))
+
+
+_NUMBERS = (
+    Number("uint8_t", "B", 0x01, 0x08),
+    Number("uint16_t", "H", 0x02, 0x09),
+    Number("uint32_t", "I", 0x03, 0x0A),
+    Number("int8_t", "b", 0x04, 0x00),
+    Number("int16_t", "h", 0x05, 0x01),
+    Number("int32_t", "i", 0x06, 0x02),
+    Number("float", "f", 0x07, 0x06),
+    Number("FP16", "e", 0x08, None),
+)
+BY_CTYPE = {number.ctype: number for number in _NUMBERS}
+BY_LOG_CODE = {n.log_code: n for n in _NUMBERS if n.log_code is not None}
+BY_PARAM_CODE = {n.param_code: n for n in _NUMBERS if n.param_code is not None}

@@ -1,0 +1,85 @@
+"""From a profile's ranges and a seed to one flight's `Scenario`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perchctl.geometry import Array, make_T, rotation_from_rpy
+from perchctl.profile import Profile
+from perchctl.sim.scenario import Scenario
+
+_STREAM = 1  # the scenario's own random stream
+
+
+def draw_scenario(profile: Profile, seed: int) -> Scenario:
+    """The scenario of that seed. Every value is drawn in a fixed order, so adding a
+    range at the end leaves the earlier ones of a seed as they were."""
+    sim = profile.simulation
+    rng = np.random.default_rng([seed, _STREAM])
+
+    def between(bounds: tuple[float, float]) -> float:
+        return float(rng.uniform(*bounds))
+
+    def direction() -> Array:
+        vector = rng.normal(size=3)
+        return np.asarray(vector / np.linalg.norm(vector))
+
+    offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
+    yaw_rad = math.radians(between(sim.target_yaw_deg))
+    ceiling_z_m = between(sim.ceiling_z_m)
+    mass_kg = between(sim.mass_kg)
+    battery_v = between(sim.battery_rest_v)
+    latency_s = between(sim.camera_latency_s)
+    noise_sigma = between(sim.camera_noise_sigma)
+    burst = None
+    burst_start_s = float(rng.uniform(4.0, 22.0))
+    if sim.camera_burst_frames is not None:
+        low, high = sim.camera_burst_frames
+        burst = (burst_start_s, int(rng.integers(low, high + 1)))
+    T_body_cam = profile.camera.T_body_cam.T_body_cam @ _mounting_error(profile, rng)
+    drift = direction() * sim.drift_mps
+    wind_angle = float(rng.uniform(-math.pi, math.pi))
+    wind_mps = between(sim.draught_mps)
+    tilt_bias = rng.uniform(-1, 1, size=2) * math.radians(sim.estimate_tilt_bias_deg)
+    fails = rng.uniform() < sim.first_contact_fails
+    weak_part = float(rng.uniform(0.0, 0.6))
+    return Scenario(
+        seed=seed,
+        mass_kg=mass_kg,
+        battery_rest_v=battery_v,
+        ceiling_z_m=ceiling_z_m,
+        target_xy_m=(float(offset[0]), float(offset[1])),
+        target_yaw_rad=yaw_rad,
+        large_side_m=profile.target.large.side_m,
+        small_side_m=profile.target.small.side_m,
+        gear_body_m=profile.vehicle.gear_body_m,
+        T_body_cam_true=tuple(tuple(float(v) for v in row) for row in T_body_cam),
+        camera_rate_hz=sim.camera_rate_hz,
+        camera_latency_s=latency_s,
+        camera_jitter_s=sim.camera_jitter_s,
+        camera_drop_rate=sim.camera_drop_rate,
+        camera_burst=burst,
+        camera_noise_sigma=noise_sigma,
+        camera_exposure_s=sim.camera_exposure_s,
+        camera_defocus_px=sim.camera_defocus_px,
+        estimate_noise_m=sim.estimate_noise_m,
+        estimate_tilt_bias_rad=(float(tilt_bias[0]), float(tilt_bias[1])),
+        drift_mps=(float(drift[0]), float(drift[1]), float(drift[2])),
+        draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
+        magnet_force_n=sim.magnet_force_n,
+        first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
+        no_target=sim.no_target,
+    )
+
+
+def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
+    """What the profile does not know: up to `mount_error_deg` and `mount_error_m`."""
+    sim = profile.simulation
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
+    way = rng.normal(size=3)
+    way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
+    return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)

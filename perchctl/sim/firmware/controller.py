@@ -1,0 +1,250 @@
+"""The cascaded PID controller: position and velocity at 100 Hz, attitude and rate at 500 Hz.
+
+Gains and limits are the firmware's defaults for the Crazyflie 2.x; they can be changed
+through the parameters of the same names. Angles in degrees, pitch nose up, as inside
+the firmware. Every change of setpoint mode resets all integrators (firmware facts,
+"Setpoint modes"), so the thrust starts again from `thrustBase`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.sim.firmware.setpoint import ABSOLUTE, DISABLED, MODE_OFF, VELOCITY, Mode, Setpoint
+
+ATTITUDE_DT_S = 0.002
+POSITION_DT_S = 0.01
+POSITION_EVERY = 5
+INT16_MAX = 32767.0
+UINT16_MAX = 65535.0
+_OVERHEAD = 1.1  # a loop may ask for a little more than its successor's limit
+_THRUST_SCALE = 1000.0
+
+
+class Pid:
+    """One PID loop; the derivative acts on the measurement. Limits of 0 mean none."""
+
+    __slots__ = ("_i_limit", "_integral", "_limit", "_measured", "_period", "kd", "ki", "kp")
+
+    def __init__(
+        self, kp: float, ki: float, kd: float, period_s: float, i_limit: float, limit: float = 0.0
+    ) -> None:
+        self.kp, self.ki, self.kd = kp, ki, kd
+        self._period = period_s
+        self._i_limit = i_limit
+        self._limit = limit
+        self._integral = 0.0
+        self._measured = 0.0
+
+    def reset(self, measured: float) -> None:
+        self._integral = 0.0
+        self._measured = measured
+
+    def set_limit(self, limit: float) -> None:
+        self._limit = limit
+
+    def update(self, desired: float, measured: float) -> float:
+        return self.respond(desired - measured, measured - self._measured, measured)
+
+    def update_angle(self, desired: float, measured: float) -> float:
+        """As `update`, on the circle of 360 degrees."""
+        error = cap_deg(desired - measured)
+        return self.respond(error, cap_deg(measured - self._measured), measured)
+
+    def respond(self, error: float, change: float, measured: float) -> float:
+        integral = self._integral + error * self._period
+        bound = self._i_limit
+        if integral > bound:
+            integral = bound
+        elif integral < -bound:
+            integral = -bound
+        self._integral = integral
+        self._measured = measured
+        output = self.kp * error + self.ki * integral
+        if self.kd != 0.0:
+            output -= self.kd * change / self._period
+        limit = self._limit
+        if limit > 0.0:
+            if output > limit:
+                return limit
+            if output < -limit:
+                return -limit
+        return output
+
+
+def cap_deg(angle: float) -> float:
+    """The same angle within +-180 degrees."""
+    while angle > 180.0:
+        angle -= 360.0
+    while angle < -180.0:
+        angle += 360.0
+    return angle
+
+
+def _saturated(value: float) -> float:
+    return max(-INT16_MAX, min(INT16_MAX, value))
+
+
+class Estimate:
+    """The state estimate in the firmware's units, written once a step."""
+
+    __slots__ = (
+        "gyro_x_dps",
+        "gyro_y_dps",
+        "gyro_z_dps",
+        "pitch_deg",
+        "roll_deg",
+        "vx_mps",
+        "vy_mps",
+        "vz_mps",
+        "x_m",
+        "y_m",
+        "yaw_deg",
+        "z_m",
+    )
+
+    def __init__(self) -> None:
+        self.x_m = self.y_m = self.z_m = 0.0
+        self.vx_mps = self.vy_mps = self.vz_mps = 0.0
+        self.roll_deg = self.pitch_deg = self.yaw_deg = 0.0
+        self.gyro_x_dps = self.gyro_y_dps = self.gyro_z_dps = 0.0
+
+
+Motors = tuple[float, float, float, float]
+MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
+
+
+class Controller:
+    """Setpoint and estimate in, four motor commands 0..65535 out."""
+
+    def __init__(self) -> None:
+        dt, pt = ATTITUDE_DT_S, POSITION_DT_S
+        self.roll_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
+        self.pitch_rate = Pid(250.0, 500.0, 2.5, dt, 33.3)
+        self.yaw_rate = Pid(120.0, 16.7, 0.0, dt, 166.7)
+        self.roll = Pid(6.0, 3.0, 0.0, dt, 20.0)
+        self.pitch = Pid(6.0, 3.0, 0.0, dt, 20.0)
+        self.yaw = Pid(6.0, 1.0, 0.35, dt, 360.0)
+        self.x = Pid(2.0, 0.0, 0.0, pt, 5000.0)
+        self.y = Pid(2.0, 0.0, 0.0, pt, 5000.0)
+        self.z = Pid(2.0, 0.5, 0.0, pt, 5000.0)
+        self.vx = Pid(25.0, 1.0, 0.0, pt, 5000.0)
+        self.vy = Pid(25.0, 1.0, 0.0, pt, 5000.0)
+        self.vz = Pid(25.0, 15.0, 0.0, pt, 5000.0, UINT16_MAX / 2.0 / _THRUST_SCALE)
+        self.thrust_base = 36000.0
+        self.thrust_min = 20000.0
+        self.roll_max_deg = 20.0
+        self.pitch_max_deg = 20.0
+        self.x_speed_max_mps = 1.0
+        self.y_speed_max_mps = 1.0
+        self.z_speed_max_mps = 1.0
+        self.limits_changed()
+        self._mode: Mode = MODE_OFF
+        self._position_in = 1
+        self.thrust = 0.0
+        self.desired_roll_deg = 0.0
+        self.desired_pitch_deg = 0.0
+        self.desired_yaw_deg = 0.0
+        self.outputs = (0.0, 0.0, 0.0)
+
+    def limits_changed(self) -> None:
+        """Hand the limits to the loops that keep them."""
+        self.x.set_limit(self.x_speed_max_mps * _OVERHEAD)
+        self.y.set_limit(self.y_speed_max_mps * _OVERHEAD)
+        self.z.set_limit(max(self.z_speed_max_mps, 0.5) * _OVERHEAD)
+        self.vx.set_limit(self.pitch_max_deg * _OVERHEAD)
+        self.vy.set_limit(self.roll_max_deg * _OVERHEAD)
+
+    def update(self, setpoint: Setpoint, now: Estimate) -> Motors:
+        mode = setpoint.mode
+        if mode != self._mode:
+            self._mode = mode
+            self._reset(now)
+        if mode[5] == VELOCITY:
+            self.desired_yaw_deg = cap_deg(
+                self.desired_yaw_deg + setpoint.yaw_rate_dps * ATTITUDE_DT_S
+            )
+        elif mode[5] == ABSOLUTE:
+            self.desired_yaw_deg = cap_deg(setpoint.yaw_deg)
+        self._position_in -= 1
+        if self._position_in == 0:
+            self._position_in = POSITION_EVERY
+            self._position(setpoint, now)
+        if mode[2] == DISABLED:
+            self.thrust = setpoint.thrust
+        if mode[0] == DISABLED or mode[1] == DISABLED:
+            self.desired_roll_deg = setpoint.roll_deg
+            self.desired_pitch_deg = setpoint.pitch_deg
+        if self.thrust == 0.0:
+            self._reset(now)
+            self.desired_yaw_deg = now.yaw_deg
+            self.outputs = (0.0, 0.0, 0.0)
+            return MOTORS_OFF
+        roll = _saturated(
+            self.roll_rate.update(
+                self.roll.update(self.desired_roll_deg, now.roll_deg), now.gyro_x_dps
+            )
+        )
+        pitch = _saturated(
+            self.pitch_rate.update(
+                self.pitch.update(self.desired_pitch_deg, now.pitch_deg), -now.gyro_y_dps
+            )
+        )
+        yaw = -_saturated(
+            self.yaw_rate.update(
+                self.yaw.update_angle(self.desired_yaw_deg, now.yaw_deg), now.gyro_z_dps
+            )
+        )
+        self.outputs = (roll, pitch, yaw)
+        return _distribute(self.thrust, 0.5 * roll, 0.5 * pitch, yaw)
+
+    def _position(self, setpoint: Setpoint, now: Estimate) -> None:
+        mode = setpoint.mode
+        yaw_rad = math.radians(now.yaw_deg)
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        want_x, want_y = setpoint.vx_mps, setpoint.vy_mps
+        if not setpoint.body_velocity:
+            want_x, want_y = want_x * c + want_y * s, want_y * c - want_x * s
+        if mode[0] == ABSOLUTE:
+            want_x = self.x.update(setpoint.x_m * c + setpoint.y_m * s, now.x_m * c + now.y_m * s)
+        if mode[1] == ABSOLUTE:
+            want_y = self.y.update(setpoint.y_m * c - setpoint.x_m * s, now.y_m * c - now.x_m * s)
+        want_z = setpoint.vz_mps
+        if mode[2] == ABSOLUTE:
+            want_z = self.z.update(setpoint.z_m, now.z_m)
+        pitch = -self.vx.update(want_x, now.vx_mps * c + now.vy_mps * s)
+        roll = -self.vy.update(want_y, now.vy_mps * c - now.vx_mps * s)
+        self.desired_pitch_deg = max(-self.pitch_max_deg, min(self.pitch_max_deg, pitch))
+        self.desired_roll_deg = max(-self.roll_max_deg, min(self.roll_max_deg, roll))
+        thrust = self.vz.update(want_z, now.vz_mps) * _THRUST_SCALE + self.thrust_base
+        self.thrust = min(UINT16_MAX, max(self.thrust_min, thrust))
+
+    def _reset(self, now: Estimate) -> None:
+        for pid, measured in (
+            (self.x, now.x_m),
+            (self.y, now.y_m),
+            (self.z, now.z_m),
+            (self.roll, now.roll_deg),
+            (self.pitch, now.pitch_deg),
+            (self.yaw, now.yaw_deg),
+        ):
+            pid.reset(measured)
+        for pid in (self.vx, self.vy, self.vz, self.roll_rate, self.pitch_rate, self.yaw_rate):
+            pid.reset(0.0)
+        self.desired_roll_deg = now.roll_deg
+        self.desired_pitch_deg = now.pitch_deg
+
+
+def _distribute(thrust: float, r: float, p: float, y: float) -> Motors:
+    m1, m2 = thrust - r + p + y, thrust - r - p - y
+    m3, m4 = thrust + r - p + y, thrust + r + p - y
+    excess = max(m1, m2, m3, m4) - UINT16_MAX
+    if excess > 0.0:
+        # Attitude comes before thrust: all four give way together.
+        m1, m2, m3, m4 = m1 - excess, m2 - excess, m3 - excess, m4 - excess
+    return (
+        m1 if m1 > 0.0 else 0.0,
+        m2 if m2 > 0.0 else 0.0,
+        m3 if m3 > 0.0 else 0.0,
+        m4 if m4 > 0.0 else 0.0,
+    )

@@ -1,0 +1,204 @@
+"""The supervisor: who may spin the motors, decided 25 times a second.
+
+States, conditions and times are those of firmware facts, "Supervisor", "When setpoints
+stop" and "Contact, tumble, crash".
+"""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+
+from perchctl.mission.types import (
+    ARMED,
+    AUTO_ARM,
+    CAN_ARM,
+    CAN_FLY,
+    CRASHED,
+    FLYING,
+    HL_ACTIVE,
+    HL_FINISHED,
+    LOCKED,
+    TUMBLED,
+)
+
+EVERY = 20  # control periods between two updates
+FLYING_MEMORY_S = 2.0
+SILENCE_LEVEL_S = 0.5
+SILENCE_CUT_S = 2.0
+WATCHDOG_S = 1.0
+PREFLIGHT_S = 30.0
+LANDED_S = 3.0
+TILT_ACC_G, TILT_S = 0.5, 1.0
+UPSIDE_DOWN_ACC_G, UPSIDE_DOWN_S = -0.2, 0.1
+FREE_FALL_G = 0.1
+_TICK_S = 1e-6  # ages are compared on a 2 ms grid
+
+
+class State(Enum):
+    NOT_INITIALIZED = auto()
+    CHECKS_NOT_PASSED = auto()
+    CHECKS_PASSED = auto()
+    READY = auto()
+    FLYING = auto()
+    LANDED = auto()
+    RESET = auto()
+    LEVEL_OUT = auto()
+    FREE_FALL = auto()
+    LOCKED = auto()
+    CRASHED = auto()
+
+
+MOTORS_ALLOWED = frozenset({State.READY, State.FLYING, State.LEVEL_OUT, State.LANDED})
+
+
+class Supervisor:
+    """`update` is called at 25 Hz; everything else only records."""
+
+    def __init__(self) -> None:
+        self.state = State.NOT_INITIALIZED
+        self.armed = False
+        self.crashed = False
+        self.tumbled = False
+        self.emergency = False
+        self.motors_allowed = False
+        self._watchdog_s: float | None = None
+        self._thrust_s: float | None = None
+        self._ready_s = 0.0
+        self._landed_s = 0.0
+        self._tumble_s: float | None = None
+        self._info = 0
+
+    def request_arming(self, do_arm: bool) -> bool:
+        if do_arm == self.armed:
+            return True
+        if do_arm and self.state is not State.CHECKS_PASSED:
+            return False
+        self.armed = do_arm
+        return True
+
+    def request_recovery(self) -> bool:
+        if not self.crashed:
+            return True
+        if self.tumbled:
+            return False
+        self.crashed = False
+        return True
+
+    def notify_watchdog(self, t_s: float) -> None:
+        self._watchdog_s = t_s
+
+    def update(
+        self,
+        t_s: float,
+        *,
+        motors_running: bool,
+        setpoint_age_s: float,
+        acc_g: tuple[float, float, float],
+    ) -> None:
+        if motors_running:
+            self._thrust_s = t_s
+        flying = self._thrust_s is not None and t_s - self._thrust_s < FLYING_MEMORY_S - _TICK_S
+        self.tumbled = self._check_tumbled(t_s, acc_g)
+        emergency = self.emergency or (
+            self._watchdog_s is not None and t_s - self._watchdog_s >= WATCHDOG_S
+        )
+        before = self.state
+        self.state = self._next(t_s, flying, emergency, setpoint_age_s)
+        if self.state is not before:
+            self._entered(t_s)
+        self.motors_allowed = self.state in MOTORS_ALLOWED
+
+    def info(self, *, hl_active: bool, hl_finished: bool) -> int:
+        """The `supervisor.info` bit field."""
+        state = self.state
+        return (
+            (CAN_ARM if state is State.CHECKS_PASSED else 0)
+            | (ARMED if self.armed else 0)
+            | AUTO_ARM
+            | (CAN_FLY if self.motors_allowed else 0)
+            | (FLYING if self.is_flying else 0)
+            | (TUMBLED if self.tumbled else 0)
+            | (LOCKED if state is State.LOCKED else 0)
+            | (CRASHED if self.crashed else 0)
+            | (HL_ACTIVE if hl_active else 0)
+            | (HL_FINISHED if hl_finished else 0)
+        )
+
+    @property
+    def is_flying(self) -> bool:
+        return self.state is State.FLYING or self.state is State.LEVEL_OUT
+
+    def _next(self, t_s: float, flying: bool, emergency: bool, age_s: float) -> State:
+        match self.state:
+            case State.NOT_INITIALIZED | State.RESET:
+                return State.CHECKS_NOT_PASSED
+            case State.FREE_FALL | State.LOCKED:
+                return State.LOCKED
+            case State.CRASHED if not self.crashed and not self.tumbled:
+                return State.CHECKS_NOT_PASSED
+            case _ if emergency:
+                return State.FREE_FALL
+            case State.CHECKS_NOT_PASSED if not self.tumbled:
+                return State.CHECKS_PASSED
+            case State.CHECKS_PASSED if self.tumbled:
+                return State.CHECKS_NOT_PASSED
+            case State.CHECKS_PASSED if self.armed:
+                return State.READY
+            case State.READY:
+                return self._from_ready(t_s, flying)
+            case State.FLYING | State.LEVEL_OUT:
+                return self._from_flight(flying, age_s)
+            case State.LANDED:
+                if not self.armed or t_s - self._landed_s > LANDED_S:
+                    return State.RESET
+                return State.FLYING if flying else State.LANDED
+            case unchanged:
+                return unchanged
+
+    def _from_ready(self, t_s: float, flying: bool) -> State:
+        if self.tumbled:
+            return State.CHECKS_NOT_PASSED
+        if flying and self.armed:
+            return State.FLYING
+        if not self.armed or t_s - self._ready_s > PREFLIGHT_S:
+            return State.RESET
+        return State.READY
+
+    def _from_flight(self, flying: bool, age_s: float) -> State:
+        if age_s > SILENCE_CUT_S + _TICK_S:
+            return State.FREE_FALL
+        if self.tumbled:
+            return State.CRASHED
+        if not self.armed:
+            return State.RESET
+        if age_s > SILENCE_LEVEL_S + _TICK_S:
+            return State.LEVEL_OUT
+        # A level-out that ends goes back through FLYING, so `flying` cannot clear
+        # while setpoints are missing: silence after a lone stop ends in the lock.
+        if self.state is State.LEVEL_OUT or flying:
+            return State.FLYING
+        return State.LANDED
+
+    def _entered(self, t_s: float) -> None:
+        state = self.state
+        if state is State.READY:
+            self._ready_s = t_s
+        elif state is State.LANDED:
+            self._landed_s = t_s
+        elif state is State.CRASHED:
+            self.crashed = True
+        if state not in MOTORS_ALLOWED:
+            self.armed = state is State.CHECKS_PASSED  # the airframe arms itself
+
+    def _check_tumbled(self, t_s: float, acc_g: tuple[float, float, float]) -> bool:
+        if max(abs(a) for a in acc_g) < FREE_FALL_G:
+            self._tumble_s = None
+        if acc_g[2] >= TILT_ACC_G:
+            self._tumble_s = None
+            return False
+        if self._tumble_s is None:
+            self._tumble_s = t_s
+        since_s = t_s - self._tumble_s
+        if acc_g[2] < UPSIDE_DOWN_ACC_G and since_s > UPSIDE_DOWN_S:
+            return True
+        return since_s > TILT_S

@@ -1,0 +1,238 @@
+"""The firmware as one object: commands in, motors out, one control period a step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
+
+from perchctl.sim.firmware.commands import HighLevelCommand, LowLevelCommand
+from perchctl.sim.firmware.controller import MOTORS_OFF, Controller
+from perchctl.sim.firmware.estimator import Estimator
+from perchctl.sim.firmware.logs import log_getters
+from perchctl.sim.firmware.parameters import apply_parameter
+from perchctl.sim.firmware.planner import Planner
+from perchctl.sim.firmware.power import PowerMonitor
+from perchctl.sim.firmware.setpoint import Decoder, Setpoint
+from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
+from perchctl.sim.firmware.supervisor import State, Supervisor
+from perchctl.sim.firmware.toc import LOG_VARIABLES, PARAMETERS, Parameter
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+
+if TYPE_CHECKING:
+    from perchctl.sim.world import World
+
+PLANNER_EVERY = 5  # 100 Hz
+ESTIMATOR_KALMAN = 2
+
+_MOTORS_STATES = (State.READY, State.FLYING, State.LANDED)
+
+
+class Firmware:
+    """A Crazyflie 2.1 as firmware release 2026.08 (CRTP protocol 12) behaves.
+
+    Every behaviour is a row of the firmware facts. `step` senses, estimates,
+    supervises, controls, drives the motors and advances the world by
+    `CONTROL_PERIOD_S`. Commands take effect in the next step.
+    """
+
+    LOG_VARIABLES: ClassVar[dict[str, str]] = LOG_VARIABLES
+    PARAMETERS: ClassVar[dict[str, Parameter]] = PARAMETERS
+
+    def __init__(self, world: World, scenario: Scenario) -> None:
+        self.world = world
+        self.scenario = scenario
+        self._parameters = {name: p.default for name, p in PARAMETERS.items()}
+        self._boot()
+
+    def _boot(self) -> None:
+        self._steps = 0
+        self._flown = False
+        self.motors = MOTORS_OFF
+        self._null = Setpoint()
+        self._setpoint = self._null
+        self.flown_setpoint = self._null
+        self._levelled_from = self._null
+        self._levelled = self._null
+        self._low_level = False
+        self._decoder = Decoder()
+        self.estimator = Estimator(self.scenario)
+        self.planner = Planner()
+        self.supervisor = Supervisor()
+        self.controller = Controller()
+        self.power = PowerMonitor(self.world.battery_v)
+        self._getters: dict[str, Callable[[], float]] = log_getters(self)
+        self._external_positions = True
+        if self.scenario.extra.get("external_position"):
+            self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
+        for name in PARAMETERS:
+            self._apply(name)
+
+    @property
+    def t_s(self) -> float:
+        """Time since boot."""
+        return self._steps * CONTROL_PERIOD_S
+
+    def step(self) -> None:
+        """One control period."""
+        step = self._steps
+        t_s = step * CONTROL_PERIOD_S
+        supervisor = self.supervisor
+        self.estimator.update(
+            self.world,
+            t_s,
+            flown=self._flown,
+            spinning=self.motors is not MOTORS_OFF,
+            external=self._external_positions,
+        )
+        if step % PLANNER_EVERY == 0:
+            self._consult_planner(t_s)
+        if step % SUPERVISOR_EVERY == 0:
+            supervisor.update(
+                t_s,
+                motors_running=self.motors is not MOTORS_OFF and max(self.motors) > 0.0,
+                setpoint_age_s=t_s - self._setpoint.stamp_s,
+                acc_g=self.estimator.acc_g,
+            )
+            self.planner.block(not supervisor.motors_allowed)
+            self.power.update(t_s, self.world.battery_v, self._parameters)
+        setpoint = self._setpoint
+        state = supervisor.state
+        if state is State.LEVEL_OUT:
+            if self._levelled_from is not setpoint:
+                self._levelled_from = setpoint
+                self._levelled = setpoint.levelled()
+            setpoint = self._levelled
+        elif state not in _MOTORS_STATES:
+            setpoint = self._null
+        motors = self.controller.update(setpoint, self.estimator.now)
+        if not supervisor.motors_allowed:
+            motors = MOTORS_OFF
+        if motors is not MOTORS_OFF:
+            self._flown = True
+        self.motors = motors
+        self.flown_setpoint = setpoint
+        self._steps = step + 1
+        self.world.step(motors)
+
+    # Commands -----------------------------------------------------------------------
+
+    def low_level(self, command: LowLevelCommand) -> None:
+        """A setpoint packet; takes over from the high-level commander."""
+        self._accept(self._decoder.decode(command))
+        self._low_level = True
+        self.planner.stop()
+
+    def notify_setpoint_stop(self, remain_valid_s: float = 0.0) -> None:
+        """Low-level setpoints end: the high-level commander may fly again.
+
+        The firmware reads past `remain_valid_s`; so does this.
+        """
+        self._tell_planner()
+        self._low_level = False
+
+    def high_level(self, command: HighLevelCommand) -> None:
+        """A high-level command; flown only when no low-level stream has priority."""
+        self.planner.command(command, self.t_s)
+
+    def emergency_stop(self) -> None:
+        """Motors off and locked, within one supervisor update."""
+        self.supervisor.emergency = True
+
+    def emergency_stop_watchdog(self) -> None:
+        """The first call starts the watchdog; a gap over 1 s then cuts and locks."""
+        self.supervisor.notify_watchdog(self.t_s)
+
+    def arm(self, do_arm: bool) -> tuple[bool, bool]:
+        """(success, armed)."""
+        success = self.supervisor.request_arming(do_arm)
+        return success, self.supervisor.armed
+
+    def recover_from_crash(self) -> tuple[bool, bool]:
+        """(success, recovered); refused while still tumbled."""
+        success = self.supervisor.request_recovery()
+        return success, not self.supervisor.crashed
+
+    def external_position(self, position_m: tuple[float, float, float]) -> None:
+        """A position from outside, m; see `Estimator`."""
+        self.estimator.external_position(position_m, self.t_s)
+
+    def external_pose(
+        self,
+        position_m: tuple[float, float, float],
+        quaternion_xyzw: tuple[float, float, float, float],
+    ) -> None:
+        """A pose from outside; the attitude is taken from the gyroscope all the same."""
+        self.external_position(position_m)
+
+    def reboot(self) -> None:
+        """Everything but the world, the battery and persistent parameters starts again."""
+        for name, parameter in PARAMETERS.items():
+            if not parameter.persistent:
+                self._parameters[name] = parameter.default
+        self._boot()
+
+    # What can be read ---------------------------------------------------------------
+
+    @property
+    def supervisor_info(self) -> int:
+        """`supervisor.info`, uint16 (firmware facts, "Supervisor")."""
+        return self.supervisor.info(
+            hl_active=self.planner.active, hl_finished=self.planner.finished(self.t_s)
+        )
+
+    def log_value(self, name: str) -> float:
+        """A log variable in its own units (degrees, g, pitch nose up).
+
+        Raises KeyError for an unknown name.
+        """
+        getter = self._getters.get(name)
+        if getter is not None:
+            return getter()
+        if name not in LOG_VARIABLES:
+            raise KeyError(name)
+        return 0.0
+
+    def get_parameter(self, name: str) -> float:
+        """Raises KeyError for an unknown name."""
+        return self._parameters[name]
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Raises KeyError for an unknown name, PermissionError for a read-only one."""
+        if PARAMETERS[name].readonly:
+            raise PermissionError(f"parameter {name} is read-only")
+        self._parameters[name] = float(value)
+        self._apply(name)
+
+    # Inside -------------------------------------------------------------------------
+
+    def _apply(self, name: str) -> None:
+        value = self._parameters[name]
+        if name == "kalman.resetEstimation":
+            if value == 1.0:
+                self.estimator.reset(self.t_s)
+        elif name == "stabilizer.estimator":
+            self._external_positions = value == ESTIMATOR_KALMAN
+        elif name == "stabilizer.stop":
+            self.supervisor.emergency = self.supervisor.emergency or value != 0.0
+        else:
+            apply_parameter(self.controller, name, value)
+
+    def _accept(self, setpoint: Setpoint) -> None:
+        setpoint.stamp_s = self.t_s
+        self._setpoint = setpoint
+
+    def _consult_planner(self, t_s: float) -> None:
+        setpoint = self.planner.setpoint(t_s)
+        if not self.planner.active:
+            self._tell_planner()
+        if not self._low_level:
+            self._accept(setpoint)
+
+    def _tell_planner(self) -> None:
+        now = self.estimator.now
+        self.planner.tell_state(
+            (now.x_m, now.y_m, now.z_m),
+            (now.vx_mps, now.vy_mps, now.vz_mps),
+            math.radians(now.yaw_deg),
+        )

@@ -1,0 +1,91 @@
+"""View rays of a camera and where they meet the target's plane; pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.vision.types import CameraModel
+
+FINE_PX, COARSE_PX = 2, 8
+"""Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks."""
+
+FAR_AWAY_M = 1e4
+"""Where rays that miss the plane are said to meet it."""
+LEAST_RISE = 0.02
+"""z of a ray (target axes, depth 1 in the view) that still meets the plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class RayGrid:
+    """Undistorted rays (x, y, 1) at nodes `stride` px apart, with one node around.
+
+    Node (j, i) sits at pixel ``stride * (i - 1) + (stride - 1) / 2``: where
+    cv2.resize by `stride` puts its sample centres.
+    """
+
+    stride: int
+    rays: NDArray[np.float32]  # (3, rows, cols)
+
+
+def undistorted_rays(camera: CameraModel, pixels: Array) -> Array:
+    """View rays (x, y) at depth one of pixels (n, 2), shape (n, 2)."""
+    points = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
+    criteria = (3, 100, 1e-12)  # by default OpenCV stops early, 0.12 px off in the corners
+    if camera.model == "fisheye":
+        rays = cv2.fisheye.undistortPoints(points, camera.K, camera.dist, criteria=criteria)
+    else:
+        rays = cv2.undistortPoints(points, camera.K, camera.dist, criteria=criteria)
+    return np.asarray(rays, np.float64).reshape(-1, 2)
+
+
+def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
+    """Rays over the image, its size rounded up to whole coarse blocks."""
+    cols, rows = (-(-side // COARSE_PX) * (COARSE_PX // stride) + 2 for side in camera.size_px)
+    u = stride * (np.arange(cols) - 1) + (stride - 1) / 2.0
+    v = stride * (np.arange(rows) - 1) + (stride - 1) / 2.0
+    pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    xy = undistorted_rays(camera, pixels).T
+    rays = np.stack([xy[0], xy[1], np.ones(len(pixels))])
+    return RayGrid(stride, rays.reshape(3, rows, cols).astype(np.float32))
+
+
+def plane_map(T_target_cam: Array) -> Array:
+    """Maps a ray (x, y, 1) to (X w, Y w, w), where it meets the target's plane, (3, 3).
+
+    From X = t + s R r with X_z = 0. A camera above the plane sees nothing of it
+    (w is made negative).
+    """
+    R, t = T_target_cam[:3, :3], T_target_cam[:3, 3]
+    H = np.stack([t[0] * R[2] - t[2] * R[0], t[1] * R[2] - t[2] * R[1], R[2]])
+    return H if t[2] < 0.0 else np.array([H[0], H[1], [0.0, 0.0, -1.0]])
+
+
+def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where the grid's rays meet the plane, (rows, cols, 2) m, and which do not."""
+    rays = grid.rays
+    q = to_plane.astype(np.float32) @ rays.reshape(3, -1)
+    misses = q[2] < LEAST_RISE
+    any_miss = bool(misses.any())
+    if any_miss:
+        q[2, misses] = 1.0
+    points = np.empty((q.shape[1], 2), np.float32)
+    np.divide(q[0], q[2], out=points[:, 0])
+    np.divide(q[1], q[2], out=points[:, 1])
+    if any_miss:
+        points[misses] = FAR_AWAY_M
+    return points.reshape(*rays.shape[1:], 2), misses.reshape(rays.shape[1:])
+
+
+def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:
+    """Local scale of the picture around a node (geometric mean of both directions)."""
+    row, col = min(max(row, 1), len(nodes) - 2), min(max(col, 1), nodes.shape[1] - 2)
+    a = (nodes[row, col + 1] - nodes[row, col - 1]).astype(np.float64)
+    b = (nodes[row + 1, col] - nodes[row - 1, col]).astype(np.float64)
+    area = abs(a[0] * b[1] - a[1] * b[0])
+    return 2.0 * stride / math.sqrt(max(area, 1e-12))

@@ -1,0 +1,297 @@
+"""The picture of the ceiling and its target from a camera pose.
+
+Every image pixel is a ray, traced to the ceiling's plane and looked up in
+textures; lens distortion lies in the rays, which are precomputed. The exact
+map is evaluated at every second pixel (the ceiling's at every eighth) and
+interpolated, which errs by less than 0.01 px for lenses up to 90 degrees.
+
+Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array, invert_T, make_T, rot_z
+from perchctl.profile import TargetConfig
+from perchctl.sim.analogue import spoil
+from perchctl.sim.exposure import line_kernel, path_length_px, sample_count, spread
+from perchctl.sim.rays import (
+    COARSE_PX,
+    FINE_PX,
+    LEAST_RISE,
+    RayGrid,
+    local_px_per_m,
+    plane_map,
+    ray_grid,
+    trace,
+)
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.surfaces import (
+    CEILING_TEXTURE_PX,
+    SAMPLING_SIGMA_PX,
+    TILE_M,
+    Ceiling,
+    Picture,
+    Sheet,
+)
+from perchctl.target.drawing import draw_target
+from perchctl.vision.types import CameraModel
+
+CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
+"""Numbers of this part's random streams."""
+
+FLOOR_GREY = 60
+VIGNETTING_EXPONENT = 0.6
+"""Relative light is (1 + tan^2(angle))^-exponent; 2 would be the cos^4 law of a
+bare lens, real ones correct most of it."""
+
+_NOISE_BANK_PX = 1024
+_CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
+
+
+class Renderer:
+    """Renders frames; `render` depends on its arguments and the seed only.
+
+    Args:
+        scenario: the ceiling's height, the target's place and true print sizes
+            (`large_side_m`, `small_side_m`), noise, bare ceiling or not;
+            ``extra["analogue"]`` in 0..1 adds the faults of an analogue video link.
+        camera: the true camera.
+        target: dictionaries and ids; its sizes are replaced by the scenario's.
+        seed: of texture and noise; the scenario's own if None.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        camera: CameraModel,
+        target: TargetConfig,
+        seed: int | None = None,
+    ) -> None:
+        self.scenario = scenario
+        self.camera = camera
+        self.seed = scenario.seed if seed is None else seed
+        printed = TargetConfig(
+            large=target.large.model_copy(update={"side_m": scenario.large_side_m}),
+            small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
+        )
+        self.sheet = None if scenario.no_target else Sheet(draw_target(printed))
+        self.T_world_target = make_T(
+            rot_z(scenario.target_yaw_rad), (*scenario.target_xy_m, scenario.ceiling_z_m)
+        )
+        self._T_target_world = invert_T(self.T_world_target)
+        self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
+        self._fine = ray_grid(camera, FINE_PX)
+        self._coarse = ray_grid(camera, COARSE_PX)
+        self._focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
+        self.shade = _vignetting(self._fine, camera.size_px)
+        self._noise = self._noise_bank()
+        self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
+
+    def render(
+        self,
+        T_world_cam_samples: Sequence[Array],
+        defocus_px: float | None = None,
+        frame_index: int = 0,
+    ) -> Picture:
+        """One exposure.
+
+        Args:
+            T_world_cam_samples: poses (4, 4) at equal steps over the exposure,
+                first and last included; a single one is a still camera.
+            defocus_px: sigma of the lens's blur; the scenario's if None.
+            frame_index: chooses the noise.
+
+        Returns: uint8, shape (height, width).
+        """
+        poses = [self._T_target_world @ np.asarray(T) for T in T_world_cam_samples]
+        motion_px = self._motion_px(poses)
+        maps = [plane_map(T) for T in spread(poses, sample_count(motion_px))]
+        picture: Any = self._optical(maps, motion_px)
+        sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
+        lens = math.sqrt(max(sigma**2 - SAMPLING_SIGMA_PX**2, 0.0))
+        if lens > 0.05:
+            picture = cv2.GaussianBlur(picture, (0, 0), lens)
+        width, height = self.camera.size_px
+        picture = cv2.multiply(picture[:height, :width], self.shade, scale=1.0 / 255.0)
+        rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
+        if self._noise is not None:
+            rows, cols = self._noise.shape
+            r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
+            picture = cv2.add(picture, self._noise[r : r + height, c : c + width], dtype=cv2.CV_8U)
+        if self._analogue > 0.0:
+            picture = spoil(picture, self._analogue, rng)
+        return np.asarray(picture, np.uint8)
+
+    # -- what the lens sees -------------------------------------------------
+
+    def _optical(self, maps: list[Array], motion_px: Array) -> Picture:
+        """The picture before defocus, at the ray grids' padded size."""
+        middle = maps[len(maps) // 2]
+        if len(maps) % 2 == 0:
+            middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
+        nodes, misses = trace(self._coarse, middle)
+        inside = None if self.sheet is None else self._nodes_on_sheet(nodes)
+        hidden = inside is not None and self._covers_all(nodes)
+        height, width = ((n - 2) * COARSE_PX for n in nodes.shape[:2])
+        if hidden:
+            picture = np.zeros((height, width), np.uint8)
+        else:
+            picture = self._background(nodes, misses, motion_px)
+        if inside is not None and inside.any():
+            length_px = path_length_px(motion_px)
+            self._add_sheet(picture, nodes, inside, maps, length_px, opaque=hidden)
+        return picture
+
+    def _background(
+        self, nodes: NDArray[np.float32], misses: NDArray[np.bool_], motion_px: Array
+    ) -> Picture:
+        """The bare ceiling, at half resolution: its texture carries no measurement."""
+        rows, cols = nodes.shape[:2]
+        mid = nodes[rows // 2, cols // 2]
+        px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
+        texture = self._ceiling.texture(px_per_m / 2.0)
+        # Whole tiles, to have the view in the middle of the texture.
+        tile = np.clip(np.round(mid / TILE_M), -1e3, 1e3) * TILE_M
+        texels = (nodes - tile) * texture.px_per_m + _CENTER_TEXEL
+        half = cv2.resize(texels.astype(np.float32), None, fx=COARSE_PX // 2, fy=COARSE_PX // 2)
+        crop = COARSE_PX // 2
+        half = np.ascontiguousarray(half[crop:-crop, crop:-crop])
+        picture = _sample(texture.image, half, cv2.BORDER_WRAP)
+        if misses.any():
+            mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
+                              interpolation=cv2.INTER_NEAREST)  # fmt: skip
+            picture[mask > 0] = FLOOR_GREY
+        kernel = line_kernel(motion_px / 2.0)
+        if kernel is not None:
+            picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
+        return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
+
+    def _nodes_on_sheet(self, nodes: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Coarse nodes on the sheet or within 1.5 nodes of it."""
+        assert self.sheet is not None
+        step = np.abs(np.diff(nodes, axis=1)).max(axis=2)  # m a node
+        step = np.minimum(np.pad(step, ((0, 0), (0, 1)), mode="edge"), 1.0)
+        reach = self.sheet.drawing.sheet_side_m / 2.0 + 1.5 * step
+        return np.asarray(np.abs(nodes).max(axis=2) < reach)
+
+    def _covers_all(self, nodes: NDArray[np.float32]) -> bool:
+        """Whether nothing but paper is in view (with room for motion and blur)."""
+        assert self.sheet is not None
+        return float(np.abs(nodes).max()) < 0.45 * self.sheet.drawing.sheet_side_m
+
+    def _add_sheet(
+        self,
+        picture: Picture,
+        nodes: NDArray[np.float32],
+        inside: NDArray[np.bool_],
+        maps: list[Array],
+        length_px: float,
+        opaque: bool,
+    ) -> None:
+        assert self.sheet is not None
+        rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+        # One more block all around: motion moves the sheet within the exposure.
+        grow = 1 + math.ceil(length_px / COARSE_PX)
+        top, left = max(rows[0] - 1 - grow, 0), max(cols[0] - 1 - grow, 0)
+        bottom = min(rows[-1] + grow, nodes.shape[0] - 2)
+        right = min(cols[-1] + grow, nodes.shape[1] - 2)
+        if bottom <= top or right <= left:
+            return
+        j, i = int(rows.mean()), int(cols.mean())
+        texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
+        k = COARSE_PX // FINE_PX
+        grid = RayGrid(
+            FINE_PX, self._fine.rays[:, top * k : bottom * k + 2, left * k : right * k + 2]
+        )
+        value, alpha = _Mean(len(maps)), _Mean(len(maps))
+        for each in maps:
+            points, _ = trace(grid, each)
+            points *= texture.px_per_m
+            points += texture.center_px
+            texels = cv2.resize(points, None, fx=FINE_PX, fy=FINE_PX)
+            texels = np.ascontiguousarray(texels[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX])
+            value.add(_sample(texture.value, texels))
+            if not opaque:
+                alpha.add(_sample(texture.alpha, texels))
+        area = picture[top * COARSE_PX : bottom * COARSE_PX, left * COARSE_PX : right * COARSE_PX]
+        if opaque:
+            area[:] = value.result()
+            return
+        behind = cv2.multiply(area, cv2.bitwise_not(alpha.result()), scale=1.0 / 255.0)
+        area[:] = cv2.add(behind, value.result())
+
+    # -- motion -------------------------------------------------------------
+
+    def _motion_px(self, poses: list[Array]) -> Array:
+        """Path of the ceiling's image during the exposure at five places, (5, n, 2) px."""
+        if len(poses) == 1:
+            return np.zeros((5, 1, 2))
+        rays = self._coarse.rays
+        rows, cols = rays.shape[1:]
+        places = [(rows // 2, cols // 2)] + [
+            (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
+        ]
+        seen = np.stack([rays[:, r, c] for r, c in places], axis=1).astype(np.float64)  # (3, 5)
+        middle = poses[len(poses) // 2]
+        points = plane_map(middle) @ seen
+        height = np.maximum(points[2], LEAST_RISE)
+        points = np.stack([points[0] / height, points[1] / height, np.zeros(5), np.ones(5)])
+        path = []
+        for T in poses:
+            cam = invert_T(T) @ points
+            depth = np.maximum(cam[2], 1e-3)
+            path.append((cam[:2] / depth).T * self._focal_px)
+        return np.stack(path, axis=1)
+
+    def _noise_bank(self) -> NDArray[np.int16] | None:
+        sigma = self.scenario.camera_noise_sigma
+        if sigma <= 0.0:
+            return None
+        width, height = self.camera.size_px
+        size = (max(_NOISE_BANK_PX, height + 256), max(_NOISE_BANK_PX, width + 256))
+        rng = np.random.default_rng([self.seed, NOISE_STREAM])
+        bank = rng.standard_normal(size, np.float32) * np.float32(sigma)
+        return np.rint(bank).astype(np.int16)
+
+
+class _Mean:
+    """Mean of `count` pictures, rounded once."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._sum: Any = None
+
+    def add(self, picture: Picture) -> None:
+        if self._count == 1:
+            self._sum = picture
+        elif self._sum is None:
+            self._sum = picture.astype(np.uint16)
+        else:
+            self._sum = cv2.add(self._sum, picture, dtype=cv2.CV_16U)
+
+    def result(self) -> Picture:
+        assert self._sum is not None
+        if self._count == 1:
+            return np.asarray(self._sum, np.uint8)
+        return np.asarray(cv2.convertScaleAbs(self._sum, alpha=1.0 / self._count), np.uint8)
+
+
+def _sample(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
+    """Bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
+    remap: Any = cv2.remap  # its stub denies that the second map may be None
+    return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
+
+
+def _vignetting(fine: RayGrid, size_px: tuple[int, int]) -> Picture:
+    r2 = (fine.rays[:2] ** 2).sum(axis=0)
+    light = (255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32)
+    full = cv2.resize(light, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
+    return np.rint(full[: size_px[1], : size_px[0]]).astype(np.uint8)

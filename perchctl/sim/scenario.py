@@ -1,0 +1,67 @@
+"""One simulated flight's conditions, drawn from ranges by a seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+CONTROL_PERIOD_S = 0.002
+"""Step of the physics and of the firmware model (500 Hz)."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that differs between two simulated flights; SI, world frame.
+
+    World origin: the floor under the place where the vehicle starts; its state
+    estimate starts there with heading zero *in the estimate's frame*, so
+    `start_yaw_rad` turns the target instead: target_* are given in that frame.
+
+    Attributes:
+        mass_kg: all-up mass.
+        battery_rest_v: resting voltage at the start.
+        ceiling_z_m: height of the ceiling's underside over the floor.
+        target_xy_m, target_yaw_rad: centre and heading of the target.
+        gear_body_m: tip of the magnet gear in body axes (its truth).
+        T_body_cam_true: rows of the camera's true pose, mounting error included.
+        camera_*: what the camera and its radio do to the frames.
+        drift_mps: drift of the state estimate, world axes.
+        draught_mps: mean wind; gusts have the same order.
+        magnet_force_n: pull the magnet can hold.
+        first_contact_force_n: pull at the first contact; None means the same.
+        no_target: the ceiling is bare.
+        camera_freeze_at_s, camera_gone_at_s: faults; None means never.
+    """
+
+    seed: int = 0
+    mass_kg: float = 0.042
+    battery_rest_v: float = 4.15
+    ceiling_z_m: float = 2.2
+    target_xy_m: tuple[float, float] = (0.0, 0.0)
+    target_yaw_rad: float = 0.0
+    large_side_m: float = 0.150
+    small_side_m: float = 0.025
+    gear_body_m: tuple[float, float, float] = (0.0, 0.0, 0.03)
+    T_body_cam_true: tuple[tuple[float, ...], ...] = (
+        (1.0, 0.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        (0.0, 0.0, 1.0, 0.01),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+    camera_rate_hz: float = 30.0
+    camera_latency_s: float = 0.06
+    camera_jitter_s: float = 0.008
+    camera_drop_rate: float = 0.0
+    camera_burst: tuple[float, int] | None = None  # (start s, number of lost frames)
+    camera_noise_sigma: float = 5.0
+    camera_exposure_s: float = 0.008
+    camera_defocus_px: float = 0.6
+    estimate_noise_m: float = 0.002
+    estimate_tilt_bias_rad: tuple[float, float] = (0.0, 0.0)
+    drift_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    draught_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    magnet_force_n: float = 1.2
+    first_contact_force_n: float | None = None
+    no_target: bool = False
+    camera_freeze_at_s: float | None = None
+    camera_gone_at_s: float | None = None
+    extra: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,132 @@
+"""What the simulated camera looks at: the printed sheet and the ceiling, as textures.
+
+Both are kept at several resolutions, each the exact or filtered mean over its
+texels' areas, so that sampling near one texel a pixel is correct near and far.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.target.drawing import TargetDrawing, ink_coverage, sheet_coverage
+
+Picture = NDArray[np.uint8]
+
+PAPER_GREY, INK_GREY, CEILING_GREY = 225.0, 30.0, 140.0
+
+SHEET_FINEST_PX_PER_M = 8000.0
+SHEET_LEVELS = 28  # a factor 2^(1/4) between levels: 8000 .. 74 px/m
+TEXELS_PER_PIXEL = 2.0**0.875
+"""Texels per image pixel, at least: 1.83 to 2.18 from one level to the next."""
+PIXEL_WINDOW_TEXELS = 2.0
+"""Each texel is the exact mean over a window of one image pixel's size. A smaller
+window, or one that is no whole number of texels, aliases: edges would be out of
+place by up to 0.03 px."""
+SAMPLING_SIGMA_PX = 1.0 / (PIXEL_WINDOW_TEXELS * math.sqrt(6.0))
+"""Blur that bilinear sampling between texels adds to the pixel's own window."""
+
+TILE_M = 2.0
+"""The ceiling's texture repeats after this length."""
+TILE_FINEST_PX = 1024
+CEILING_TEXTURE_PX = 2048
+CEILING_OCTAVES: tuple[tuple[int, float], ...] = (
+    # (cells along the tile, standard deviation in grey levels)
+    (4, 5.0),
+    (16, 4.0),
+    (64, 3.0),
+    (256, 3.0),
+    (1024, 3.0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SheetTexture:
+    """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage.
+
+    A point (x, y) of the target's plane (target axes) is at column
+    ``center_px + x * px_per_m`` and row ``center_px + y * px_per_m``.
+    """
+
+    value: Picture
+    alpha: Picture
+    px_per_m: float
+    center_px: float
+
+
+class Sheet:
+    """The printed sheet's textures, built when first needed."""
+
+    def __init__(self, drawing: TargetDrawing) -> None:
+        self.drawing = drawing
+        self._levels: dict[int, SheetTexture] = {}
+
+    def texture(self, image_px_per_m: float) -> SheetTexture:
+        """The level that suits an image in which one metre spans that many pixels."""
+        ratio = SHEET_FINEST_PX_PER_M / (TEXELS_PER_PIXEL * max(image_px_per_m, 1.0))
+        # Level -1 is the finest resolution with single texels, for views nearer than it suits.
+        level = min(max(math.floor(4.0 * math.log2(ratio)), -1), SHEET_LEVELS - 1)
+        if level not in self._levels:
+            px_per_m = SHEET_FINEST_PX_PER_M * 2.0 ** (-max(level, 0) / 4.0)
+            self._levels[level] = self._build(px_per_m, 1.0 if level < 0 else PIXEL_WINDOW_TEXELS)
+        return self._levels[level]
+
+    def _build(self, px_per_m: float, window_px: float) -> SheetTexture:
+        size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
+        ink = ink_coverage(self.drawing, px_per_m, size, window_px)
+        sheet = sheet_coverage(self.drawing, px_per_m, size, window_px)
+        value = PAPER_GREY * sheet + (INK_GREY - PAPER_GREY) * ink
+        return SheetTexture(
+            np.rint(value).astype(np.uint8),
+            np.rint(255.0 * sheet).astype(np.uint8),
+            px_per_m,
+            (size - 1) / 2.0,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CeilingTexture:
+    """A piece of ceiling, `CEILING_TEXTURE_PX` square, that repeats without a seam."""
+
+    image: Picture
+    px_per_m: float
+
+
+class Ceiling:
+    """A seeded, seamless grey texture with detail from 2 mm to half a metre."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        tile = np.full((TILE_FINEST_PX, TILE_FINEST_PX), CEILING_GREY, np.float32)
+        for cells, sigma in CEILING_OCTAVES:
+            tile += _periodic_noise(rng, cells, sigma)
+        self._tiles = [np.clip(tile, 0.0, 255.0)]
+        while len(self._tiles[-1]) > 128:
+            half = cv2.resize(self._tiles[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            self._tiles.append(np.asarray(half, np.float32))
+        self._levels: dict[int, CeilingTexture] = {}
+
+    def texture(self, image_px_per_m: float) -> CeilingTexture:
+        """The level with 1 to 2 texels a pixel, or the nearest there is."""
+        finest = TILE_FINEST_PX / TILE_M
+        level = math.floor(math.log2(finest / max(image_px_per_m, 1.0)))
+        level = min(max(level, 0), len(self._tiles) - 1)
+        if level not in self._levels:
+            tile = np.rint(self._tiles[level]).astype(np.uint8)
+            times = CEILING_TEXTURE_PX // len(tile)
+            self._levels[level] = CeilingTexture(np.tile(tile, (times, times)), finest / 2**level)
+        return self._levels[level]
+
+
+def _periodic_noise(rng: np.random.Generator, cells: int, sigma: float) -> NDArray[np.float32]:
+    """Smooth noise over one tile whose left and right, top and bottom fit together."""
+    grid = rng.normal(0.0, sigma, (cells, cells)).astype(np.float32)
+    if cells == TILE_FINEST_PX:
+        return grid
+    zoom = TILE_FINEST_PX // cells
+    padded = np.pad(grid, 2, mode="wrap")
+    big = cv2.resize(padded, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(big[2 * zoom : -2 * zoom, 2 * zoom : -2 * zoom], np.float32)

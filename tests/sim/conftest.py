@@ -1,0 +1,41 @@
+"""One simulated vehicle and one cflib connection, shared by the tests of the link."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+
+@pytest.fixture(scope="session")
+def toc_cache(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """cflib's table cache, so that only the first connection downloads the tables."""
+    return str(tmp_path_factory.mktemp("toc"))
+
+
+@pytest.fixture(scope="session")
+def shared_pilot(toc_cache: str) -> Iterator[object]:
+    from crtp_rig import Pilot
+
+    from perchctl.sim.process import SimProcess
+
+    with SimProcess.start(pace="stepped") as sim:
+        pilot = Pilot(sim, toc_cache)
+        assert pilot.connect()
+        pilot.start_log()
+        yield pilot
+        pilot.close()
+
+
+@pytest.fixture
+def pilot(shared_pilot: object) -> object:
+    """The connection with a new 42 g vehicle, ready on the floor."""
+    return shared_pilot.fresh()  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def truth_file(tmp_path: Path) -> Path:
+    return tmp_path / "truth.jsonl"

@@ -1,0 +1,64 @@
+"""A firmware in a world, and the few things tests do with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from perchctl.sim.firmware import Firmware
+from perchctl.sim.firmware.commands import HlTakeoff, LowLevelCommand, PositionCommand
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.world import World
+
+STREAM_PERIOD_S = 0.02
+PERFECT = {"estimate_noise_m": 0.0}
+
+
+@dataclass
+class Rig:
+    world: World
+    firmware: Firmware
+
+    def run(self, seconds: float, stream: LowLevelCommand | None = None) -> list[float]:
+        """Advance, streaming a setpoint at 50 Hz; the true heights on the way."""
+        heights = []
+        every = round(STREAM_PERIOD_S / CONTROL_PERIOD_S)
+        for i in range(round(seconds / CONTROL_PERIOD_S)):
+            if stream is not None and i % every == 0:
+                self.firmware.low_level(stream)
+            self.firmware.step()
+            heights.append(self.world.z_m)
+        return heights
+
+    def run_until(self, condition: Any, limit_s: float) -> float:
+        """Seconds until `condition()` holds; fails past the limit."""
+        for i in range(round(limit_s / CONTROL_PERIOD_S)):
+            if condition():
+                return i * CONTROL_PERIOD_S
+            self.firmware.step()
+        raise AssertionError(f"did not happen within {limit_s} s")
+
+    @property
+    def info(self) -> int:
+        return self.firmware.supervisor_info
+
+    @property
+    def motors_off(self) -> bool:
+        return max(self.firmware.motors) == 0.0
+
+    def take_off(self, height_m: float = 0.8, settle_s: float = 2.5) -> None:
+        self.firmware.high_level(HlTakeoff(height_m, 2.5))
+        self.run(2.5 + settle_s)
+
+    def hold(self, seconds: float = 2.0, z_m: float = 0.8) -> None:
+        self.run(seconds, PositionCommand(0.0, 0.0, z_m, 0.0))
+
+
+def make_rig(*, booted: bool = True, **conditions: Any) -> Rig:
+    """A vehicle on the floor with a fresh battery, ready unless `booted` is false."""
+    scenario = Scenario(**({"battery_rest_v": 4.2} | conditions))
+    world = World(scenario)
+    rig = Rig(world, Firmware(world, scenario))
+    if booted:
+        rig.run(0.3)
+    return rig

@@ -1,0 +1,307 @@
+"""The supervisor's rows of the firmware facts, seen through cflib's `udp://` driver."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from crtp_rig import (
+    ARMED_BIT,
+    CAN_FLY_BIT,
+    CRASHED_BIT,
+    FLYING_BIT,
+    HL_DONE,
+    HL_RUNNING,
+    LOCKED,
+    LOCKED_BIT,
+    LOW_LEVEL,
+    READY,
+    TUMBLED_BIT,
+    Pilot,
+)
+
+UPDATE_S = 0.04  # 25 Hz
+
+
+def locked(truth: dict[str, object]) -> bool:
+    return bool(int(str(truth["supervisor_info"])) & LOCKED_BIT)
+
+
+def off(truth: dict[str, tuple[int, ...]]) -> bool:
+    return max(truth["motors"]) == 0
+
+
+# --- Supervisor -------------------------------------------------------------------
+
+
+def test_values_of_the_states(pilot: Pilot) -> None:
+    """Row "supervisor.info": 0x020E, 0x011E, 0x031E, 0x021E, 0x0244, on port 9 and as a log."""
+    assert pilot.supervisor_info() == pilot.info == READY
+    pilot.unlock()
+    pilot.cf.high_level_commander.takeoff(0.6, 2.0)
+    pilot.advance(1.9)
+    assert pilot.supervisor_info() == pilot.info == HL_RUNNING
+    pilot.advance(2.0)
+    assert pilot.supervisor_info() == pilot.info == HL_DONE
+    pilot.stream(0.5, lambda: pilot.hold(0.6))
+    assert pilot.supervisor_info() == pilot.info == LOW_LEVEL
+    pilot.cf.supervisor.send_emergency_stop()
+    pilot.advance(3.0)
+    assert pilot.supervisor_info() == pilot.info == LOCKED
+
+
+def test_cflib_names_the_bits(pilot: Pilot) -> None:
+    """Row "supervisor.info": cflib's getters read the same bits."""
+    pilot.supervisor_info()
+    states = pilot.cf.supervisor.decode_bitfield(pilot.supervisor_info())
+    assert states == ["Is armed", "Is auto armed", "Can fly", "Finished HL trajectory"]
+
+
+def test_updates_at_25_hz(pilot: Pilot) -> None:
+    """Row "Updates at 25 Hz": the bits change only on a grid of 40 ms."""
+    pilot.fly_to(0.4, 0.5)
+    pilot.cf.commander.send_stop_setpoint()
+    pilot.cf.commander.send_notify_setpoint_stop()
+    since_s = pilot.t_s
+    pilot.until(lambda t: not t["supervisor_info"] & FLYING_BIT, 3.0)
+    cleared_s = pilot.sim.truth()["t_s"]
+    assert pilot.t_s > since_s + 1.0
+    phase = (pilot.t_s - 0.002) / UPDATE_S
+    assert abs(phase - round(phase)) * UPDATE_S < 0.0021
+    assert cleared_s > 0.0
+
+
+def test_flying_clears_two_seconds_after_the_motors_stop(pilot: Pilot) -> None:
+    """Row "flying = a motor was above idle in the last 2.0 s"."""
+    pilot.fly_to(0.3, 0.5)
+    pilot.cf.commander.send_stop_setpoint()
+    pilot.cf.commander.send_notify_setpoint_stop()
+    took_s = pilot.until(lambda t: not t["supervisor_info"] & FLYING_BIT, 3.0)
+    assert took_s == pytest.approx(2.02, abs=0.06)
+
+
+def test_arms_itself_and_rearms_on_the_ground(pilot: Pilot) -> None:
+    """Row "arms itself ... Disarm on the ground re-arms in 0.15 s"."""
+    assert pilot.info & ARMED_BIT
+    assert pilot.ask(9, 1, b"\x01\x00") == b"\x81\x01\x00"
+    pilot.sim.advance(0.002)
+    assert not pilot.sim.truth()["supervisor_info"] & ARMED_BIT
+    pilot.t_s = round(pilot.t_s + 0.002, 6)
+    assert pilot.until(lambda t: t["supervisor_info"] == READY, 1.0) == pytest.approx(0.13, abs=0.05)
+
+
+def test_disarm_in_flight_cuts_without_locking(pilot: Pilot) -> None:
+    """Row "Disarm in flight cuts the motors within one update; it does not lock"."""
+    pilot.fly_to(0.5, 0.5)
+    since_s = pilot.t_s
+    pilot.cf.supervisor.send_arming_request(False)
+    assert pilot.until(off, 0.2) <= UPDATE_S + 0.002
+    pilot.advance(0.4)  # before the silent setpoints count
+    seen = {int(v) for _, v in pilot.log("supervisor.info", since_s)}
+    assert not any(v & LOCKED_BIT for v in seen)
+
+
+def test_rearms_after_30_s_on_the_ground(pilot: Pilot) -> None:
+    """Row "After 30 s armed on the ground it disarms and re-arms (can-fly 0 for 120 ms)"."""
+    pilot.advance(32.0)
+    gone = [t for t, v in pilot.log("supervisor.info", 1.0) if not int(v) & CAN_FLY_BIT]
+    assert gone[0] == pytest.approx(30.1, abs=0.2)
+    assert gone[-1] - gone[0] + 0.01 == pytest.approx(0.12, abs=0.04)
+    assert pilot.info == READY
+
+
+def test_rearms_5_s_after_a_landing(pilot: Pilot) -> None:
+    """Row "... and 5 s after a landing, it disarms and re-arms"."""
+    pilot.take_off(0.4, settle_s=1.0)
+    pilot.cf.high_level_commander.land(0.0, 2.0)
+    pilot.until(off, 4.0)
+    down_s = pilot.t_s
+    pilot.advance(7.0)
+    gone = [t for t, v in pilot.log("supervisor.info", down_s) if not int(v) & CAN_FLY_BIT]
+    assert gone[0] - down_s == pytest.approx(5.05, abs=0.15)
+    assert gone[-1] - gone[0] + 0.01 == pytest.approx(0.12, abs=0.04)
+
+
+# --- When setpoints stop ----------------------------------------------------------
+
+
+def test_silence_levels_out_then_cuts_and_locks(pilot: Pilot) -> None:
+    """Row "Low-level stream silent": level at +0.5 s, cut at +2.0 s, locked for good."""
+    pilot.fresh(mass_kg=0.030)
+    pilot.fly_to(0.8, 2.0)
+    pilot.stream(0.4, lambda: pilot.cf.commander.send_position_setpoint(1.5, 0, 0.8, 0))
+    silent_s = pilot.t_s
+    pilot.advance(0.4)
+    assert abs(pilot.sim.truth()["rpy_rad"][1]) > math.radians(2.0)  # still under way
+    pilot.advance(1.0)
+    assert abs(pilot.sim.truth()["rpy_rad"][1]) < math.radians(2.0)
+    assert pilot.sim.truth()["position_m"][2] > 0.6
+    pilot.until(off, 1.0)
+    assert pilot.t_s - silent_s == pytest.approx(2.02, abs=0.06)
+    pilot.advance(1.0)
+    assert pilot.info & LOCKED_BIT
+    pilot.unlock()
+    pilot.cf.high_level_commander.takeoff(0.5, 2.0)
+    pilot.cf.supervisor.send_arming_request(True)
+    pilot.cf.supervisor.send_crash_recovery_request()
+    pilot.advance(5.0)
+    assert pilot.info & LOCKED_BIT
+    assert pilot.motors_off()
+
+
+def test_silence_of_1200_ms_recovers(pilot: Pilot) -> None:
+    """Row "Silence of 1.2 s and then resuming recovers"."""
+    pilot.fly_to(0.8)
+    pilot.advance(1.2)
+    pilot.stream(5.0, lambda: pilot.hold(0.8))
+    assert pilot.info == LOW_LEVEL
+    assert pilot.sim.truth()["position_m"][2] == pytest.approx(0.8, abs=0.1)
+
+
+@pytest.mark.parametrize("perched", [False, True])
+def test_stop_alone_cuts_at_once_and_locks(pilot: Pilot, perched: bool) -> None:
+    """Row "send_stop_setpoint once and then silence": off within 7 ms, locked at +2.0 s."""
+    if perched:
+        pilot.perch()
+    else:
+        pilot.fly_to(0.8, 0.5)
+    pilot.cf.commander.send_stop_setpoint()
+    start_s = pilot.t_s
+    assert pilot.until(off, 0.1) <= 0.007
+    pilot.until(locked, 3.0)
+    assert pilot.t_s - start_s == pytest.approx(2.06, abs=0.07)
+    assert pilot.sim.truth()["magnet_engaged"] == perched
+
+
+def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
+    """Row "stop followed by notify": off, no lock, 0x020E after 2.1 s, take-off works later."""
+    pilot.fly_to(0.3, 0.5)
+    since_s = pilot.t_s
+    pilot.cf.commander.send_stop_setpoint()
+    pilot.cf.commander.send_notify_setpoint_stop()
+    assert pilot.until(off, 0.1) <= 0.007
+    pilot.until(lambda t: t["supervisor_info"] == READY, 4.0)
+    assert pilot.t_s - since_s == pytest.approx(2.06, abs=0.1)
+    pilot.advance(10.0)
+    assert not any(int(v) & LOCKED_BIT for _, v in pilot.log("supervisor.info"))
+    pilot.cf.high_level_commander.takeoff(0.5, 2.0)
+    pilot.advance(4.0)
+    assert pilot.info == HL_DONE
+    assert pilot.sim.truth()["position_m"][2] > 0.4
+
+
+def test_the_farewell_packet_drops_a_flying_vehicle(pilot: Pilot) -> None:
+    """Row "close_link() sends send_setpoint(0,0,0,0)": falls at once and locks."""
+    pilot.fly_to(0.8, 0.5)
+    pilot.cf.commander.send_setpoint(0, 0, 0, 0)
+    assert pilot.until(off, 0.1) <= 0.007
+    pilot.advance(3.0)
+    assert pilot.sim.truth()["floor_contact"]
+    assert pilot.info & LOCKED_BIT
+
+
+@pytest.mark.parametrize(("wait_s", "locks"), [(1.0, True), (4.0, False)])
+def test_the_farewell_packet_when_perched(pilot: Pilot, wait_s: float, locks: bool) -> None:
+    """Row "perched, it locks when the flying bit is still set (1 s after), not 4 s after"."""
+    pilot.perch()
+    pilot.cf.commander.send_stop_setpoint()
+    pilot.cf.commander.send_notify_setpoint_stop()
+    pilot.advance(wait_s)
+    pilot.cf.commander.send_setpoint(0, 0, 0, 0)
+    pilot.advance(6.0)
+    assert bool(pilot.info & LOCKED_BIT) == locks
+    assert pilot.sim.truth()["magnet_engaged"]
+
+
+def test_hl_hover_never_times_out(pilot: Pilot) -> None:
+    """Row "HL hover never times out: with the link cut for 8 s it keeps hovering"."""
+    pilot.take_off(0.8)
+    pilot.sim.silence(8.0)
+    pilot.sim.advance(8.0)
+    truth = pilot.sim.truth()
+    pilot.t_s = round(pilot.t_s + 8.0, 6)
+    assert truth["supervisor_info"] == HL_DONE
+    assert truth["position_m"][2] == pytest.approx(0.8, abs=0.05)
+
+
+def test_emergency_stop(pilot: Pilot) -> None:
+    """Row "Emergency stop: motors off in 25 ms, locked" (within one update)."""
+    pilot.take_off(0.6, settle_s=1.0)
+    pilot.cf.supervisor.send_emergency_stop()
+    assert pilot.until(off, 0.1) <= UPDATE_S + 0.002
+    pilot.advance(3.0)
+    assert pilot.info == LOCKED
+
+
+def test_emergency_stop_watchdog(pilot: Pilot) -> None:
+    """Row "Emergency-stop watchdog": starts with its first packet; a gap over 1 s locks."""
+    pilot.take_off(0.6, settle_s=1.0)
+    pilot.stream(3.0, pilot.cf.supervisor.send_emergency_stop_watchdog, 0.9)
+    assert pilot.info == HL_DONE
+    pilot.cf.supervisor.send_emergency_stop_watchdog()
+    assert pilot.until(off, 2.0) == pytest.approx(1.02, abs=0.05)
+    pilot.advance(3.0)
+    assert pilot.info == LOCKED
+
+
+def test_hl_without_notify_is_not_flown(pilot: Pilot) -> None:
+    """Row "HL command after low-level without notify": HL active, not flown, locks after 2 s."""
+    pilot.fly_to(0.8, 1.0)
+    last_s = pilot.t_s
+    pilot.cf.high_level_commander.go_to(0, 0, 1.4, 0, 1.5)
+    pilot.advance(0.3)
+    assert pilot.info == HL_RUNNING
+    pilot.advance(1.4)
+    assert pilot.sim.truth()["position_m"][2] < 0.9
+    pilot.until(off, 1.0)
+    assert pilot.t_s - last_s == pytest.approx(2.0, abs=0.1)
+    pilot.advance(0.2)
+    assert pilot.info & LOCKED_BIT
+
+
+def test_hl_after_notify_flies(pilot: Pilot) -> None:
+    """Row "With notify first it flies"."""
+    pilot.fly_to(0.8, 1.0)
+    pilot.cf.commander.send_notify_setpoint_stop()
+    pilot.cf.high_level_commander.go_to(0, 0, 1.2, 0, 2.0)
+    pilot.advance(6.0)
+    assert pilot.info == HL_DONE
+    assert pilot.sim.truth()["position_m"][2] == pytest.approx(1.2, abs=0.08)
+
+
+# --- Contact, tumble, crash -------------------------------------------------------
+
+
+def test_pressing_on_the_ceiling_is_no_crash(pilot: Pilot) -> None:
+    """Row "Hitting a ceiling ... and 3 s of full-thrust pressing": no tumble, no lock, +1 g."""
+    pilot.fresh(no_target=True)
+    pilot.fly_to(1.6, 0.5)
+    since_s = pilot.t_s
+    pilot.stream(2.0, lambda: pilot.hold(3.0))
+    peak_g = max(abs(v) for _, v in pilot.log("acc.z", since_s))
+    assert peak_g > 5.0
+    pilot.stream(3.0, lambda: pilot.hold(3.0))
+    assert {int(v) for _, v in pilot.log("supervisor.info", since_s)} == {LOW_LEVEL}
+    assert pilot.sim.truth()["ceiling_force_n"] > 0.0
+    assert pilot.now("acc.z") == pytest.approx(1.0, abs=0.05)
+
+
+def test_upside_down_crashes_and_recovers(pilot: Pilot) -> None:
+    """Row "Upside down in flight": motors off, crashed within 0.7 s; recovery after righting."""
+    pilot.fly_to(0.8, 0.5)
+    start_s = pilot.t_s
+    pilot.sim.set_pose((0, 0, 1.5), (math.pi, 0, 0), hold=True)
+    pilot.stream(0.7, lambda: pilot.hold(0.8))
+    assert pilot.info & CRASHED_BIT
+    assert pilot.info & TUMBLED_BIT
+    assert not pilot.info & LOCKED_BIT
+    assert pilot.motors_off()
+    first_s = next(t for t, v in pilot.log("supervisor.info", start_s) if int(v) & CRASHED_BIT)
+    assert first_s - start_s > 0.1  # the rule: below -0.2 g for 0.1 s
+    assert pilot.ask(9, 1, b"\x02") == b"\x82\x00\x00"  # not while upside down
+    pilot.sim.set_pose((0, 0, 0.012))
+    pilot.sim.let_go()
+    pilot.advance(0.5)
+    assert pilot.info & CRASHED_BIT
+    pilot.cf.supervisor.send_crash_recovery_request()
+    assert pilot.until(lambda t: t["supervisor_info"] == READY, 1.0) <= 0.2

@@ -1,0 +1,248 @@
+"""Log variables, parameters, battery and the state estimate's errors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from firmware_rig import PERFECT, make_rig
+
+from perchctl.sim.firmware import Firmware
+from perchctl.sim.firmware.commands import PositionCommand
+from perchctl.sim.firmware.controller import Pid
+from perchctl.sim.firmware.planner import AxisState, Polynomial
+from perchctl.sim.world import REST_HEIGHT_M
+
+HERE = PositionCommand(0.0, 0.0, 0.8, 0.0)
+CTYPES = {"uint8_t", "uint16_t", "uint32_t", "int8_t", "int16_t", "int32_t", "float"}
+
+
+def test_tables_have_the_measured_sizes_and_fit_their_packets() -> None:
+    assert len(Firmware.LOG_VARIABLES) == 385
+    assert len(Firmware.PARAMETERS) == 257
+    ctypes = {*Firmware.LOG_VARIABLES.values(), *(p.ctype for p in Firmware.PARAMETERS.values())}
+    assert ctypes <= CTYPES
+    for name in (*Firmware.LOG_VARIABLES, *Firmware.PARAMETERS):
+        group, variable = name.split(".", 1)
+        assert group
+        assert variable
+        assert len(name) <= 26  # with its two zero bytes, within one packet
+
+
+def test_every_log_variable_has_a_value_and_unknown_names_none() -> None:
+    rig = make_rig()
+    for name in Firmware.LOG_VARIABLES:
+        assert math.isfinite(rig.firmware.log_value(name))
+    with pytest.raises(KeyError):
+        rig.firmware.log_value("stateEstimate.w")
+
+
+def test_log_units() -> None:
+    rig = make_rig(**PERFECT)
+    rig.world.set_pose((0.1, -0.2, 0.5), (0.1, 0.2, 0.3), hold=True)
+    rig.run(0.5)
+    log = rig.firmware.log_value
+    assert log("stateEstimate.roll") == pytest.approx(math.degrees(0.1), abs=1e-6)
+    assert log("stateEstimate.pitch") == pytest.approx(-math.degrees(0.2), abs=1e-6)
+    assert log("stateEstimate.yaw") == pytest.approx(math.degrees(0.3), abs=1e-6)
+    assert [log(f"stateEstimate.{a}") for a in "xyz"] == pytest.approx([0.1, -0.2, 0.5])
+    assert log("stateEstimateZ.x") == pytest.approx(100.0)
+    assert math.hypot(log("acc.x"), log("acc.y"), log("acc.z")) == pytest.approx(1.0, abs=0.02)
+    assert log("supervisor.info") == rig.info
+
+
+def test_accelerometer_and_gyro_are_noisy_but_true() -> None:
+    rig = make_rig()
+    samples = []
+    for _ in range(200):
+        rig.run(0.01)
+        samples.append([rig.firmware.log_value(n) for n in ("acc.z", "gyro.x")])
+    mean, spread = np.mean(samples, axis=0), np.std(samples, axis=0)
+    assert mean == pytest.approx([1.0, 0.0], abs=0.02)
+    assert (spread > 1e-4).all()
+    assert spread[0] < 0.02
+
+
+def test_parameters_read_write_and_refuse() -> None:
+    firmware = make_rig().firmware
+    assert firmware.get_parameter("posCtlPid.thrustBase") == 36000
+    firmware.set_parameter("posCtlPid.thrustBase", 52000)
+    assert firmware.get_parameter("posCtlPid.thrustBase") == 52000
+    assert firmware.controller.thrust_base == 52000
+    firmware.set_parameter("velCtlPid.vzKp", 20)
+    assert firmware.controller.vz.kp == 20
+    firmware.set_parameter("pid_rate.yaw_ki", 3)
+    assert firmware.controller.yaw_rate.ki == 3
+    with pytest.raises(KeyError):
+        firmware.set_parameter("posCtlPid.none", 1)
+    with pytest.raises(PermissionError):
+        firmware.set_parameter("deck.bcFlow2", 0)
+
+
+def test_a_reboot_keeps_only_persistent_parameters() -> None:
+    firmware = make_rig().firmware
+    firmware.set_parameter("posCtlPid.thrustBase", 52000)
+    firmware.set_parameter("supervisor.infdmp", 1)
+    firmware.reboot()
+    assert firmware.t_s == 0.0
+    assert firmware.controller.thrust_base == 52000
+    assert firmware.get_parameter("supervisor.infdmp") == 0
+
+
+def test_a_fitting_thrust_base_ends_the_late_lift() -> None:
+    rig = make_rig()
+    rig.firmware.set_parameter("posCtlPid.thrustBase", 56000)
+    rig.take_off(0.5, settle_s=0.0)
+    assert rig.world.z_m > 0.42
+
+
+def test_parameters_written_by_default_equal_the_controllers_own() -> None:
+    firmware = make_rig().firmware
+    before = {
+        loop: (pid.kp, pid.ki, pid.kd)
+        for loop, pid in vars(firmware.controller).items()
+        if isinstance(pid, Pid)
+    }
+    assert len(before) == 12
+    assert before["z"] == (2.0, 0.5, 0.0)
+    assert before["vz"] == (25.0, 15.0, 0.0)
+    assert before["roll_rate"] == (250.0, 500.0, 2.5)
+
+
+def test_battery_state_turns_low_after_five_seconds_below_3_2_v() -> None:
+    rig = make_rig(battery_rest_v=3.45)
+    rig.take_off(settle_s=1.0)
+    assert rig.firmware.log_value("pm.vbat") < 3.2
+    assert rig.firmware.log_value("pm.state") == 0
+    rig.run(5.0)
+    assert rig.firmware.log_value("pm.state") == 3
+
+
+def test_battery_reading_follows_the_load() -> None:
+    rig = make_rig(battery_rest_v=4.1)
+    assert rig.firmware.log_value("pm.vbat") == pytest.approx(4.1, abs=0.02)
+    assert rig.firmware.log_value("pm.batteryLevel") == 90
+    rig.take_off()
+    assert 3.6 < rig.firmware.log_value("pm.vbat") < 3.8
+    assert rig.firmware.log_value("pm.state") == 0
+
+
+# State estimate ---------------------------------------------------------------------
+
+
+def test_estimate_starts_at_the_truth() -> None:
+    rig = make_rig()
+    log = rig.firmware.log_value
+    assert [log(f"stateEstimate.{a}") for a in "xyz"] == pytest.approx(
+        [0, 0, REST_HEIGHT_M], abs=0.01
+    )
+
+
+def test_estimate_noise_has_the_scenarios_size() -> None:
+    rig = make_rig(estimate_noise_m=0.005)
+    errors = []
+    for _ in range(600):
+        rig.run(0.1)
+        errors.append(rig.firmware.log_value("stateEstimate.x") - rig.world.x_m)
+    assert np.std(errors) == pytest.approx(0.005, rel=0.35)
+
+
+def test_drift_runs_from_the_first_take_off_and_moves_the_vehicle() -> None:
+    rig = make_rig(drift_mps=(0.02, -0.01, 0.0), **PERFECT)
+    rig.run(5.0)
+    assert rig.firmware.log_value("stateEstimate.x") == pytest.approx(0.0, abs=1e-3)
+    rig.take_off()
+    flown_s = 5.0
+    rig.hold(5.0)
+    error_m = rig.firmware.log_value("stateEstimate.x") - rig.world.x_m
+    assert error_m == pytest.approx(0.02 * (flown_s + 5.0), abs=0.005)
+    # It holds its estimate, so the body wanders the other way.
+    assert rig.firmware.log_value("stateEstimate.x") == pytest.approx(0.0, abs=0.03)
+    assert rig.world.x_m < -0.15
+    assert rig.world.y_m > 0.07
+
+
+def test_tilt_bias_shows_in_the_estimate_and_is_flown_out() -> None:
+    rig = make_rig(estimate_tilt_bias_rad=(0.02, -0.03), **PERFECT)
+    assert rig.firmware.log_value("stateEstimate.roll") == pytest.approx(math.degrees(0.02))
+    assert rig.firmware.log_value("stateEstimate.pitch") == pytest.approx(math.degrees(0.03))
+    rig.take_off()
+    rig.hold(8.0)
+    assert rig.firmware.log_value("stateEstimate.roll") == pytest.approx(
+        math.degrees(0.02), abs=0.4
+    )
+    assert math.hypot(rig.world.x_m, rig.world.y_m) < 0.15
+
+
+def test_variance_falls_after_a_reset() -> None:
+    rig = make_rig()
+    rig.run(2.0)
+    assert rig.firmware.log_value("kalman.varPX") < 1e-3
+    rig.firmware.set_parameter("kalman.resetEstimation", 1)
+    assert rig.firmware.log_value("kalman.varPX") > 1.0
+    rig.firmware.set_parameter("kalman.resetEstimation", 0)
+    rig.run(2.0)
+    assert rig.firmware.log_value("kalman.varPX") < 1e-3
+
+
+def test_outside_positions_are_followed_and_their_loss_slides_away() -> None:
+    rig = make_rig(extra={"external_position": 1.0}, drift_mps=(0.05, 0.0, 0.0))
+    rig.take_off()
+    for _ in range(400):
+        world = rig.world
+        rig.firmware.external_position((world.x_m + 0.1, world.y_m, world.z_m))
+        rig.run(0.01, HERE)
+    assert rig.firmware.log_value("stateEstimate.x") - rig.world.x_m == pytest.approx(0.1, abs=0.01)
+    rig.run(3.0, HERE)
+    log = rig.firmware.log_value
+    error_m = math.hypot(
+        log("stateEstimate.x") - world.x_m - 0.1, log("stateEstimate.y") - world.y_m
+    )
+    assert error_m > 0.1
+    assert log("kalman.varPX") > 1e-3
+
+
+def test_outside_positions_are_only_counted_on_a_flow_deck() -> None:
+    rig = make_rig()
+    rig.firmware.external_pose((5.0, 5.0, 5.0), (0.0, 0.0, 0.0, 1.0))
+    rig.run(0.1)
+    assert abs(rig.firmware.log_value("stateEstimate.x")) < 0.02
+    assert rig.firmware.estimator.external_count == 1
+
+
+def test_same_seed_same_flight() -> None:
+    def flight(seed: int) -> list[float]:
+        rig = make_rig(seed=seed, draught_mps=(0.2, 0.0, 0.0))
+        rig.take_off(settle_s=0.5)
+        return rig.world.state().position_m.tolist()
+
+    assert flight(5) == flight(5)
+    assert flight(5) != flight(6)
+
+
+# Trajectories -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("duration_s", [0.7, 3.0])
+def test_polynomial_meets_both_ends(duration_s: float) -> None:
+    curve = Polynomial(AxisState(0.3, -0.2, 0.5), 1.1, duration_s)
+    start = curve.at(0.0)
+    assert tuple(start) == pytest.approx((0.3, -0.2, 0.5))
+    end = curve.at(duration_s * (1 - 1e-9))
+    assert tuple(end) == pytest.approx((1.1, 0.0, 0.0), abs=1e-5)
+    assert curve.at(duration_s + 5.0) == AxisState(1.1)
+
+
+def test_polynomial_derivatives_are_its_own() -> None:
+    curve = Polynomial(AxisState(0.0), 1.0, 2.0)
+    h = 1e-5
+    for t_s in (0.3, 1.0, 1.7):
+        before, now, after = curve.at(t_s - h), curve.at(t_s), curve.at(t_s + h)
+        assert now.rate == pytest.approx((after.value - before.value) / (2 * h), abs=1e-6)
+        assert now.accel == pytest.approx((after.rate - before.rate) / (2 * h), abs=1e-6)
+    assert curve.at(1.0).value == pytest.approx(0.5)
+
+
+def test_a_plan_of_no_duration_is_its_goal() -> None:
+    assert Polynomial(AxisState(0.0), 1.0, 0.0).at(0.0) == AxisState(1.0)

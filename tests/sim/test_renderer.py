@@ -1,0 +1,323 @@
+"""The rendered picture against the geometry it claims to show."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from perchctl.geometry import (
+    R_MARKER_TARGET,
+    Array,
+    invert_T,
+    make_T,
+    rot_z,
+    rotation_from_rpy,
+)
+from perchctl.profile import TargetConfig
+from perchctl.sim.renderer import Renderer
+from perchctl.sim.scenario import Scenario
+from perchctl.target.drawing import marker_corners_m
+from perchctl.vision.types import CameraModel
+
+K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])
+PLUMB_BOB = CameraModel((640, 480), K, np.array([-0.17, 0.04, 0.0004, -0.0007, -0.003]))
+RATIONAL = CameraModel(
+    (640, 480),
+    K,
+    np.array([-0.2, 0.05, 0.0003, -0.0004, 0.002, 0.03, -0.01, 0.001]),
+    "rational_polynomial",
+)
+FISHEYE = CameraModel((640, 480), K, np.array([-0.02, 0.004, -0.002, 0.0003]), "fisheye")
+TARGET = TargetConfig()
+XY, CEILING = (0.3, -0.2), 2.2
+
+
+def scenario(**changes: object) -> Scenario:
+    values: dict[str, object] = {
+        "target_xy_m": XY,
+        "target_yaw_rad": 0.5,
+        "ceiling_z_m": CEILING,
+        "camera_noise_sigma": 0.0,
+    }
+    return Scenario(**(values | changes))  # type: ignore[arg-type]
+
+
+def camera_pose(
+    below_m: float, x_m: float = 0.0, y_m: float = 0.0, rpy: tuple[float, float, float] = (0, 0, 0)
+) -> Array:
+    """A camera `below_m` under the ceiling, off the target's centre by x, y (world axes)."""
+    return make_T(rotation_from_rpy(*rpy), (XY[0] + x_m, XY[1] + y_m, CEILING - below_m))
+
+
+def project(camera: CameraModel, scene: Scenario, T_world_cam: Array, points_m: Array) -> Array:
+    """Image of points given in OpenCV's marker axes, by OpenCV's own projection."""
+    T_world_target = make_T(rot_z(scene.target_yaw_rad), (*scene.target_xy_m, scene.ceiling_z_m))
+    T_cam_marker = invert_T(T_world_cam) @ T_world_target @ make_T(R_MARKER_TARGET, (0, 0, 0))
+    rvec = cv2.Rodrigues(T_cam_marker[:3, :3])[0]
+    tvec = T_cam_marker[:3, 3].copy()
+    if camera.model == "fisheye":
+        found, _ = cv2.fisheye.projectPoints(
+            points_m.reshape(-1, 1, 3), rvec, tvec.reshape(3, 1), camera.K, camera.dist
+        )
+    else:
+        found, _ = cv2.projectPoints(points_m, rvec, tvec, camera.K, camera.dist)
+    return np.asarray(found).reshape(-1, 2)
+
+
+def corner_errors_px(
+    image: NDArray[np.uint8],
+    camera: CameraModel,
+    scene: Scenario,
+    pose: Array,
+    side_m: float,
+    reach_px: float,
+) -> Array:
+    """How far the picture's edges meet from the true corners, (4, 2) px.
+
+    Across each side, at places spread along it, the edge is where a step of the
+    same two levels would have the same area; a line through those offsets,
+    side by side, gives the corner. Unbiased for any symmetric blur.
+    """
+    corners_m = marker_corners_m(side_m)
+    image32 = image.astype(np.float32)
+    steps = np.arange(-reach_px, reach_px + 1e-9, 0.05)
+    lines, normals = [], []
+    for k in range(4):
+        a, b = corners_m[k], corners_m[(k + 1) % 4]
+        # Away from the corners, where the neighbouring side would be in reach.
+        length_px = np.linalg.norm(np.subtract(*project(camera, scene, pose, np.stack([a, b]))))
+        margin = min(1.5 * reach_px / float(length_px), 0.3)
+        along = np.linspace(margin, 1.0 - margin, 60)
+        points = project(camera, scene, pose, a + along[:, None] * (b - a))
+        ahead = project(camera, scene, pose, a + (along + 1e-4)[:, None] * (b - a))
+        tangent = (ahead - points) / np.linalg.norm(ahead - points, axis=1, keepdims=True)
+        normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)  # outward
+        where = (points[:, None, :] + steps[None, :, None] * normal[:, None, :]).astype(np.float32)
+        profile = cv2.remap(image32, where, None, cv2.INTER_CUBIC)
+        few = max(len(steps) // 10, 1)
+        low, high = profile[:, :few].mean(axis=1), profile[:, -few:].mean(axis=1)
+        dark = ((high[:, None] - profile) / (high - low)[:, None]).mean(axis=1)
+        offset = (2.0 * dark - 1.0) * reach_px
+        lines.append(np.polyfit(along, offset, 1))
+        normals.append((normal[0], normal[-1]))
+    errors = []
+    for k in range(4):
+        before = (k - 1) % 4
+        A = np.stack([normals[before][1], normals[k][0]])
+        b = np.array([np.polyval(lines[before], 1.0), np.polyval(lines[k], 0.0)])
+        errors.append(np.linalg.solve(A, b))
+    return np.stack(errors)
+
+
+POSES = {
+    "far": (camera_pose(2.0), 0.150, 2.0),
+    "far, aside, turned": (camera_pose(1.15, 0.4, -0.3, (0.05, -0.08, 1.1)), 0.150, 3.0),
+    "middle, tilted": (camera_pose(0.6, 0.05, 0.1, (0.25, -0.2, -0.7)), 0.150, 4.0),
+    "near": (camera_pose(0.24, 0.01, -0.01, (0.03, 0.02, 2.8)), 0.150, 5.0),
+    "large fills the view": (camera_pose(0.16, rpy=(0.0, 0.0, 0.5)), 0.150, 5.0),
+    "small, near": (camera_pose(0.12, 0.005, 0.01, (-0.06, 0.04, 0.3)), 0.025, 4.0),
+    "small, touching": (camera_pose(0.05, 0.002, 0.001, (0.02, 0.0, -2.0)), 0.025, 6.0),
+}
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(scenario(), PLUMB_BOB, TARGET)
+
+
+def evenly_lit(image: NDArray[np.uint8], renderer: Renderer) -> NDArray[np.uint8]:
+    return np.clip(image * (255.0 / renderer.shade), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", list(POSES))
+def test_corners_lie_where_opencv_projects_them(renderer: Renderer, name: str) -> None:
+    pose, side_m, reach_px = POSES[name]
+    image = evenly_lit(renderer.render([pose]), renderer)
+    errors = corner_errors_px(image, PLUMB_BOB, scenario(), pose, side_m, reach_px)
+    assert np.abs(errors).max() < 0.025
+    assert np.abs(errors.mean(axis=0)).max() < 0.01
+
+
+@pytest.mark.parametrize("camera", [RATIONAL, FISHEYE], ids=lambda c: c.model)
+@pytest.mark.parametrize("name", ["far, aside, turned", "middle, tilted"])
+def test_other_lens_models(camera: CameraModel, name: str) -> None:
+    pose, side_m, reach_px = POSES[name]
+    renderer = Renderer(scenario(), camera, TARGET)
+    image = evenly_lit(renderer.render([pose]), renderer)
+    errors = corner_errors_px(image, camera, scenario(), pose, side_m, reach_px)
+    assert np.abs(errors).max() < 0.025
+
+
+def test_nothing_shifts_the_corners_together(renderer: Renderer) -> None:
+    """A bias of pose, size or place would survive the mean over many views."""
+    rng = np.random.default_rng(5)
+    outward, shift = [], []
+    for _ in range(12):
+        rpy = (*rng.uniform(-0.15, 0.15, 2), rng.uniform(-3.0, 3.0))
+        pose = camera_pose(rng.uniform(0.4, 1.6), *rng.uniform(-0.08, 0.08, 2), rpy)
+        image = evenly_lit(renderer.render([pose]), renderer)
+        errors = corner_errors_px(image, PLUMB_BOB, scenario(), pose, 0.150, 2.5)
+        corners = project(PLUMB_BOB, scenario(), pose, marker_corners_m(0.150))
+        ray = corners - corners.mean(axis=0)
+        outward.append((errors * ray / np.linalg.norm(ray, axis=1, keepdims=True)).sum(axis=1))
+        shift.append(errors)
+    assert abs(np.mean(outward)) < 0.004
+    assert np.abs(np.mean(shift, axis=(0, 1))).max() < 0.004
+
+
+def detect(image: NDArray[np.uint8], dictionary: str) -> dict[int, Array]:
+    predefined = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    corners, ids, _ = cv2.aruco.ArucoDetector(predefined).detectMarkers(image)
+    if ids is None:
+        return {}
+    return {int(i): c.reshape(4, 2) for i, c in zip(np.ravel(ids), corners, strict=True)}
+
+
+def test_both_markers_read_unmirrored_with_their_corners_in_order(renderer: Renderer) -> None:
+    pose = camera_pose(0.3, 0.01, 0.02, (0.03, -0.04, 0.9))
+    image = renderer.render([pose])
+    for dictionary, wanted, side_m in (
+        ("DICT_4X4_1000", 997, 0.150),
+        ("DICT_ARUCO_ORIGINAL", 5, 0.025),
+    ):
+        truth = project(PLUMB_BOB, scenario(), pose, marker_corners_m(side_m))
+        assert np.abs(detect(image, dictionary)[wanted] - truth).max() < 1.5
+
+
+def test_with_an_aligned_camera_the_marker_is_upright() -> None:
+    """No rotation between body, camera and target: top-left corner at the top left."""
+    renderer = Renderer(scenario(target_yaw_rad=0.0), PLUMB_BOB, TARGET)
+    corners = detect(renderer.render([camera_pose(0.6)]), "DICT_4X4_1000")[997]
+    assert corners[0, 0] < corners[1, 0]
+    assert corners[0, 1] < corners[3, 1]
+    assert abs(corners[0, 1] - corners[1, 1]) < 2.0
+
+
+@pytest.mark.parametrize("marker_id", [0, 23])
+def test_ids_with_a_black_centre_get_a_white_ring_and_are_found(marker_id: int) -> None:
+    large = TARGET.large.model_copy(update={"id": marker_id})
+    renderer = Renderer(scenario(), PLUMB_BOB, TARGET.model_copy(update={"large": large}))
+    image = renderer.render([camera_pose(0.25)])
+    assert marker_id in detect(image, "DICT_4X4_1000")
+    assert 5 in detect(image, "DICT_ARUCO_ORIGINAL")
+
+
+def test_true_print_sizes_come_from_the_scenario() -> None:
+    scene = scenario(large_side_m=0.1485)
+    pose, _, reach_px = POSES["near"]
+    renderer = Renderer(scene, PLUMB_BOB, TARGET)
+    image = evenly_lit(renderer.render([pose]), renderer)
+    errors = corner_errors_px(image, PLUMB_BOB, scene, pose, 0.1485, reach_px)
+    assert np.abs(errors).max() < 0.025
+
+
+def moving(speed_mps: float, below_m: float = 0.6) -> list[Array]:
+    reach = speed_mps * 0.008 / 2.0
+    return [camera_pose(below_m, x) for x in (-reach, 0.0, reach)]
+
+
+def test_blur_grows_with_speed_and_keeps_the_place(renderer: Renderer) -> None:
+    sharpness = []
+    for speed in (0.0, 0.5, 1.0, 2.0, 4.0):
+        image = renderer.render(moving(speed))
+        sharpness.append(float(cv2.Laplacian(image, cv2.CV_64F).var()))
+        errors = corner_errors_px(
+            evenly_lit(image, renderer), PLUMB_BOB, scenario(), camera_pose(0.6), 0.150, 6.0
+        )
+        assert np.abs(errors.mean(axis=0)).max() < 0.03
+    assert all(a > 1.02 * b for a, b in pairwise(sharpness))
+
+
+def test_motion_blur_is_the_mean_of_the_views_on_the_way(renderer: Renderer) -> None:
+    """4 px of motion against the mean of 41 sharp pictures."""
+    poses = moving(0.8)
+    reach = 0.8 * 0.008 / 2.0
+    views = [renderer.render([camera_pose(0.6, x)]) for x in np.linspace(-reach, reach, 41)]
+    # An exposure's ends count half.
+    weights = np.array([0.5] + [1.0] * 39 + [0.5]) / 40.0
+    exact = np.tensordot(weights, np.stack(views).astype(np.float64), axes=1)
+    difference = np.abs(renderer.render(poses) - exact)
+    assert difference.max() < 14.0  # of a contrast of 195
+    assert difference.mean() < 1.0
+
+
+def test_defocus_softens(renderer: Renderer) -> None:
+    pose = camera_pose(0.6)
+    variances = [cv2.Laplacian(renderer.render([pose], s), cv2.CV_64F).var() for s in (0.3, 1, 3)]
+    assert variances[0] > 2 * variances[1] > 4 * variances[2]
+
+
+def test_a_fast_tilt_is_followed_to_the_edge_of_the_blur(renderer: Renderer) -> None:
+    """20 px of motion: the sheet is not cut off where it moves out of its middle place."""
+    poses = [camera_pose(1.0, rpy=(0.0, a, 0.0)) for a in (-0.026, 0.0, 0.026)]
+    bare = Renderer(scenario(no_target=True), PLUMB_BOB, TARGET)
+    touched = np.abs(renderer.render(poses).astype(int) - bare.render(poses)) > 3
+    cols = np.flatnonzero(touched.any(axis=0))
+    start, end = (
+        project(PLUMB_BOB, scenario(), T, marker_corners_m(0.2)) for T in (poses[0], poses[-1])
+    )
+    both = np.concatenate([start, end])
+    assert abs(cols[0] - both[:, 0].min()) < 3.0
+    assert abs(cols[-1] - both[:, 0].max()) < 3.0
+
+
+def test_same_seed_same_bytes_and_the_frame_index_changes_only_the_noise() -> None:
+    scene = scenario(camera_noise_sigma=5.0, seed=3)
+    a, b = (Renderer(scene, PLUMB_BOB, TARGET) for _ in range(2))
+    pose = camera_pose(0.8, 0.1)
+    other_first = a.render([camera_pose(0.3)], frame_index=1)
+    assert other_first.shape == (480, 640)
+    assert other_first.dtype == np.uint8
+    assert np.array_equal(a.render([pose], frame_index=7), b.render([pose], frame_index=7))
+    difference = a.render([pose], frame_index=7).astype(int) - a.render([pose], frame_index=8)
+    assert abs(difference.mean()) < 0.1
+    assert difference.std() == pytest.approx(5.0 * math.sqrt(2.0), rel=0.05)
+    another = Renderer(scene, PLUMB_BOB, TARGET, seed=4)
+    assert not np.array_equal(a.render([pose]), another.render([pose]))
+
+
+def test_a_bare_ceiling_shows_texture_and_no_paper() -> None:
+    image = Renderer(scenario(no_target=True), PLUMB_BOB, TARGET).render([camera_pose(0.6)])
+    assert image.max() < 200
+    assert image.std() > 3.0
+    assert not detect(image, "DICT_4X4_1000")
+
+
+def test_a_camera_that_looks_down_sees_no_target(renderer: Renderer) -> None:
+    upside_down = camera_pose(1.0, rpy=(math.pi, 0.0, 0.0))
+    assert renderer.render([upside_down]).max() < 80
+    above = camera_pose(-0.1)
+    assert renderer.render([above]).max() < 80
+
+
+def test_on_its_side_the_camera_sees_ceiling_and_floor(renderer: Renderer) -> None:
+    image = renderer.render([camera_pose(1.0, rpy=(math.pi / 2, 0.0, 0.0))])
+    assert image[:200, 320].mean() < 80 < image[280:, 320].mean()
+
+
+@pytest.mark.parametrize("size", [(320, 240), (1280, 720), (333, 251)])
+def test_any_image_size(size: tuple[int, int]) -> None:
+    width, height = size
+    f = 0.6 * width
+    camera_matrix = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1.0]])
+    camera = CameraModel(size, camera_matrix, np.zeros(5))
+    renderer = Renderer(scenario(), camera, TARGET)
+    pose = camera_pose(0.5)
+    image = evenly_lit(renderer.render([pose]), renderer)
+    assert image.shape == (height, width)
+    errors = corner_errors_px(image, camera, scenario(), pose, 0.150, 2.5)
+    assert np.abs(errors).max() < 0.025
+
+
+def test_analogue_faults_spoil_but_repeat() -> None:
+    pose = camera_pose(0.5)
+    clean = Renderer(scenario(), PLUMB_BOB, TARGET).render([pose], frame_index=2)
+    poor = Renderer(scenario(extra={"analogue": 0.9}), PLUMB_BOB, TARGET)
+    spoilt = poor.render([pose], frame_index=2)
+    assert np.array_equal(spoilt, poor.render([pose], frame_index=2))
+    assert np.abs(spoilt.astype(int) - clean).mean() > 2.0

@@ -1,0 +1,272 @@
+"""Laws of the simulated physics: each against a hand calculation."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.geometry import GRAVITY_MPS2, rotation_from_rpy
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.world import (
+    DRAG_LEVEL_NSPM,
+    DRAG_VERTICAL_NSPM,
+    FULL_COMMAND,
+    GEAR_RADIUS_M,
+    MOTOR_FORCE_N,
+    REST_HEIGHT_M,
+    World,
+)
+
+OFF = (0.0, 0.0, 0.0, 0.0)
+GEAR_Z_M = 0.03
+CEILING_M = 2.2
+
+
+def make(**conditions: Any) -> World:
+    return World(Scenario(**({"battery_rest_v": 4.2} | conditions)))
+
+
+def run(world: World, seconds: float, motors: tuple[float, float, float, float] = OFF) -> None:
+    for _ in range(round(seconds / CONTROL_PERIOD_S)):
+        world.step(motors)
+
+
+def hang(world: World, offset_m: tuple[float, float] = (0.0, 0.0)) -> None:
+    """Put the gear's tip against the ceiling."""
+    world.set_pose((offset_m[0], offset_m[1], CEILING_M - GEAR_Z_M))
+    run(world, 0.1)
+
+
+def test_rests_on_the_floor_and_reads_one_g() -> None:
+    world = make()
+    run(world, 0.5)
+    state = world.state()
+    assert state.floor_contact
+    assert state.position_m == pytest.approx([0, 0, REST_HEIGHT_M], abs=2e-4)
+    assert state.specific_force_mps2 == pytest.approx([0, 0, GRAVITY_MPS2], abs=0.02)
+
+
+def test_free_fall_is_the_closed_form_with_linear_drag() -> None:
+    world = make(ceiling_z_m=4.0)
+    world.set_pose((0.0, 0.0, 3.0))
+    run(world, 0.4)
+    state = world.state()
+    memory_s = 0.042 / DRAG_VERTICAL_NSPM
+    gone = 1.0 - math.exp(-0.4 / memory_s)
+    fallen_m = GRAVITY_MPS2 * memory_s * (0.4 - memory_s * gone)
+    assert state.velocity_mps[2] == pytest.approx(-GRAVITY_MPS2 * memory_s * gone, rel=1e-3)
+    # One Euler step of 2 ms at this speed is 8 mm.
+    assert 3.0 - state.position_m[2] == pytest.approx(fallen_m, abs=0.008)
+    assert np.linalg.norm(state.specific_force_mps2) < 1.2
+
+
+@pytest.mark.parametrize("mass_kg", [0.030, 0.042])
+def test_hovers_at_the_weight_over_full_thrust(mass_kg: float) -> None:
+    world = make(mass_kg=mass_kg)
+    command = mass_kg * GRAVITY_MPS2 / (4 * MOTOR_FORCE_N) * FULL_COMMAND
+    world.set_pose((0.0, 0.0, 1.0), hold=True)
+    run(world, 0.5, (command,) * 4)  # past the motors' lag
+    world.let_go()
+    run(world, 0.5, (command,) * 4)
+    assert world.vz_mps == pytest.approx(0.0, abs=0.05)
+
+
+def test_hover_command_of_42_g_is_the_measured_one() -> None:
+    command = 0.042 * GRAVITY_MPS2 / (4 * MOTOR_FORCE_N) * FULL_COMMAND
+    assert command == pytest.approx(56200, abs=100)
+
+
+@pytest.mark.parametrize(("rest_v", "share"), [(4.2, 1.0), (3.7, 0.95)])
+def test_thrust_at_full_command_follows_the_resting_voltage(rest_v: float, share: float) -> None:
+    world = make(mass_kg=0.048, battery_rest_v=rest_v, ceiling_z_m=4.0)
+    world.set_pose((0.0, 0.0, 1.0), hold=True)
+    run(world, 0.3, (FULL_COMMAND,) * 4)
+    world.let_go()
+    run(world, 0.02, (FULL_COMMAND,) * 4)
+    thrust_n = world.state().specific_force_mps2[2] * 0.048
+    assert thrust_n == pytest.approx(0.48 * share, rel=0.005)
+
+
+def test_battery_sags_under_load_discharges_and_recovers() -> None:
+    world = make(battery_rest_v=4.0)
+    run(world, 1.0, (56000.0,) * 4)
+    assert 3.4 < world.battery_v < 3.75
+    run(world, 30.0, (56000.0,) * 4)
+    run(world, 1.0)
+    assert 3.85 < world.battery_v < 3.95
+
+
+@pytest.mark.parametrize(
+    ("motors", "axis", "sign"),
+    [
+        ((0, 0, 1, 1), 0, 1),  # left motors up: roll to the right
+        ((0, 1, 1, 0), 1, 1),  # back motors up: nose down
+        ((0, 1, 0, 1), 2, 1),  # M2 and M4 turn clockwise: counter-clockwise reaction
+    ],
+)
+def test_motor_pairs_turn_the_right_way(
+    motors: tuple[int, int, int, int], axis: int, sign: int
+) -> None:
+    world = make()
+    world.set_pose((0.0, 0.0, 1.0))
+    a, b, c, d = (56000.0 + 2000.0 * m for m in motors)
+    run(world, 0.05, (a, b, c, d))
+    rates = world.state().rates_radps
+    assert sign * rates[axis] > 0.01
+    others = [i for i in range(3) if i != axis]
+    assert np.abs(rates[others]).max() < 0.2 * abs(rates[axis])
+
+
+@settings(max_examples=15, deadline=None)
+@given(roll=st.floats(-3.0, 3.0), pitch=st.floats(-1.4, 1.4), yaw=st.floats(-3.0, 3.0))
+def test_a_held_pose_is_kept_and_reads_gravity_in_body_axes(
+    roll: float, pitch: float, yaw: float
+) -> None:
+    world = make()
+    R = rotation_from_rpy(roll, pitch, yaw)
+    world.set_pose((0.1, -0.2, 1.0), (roll, pitch, yaw), hold=True)
+    run(world, 0.01, (50000.0,) * 4)
+    state = world.state()
+    assert state.R_world_body == pytest.approx(R, abs=1e-9)
+    assert state.position_m == pytest.approx([0.1, -0.2, 1.0])
+    assert state.specific_force_mps2 == pytest.approx(R.T @ [0, 0, GRAVITY_MPS2], abs=1e-9)
+
+
+def test_draught_pushes_to_its_own_side_and_gusts_repeat_with_the_seed() -> None:
+    def drifted(seed: int, wind: tuple[float, float, float]) -> np.ndarray[Any, Any]:
+        world = make(seed=seed, draught_mps=wind)
+        world.set_pose((0.0, 0.0, 1.5))
+        run(world, 0.4)
+        return world.state().velocity_mps
+
+    still = drifted(1, (0.0, 0.0, 0.0))
+    assert still[:2] == pytest.approx([0, 0], abs=1e-9)
+    windy = drifted(1, (1.0, 0.0, 0.0))
+    assert windy[0] > 0.02
+    assert windy == pytest.approx(drifted(1, (1.0, 0.0, 0.0)), abs=0.0)
+    assert windy[1] != drifted(2, (1.0, 0.0, 0.0))[1]
+
+
+def test_gusts_are_as_strong_as_the_draught() -> None:
+    world = make(draught_mps=(0.3, 0.0, 0.0), mass_kg=0.042)
+    speeds = []
+    for _ in range(60):
+        world.set_pose((0.0, 0.0, 1.0))
+        run(world, 0.02)
+        speeds.append(world.vx_mps / (DRAG_LEVEL_NSPM / 0.042 * 0.02))
+        run(world, 0.4)
+    assert 0.1 < np.mean(speeds) < 0.5
+    assert 0.05 < np.std(speeds) < 0.4
+
+
+def test_the_ceiling_sucks_within_a_few_centimetres() -> None:
+    def climb(height_m: float) -> float:
+        world = make(no_target=True)
+        world.set_pose((0.0, 0.0, height_m), hold=True)
+        run(world, 0.4, (56000.0,) * 4)
+        world.let_go()
+        run(world, 0.01, (56000.0,) * 4)
+        return world.vz_mps
+
+    far, near = climb(1.0), climb(CEILING_M - GEAR_Z_M - 0.005)
+    assert 0.0 < (near - far) / 0.01 < 0.05 * GRAVITY_MPS2
+
+
+def test_hangs_level_in_its_place_for_a_minute() -> None:
+    world = make()
+    hang(world, (0.004, 0.003))
+    run(world, 1.0)
+    before = world.gear_miss_m()
+    assert before == pytest.approx(0.005, abs=2e-4)
+    run(world, 60.0)
+    state = world.state()
+    assert state.magnet_engaged
+    assert world.gear_miss_m() == pytest.approx(before, abs=1e-4)
+    assert state.R_world_body[2, 2] > math.cos(math.radians(0.5))
+    # What the ceiling pushes back is the pull less the weight.
+    assert state.ceiling_force_n == pytest.approx(1.2 - 0.042 * GRAVITY_MPS2, rel=0.1)
+    assert state.specific_force_mps2[2] == pytest.approx(GRAVITY_MPS2, abs=0.05)
+
+
+def test_a_swing_under_the_magnet_dies_out() -> None:
+    world = make()
+    hang(world)
+    world.external_force_n = (0.1, 0.0, 0.0)
+    run(world, 0.1)
+    world.external_force_n = (0.0, 0.0, 0.0)
+    run(world, 1.5)
+    state = world.state()
+    assert state.magnet_engaged
+    assert np.abs(state.rates_radps).max() < 0.02
+    assert world.gear_miss_m() < 0.002
+
+
+@pytest.mark.parametrize(("pull_n", "holds"), [(0.70, True), (0.90, False)])
+def test_breaks_when_pulled_with_more_than_its_force(pull_n: float, holds: bool) -> None:
+    world = make()  # 1.2 N, of which the weight takes 0.41
+    hang(world)
+    world.external_force_n = (0.0, 0.0, -pull_n)
+    run(world, 0.3)
+    assert world.magnet_engaged is holds
+    assert (world.z_m > 2.1) is holds
+
+
+@pytest.mark.parametrize(("offset_m", "holds"), [(0.020, True), (0.030, False)])
+def test_holds_only_within_25_mm_of_the_centre(offset_m: float, holds: bool) -> None:
+    world = make(target_xy_m=(0.5, -0.2))
+    hang(world, (0.5 + offset_m, -0.2))
+    run(world, 0.3)
+    assert world.magnet_engaged is holds
+
+
+def test_a_bare_ceiling_holds_nothing() -> None:
+    world = make(no_target=True)
+    hang(world)
+    run(world, 0.3)
+    assert not world.magnet_engaged
+    assert world.z_m < 2.0
+
+
+def test_the_pull_does_not_reach_beyond_a_few_millimetres() -> None:
+    world = make()
+    world.set_pose((0.0, 0.0, CEILING_M - GEAR_Z_M - 0.004))
+    run(world, 0.2)
+    assert not world.magnet_engaged
+    assert world.z_m < 2.1
+
+
+def test_a_weak_first_contact_breaks_and_the_second_holds() -> None:
+    world = make(first_contact_force_n=0.3)  # less than the weight
+    hang(world)
+    run(world, 0.3)
+    assert not world.magnet_engaged
+    assert world.z_m < 2.1
+    hang(world)
+    run(world, 0.5)
+    assert world.magnet_engaged
+
+
+def test_the_gear_touches_before_the_frame() -> None:
+    world = make(no_target=True)
+    world.set_pose((0.0, 0.0, 2.1))
+    run(world, 1.0, (65000.0,) * 4)
+    state = world.state()
+    assert state.ceiling_force_n > 0.02
+    assert world.gear_tip_m()[2] == pytest.approx(CEILING_M, abs=1e-3)
+    assert 0.0 < GEAR_RADIUS_M < 0.01
+
+
+def test_same_seed_same_flight() -> None:
+    def path(seed: int) -> list[float]:
+        world = make(seed=seed, draught_mps=(0.2, 0.1, 0.0))
+        world.set_pose((0.0, 0.0, 1.0))
+        run(world, 0.3, (55000.0, 56000.0, 56000.0, 55000.0))
+        return world.state().position_m.tolist()
+
+    assert path(3) == path(3)
+    assert path(3) != path(4)
