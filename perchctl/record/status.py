@@ -1,0 +1,64 @@
+"""What the live display shows of one moment of a flight."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FlightStatus:
+    """SI and radians; the display turns them into centimetres and degrees.
+
+    Attributes:
+        t_s: the loop's clock.
+        in_phase_s: time since the phase was entered.
+        e_m, e_yaw_rad: target relative to the gear; None while it is not tracked.
+        stage: markers seen: none, large, both, small.
+        height_m: above the place of take-off.
+        link_age_s, camera_age_s: since the newest telemetry and the last good frame.
+        loop_late_s: how late this tick began.
+        attempts: failed perching attempts so far.
+        reason: why the phase was entered; `hold`: why the vehicle is held, or empty.
+    """
+
+    t_s: float
+    phase: str
+    in_phase_s: float
+    e_m: tuple[float, float, float] | None
+    e_yaw_rad: float | None
+    stage: str
+    height_m: float
+    battery_v: float
+    link_age_s: float
+    camera_age_s: float
+    loop_late_s: float
+    attempts: int
+    reason: str
+    hold: str = ""
+
+
+def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
+    """Name and text of each line of the display, at most 80 columns together."""
+    if status.e_m is None:
+        error = "not tracked"
+    else:
+        x, y, z = (f"{100.0 * v:+.1f}" for v in status.e_m)
+        yaw = "-" if status.e_yaw_rad is None else f"{math.degrees(status.e_yaw_rad):+.1f}"
+        error = f"x {x}  y {y}  z {z} cm   yaw {yaw} deg"
+    ages = (
+        f"link {_age(status.link_age_s)}   camera {_age(status.camera_age_s)}"
+        f"   loop late {_age(status.loop_late_s)}"
+    )
+    return [
+        ("phase", f"{status.phase}  {status.in_phase_s:.1f} s"),
+        ("error", error),
+        ("markers", f"{status.stage}   attempts {status.attempts}"),
+        ("height", f"{status.height_m:.2f} m   battery {status.battery_v:.2f} V"),
+        ("ages", ages),
+        ("held" if status.hold else "reason", status.hold or status.reason),
+    ]
+
+
+def _age(seconds: float) -> str:
+    return f"{1e3 * seconds:.0f} ms" if seconds < 10.0 else "none" if seconds > 1e6 else ">10 s"

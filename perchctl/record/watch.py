@@ -1,0 +1,176 @@
+"""What looks on while the loop flies: the flight log and the live display."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from perchctl.mission.view import NO_BATTERY_READING_V
+from perchctl.profile import Profile
+from perchctl.record.fields import tick_record
+from perchctl.record.flight_log import FlightLogWriter, log_path, make_header
+from perchctl.record.log_file import PhaseSpan
+from perchctl.record.panel import Reporter
+from perchctl.record.status import FlightStatus
+from perchctl.record.summary import FlightSummary
+
+if TYPE_CHECKING:
+    from perchctl.mission.flight import FlightReport, Tick
+
+
+Truth = tuple[tuple[float, float, float], float]
+"""The body's true position (world, m) and the gear's true miss (m)."""
+
+
+class LogWatcher:
+    """Writes every tick and event; its problem is the log's.
+
+    `truth`, where a simulation sets it, gives what is true at the time of the tick.
+    """
+
+    def __init__(self, writer: FlightLogWriter) -> None:
+        self.writer = writer
+        self.truth: Callable[[], Truth] | None = None
+        self._battery_min_v: float | None = None
+
+    @classmethod
+    def lockstep(cls, path: Path, profile: Profile, seed: int) -> LogWatcher:
+        """For a simulated flight: the same seed gives the same bytes. Errors: InvalidValue."""
+        header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
+        return cls(FlightLogWriter.open(path, header))
+
+    @classmethod
+    def real_time(
+        cls, directory: Path, profile: Profile, uri: str, source: str, seed: int | None = None
+    ) -> LogWatcher:
+        """A new file in `directory`, brought to the disk as the flight goes on.
+
+        Errors: InvalidValue."""
+        started = datetime.now(UTC)
+        header = make_header(profile, uri=uri, source=source, seed=seed, started=started)
+        path = log_path(directory, profile.name, started)
+        return cls(FlightLogWriter.open(path, header, fsync=True))
+
+    @property
+    def path(self) -> Path:
+        return self.writer.path
+
+    def tick(self, tick: Tick) -> None:
+        battery_v = tick.telemetry.battery_v
+        if battery_v >= NO_BATTERY_READING_V:
+            self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
+        position_m, miss_m = (None, None) if self.truth is None else self.truth()
+        self.writer.write(record_of(tick, position_m, miss_m))
+
+    def event(self, t_s: float, text: str) -> None:
+        level = "warning" if text.startswith("holding") else "info"
+        self.writer.event(t_s, text, level)
+
+    def close(
+        self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
+    ) -> FlightSummary | None:
+        """Write the summary and close; without a report (the flight raised) only close."""
+        if report is None:
+            self.writer.close()
+            return None
+        summary = FlightSummary(
+            outcome=report.phase.value.lower(),
+            reason=report.reason,
+            cause=report.outcome.value,
+            duration_s=report.duration_s,
+            attempts=report.attempts,
+            miss_m=miss_m,
+            battery_min_v=self._battery_min_v,
+            locked=report.locked,
+            fell=fell,
+            phases=spans_of(report),
+        )
+        self.writer.close(summary.as_record())
+        return summary
+
+    @property
+    def problem(self) -> str | None:
+        return self.writer.problem
+
+
+class DisplayWatcher:
+    """Shows the flight. A display that fails is no reason to land: no problem, ever."""
+
+    def __init__(self, reporter: Reporter) -> None:
+        self.reporter = reporter
+
+    def tick(self, tick: Tick) -> None:
+        self.reporter.update(status_of(tick))
+
+    def event(self, t_s: float, text: str) -> None:
+        self.reporter.event(t_s, text)
+
+    @property
+    def problem(self) -> str | None:
+        return None
+
+
+def spans_of(report: FlightReport) -> tuple[PhaseSpan, ...]:
+    """The report's history as stays in phases."""
+    starts = report.history
+    if not starts:
+        return ()
+    ends = [t_s for t_s, _, _ in starts[1:]] + [starts[-1][0]]
+    return tuple(
+        PhaseSpan(phase, t_s, end_s, reason)
+        for (t_s, phase, reason), end_s in zip(starts, ends, strict=True)
+    )
+
+
+def record_of(
+    tick: Tick,
+    true_position_m: tuple[float, float, float] | None = None,
+    true_miss_m: float | None = None,
+) -> dict[str, Any]:
+    """The tick as a record; the truth where a simulation knows it."""
+    return tick_record(
+        t_s=tick.t_s,
+        telemetry=tick.telemetry,
+        output=tick.output,
+        target=tick.target,
+        phase=tick.state.phase.value,
+        reason=tick.state.reason,
+        command=tick.command,
+        hold=tick.state.hold,
+        attempts=tick.state.attempts,
+        loop_late_s=tick.loop_late_s,
+        camera_age_s=tick.camera_age_s,
+        telemetry_age_s=tick.telemetry_age_s,
+        true_position_m=true_position_m,
+        true_miss_m=true_miss_m,
+    )
+
+
+def status_of(tick: Tick) -> FlightStatus:
+    """The tick as the display shows it."""
+    state, tel, target = tick.state, tick.telemetry, tick.target
+    ground_z_m = state.ground_m[2] if state.ground_m else 0.0
+    e_m = None
+    if target is not None:
+        x, y, z = (float(v) for v in target.e_m)
+        e_m = (x, y, z)
+    yaw_rad = None if target is None or math.isnan(target.e_yaw_rad) else target.e_yaw_rad
+    return FlightStatus(
+        t_s=tick.t_s,
+        phase=state.phase.value,
+        in_phase_s=tick.t_s - state.entered_s,
+        e_m=e_m,
+        e_yaw_rad=yaw_rad,
+        stage="none" if target is None else target.stage.value,
+        height_m=tel.position_m[2] - ground_z_m,
+        battery_v=tel.battery_v,
+        link_age_s=tick.telemetry_age_s,
+        camera_age_s=tick.camera_age_s,
+        loop_late_s=tick.loop_late_s,
+        attempts=state.attempts,
+        reason=state.reason,
+        hold=state.hold,
+    )
