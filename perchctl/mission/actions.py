@@ -14,6 +14,7 @@ from dataclasses import replace
 
 from perchctl.mission.guidance import (
     FREE_SPEED_MPS,
+    corrected,
     hold_here,
     limited,
     trimmed,
@@ -31,7 +32,7 @@ from perchctl.mission.types import (
     StopMotors,
     TakeOff,
 )
-from perchctl.mission.view import View
+from perchctl.mission.view import HANGING_S, View
 
 Acted = tuple[PlannerState, Command]
 
@@ -47,19 +48,22 @@ def act(v: View) -> Acted:
     return ACTIONS[v.state.phase](v)
 
 
-def _fly_to(v: View, setpoint: PositionSetpoint) -> Acted:
-    setpoint = limited(v, setpoint)
-    return replace(v.state, setpoint=setpoint), setpoint
+def _fly_to(v: View, reference: PositionSetpoint, *, lift: bool = True) -> Acted:
+    """Remember the reference, send it corrected. `lift` False sends its height as it is."""
+    return replace(v.state, setpoint=reference), limited(v, corrected(v, reference, lift=lift))
 
 
 def _walk_to(
     v: View, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> Acted:
-    """Only SEARCH, ASCEND and PERCH pass an `up_mps`: nothing else climbs."""
+    """Only SEARCH and ASCEND pass an `up_mps`, and PERCH presses: nothing else climbs."""
+    return _fly_to(v, _walked(v, goal, up_mps, down_mps))
+
+
+def _walked(v: View, goal: PositionSetpoint, up_mps: float, down_mps: float) -> PositionSetpoint:
     align = v.profile.planner.align
-    old = v.state.setpoint or hold_here(v)
-    setpoint = walk(
-        old,
+    return walk(
+        v.state.setpoint or hold_here(v),
         goal,
         v.obs.t_s - v.state.t_s,
         xy_mps=align.speed_mps,
@@ -67,21 +71,21 @@ def _walk_to(
         down_mps=down_mps,
         yaw_rate_radps=math.radians(align.yaw_rate_dps),
     )
-    return _fly_to(v, setpoint)
 
 
-def _under_target(
-    v: View, z_m: float, *, up_mps: float = 0.0, down_mps: float = 0.4, learn: bool = True
-) -> Acted:
-    """Walk under the target at height `z_m`, with the integral of the error added
-    (`learn` False keeps it as it is: against the ceiling it would only wind up)."""
+def _under_target(v: View, z_m: float, *, up_mps: float = 0.0, down_mps: float = 0.4) -> Acted:
+    """Walk under the target at height `z_m`, and learn the trim that keeps the gear there."""
+    goal = _target_goal(v, z_m)
+    trim = trimmed(v, (goal.x_m, goal.y_m), v.obs.t_s - v.state.t_s)
+    v = View(replace(v.state, trim_m=trim), v.obs, v.profile)
+    return _walk_to(v, goal, up_mps=up_mps, down_mps=down_mps)
+
+
+def _target_goal(v: View, z_m: float) -> PositionSetpoint:
     assert v.state.anchor is not None
     yaw = v.state.anchor.yaw_rad
-    goal_xy = under_target_xy(v, yaw)
-    trim = trimmed(v, goal_xy, v.obs.t_s - v.state.t_s) if learn else v.state.trim_m
-    v = View(replace(v.state, trim_m=trim), v.obs, v.profile)
-    goal = PositionSetpoint(goal_xy[0] + trim[0], goal_xy[1] + trim[1], z_m, yaw)
-    return _walk_to(v, goal, up_mps=up_mps, down_mps=down_mps)
+    x, y = under_target_xy(v, yaw)
+    return PositionSetpoint(x, y, z_m, yaw)
 
 
 def _approach(v: View) -> Acted:
@@ -105,22 +109,23 @@ def _approach(v: View) -> Acted:
 
 
 def _search(v: View) -> Acted:
-    """Wait, climb a step, turn a step, wait again; never above the limit, nor near a
-    target that was seen before."""
+    """Wait, climb a step, turn a step, wait again; never above the limit. A target that
+    was seen before is looked for from under it, not climbed to."""
     search, state = v.profile.planner.search, v.state
     assert state.ground_m is not None
     if v.obs.t_s - state.search_step_s > search.wait_s:
         state = replace(state, searches=state.searches + 1, search_step_s=v.obs.t_s)
         v = View(state, v.obs, v.profile)
-    top = state.ground_m[2] + search.max_height_m
     x, y, z = state.entry_m
     if state.anchor is not None:
-        top = min(top, v.contact_goal_z_m - v.profile.planner.ascend.near_m)
         x, y = under_target_xy(v, state.entry_yaw_rad)
-    climbed = max(min(z + search.step_m * state.searches, top), min(z, top))
+        height = min(z, v.contact_goal_z_m - v.profile.planner.ascend.near_m)
+    else:
+        top = max(z, state.ground_m[2] + search.max_height_m)
+        height = min(z + search.step_m * state.searches, top)
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
     up_mps = v.profile.planner.ascend.speed_mps
-    return _walk_to(v, PositionSetpoint(x, y, climbed, yaw), up_mps=up_mps)
+    return _walk_to(v, PositionSetpoint(x, y, height, yaw), up_mps=up_mps)
 
 
 def _estimate(v: View) -> Acted:
@@ -140,16 +145,20 @@ def _ascend(v: View) -> Acted:
     may_climb = v.fresh and v.error_xy_m < 0.7 * v.cone_m
     lag = setpoint.z_m - v.obs.telemetry.position_m[2]
     speed = ascend.near_speed_mps if v.error_z_m < ascend.near_m else ascend.speed_mps
-    # A vehicle short of thrust is not pulled by a setpoint that runs away from it.
-    up = speed if may_climb and lag < 0.15 else 0.0
-    return _under_target(v, goal_z, up_mps=up)
+    # Slower and slower towards the stand-off, and a vehicle short of thrust is not
+    # pulled by a setpoint that runs away from it.
+    speed = min(speed, max(0.02, goal_z - setpoint.z_m))
+    return _under_target(v, goal_z, up_mps=speed if may_climb and lag < 0.15 else 0.0)
 
 
 def _perch(v: View) -> Acted:
+    """Press. Position and trim are kept as they are: against the ceiling they would
+    only wind up."""
     perch = v.profile.planner.perch
     if perch.mode == "raw":
         return v.state, RawThrust(perch.thrust)
-    return _under_target(v, v.contact_goal_z_m + perch.press_m, up_mps=perch.climb_mps, learn=False)
+    goal = _target_goal(v, v.contact_goal_z_m + perch.press_m)
+    return _fly_to(v, _walked(v, goal, perch.climb_mps, 0.0), lift=False)
 
 
 def _complete(v: View) -> Acted:
@@ -170,7 +179,7 @@ def _complete(v: View) -> Acted:
     assert state.contact_z_m is not None
     top = state.entry_m[2] + v.profile.planner.perch.press_m
     low = state.contact_z_m - complete.release_drop_m
-    return _fly_to(v, replace(setpoint, z_m=top + part * (low - top)))
+    return _fly_to(v, replace(setpoint, z_m=top + part * (low - top)), lift=False)
 
 
 def _stop_motors(v: View) -> Acted:
@@ -194,7 +203,7 @@ def _recover(v: View) -> Acted:
         setpoint = replace(setpoint, z_m=z)
     if state.anchor is not None and v.target_age_s < 3.0:
         x, y = under_target_xy(v, setpoint.yaw_rad)
-        goal = PositionSetpoint(x + state.trim_m[0], y + state.trim_m[1], z, setpoint.yaw_rad)
+        goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
         goal = replace(setpoint, z_m=z)
     v = View(replace(state, setpoint=setpoint), v.obs, v.profile)
@@ -205,7 +214,7 @@ def _landing(v: View) -> Acted:
     """One high-level landing; given again only while it shows no effect. When the motors
     are off already (on the ground, or hanging), nothing is started again."""
     landing, state = v.profile.planner.landing, v.state
-    if state.motors_stopped:
+    if state.motors_stopped or v.held("hanging") >= HANGING_S:
         return _stop_motors(v)
     if not v.flying and v.obs.telemetry.thrust < 1:
         return state, Idle()

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from perchctl.camera.health import HealthState, check_frame
+from perchctl.camera.health import HealthState, assess
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.errors import Interrupted
 from perchctl.link.protocol import Link
@@ -206,8 +206,8 @@ def _sense(parts: FlightParts, senses: _Senses, now_s: float) -> bool:
             senses.camera_problem = problem
         return False
     if senses.frames == 0:
-        check_size(frame.image, parts.pipeline.camera.size_px)
-    senses.camera_problem = problem or _rejection(senses, frame, now_s, safety.max_frame_age_s)
+        check_size(parts.source.size_px, parts.pipeline.camera, parts.source.describe())
+    senses.camera_problem = problem or _rejection(parts, senses, frame, now_s)
     if senses.camera_problem is not None:
         return False
     attitude = attitude_at(senses.history, frame.t_s)
@@ -218,13 +218,14 @@ def _sense(parts: FlightParts, senses: _Senses, now_s: float) -> bool:
     return True
 
 
-def _rejection(senses: _Senses, frame: Frame, now_s: float, max_age_s: float) -> str | None:
-    """Why this frame is no measurement: too old, frozen, or no picture at all."""
-    senses.health, verdict = check_frame(senses.health, frame)
-    if verdict is not None:
-        return verdict
+def _rejection(parts: FlightParts, senses: _Senses, frame: Frame, now_s: float) -> str | None:
+    """Why this frame is no measurement: frozen, no picture at all, or too old."""
+    live = parts.source.live
+    senses.health, verdict = assess(senses.health, frame, live)
+    if not verdict.usable and verdict.kind != "dark":  # a dark target may still be seen
+        return verdict.text
     age_s = now_s - frame.t_s
-    if age_s > max_age_s:
+    if live and age_s > parts.profile.safety.max_frame_age_s:
         return f"the picture is {age_s:.1f} s late"
     return None
 

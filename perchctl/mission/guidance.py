@@ -9,6 +9,8 @@ from perchctl.geometry import rot_z, wrap_rad
 from perchctl.mission.types import PositionSetpoint
 from perchctl.mission.view import View
 
+HEIGHT_GAIN = 1.5
+HEIGHT_LIMIT_M = 0.15
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
 
 
@@ -66,6 +68,24 @@ def trimmed(v: View, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, 
     if size > planner.trim_limit_m:
         tx, ty = tx * planner.trim_limit_m / size, ty * planner.trim_limit_m / size
     return tx, ty
+
+
+def corrected(v: View, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
+    """The setpoint that brings the vehicle to the reference.
+
+    Horizontally the learned trim is added. In height the onboard integrator has
+    wound up in a climb and carries the vehicle several centimetres past a setpoint
+    that stops (`zKi` over `zKp` of the firmware: a time constant of 4 s); adding a
+    multiple of the height error takes that down to the multiple's part.
+    """
+    rise = reference.z_m - v.obs.telemetry.position_m[2]
+    lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, HEIGHT_GAIN * rise)) if lift else 0.0
+    return replace(
+        reference,
+        x_m=reference.x_m + v.state.trim_m[0],
+        y_m=reference.y_m + v.state.trim_m[1],
+        z_m=reference.z_m + lifted,
+    )
 
 
 def limited(v: View, setpoint: PositionSetpoint) -> PositionSetpoint:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from perchctl.mission.state import FLYING_PHASES, Operator, Outcome, Phase, Severity
 from perchctl.mission.types import CRASHED, LOCKED, TUMBLED
-from perchctl.mission.view import View
+from perchctl.mission.view import HANGING_S, View
 
 Guard = Callable[[View], bool]
 P, S, O = Phase, Severity, Outcome  # noqa: E741 - column names of the table below
@@ -155,6 +155,12 @@ TABLE: tuple[Row, ...] = (
         lambda v: v.obs.t_s - v.state.started_s > v.profile.planner.perching_time_s, P.LANDING,
         "the perching time is over", S.LAND, O.ATTEMPTS_USED_UP,
     ),
+    # --- the magnet may catch early ---------------------------------------------
+    Row(
+        "caught", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
+        lambda v: v.held("hanging") >= HANGING_S, P.COMPLETE,
+        "hanging on the magnet already",
+    ),
     # --- phase 1: approach ---------------------------------------------------
     Row(
         "approached", _only(P.APPROACH), lambda v: v.held("at_takeoff_height") >= 0.3, P.SEARCH,
@@ -178,8 +184,9 @@ TABLE: tuple[Row, ...] = (
     # --- phase 3: estimate ---------------------------------------------------
     Row(
         "estimate-lost", _only(P.ESTIMATE),
-        lambda v: not v.tracked or v.in_phase_s > v.profile.planner.estimate.timeout_s, P.SEARCH,
-        "the target's pose does not settle", S.HOLD,
+        lambda v: v.held("untracked") > 1.0
+        or v.in_phase_s > v.profile.planner.estimate.timeout_s,
+        P.SEARCH, "the target's pose does not settle", S.HOLD,
     ),
     Row(
         "estimated", _only(P.ESTIMATE),

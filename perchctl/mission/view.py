@@ -19,6 +19,8 @@ from perchctl.mission.state import Observation, Phase, PlannerState
 from perchctl.mission.types import FLYING, HL_ACTIVE, HL_FINISHED
 from perchctl.profile import Profile
 
+HANGING_S = 1.0
+"""For how long a thrust below the weight must be enough before it proves the magnet."""
 LOW_POWER = 3  # pm.state
 NO_BATTERY_READING_V = 1.0
 """Below this nothing is measured: the battery is unknown, not empty (fault 7)."""
@@ -220,6 +222,21 @@ def _slipping(v: View) -> bool:
     return (below and sinking) or (sinking and tel.acc_z_g < complete.slip_acc_g)
 
 
+def _hanging(v: View) -> bool:
+    """Held up by the magnet, wherever the mission is: still, at the target's height, on
+    a thrust that could not carry the vehicle."""
+    tel, complete = v.obs.telemetry, v.profile.planner.complete
+    return (
+        v.state.hover_thrust > 0
+        and tel.thrust <= complete.hold_ratio * v.state.hover_thrust
+        and v.height_m > 0.3
+        and v.state.anchor is not None
+        and abs(v.error_z_m) <= 0.15
+        and abs(tel.velocity_mps[2]) < 0.05
+        and abs(tel.acc_z_g - 1.0) <= v.profile.planner.perch.contact_acc_g
+    )
+
+
 def _steady(v: View) -> bool:
     return v.speed_mps <= v.profile.planner.recover.steady_mps
 
@@ -258,6 +275,8 @@ CONDITIONS: dict[str, Callable[[View], bool]] = {
     "contact": _contact,
     "magnet_holds": _magnet_holds,
     "slipping": _slipping,
+    "hanging": _hanging,
+    "untracked": lambda v: not v.tracked,
     "steady": _steady,
     "at_takeoff_height": _at_takeoff_height,
     "estimated": _estimated,

@@ -1,0 +1,121 @@
+"""The link's small parts: signs, time, the sender, URIs."""
+
+from __future__ import annotations
+
+import math
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.errors import InvalidValue
+from perchctl.link.sender import Sender
+from perchctl.link.telemetry import ATTITUDE_BLOCK, NEEDED, SLOW_BLOCK, STATE_BLOCK, telemetry_from
+from perchctl.link.timebase import WRAP_MS, Timebase
+from perchctl.link.uri import UDEV_HELP, check_uri
+from perchctl.mission.types import Command, PositionSetpoint, StopMotors
+
+SIZES = {"float": 4, "uint16_t": 2, "int8_t": 1}
+
+
+@pytest.mark.parametrize("block", [STATE_BLOCK, ATTITUDE_BLOCK, SLOW_BLOCK])
+def test_blocks_fit_into_a_packet(block: dict[str, str]) -> None:
+    """Firmware facts, "Link": at most 26 bytes a log block."""
+    assert sum(SIZES[ctype] for ctype in block.values()) <= 26
+
+
+def test_pitch_and_degrees_turn_at_the_edge() -> None:
+    """stateEstimate.pitch is nose up in degrees; inside it is nose down in radians."""
+    values = dict.fromkeys(NEEDED, 0.0) | {
+        "stateEstimate.roll": 10.0,
+        "stateEstimate.pitch": 20.0,
+        "stateEstimate.yaw": 30.0,
+        "supervisor.info": 0x021E,
+    }
+    sample = telemetry_from(values, 1.5)
+    assert sample.roll_rad == pytest.approx(math.radians(10))
+    assert sample.pitch_rad == pytest.approx(-math.radians(20))
+    assert sample.yaw_rad == pytest.approx(math.radians(30))
+    assert sample.supervisor == 0x021E
+    assert sample.t_s == 1.5
+    assert sample.position_variance_m2 is None
+
+
+@given(
+    start_ms=st.integers(0, WRAP_MS - 1),
+    delays_ms=st.lists(st.integers(0, 80), min_size=20, max_size=60),
+)
+def test_timebase_follows_stamps_not_arrivals(start_ms: int, delays_ms: list[int]) -> None:
+    """Also across the wrap of the three-byte stamp; the best delivery sets the offset."""
+    base = Timebase()
+    times = []
+    for i, delay_ms in enumerate(delays_ms):
+        stamp = (start_ms + 10 * i) % WRAP_MS
+        times.append(base.to_loop_s(stamp, 100.0 + 0.01 * i + 0.001 * delay_ms))
+    best_s = min(delays_ms) / 1000.0
+    after = delays_ms.index(min(delays_ms))
+    for i in range(after, len(times)):
+        assert times[i] == pytest.approx(100.0 + 0.01 * i + best_s, abs=2e-4)
+
+
+def test_sender_keeps_orders_and_only_the_newest_setpoint() -> None:
+    gate, begun = threading.Event(), threading.Event()
+    sent: list[Command] = []
+
+    def hand_over(command: Command) -> None:
+        begun.set()
+        gate.wait(5.0)
+        sent.append(command)
+
+    sender = Sender(hand_over)
+    points = [PositionSetpoint(float(i), 0.0, 1.0, 0.0) for i in range(4)]
+    sender.put(points[0])
+    assert begun.wait(5.0)
+    sender.put(points[1])
+    sender.put(points[2])
+    sender.put(StopMotors())
+    sender.put(points[3])
+    assert sender.stuck_s() > 0
+    gate.set()
+    assert sender.drain(5.0)
+    sender.stop()
+    assert sent == [points[0], points[2], StopMotors(), points[3]] or sent == [
+        points[0],
+        StopMotors(),
+        points[3],
+    ]
+
+
+def test_sender_reports_what_the_library_raised() -> None:
+    def hand_over(command: Command) -> None:
+        raise RuntimeError("no radio")
+
+    sender = Sender(hand_over)
+    sender.put(StopMotors())
+    assert sender.drain(5.0)
+    sender.stop()
+    assert sender.problem is not None
+    assert "no radio" in sender.problem
+
+
+@pytest.mark.parametrize(
+    "uri",
+    ["sim://", "radio://0/80/2M/E7E7E7E7E7", "radio://0/80/250K", "usb://0", "udp://host:19850"],
+)
+def test_good_uris(uri: str) -> None:
+    assert check_uri(uri) == uri.split(":")[0]
+
+
+@pytest.mark.parametrize(
+    "uri", ["", "radio:/0", "radio://0/80/3M/E7E7E7E7E7", "udp://host", "http://host:80", "sim"]
+)
+def test_bad_uris_name_examples(uri: str) -> None:
+    with pytest.raises(InvalidValue, match="radio://0/80/2M"):
+        check_uri(uri)
+
+
+def test_udev_lines_name_all_three_devices() -> None:
+    """Conventions: radio, bootloader, Crazyflie over USB."""
+    for ids in (("1915", "7777"), ("1915", "0101"), ("0483", "5740")):
+        assert any(all(i in line for i in ids) for line in UDEV_HELP.splitlines())
