@@ -11,6 +11,11 @@ from perchctl.mission.view import View
 
 HEIGHT_GAIN = 1.5
 HEIGHT_LIMIT_M = 0.15
+POSITION_GAIN = 1.0
+VELOCITY_GAIN_S = 0.3
+STIFF_BELOW_M = 0.8
+STIFF_RANGE_M = 0.4
+STIFF_LIMIT_M = 0.1
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
 
 
@@ -73,19 +78,39 @@ def trimmed(v: View, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, 
 def corrected(v: View, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
     """The setpoint that brings the vehicle to the reference.
 
-    Horizontally the learned trim is added. In height the onboard integrator has
-    wound up in a climb and carries the vehicle several centimetres past a setpoint
-    that stops (`zKi` over `zKp` of the firmware: a time constant of 4 s); adding a
-    multiple of the height error takes that down to the multiple's part.
+    Horizontally the learned trim is added and, near the target, the position loop is
+    stiffened (`_stiffened`). In height the onboard integrator has wound up in a climb
+    and carries the vehicle several centimetres past a setpoint that stops (`zKi` over
+    `zKp` of the firmware: a time constant of 4 s); adding a multiple of the height
+    error takes that down to the multiple's part.
     """
     rise = reference.z_m - v.obs.telemetry.position_m[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, HEIGHT_GAIN * rise)) if lift else 0.0
+    dx, dy = _stiffened(v, reference)
     return replace(
         reference,
-        x_m=reference.x_m + v.state.trim_m[0],
-        y_m=reference.y_m + v.state.trim_m[1],
+        x_m=reference.x_m + v.state.trim_m[0] + dx,
+        y_m=reference.y_m + v.state.trim_m[1] + dy,
         z_m=reference.z_m + lifted,
     )
+
+
+def _stiffened(v: View, reference: PositionSetpoint) -> tuple[float, float]:
+    """Position and velocity feedback on top of the onboard loop, near the target only.
+
+    Far away an attitude that is some milliseconds beside its frame moves the seen
+    target by centimetres, and a stiff loop would chase that into an oscillation.
+    """
+    near = (STIFF_BELOW_M - v.error_z_m) / STIFF_RANGE_M
+    gain = max(0.0, min(1.0, near))
+    if gain == 0.0:
+        return 0.0, 0.0
+    (x, y, _), (vx, vy, _) = v.obs.telemetry.position_m, v.obs.telemetry.velocity_mps
+    dx = gain * (POSITION_GAIN * (reference.x_m - x) - VELOCITY_GAIN_S * vx)
+    dy = gain * (POSITION_GAIN * (reference.y_m - y) - VELOCITY_GAIN_S * vy)
+    size = math.hypot(dx, dy)
+    part = 1.0 if size <= STIFF_LIMIT_M else STIFF_LIMIT_M / size
+    return part * dx, part * dy
 
 
 def limited(v: View, setpoint: PositionSetpoint) -> PositionSetpoint:

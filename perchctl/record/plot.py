@@ -46,7 +46,7 @@ def plot_flight(log: FlightLog, png_path: Path) -> None:
     _plot_errors(axes[0], log, t_s)
     for ax, (name, unit, scale, label) in zip(axes[1:5], (*AXES, YAW), strict=True):
         _plot_raw_and_filtered(ax, log, t_s, f"{name}_{unit}", scale, label)
-    axes[1].legend(handles=_track_legend(), loc="upper right", ncols=4, fontsize=8)
+    axes[1].legend(handles=_track_legend(), loc="best", ncols=4, fontsize=8)
     _plot_height(axes[5], log, t_s)
     _plot_power(axes[6], log, t_s)
     for ax in axes:
@@ -132,7 +132,7 @@ def _plot_height(ax: Axes, log: FlightLog, t_s: Array) -> None:
     if np.isfinite(true_m).any():
         ax.plot(t_s, true_m, color=GREY, linestyle=":", linewidth=1.4, label="truth")
     ax.set_ylabel("height [m]")
-    ax.legend(loc="upper left", ncols=3, fontsize=8)
+    ax.legend(loc="best", ncols=3, fontsize=8)
 
 
 def _plot_power(ax: Axes, log: FlightLog, t_s: Array) -> None:
@@ -145,7 +145,7 @@ def _plot_power(ax: Axes, log: FlightLog, t_s: Array) -> None:
     ax.set_ylim(0.0, 105.0)
     ax.set_ylabel("thrust [%]")
     battery_ax.set_ylabel("battery [V]")
-    ax.legend(handles=lines, loc="lower left", ncols=2, fontsize=8)
+    ax.legend(handles=lines, loc="best", ncols=2, fontsize=8)
 
 
 def _shade_phases(ax: Axes, log: FlightLog) -> None:

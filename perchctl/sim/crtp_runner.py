@@ -30,16 +30,23 @@ class Runner:
     """Runs one host until it is told to stop or its parent has been gone for a while."""
 
     def __init__(
-        self, host: VehicleHost, channel: Channel | None, *, realtime: bool, linger_s: float
+        self,
+        host: VehicleHost,
+        channel: Channel | None,
+        *,
+        realtime: bool,
+        linger_s: float,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._host = host
         self._channel = channel
         self._realtime = realtime
         self._linger_s = linger_s
+        self._clock = clock
         self._parent = os.getppid()
         self._end_s: float | None = None
         self._stopped = False
-        self._origin_s = 0.0
+        self._origin_s = clock() - host.elapsed_s
         self._calls: dict[str, Callable[..., Any]] = {
             "advance": self._advance,
             "truth": host.truth,
@@ -54,25 +61,24 @@ class Runner:
         }
 
     def run(self) -> None:
-        self._restart_clock()
         while not self._stopped and not self._is_over():
-            self._wait(self._catch_up() if self._realtime else _IDLE_S)
+            self._wait(self.catch_up() if self._realtime else _IDLE_S)
 
     def _restart_clock(self) -> None:
-        self._origin_s = time.monotonic() - self._host.elapsed_s
+        self._origin_s = self._clock() - self._host.elapsed_s
 
-    def _catch_up(self) -> float:
-        """Step up to now; how long to wait for the next step."""
-        now_s = time.monotonic() - self._origin_s
+    def catch_up(self) -> float:
+        """Step up to now, some steps at most at once; how long to wait for the next step."""
+        now_s = self._clock() - self._origin_s
         if now_s - self._host.elapsed_s > MAX_LAG_S:
             self._origin_s += now_s - self._host.elapsed_s - MAX_LAG_S
-            now_s = time.monotonic() - self._origin_s
+            now_s = self._clock() - self._origin_s
         for _ in range(_BATCH):
             if self._host.elapsed_s + CONTROL_PERIOD_S > now_s:
                 break
             self._host.step()
         next_s = self._origin_s + self._host.elapsed_s + CONTROL_PERIOD_S
-        return max(0.0, next_s - time.monotonic())
+        return max(0.0, next_s - self._clock())
 
     def _wait(self, timeout_s: float) -> None:
         sockets = [self._host.endpoint.socket]
@@ -104,13 +110,13 @@ class Runner:
     def _is_over(self) -> bool:
         if self._channel is not None and os.getppid() != self._parent:
             self._lose_parent()
-        return self._end_s is not None and time.monotonic() >= self._end_s
+        return self._end_s is not None and self._clock() >= self._end_s
 
     def _lose_parent(self) -> None:
         if self._channel is not None:
             self._channel.close()
             self._channel = None
-        self._end_s = time.monotonic() + self._linger_s
+        self._end_s = self._clock() + self._linger_s
         self._realtime = True
         self._restart_clock()
 

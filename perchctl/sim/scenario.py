@@ -25,7 +25,7 @@ class Scenario:
         T_body_cam_true: rows of the camera's true pose, mounting error included.
         camera_*: what the camera and its radio do to the frames.
         drift_mps: drift of the state estimate, world axes.
-        draught_mps: mean wind; gusts have the same order.
+        draught_mps: the wind with its gusts (`perchctl.sim.wind`).
         magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
         no_target: the ceiling is bare.

@@ -1,4 +1,4 @@
-"""The draught in the room: a mean wind with smooth gusts of the same order."""
+"""The draught in the room: a steady part with smooth gusts, together up to a given speed."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from perchctl.sim.scenario import Scenario
 
 _TERMS = 5
 _SLOWEST_HZ, _FASTEST_HZ = 0.05, 1.0
-_SHARES = (0.6, 0.6, 0.3)  # standard deviation of the gusts over the mean speed: x, y, z
+_STEADY = 0.7  # the steady part of the draught's speed
+_SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts over that speed: x, y, z
 _STREAM = 1
 
 _Terms = tuple[tuple[float, float, float], ...]
 
 
 class Wind:
-    """A few sines of seeded frequency and phase on top of `Scenario.draught_mps`."""
+    """`Scenario.draught_mps` is the speed that the gusts reach at two standard deviations."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._mean = scenario.draught_mps
-        speed_mps = math.sqrt(sum(v * v for v in self._mean))
+        draught = scenario.draught_mps
+        x, y, z = draught
+        self._mean = (_STEADY * x, _STEADY * y, _STEADY * z)
+        speed_mps = math.hypot(*draught)
         rng = np.random.default_rng([scenario.seed, _STREAM])
         self._still = speed_mps == 0.0
         self._gusts = tuple(_draw(rng, share * speed_mps) for share in _SHARES)

@@ -35,6 +35,8 @@ MIN_LINE_SIGMA_PX = 0.015
 
 _NEXT, _BEFORE = [1, 2, 3, 0], [3, 0, 1, 2]
 _PROFILES = 32  # across each side
+_ALONG: Array = np.linspace(-1.0, 1.0, _PROFILES)  # a side, between its margins
+_POWERS: Array = _ALONG[:, None] ** np.arange(3)
 _STEPS = 16  # gradient samples in each profile
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
@@ -129,7 +131,8 @@ def _line_refine(
     step_px = 2.0 * half_px / _STEPS
     offsets = np.linspace(-1.0, 1.0, _STEPS + 1) * half_px[:, None]  # (4m, steps + 1)
     grey = _sample(image, origin, normal, offsets)
-    gradient = np.diff(grey, axis=2) / step_px[:, None, None]  # dark inside: positive
+    gradient = np.diff(grey, axis=2)  # dark inside: positive
+    gradient /= step_px[:, None, None].astype(np.float32)
     u = 0.5 * (offsets[:, 1:] + offsets[:, :-1])  # (4m, steps)
     edge, weight, blur_px = _edges(gradient, u, near_px, inner, depth_px)
     points = origin + edge[:, :, None] * normal
@@ -173,7 +176,7 @@ def _profile_lines(
     m = len(raw_px)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(m, 4, 2)
     margin = np.clip(2.5 / sides_px, 0.04, 0.25)[:, :, None]  # the other side's blur
-    s = margin + (1.0 - 2.0 * margin) * np.linspace(0.0, 1.0, _PROFILES)  # (m, 4, n)
+    s = margin + (1.0 - 2.0 * margin) * 0.5 * (1.0 + _ALONG)  # (m, 4, n)
     ends = corners[:, _NEXT]
     along = corners[:, :, None] + s[..., None] * (ends - corners)[:, :, None]
     origin = distort(along.reshape(-1, 2), camera).reshape(m, 4, _PROFILES, 2)
@@ -190,7 +193,9 @@ def _profile_lines(
     return origin.reshape(4 * m, _PROFILES, 2), normal.reshape(4 * m, _PROFILES, 2), s
 
 
-def _sample(image: NDArray[np.uint8], origin: Array, normal: Array, offsets: Array) -> Array:
+def _sample(
+    image: NDArray[np.uint8], origin: Array, normal: Array, offsets: Array
+) -> NDArray[np.float32]:
     """Grey values at origin + offset * normal, (4m, n, steps + 1): bilinear, the rim
     repeated outside.
 
@@ -211,31 +216,30 @@ def _sample(image: NDArray[np.uint8], origin: Array, normal: Array, offsets: Arr
         for k in (0, 1)
     )
     grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(grey.reshape(*origin.shape[:2], -1), dtype=np.float64)
+    return np.asarray(grey, dtype=np.float32).reshape(*origin.shape[:2], -1)
 
 
 def _edges(
-    gradient: Array, u: Array, near_px: Array, inner: Array, depth_px: Array
+    gradient: NDArray[np.float32], u: Array, near_px: Array, inner: Array, depth_px: Array
 ) -> tuple[Array, Array, Array]:
     """The edge's place in each profile, (4m, n) px along the normal; the profiles'
     weights (0 for outliers); and each side's blur as a standard deviation, (4m,)."""
-    sides, n, _ = gradient.shape
-    s = np.linspace(-1.0, 1.0, n)
-    mass = np.maximum(gradient, 0.0)
-    mass *= np.exp(-0.5 * (u / (0.6 * near_px[:, None])) ** 2)[:, None, :]
-    total = mass.sum(axis=2)
+    u32 = u.astype(np.float32)  # sums of some dozen grey values lose nothing by it
+    mass = np.maximum(gradient, np.float32(0.0))
+    mass *= np.exp(-0.5 * (u / (0.6 * near_px[:, None])) ** 2)[:, None, :].astype(np.float32)
+    total = np.einsum("sni->sn", mass).astype(np.float64)
     usable = total > 0.25 * _median(total, None)[:, None]
-    edge = np.einsum("sni,si->sn", mass, u) / np.where(usable, total, 1.0)
-    line, weight = _robust_line(edge, usable, s, 0.3, 2)
-    blur = np.full(sides, 1.0)
+    edge = np.einsum("sni,si->sn", mass, u32) / np.where(usable, total, 1.0)
+    line, weight = _robust_line(edge, usable, 0.3, 2)
+    blur = np.ones(len(gradient))
     limit = near_px[:, None]
     for last in (False, False, True):
-        relative = u[:, None, :] - line[:, :, None]
+        relative = u32[:, None, :] - line[:, :, None].astype(np.float32)
         # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
         w2 = np.clip(1.5 * blur, 0.9, 0.5 * near_px) ** 2
         squared = relative * relative
-        mass = gradient * np.exp(squared * (-0.5 / w2)[:, None, None])
-        total = mass.sum(axis=2)
+        mass = gradient * np.exp(squared * (-0.5 / w2)[:, None, None].astype(np.float32))
+        total = np.einsum("sni->sn", mass).astype(np.float64)
         floor = 0.2 * _median(total, None)
         usable = total > np.maximum(floor, 1e-9)[:, None]
         # A white inner cell adds a falling edge of the same height, one cell further in;
@@ -248,18 +252,19 @@ def _edges(
         second = np.einsum("sni,sni->sn", mass, squared)
         second += total * share * (place**2 + w2 * blur**2 / wide2)[:, None]
         centroid = first / total
-        moment = (second * usable).sum(axis=1) / np.maximum((total * usable).sum(axis=1), 1e-9)
+        mean_of = usable / np.maximum(np.einsum("sn,sn->s", total, usable), 1e-9)[:, None]
+        moment = np.einsum("sn,sn->s", second, mean_of)
         moment = np.clip(moment, 0.01, 0.8 * w2)
         blur = np.sqrt(1.0 / (1.0 / moment - 1.0 / w2))
         # The window pulls the centroid towards its own middle: undo that.
         centroid *= (1.0 + blur**2 / w2)[:, None]
         edge = line + np.clip(centroid, -limit, limit)
-        line, weight = _robust_line(edge, usable, s, 0.05, 2 if last else 1)
+        line, weight = _robust_line(edge, usable, 0.05, 2 if last else 1)
     return edge, weight, blur
 
 
 def _robust_line(
-    edge: Array, usable: NDArray[np.bool_], s: Array, floor_px: float, rounds: int
+    edge: Array, usable: NDArray[np.bool_], floor_px: float, rounds: int
 ) -> tuple[Array, Array]:
     """Straight lines edge(s) a side with Tukey's weights; returns (line, weight)."""
     error = edge - _median(edge, usable)[:, None]
@@ -268,12 +273,11 @@ def _robust_line(
         size = np.abs(error)
         scale = np.maximum(1.4826 * _median(size, usable), floor_px)
         weight = usable * np.maximum(1.0 - (size / (3.5 * scale[:, None])) ** 2, 0.0) ** 2
-        total = np.maximum(weight.sum(axis=1), 1e-9)
-        s0 = weight @ s / total
-        e0 = (weight * edge).sum(axis=1) / total
-        lever = weight * (s - s0[:, None])
-        slope = (lever * edge).sum(axis=1) / np.maximum(lever @ s, 1e-9)
-        line = (e0 - slope * s0)[:, None] + slope[:, None] * s
+        w0, w1, w2 = (weight @ _POWERS).T
+        e0, e1 = (weight * edge @ _POWERS[:, :2]).T
+        w0 = np.maximum(w0, 1e-9)
+        slope = (e1 - e0 * w1 / w0) / np.maximum(w2 - w1 * w1 / w0, 1e-9)
+        line = ((e0 - slope * w1) / w0)[:, None] + slope[:, None] * _ALONG
         error = edge - line
     return line, np.asarray(weight, dtype=np.float64)
 

@@ -22,6 +22,8 @@ from perchctl.vision.corners import refine, rim_of_bits, side_lengths_px
 from perchctl.vision.types import MARKERS, CameraModel, Detection, Detections, Frame, MarkerName
 
 _MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, of 640 px
+_THRESHOLDS_PX = (3, 23)  # OpenCV's: 3, 13, 23
+_QUICK_THRESHOLDS_PX = (13, 13)  # enough where both markers were seen a frame ago
 _WINDOW_MARGIN = 0.25  # of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MAX_SPEED_GAP_S = 0.25  # older motion says nothing about where to look
@@ -87,7 +89,10 @@ def detect(
     if setup.window and expected:
         box = search_window(expected, setup.ratio, image.shape)
         if box is not None:
-            found, _ = _search(image, box, expected, setup)
+            if len(expected) == 2:
+                found, _ = _search(image, box, expected, setup, _QUICK_THRESHOLDS_PX)
+            if len(found) < 2:
+                found, _ = _search(image, box, expected, setup)
             full_frame = not found
     if full_frame:
         whole = (0, 0, image.shape[1], image.shape[0])
@@ -162,9 +167,11 @@ def _search(
     box: tuple[int, int, int, int],
     expected: dict[MarkerName, Array],
     setup: DetectorSetup,
+    thresholds_px: tuple[int, int] = _THRESHOLDS_PX,
 ) -> tuple[dict[MarkerName, Array], bool]:
     left, top, right, bottom = box
     parameters = setup.parameters
+    parameters.adaptiveThreshWinSizeMin, parameters.adaptiveThreshWinSizeMax = thresholds_px
     parameters.minMarkerPerimeterRate = min(
         1.0, _MIN_PERIMETER_PX / max(right - left, bottom - top)
     )

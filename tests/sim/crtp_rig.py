@@ -6,6 +6,7 @@ cflib's threads are waited for with bounded events; simulated time moves only by
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -58,13 +59,15 @@ class Client:
     def close(self) -> None:
         self.cf.close_link()
 
-    def ask(self, port: int, channel: int, data: bytes, wait_s: float = WAIT_S) -> bytes | None:
+    def ask(
+        self, port: int, channel: int, data: bytes, wait_s: float = WAIT_S, begins: bytes = b""
+    ) -> bytes | None:
         """Send one packet and wait for the next answer on its port and channel."""
         arrived = threading.Event()
         answers: list[bytes] = []
 
         def take(packet: Any) -> None:
-            if packet.data[:1] != b"" and not arrived.is_set():
+            if bytes(packet.data[: len(begins)]) == begins and not arrived.is_set():
                 answers.append(bytes(packet.data))
                 arrived.set()
 
@@ -80,6 +83,14 @@ class Client:
         packet.set_header(port, channel)
         packet.data = data
         self.cf.send_packet(packet)
+
+    def echo(self, number: int, wait_s: float = WAIT_S) -> bool:
+        """Whether the vehicle answers; by then it has served all that was sent before.
+
+        The first byte sets it apart from cflib's own pings.
+        """
+        ping = struct.pack("<Bd", 1, number)
+        return self.ask(15, 0, ping, wait_s, begins=ping) == ping
 
     def supervisor_info(self) -> int:
         """Asked of the supervisor port; cflib's getters may answer from a cache."""

@@ -101,9 +101,7 @@ def test_position_to_hover_dips(pilot: Pilot, mass_kg: float, lowest_m: float) -
     """Row "position -> hover dips to 0.47 m" at 42 g, 0.74 m at 30 g, from 0.8 m."""
     pilot.fresh(mass_kg=mass_kg)
     pilot.fly_to(0.8, 4.0)
-    dip_m = lowest_after(
-        pilot, 3.0, lambda: pilot.cf.commander.send_hover_setpoint(0, 0, 0, 0.8)
-    )
+    dip_m = lowest_after(pilot, 3.0, lambda: pilot.cf.commander.send_hover_setpoint(0, 0, 0, 0.8))
     assert dip_m == pytest.approx(lowest_m, abs=0.05)
 
 

@@ -1,0 +1,291 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from target_picture import CAMERA, pose_of, render
+
+from perchctl.geometry import (
+    R_MARKER_TARGET,
+    Array,
+    invert_T,
+    make_T,
+    rot_z,
+    rotation_from_rpy,
+    wrap_rad,
+)
+from perchctl.pipeline import PipelineSetup, make_setup, step
+from perchctl.profile import (
+    DetectorConfig,
+    KalmanConfig,
+    MarkerConfig,
+    MergeConfig,
+    PoseConfig,
+    TargetConfig,
+)
+from perchctl.vision.types import Attitude, Frame, PipelineOutput, PipelineState, Stage
+
+Build = Callable[..., PipelineSetup]
+MOUNT = make_T(rotation_from_rpy(0.03, -0.02, 0.4), (0.02, 0.0, 0.01))
+GEAR = np.array([0.0, 0.0, 0.03])
+TARGET = np.array([0.4, -0.2, 2.0])
+TARGET_YAW = 2.5
+EMPTY: NDArray[np.uint8] = np.full((480, 640), 120, np.uint8)
+
+
+def view(attitude: Attitude) -> NDArray[np.uint8]:
+    """What the mounted camera sees of the target in the world."""
+    R = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
+    T_world_cam = make_T(R, np.array(attitude.position_m)) @ MOUNT
+    T = invert_T(T_world_cam) @ make_T(rot_z(TARGET_YAW) @ R_MARKER_TARGET, TARGET)
+    return render(np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=float).ravel(), T[:3, 3])
+
+
+def true_e(attitude: Attitude) -> tuple[Array, float]:
+    R = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
+    gear = np.array(attitude.position_m) + R @ GEAR
+    return rot_z(-attitude.yaw_rad) @ (TARGET - gear), wrap_rad(TARGET_YAW - attitude.yaw_rad)
+
+
+def fly(k: int) -> Attitude:
+    """A vehicle that drifts, climbs, sways and turns: frame k at 30 Hz."""
+    t = k / 30.0
+    return Attitude(
+        t,
+        0.05 * math.sin(3 * t),
+        0.04 * math.cos(2 * t),
+        0.8 + 0.5 * t,
+        (0.35 + 0.1 * t, -0.15 - 0.08 * t, 1.4 + 0.1 * t),
+    )
+
+
+def run(
+    setup: PipelineSetup,
+    frames: int,
+    lost: Callable[[int], bool] = lambda k: False,
+    blind: bool = False,
+) -> list[PipelineOutput]:
+    state, outputs = PipelineState(), []
+    for k in range(frames):
+        attitude = fly(k)
+        image = EMPTY if lost(k) else view(attitude)
+        frame = Frame(k, attitude.t_s, image)
+        state, output = step(state, frame, None if blind else attitude, setup)
+        outputs.append(output)
+    return outputs
+
+
+@pytest.mark.parametrize("method", ["joint", "weights"])
+@pytest.mark.parametrize("frame", ["world", "level"])
+def test_a_flight_past_the_target_is_measured(build: Build, method: str, frame: str) -> None:
+    setup = build(
+        kalman=KalmanConfig(frame=frame),  # type: ignore[arg-type]
+        merge=MergeConfig(method=method),  # type: ignore[arg-type]
+        T_body_cam=MOUNT,
+        gear_body_m=GEAR,
+    )
+    outputs = run(setup, 12)
+    # A constant-velocity filter of a turning frame lags; the world's target stands still.
+    limit_m, limit_rad = (0.002, 0.01) if frame == "world" else (0.012, 0.03)
+    for k, output in enumerate(outputs):
+        e, yaw = true_e(fly(k))
+        assert output.target is not None
+        assert output.target.measured
+        assert output.target.stage is Stage.BOTH
+        assert np.abs(output.target.e_m - e).max() < limit_m
+        assert abs(wrap_rad(output.target.e_yaw_rad - yaw)) < limit_rad
+        assert output.target.world_m is not None
+        assert np.abs(output.target.world_m - TARGET).max() < limit_m
+        assert output.target.world_yaw_rad is not None
+        assert abs(wrap_rad(output.target.world_yaw_rad - TARGET_YAW)) < limit_rad
+        assert (output.target.world_velocity_mps is not None) == (frame == "world")
+        for pose in output.poses.values():
+            assert np.abs(pose.e_m - e).max() < 0.01
+        expected = {"large", "small"} | ({"joint"} if method == "joint" else set())
+        assert set(output.poses) == expected
+
+
+@pytest.mark.parametrize("method", ["joint", "weights"])
+def test_while_unseen_the_target_coasts_in_the_world_and_is_then_given_up(
+    build: Build, method: str
+) -> None:
+    setup = build(merge=MergeConfig(method=method), T_body_cam=MOUNT, gear_body_m=GEAR)  # type: ignore[arg-type]
+    n_max = setup.kalman.n_max
+    outputs = run(setup, 4 + n_max + 3, lost=lambda k: k >= 4)
+    for n in range(1, n_max + 1):
+        target = outputs[3 + n].target
+        assert target is not None
+        assert not target.measured
+        assert target.unseen == n
+        assert target.stage is Stage.NONE
+        e, yaw = true_e(fly(3 + n))  # the vehicle flies on: e follows
+        assert np.abs(target.e_m - e).max() < 0.01
+        assert abs(wrap_rad(target.e_yaw_rad - yaw)) < 0.02
+        assert outputs[3 + n].stage is Stage.NONE
+        assert (target.sigma_m > outputs[3].target.sigma_m).all()  # type: ignore[union-attr]
+    assert all(output.target is None for output in outputs[4 + n_max :])
+
+
+def test_nothing_seen_is_no_target(build: Build) -> None:
+    state, output = step(PipelineState(), Frame(0, 0.0, EMPTY), None, build())
+    assert output.target is None
+    assert output.poses == {}
+    assert state.tracks == {}
+    assert output.stage is Stage.NONE
+
+
+def test_without_an_attitude_the_camera_counts_as_level(build: Build) -> None:
+    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    rvec, tvec = pose_of(0.03, 0.02, 0.5, 0.3)
+    state, output = step(PipelineState(), Frame(0, 0.0, render(rvec, tvec)), None, setup)
+    assert output.target is not None
+    expected = MOUNT[:3, :3] @ tvec + MOUNT[:3, 3] - GEAR
+    assert np.abs(output.target.e_m - expected).max() < 0.001
+    assert output.target.world_m is None
+    assert not state.in_world
+
+
+def test_tracks_do_not_mix_frames_when_the_attitude_comes_and_goes(build: Build) -> None:
+    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    state = PipelineState()
+    for k, known in enumerate([True, True, False, False, True]):
+        attitude = fly(k)
+        frame = Frame(k, attitude.t_s, view(attitude))
+        state, output = step(state, frame, attitude if known else None, setup)
+        assert state.in_world is known
+        assert output.target is not None
+        assert output.target.measured
+        if known:
+            assert np.abs(output.target.e_m - true_e(attitude)[0]).max() < 0.002
+
+
+def test_the_same_frame_again_changes_no_track(build: Build) -> None:
+    setup = build()
+    frame = Frame(0, 0.0, render(*pose_of(0.0, 0.0, 0.4)))
+    state, first = step(PipelineState(), frame, None, setup)
+    again, second = step(state, Frame(1, -0.01, frame.image), None, setup)
+    assert again.tracks["joint"] is state.tracks["joint"]
+    assert first.target is not None
+    assert first.target.measured
+    assert second.target is not None
+    assert not second.target.measured
+
+
+def test_the_same_frames_give_the_same_bytes(build: Build) -> None:
+    def bytes_of(output: PipelineOutput) -> bytes:
+        assert output.target is not None
+        return output.target.e_m.tobytes() + output.target.velocity_mps.tobytes()
+
+    first = [bytes_of(o) for o in run(build(), 5)]
+    setup = build()
+    assert [bytes_of(o) for o in run(setup, 5)] == first
+    assert [bytes_of(o) for o in run(setup, 5)] == first  # a used setup holds no memory
+
+
+@pytest.mark.parametrize(
+    ("seen", "stage"),
+    [(("large",), Stage.LARGE), (("small",), Stage.SMALL), (("large", "small"), Stage.BOTH)],
+)
+@pytest.mark.parametrize("method", ["joint", "weights"])
+def test_any_one_marker_feeds_the_target(
+    build: Build, seen: tuple[str, ...], stage: Stage, method: str
+) -> None:
+    setup = build(merge=MergeConfig(method=method))  # type: ignore[arg-type]
+    image = render(*pose_of(0.01, 0.02, 0.22, 0.2), markers=seen)
+    _, output = step(PipelineState(), Frame(0, 0.0, image), None, setup)
+    assert output.stage is stage
+    assert output.target is not None
+    assert output.target.stage is stage
+    assert np.abs(output.target.e_m - [0.01, 0.02, 0.22]).max() < 0.001
+
+
+def test_the_joint_track_goes_on_from_marker_to_marker(build: Build) -> None:
+    setup, state = build(), PipelineState()
+    for k, seen in enumerate([("large",), ("large", "small"), ("small",), ("small",)]):
+        image = render(*pose_of(0.0, 0.0, 0.22), markers=seen)
+        state, output = step(state, Frame(k, k / 30, image), None, setup)
+        assert set(state.tracks) == {"joint"}
+        assert output.target is not None
+        assert output.target.unseen == 0
+        assert np.abs(output.target.e_m - [0.0, 0.0, 0.22]).max() < 0.001
+
+
+def test_a_marker_that_is_unseen_coasts_while_the_other_is_used(build: Build) -> None:
+    setup, state = build(merge=MergeConfig(method="weights")), PipelineState()
+    for k, seen in enumerate([("large", "small"), ("large",), ("large",)]):
+        image = render(*pose_of(0.0, 0.0, 0.22), markers=seen)
+        state, output = step(state, Frame(k, k / 30, image), None, setup)
+    assert state.tracks["small"].unseen == 2
+    assert state.tracks["large"].unseen == 0
+    assert output.target is not None
+    assert output.target.measured
+    assert output.target.stage is Stage.LARGE
+
+
+@pytest.mark.parametrize(
+    ("z_m", "stage"), [(0.30, Stage.LARGE), (0.22, Stage.BOTH), (0.17, Stage.SMALL)]
+)
+@pytest.mark.parametrize("method", ["joint", "weights"])
+def test_stages_by_range(build: Build, z_m: float, stage: Stage, method: str) -> None:
+    merge = MergeConfig(method=method, stages="range", z3_m=0.18)  # type: ignore[arg-type]
+    # z counts from the camera: the gear above it must not matter
+    setup = build(merge=merge, gear_body_m=(0.0, 0.0, 0.05))
+    image = render(*pose_of(0.0, 0.0, z_m))
+    _, output = step(PipelineState(), Frame(0, 0.0, image), None, setup)
+    assert output.stage is Stage.BOTH
+    assert output.target is not None
+    assert output.target.stage is stage
+
+
+@pytest.mark.parametrize("method", ["joint", "weights"])
+def test_markers_that_contradict_are_counted_and_the_better_is_used(method: str) -> None:
+    wrong = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.030))
+    setup = make_setup(
+        DetectorConfig(),
+        PoseConfig(),
+        KalmanConfig(),
+        MergeConfig(method=method),  # type: ignore[arg-type]
+        wrong,
+        np.eye(4),
+        (0.0, 0.0, 0.0),
+        CAMERA,
+    )
+    state = PipelineState()
+    for k in range(3):
+        image = render(*pose_of(0.0, 0.0, 0.24))
+        state, output = step(state, Frame(k, k / 30, image), None, setup)
+        assert output.disagreeing_frames == k + 1
+        assert output.target is not None
+        assert output.target.e_m[2] == pytest.approx(0.24, abs=0.001)
+        assert output.target.stage is Stage.LARGE
+
+
+def test_a_wild_step_in_time_starts_the_tracks_afresh(build: Build) -> None:
+    setup = build()
+    image = render(*pose_of(0.0, 0.0, 0.4))
+    state, _ = step(PipelineState(), Frame(0, 0.0, image), None, setup)
+    moved = render(*pose_of(0.1, 0.0, 0.5))
+    state, output = step(state, Frame(1, 30.0, moved), None, setup)
+    assert output.target is not None
+    assert np.abs(output.target.e_m - [0.1, 0.0, 0.5]).max() < 0.002
+    assert np.allclose(output.target.velocity_mps, 0.0)
+
+
+def test_velocity_is_in_level_axes(build: Build) -> None:
+    """A target carried through the world along x, seen by a vehicle that faces y."""
+    setup, state = build(kalman=KalmanConfig(k1=0.001, k2=1.0)), PipelineState()
+    for k in range(12):
+        attitude = Attitude(k / 30, 0.0, 0.0, math.pi / 2, (0.0, 0.0, 1.0))
+        e = rot_z(-math.pi / 2) @ np.array([0.3 * k / 30, 0.0, 0.5])
+        image = render(*pose_of(*e))
+        state, output = step(state, Frame(k, k / 30, image), attitude, setup)
+    assert output.target is not None
+    assert output.target.world_velocity_mps is not None
+    assert output.target.world_velocity_mps[0] > 0.08
+    assert np.abs(output.target.world_velocity_mps[1:]).max() < 0.01
+    assert output.target.velocity_mps[1] == pytest.approx(-output.target.world_velocity_mps[0])
+    assert np.abs(output.target.velocity_mps[[0, 2]]).max() < 0.01

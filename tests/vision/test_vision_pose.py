@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from target_picture import CAMERA, pose_of
+
+from perchctl.geometry import (
+    R_MARKER_TARGET,
+    Array,
+    invert_T,
+    make_T,
+    rot_z,
+    rotation_from_rpy,
+    wrap_rad,
+)
+from perchctl.profile import PoseConfig, TargetConfig
+from perchctl.vision.camera_model import project
+from perchctl.vision.pose import (
+    PoseSetup,
+    estimate_pose,
+    flipped,
+    make_pose_setup,
+    normal_cam,
+    square,
+)
+from perchctl.vision.types import Attitude, Detection, MarkerPose
+
+SIDES = {"large": 0.150, "small": 0.025}
+SOLVERS = ["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
+MOUNT = make_T(rotation_from_rpy(0.05, -0.03, 1.2), (0.02, -0.01, 0.015))
+GEAR = np.array([0.004, -0.003, 0.03])
+
+
+def setup_with(mount: Array | None = None, gear: Array | None = None, **config) -> PoseSetup:  # type: ignore[no-untyped-def]
+    return make_pose_setup(
+        PoseConfig(**config),
+        TargetConfig(),
+        np.eye(4) if mount is None else mount,
+        np.zeros(3) if gear is None else gear,
+        CAMERA,
+    )
+
+
+PLAIN = setup_with()
+
+
+def marker(
+    name: str,
+    rvec: Array,
+    tvec: Array,
+    noise_px: float = 0.0,
+    rng: np.random.Generator | None = None,
+    sigma_px: float = 0.02,
+) -> Detection:
+    corners = project(square(SIDES[name]), rvec, tvec, CAMERA)
+    if rng is not None:
+        corners = corners + rng.normal(0.0, noise_px, corners.shape)
+    return Detection(name, corners, sigma_px, True)  # type: ignore[arg-type]
+
+
+def must(pose: MarkerPose | None) -> MarkerPose:
+    assert pose is not None
+    return pose
+
+
+def test_an_upright_marker_has_no_yaw() -> None:
+    pose = must(estimate_pose([marker("large", *pose_of(0, 0, 0.5))], 0.0, None, PLAIN))
+    assert pose.e_yaw_rad == pytest.approx(0.0, abs=1e-6)
+    assert np.allclose(pose.e_m, [0, 0, 0.5], atol=1e-6)
+    assert pose.source == "large"
+
+
+near = st.tuples(
+    st.floats(-0.1, 0.1),
+    st.floats(-0.1, 0.1),
+    st.floats(0.3, 1.0),
+    st.floats(-math.pi, math.pi),
+    st.floats(-0.25, 0.25),
+    st.floats(-0.25, 0.25),
+)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@given(values=near)
+@settings(max_examples=25, deadline=None)
+def test_every_solver_returns_the_pose_it_was_shown(solver: str, values: tuple) -> None:
+    rvec, tvec = pose_of(*values)
+    setup = setup_with(solver=solver)
+    for seen in (["large"], ["large", "small"]):
+        detections = [marker(name, rvec, tvec) for name in seen]
+        pose = must(estimate_pose(detections, 0.0, Attitude(0.0, *values[4:], 0.0), setup))
+        assert np.allclose(pose.tvec_m, tvec, atol=2e-5)
+        assert pose.source == ("joint" if len(seen) == 2 else "large")
+        assert pose.reprojection_px < 0.01
+        R = cv2.Rodrigues(pose.rvec_rad)[0] @ cv2.Rodrigues(rvec)[0].T
+        assert math.acos(min(1.0, (np.trace(R) - 1) / 2)) < 2e-3
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, math.pi, -math.pi / 4])
+def test_exactly_frontal_views_work_with_every_solver(solver: str, yaw: float) -> None:
+    rvec, tvec = pose_of(0.0, 0.0, 0.24, yaw)
+    for seen in (["large"], ["small"], ["large", "small"]):
+        detections = [marker(name, rvec, tvec) for name in seen]
+        pose = must(estimate_pose(detections, 0.0, None, setup_with(solver=solver)))
+        assert np.allclose(pose.e_m, tvec, atol=1e-4)
+        assert abs(wrap_rad(pose.e_yaw_rad - yaw)) < 1e-3
+
+
+@given(
+    position=st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.5, 1.2)),
+    attitude=st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-math.pi, math.pi)),
+    offset=st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
+    target_yaw=st.floats(-math.pi, math.pi),
+)
+@settings(max_examples=60, deadline=None)
+def test_e_is_the_target_relative_to_the_gear_in_the_level_frame(  # type: ignore[no-untyped-def]
+    position, attitude, offset, target_yaw
+) -> None:
+    roll, pitch, yaw = attitude
+    p = np.array(position)
+    target = np.array([p[0] + offset[0], p[1] + offset[1], 1.7])
+    T_world_body = make_T(rotation_from_rpy(roll, pitch, yaw), p)
+    T_world_marker = make_T(rot_z(target_yaw) @ R_MARKER_TARGET, target)
+    T_cam_marker = invert_T(T_world_body @ MOUNT) @ T_world_marker
+    rvec = np.asarray(cv2.Rodrigues(T_cam_marker[:3, :3])[0], dtype=float).ravel()
+    setup = setup_with(MOUNT, GEAR)
+    pose = must(
+        estimate_pose(
+            [marker("large", rvec, T_cam_marker[:3, 3])],
+            1.0,
+            Attitude(1.0, roll, pitch, yaw, position),
+            setup,
+        )
+    )
+    gear_world = (T_world_body @ np.array([*GEAR, 1.0]))[:3]
+    expected = rot_z(-yaw) @ (target - gear_world)
+    assert np.allclose(pose.e_m, expected, atol=1e-4)
+    assert abs(wrap_rad(pose.e_yaw_rad - wrap_rad(target_yaw - yaw))) < 2e-3
+
+
+def test_the_other_tilt_looks_the_same_and_its_other_tilt_is_the_first() -> None:
+    rvec, tvec = pose_of(0.05, 0.02, 1.2, 0.4, 0.15, -0.1)
+    other = flipped(rvec, tvec)
+    assert other is not None
+    back = flipped(other, tvec)
+    assert back is not None
+    assert np.allclose(cv2.Rodrigues(back)[0], cv2.Rodrigues(rvec)[0], atol=1e-9)
+    shift = project(square(0.025), other, tvec, CAMERA) - project(square(0.025), rvec, tvec, CAMERA)
+    assert np.abs(shift).max() < 0.05
+    sight = tvec / np.linalg.norm(tvec)
+    n, m = (cv2.Rodrigues(r)[0][:, 2] for r in (rvec, other))
+    assert n @ sight == pytest.approx(m @ sight)
+    frontal, ahead = pose_of(0.0, 0.0, 1.0)
+    assert flipped(frontal, ahead) is None
+
+
+def tilts_deg(attitude: bool, previous: bool, draws: int = 60) -> Array:
+    """Angle between the true and the found normal of a small, far, tilted marker."""
+    rng = np.random.default_rng(3)
+    roll, pitch = 0.20, -0.15
+    rvec, tvec = pose_of(0.02, -0.03, 0.9, 0.5, roll, pitch)
+    true = cv2.Rodrigues(rvec)[0][:, 2]
+    result = []
+    for _ in range(draws):
+        detection = marker("small", rvec, tvec, 0.1, rng, sigma_px=0.1)
+        pose = must(
+            estimate_pose(
+                [detection],
+                0.0,
+                Attitude(0.0, roll, pitch, 0.0) if attitude else None,
+                PLAIN,
+                true if previous else None,
+            )
+        )
+        result.append(math.degrees(math.acos(min(1.0, float(normal_cam(pose) @ true)))))
+    return np.array(result)
+
+
+def test_attitude_or_the_frame_before_decides_the_tilt() -> None:
+    alone = tilts_deg(False, False)
+    levelled = tilts_deg(True, False)
+    guided = tilts_deg(False, True)
+    assert (alone > 20.0).mean() > 0.2  # the flips are real
+    assert (levelled > 20.0).mean() < 0.05
+    assert (guided > 20.0).mean() < 0.05
+    assert levelled.mean() < 0.7 * alone.mean()
+
+
+def test_the_position_is_usable_even_with_the_wrong_tilt() -> None:
+    rng = np.random.default_rng(1)
+    roll, pitch = 0.1, -0.1
+    rvec, tvec = pose_of(0.02, -0.03, 1.1, 0.5, roll, pitch)
+    expected = rotation_from_rpy(roll, pitch, 0.0) @ tvec
+    for _ in range(30):
+        detection = marker("large", rvec, tvec, 0.1, rng, 0.1)
+        pose = must(estimate_pose([detection], 0.0, Attitude(0.0, roll, pitch, 0.0), PLAIN))
+        assert np.abs(pose.e_m - expected)[:2].max() < 0.002
+        assert abs(pose.e_m[2] - expected[2]) < 0.02
+
+
+@pytest.mark.parametrize("seen", [["large"], ["small"], ["large", "small"]])
+def test_sigma_is_the_spread_that_noise_makes(seen: list[str]) -> None:
+    rng = np.random.default_rng(5)
+    rvec, tvec = pose_of(0.01, 0.02, 0.3, 0.4, 0.12, -0.16)
+    attitude = Attitude(0.0, 0.12, -0.16, 0.0)
+    poses = [
+        must(
+            estimate_pose(
+                [marker(n, rvec, tvec, 0.1, rng, 0.1) for n in seen], 0.0, attitude, PLAIN
+            )
+        )
+        for _ in range(150)
+    ]
+    spread = np.std([p.e_m for p in poses], axis=0)
+    claimed = np.sqrt(np.mean([p.sigma_m**2 for p in poses], axis=0))
+    assert (claimed > 0.75 * spread).all()
+    assert (claimed < 2.0 * spread).all()
+    spread_yaw = np.std([p.e_yaw_rad for p in poses])
+    claimed_yaw = math.sqrt(np.mean([p.sigma_yaw_rad**2 for p in poses]))
+    assert 0.75 * spread_yaw < claimed_yaw < 2.0 * spread_yaw
+
+
+def test_both_markers_together_are_surer_than_either() -> None:
+    rvec, tvec = pose_of(0.0, 0.0, 0.24, 0.3)
+    both = [marker(name, rvec, tvec) for name in ("large", "small")]
+    joint = must(estimate_pose(both, 0.0, None, PLAIN))
+    for one in both:
+        assert (joint.sigma_m < must(estimate_pose([one], 0.0, None, PLAIN)).sigma_m).all()
+
+
+def test_a_vague_marker_does_not_spoil_a_sharp_one() -> None:
+    rvec, tvec = pose_of(0.01, 0.0, 0.5, 0.3, 0.05, 0.05)
+    sharp = marker("large", rvec, tvec)
+    off = marker("small", rvec, tvec)
+    attitude = Attitude(0.0, 0.05, 0.05, 0.0)
+
+    def error_m(sigma_px: float) -> float:
+        vague = Detection("small", off.corners_px + 1.0, sigma_px, False)
+        pose = must(estimate_pose([sharp, vague], 0.0, attitude, PLAIN))
+        return float(np.abs(pose.tvec_m - tvec)[:2].max())
+
+    assert error_m(1.0) < 5e-5
+    assert error_m(0.02) > 4e-4  # taken for as sharp as the other
+
+
+def test_corners_that_are_no_square_are_refused() -> None:
+    rvec, tvec = pose_of(0.0, 0.0, 0.3)
+    detection = marker("large", rvec, tvec)
+    bent = detection.corners_px.copy()
+    bent[0] += (25.0, -18.0)
+    bent[2] += (30.0, 22.0)
+    broken = Detection("large", bent[[0, 2, 1, 3]], 0.1, False)
+    assert estimate_pose([broken], 0.0, None, PLAIN) is None
+    shifted = Detection("small", marker("small", rvec, tvec).corners_px + 12.0, 0.02, True)
+    assert estimate_pose([detection, shifted], 0.0, None, PLAIN) is None
+    loose = setup_with(max_reprojection_px=50.0)
+    assert estimate_pose([detection, shifted], 0.0, None, loose) is not None
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    "corners",
+    [
+        np.full((4, 2), np.nan),
+        np.full((4, 2), 100.0),
+        np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0], [30.0, 0.0]]),
+        np.array([[0.0, 0.0], [1e9, 0.0], [1e9, 1e9], [0.0, 1e9]]),
+    ],
+)
+def test_useless_corners_give_no_pose_or_a_finite_one(solver: str, corners: Array) -> None:
+    detection = Detection("large", corners, 0.1, False)
+    pose = estimate_pose([detection], 0.0, None, setup_with(solver=solver))
+    if pose is not None:
+        assert np.isfinite(pose.e_m).all()
+        assert math.isfinite(pose.e_yaw_rad)
+
+
+def test_a_start_from_the_joint_pose_gives_the_markers_own_pose() -> None:
+    rvec, tvec = pose_of(0.02, -0.01, 0.3, 0.6, 0.1, 0.05)
+    attitude = Attitude(0.0, 0.1, 0.05, 0.0)
+    rng = np.random.default_rng(2)
+    both = [marker(name, rvec, tvec, 0.05, rng) for name in ("large", "small")]
+    joint = must(estimate_pose(both, 0.0, attitude, PLAIN))
+    for one in both:
+        alone = must(estimate_pose([one], 0.0, attitude, PLAIN))
+        started = must(estimate_pose([one], 0.0, attitude, PLAIN, start=joint))
+        assert np.allclose(alone.e_m, started.e_m, atol=2e-5)
