@@ -34,6 +34,8 @@ def reported() -> Iterator[None]:
     """Turns every failure into one sentence on stderr and its exit code."""
     try:
         yield
+    except typer.Exit:
+        raise
     except PerchError as error:
         print(f"perchctl: {error}", file=sys.stderr)
         raise typer.Exit(error.exit_code) from None

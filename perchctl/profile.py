@@ -281,7 +281,7 @@ class SafetyConfig(Section):
     tilt_debounce_s: float = Field(0.2, ge=0, le=2)
     loop_late_hold_s: float = Field(0.25, gt=0, le=5)
     loop_late_land_s: float = Field(1.0, gt=0, le=10)
-    estimator_wait_s: float = Field(6.0, gt=0, le=60)
+    estimator_wait_s: float = Field(10.0, gt=0, le=60)
     estimator_variance_m2: float = Field(0.01, gt=0, le=10)
     land_on_log_error: bool = False
 

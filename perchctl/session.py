@@ -159,7 +159,7 @@ def fly_session(options: FlyOptions, watchers: tuple[Watcher, ...] = ()) -> Sess
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
-        miss_m = simulated.truth()["miss_m"] if simulated is not None else None
+        miss_m = simulated.truth()["gear_miss_m"] if simulated is not None else None
     return SessionResult(report, miss_m=miss_m)
 
 

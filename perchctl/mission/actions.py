@@ -111,8 +111,8 @@ def _approach(v: View) -> Acted:
 def _search(v: View) -> Acted:
     """Wait, climb a step, turn a step, wait again; never above the limit. A target that
     was seen before is looked for from under it, not climbed to."""
-    search, state = v.profile.planner.search, v.state
-    assert state.ground_m is not None
+    search, state, ground_m = v.profile.planner.search, v.state, v.state.ground_m
+    assert ground_m is not None
     if v.obs.t_s - state.search_step_s > search.wait_s:
         state = replace(state, searches=state.searches + 1, search_step_s=v.obs.t_s)
         v = View(state, v.obs, v.profile)
@@ -121,7 +121,7 @@ def _search(v: View) -> Acted:
         x, y = under_target_xy(v, state.entry_yaw_rad)
         height = min(z, v.contact_goal_z_m - v.profile.planner.ascend.near_m)
     else:
-        top = max(z, state.ground_m[2] + search.max_height_m)
+        top = max(z, ground_m[2] + search.max_height_m)
         height = min(z + search.step_m * state.searches, top)
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
     up_mps = v.profile.planner.ascend.speed_mps

@@ -95,6 +95,7 @@ class _Senses:
     target: TargetPose | None = None
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
+    camera_note: str | None = None
     frames: int = 0
 
 
@@ -207,8 +208,9 @@ def _sense(parts: FlightParts, senses: _Senses, now_s: float) -> bool:
         return False
     if senses.frames == 0:
         check_size(parts.source.size_px, parts.pipeline.camera, parts.source.describe())
-    senses.camera_problem = problem or _rejection(parts, senses, frame, now_s)
-    if senses.camera_problem is not None:
+    rejection = problem or _rejection(parts, senses, frame, now_s)
+    senses.camera_problem = rejection or senses.camera_note
+    if rejection is not None:
         return False
     attitude = attitude_at(senses.history, frame.t_s)
     senses.pipeline, senses.output = pipeline_step(senses.pipeline, frame, attitude, parts.pipeline)
@@ -222,7 +224,10 @@ def _rejection(parts: FlightParts, senses: _Senses, frame: Frame, now_s: float) 
     """Why this frame is no measurement: frozen, no picture at all, or too old."""
     live = parts.source.live
     senses.health, verdict = assess(senses.health, frame, live)
-    if not verdict.usable and verdict.kind != "dark":  # a dark target may still be seen
+    # A dark target may still be seen, and a bare ceiling looks like an empty screen:
+    # such pictures are searched all the same, but the user is told of them.
+    senses.camera_note = verdict.text if verdict.kind in ("dark", "uniform") else None
+    if not verdict.usable and senses.camera_note is None:
         return verdict.text
     age_s = now_s - frame.t_s
     if live and age_s > parts.profile.safety.max_frame_age_s:

@@ -179,7 +179,9 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "searched-out", _only(P.SEARCH), _searched_out, P.LANDING,
-        "target not found in the allowed attempts", S.LAND, O.TARGET_NOT_FOUND,
+        lambda v: "target not found in the allowed attempts"
+        + (f" ({v.obs.camera_problem})" if v.obs.camera_problem else ""),
+        S.LAND, O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
     Row(

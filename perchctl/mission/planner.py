@@ -135,20 +135,20 @@ def _enter(state: PlannerState, row: Row, view: View) -> PlannerState:
         ordered_s=None,
         orders=0,
     )
-    return replace(new, **_entry_changes(state, row, obs))
+    return _started_phase(new, state, obs)
 
 
-def _entry_changes(state: PlannerState, row: Row, obs: Observation) -> dict[str, object]:
+def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> PlannerState:
     """What a phase starts with, beyond the clock."""
-    if row.to is Phase.COMPLETE:
-        return {"contact_z_m": obs.telemetry.position_m[2]}
-    if row.to is Phase.RECOVER:
-        return {"motors_stopped": False, "contact_z_m": None}
-    if row.to is Phase.ASCEND:
-        return {"searches": 0}
-    if row.to is Phase.SEARCH and state.setpoint is not None:
-        sp = state.setpoint
-        return {"entry_m": (sp.x_m, sp.y_m, sp.z_m), "entry_yaw_rad": sp.yaw_rad}
-    if row.to is Phase.PERCH:
-        return {"entry_yaw_rad": obs.telemetry.yaw_rad}
-    return {}
+    match new.phase:
+        case Phase.COMPLETE:
+            return replace(new, contact_z_m=obs.telemetry.position_m[2])
+        case Phase.RECOVER:
+            return replace(new, motors_stopped=False, contact_z_m=None)
+        case Phase.ASCEND:
+            return replace(new, searches=0)
+        case Phase.SEARCH if old.setpoint is not None:
+            sp = old.setpoint
+            return replace(new, entry_m=(sp.x_m, sp.y_m, sp.z_m), entry_yaw_rad=sp.yaw_rad)
+        case _:
+            return new

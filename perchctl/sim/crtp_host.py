@@ -19,6 +19,7 @@ from perchctl.sim.world import TrueState
 
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
 _PAST_S = 1.0  # how far the picture may lag behind the physics
+_WAKE_EVERY = 5  # control periods between two looks of the renderer at the physics
 
 
 class VehicleHost:
@@ -141,15 +142,16 @@ class _PictureFeed:
         self._past: deque[TrueState] = deque(maxlen=round(_PAST_S / CONTROL_PERIOD_S))
         self._changed = threading.Condition()
         self._closed = False
-        self._added = False
+        self._waiting = 0
         self._thread = threading.Thread(target=self._run, name="picture-feed", daemon=True)
         self._thread.start()
 
     def add(self, state: TrueState) -> None:
         with self._changed:
             self._past.append(state)
-            self._added = True
-            self._changed.notify()
+            self._waiting += 1
+            if self._waiting >= _WAKE_EVERY:
+                self._changed.notify()
 
     def close(self) -> None:
         with self._changed:
@@ -167,8 +169,8 @@ class _PictureFeed:
     def _next_time(self) -> float | None:
         """Waits for the physics to go on; None when closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._added)
-            self._added = False
+            self._changed.wait_for(lambda: self._closed or self._waiting >= _WAKE_EVERY)
+            self._waiting = 0
             return None if self._closed else self._past[-1].t_s
 
     def _state_at(self, t_s: float) -> TrueState:

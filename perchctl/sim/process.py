@@ -79,8 +79,9 @@ class SimProcess:
 
         Ports 0 are chosen by the operating system. `truth_file` receives JSON lines of
         `truth()`, 50 a simulated second. `linger_s` is how long the vehicle lives on
-        after this process has gone (None: `crtp_control.LINGER_S`). Raises `ConnectionFailed` when the child ends
-        or does not come up, `InvalidValue` for an unknown pace.
+        after this process has gone (None: `crtp_control.LINGER_S`). Raises
+        `ConnectionFailed` when the child ends or does not come up, `InvalidValue` for an
+        unknown pace.
         """
         from perchctl.sim import crtp_control as control
         from perchctl.sim.crtp_server import LinkOptions
@@ -258,6 +259,9 @@ def _last_line(stderr: IO[bytes]) -> str:
 
 def serve_parent() -> None:
     """The child: be the vehicle that the parent describes, until it says stop or is gone."""
+    import cv2
+
+    cv2.setNumThreads(1)  # the picture must not take the physics' core
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     port, token = sys.stdin.readline().split()
     from perchctl.sim.crtp_control import connect

@@ -232,11 +232,13 @@ def _edges(
     edge = np.einsum("sni,si->sn", mass, u32) / np.where(usable, total, 1.0)
     line, weight = _robust_line(edge, usable, 0.3, 2)
     blur = np.ones(len(gradient))
-    limit = near_px[:, None]
-    for last in (False, False, True):
+    limit, moved_px = near_px[:, None], np.inf
+    for narrow in range(3):
+        if narrow == 1 and moved_px < 0.2:
+            continue  # the wide window was as good as centred
         relative = u32[:, None, :] - line[:, :, None].astype(np.float32)
         # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
-        w2 = np.clip(1.5 * blur, 0.9, 0.5 * near_px) ** 2
+        w2 = np.minimum(np.maximum(1.5 * blur, 0.9), 0.5 * near_px) ** 2
         squared = relative * relative
         mass = gradient * np.exp(squared * (-0.5 / w2)[:, None, None].astype(np.float32))
         total = np.einsum("sni->sn", mass).astype(np.float64)
@@ -254,12 +256,13 @@ def _edges(
         centroid = first / total
         mean_of = usable / np.maximum(np.einsum("sn,sn->s", total, usable), 1e-9)[:, None]
         moment = np.einsum("sn,sn->s", second, mean_of)
-        moment = np.clip(moment, 0.01, 0.8 * w2)
+        moment = np.minimum(np.maximum(moment, 0.01), 0.8 * w2)
         blur = np.sqrt(1.0 / (1.0 / moment - 1.0 / w2))
         # The window pulls the centroid towards its own middle: undo that.
         centroid *= (1.0 + blur**2 / w2)[:, None]
-        edge = line + np.clip(centroid, -limit, limit)
-        line, weight = _robust_line(edge, usable, 0.05, 2 if last else 1)
+        edge = line + np.minimum(np.maximum(centroid, -limit), limit)
+        centre, weight = _robust_line(edge, usable, 0.05, 2 if narrow == 2 else 1)
+        moved_px, line = float(np.abs(centre - line).max()), centre
     return edge, weight, blur
 
 

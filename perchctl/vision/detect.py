@@ -84,18 +84,18 @@ def detect(
     """
     image = frame.image
     expected = predicted_corners(previous, frame.t_s)
+    whole = (0, 0, image.shape[1], image.shape[0])
+    box = whole
     found: dict[MarkerName, Array] = {}
-    mirrored, full_frame = False, True
+    mirrored = False
     if setup.window and expected:
-        box = search_window(expected, setup.ratio, image.shape)
-        if box is not None:
-            if len(expected) == 2:
-                found, _ = _search(image, box, expected, setup, _QUICK_THRESHOLDS_PX)
-            if len(found) < 2:
-                found, _ = _search(image, box, expected, setup)
-            full_frame = not found
-    if full_frame:
-        whole = (0, 0, image.shape[1], image.shape[0])
+        box = search_window(expected, setup.ratio, image.shape) or whole
+        if len(expected) == 2:
+            found, _ = _search(image, box, expected, setup, _QUICK_THRESHOLDS_PX)
+        if len(found) < 2 and box != whole:
+            found, _ = _search(image, box, expected, setup)
+    if not found or (box == whole and len(found) < 2):
+        box = whole
         found, mirrored = _search(image, whole, expected, setup)
     names = [name for name in MARKERS if name in found]
     refined = refine(
@@ -114,7 +114,7 @@ def detect(
         t_s=frame.t_s,
         large=seen.get("large"),
         small=seen.get("small"),
-        full_frame=full_frame,
+        full_frame=box == whole,
         mirrored=mirrored and not seen,
     )
     return replace(result, velocity_px_s=_velocity(previous, result))

@@ -84,7 +84,9 @@ def test_equals_a_filter_written_out_by_hand(steps, k1: float, k2: float) -> Non
         if was_seen:
             S = H @ P @ H.T + setup.R
             K = np.linalg.solve(S, H @ P).T
-            x = x + K @ (np.array(z) - H @ x)
+            innovation = np.array(z) - H @ x
+            innovation[0] = wrap_rad(float(innovation[0]))
+            x = x + K @ innovation
             P = (np.eye(8) - K @ H) @ P
         assert track is not None
         difference = track.x - x
