@@ -174,6 +174,8 @@ class AscendConfig(Section):
 
     Falls back to ALIGN outside the cone `cone_base_m + cone_slope * distance`.
     `standoff_m` is between gear and target; the small marker must be in view there.
+    Settled is a gear within `settle_xy_m` of the axis, not more than `settle_z_m` below
+    the stand-off.
     """
 
     speed_mps: float = Field(0.25, gt=0, le=1)
@@ -255,7 +257,7 @@ class PlannerConfig(Section):
     complete: CompleteConfig = CompleteConfig()
     recover: RecoverConfig = RecoverConfig()
     landing: LandingConfig = LandingConfig()
-    attempts: int = Field(3, ge=1, le=50)
+    attempts: int = Field(5, ge=1, le=50)
     perching_time_s: float = Field(120.0, gt=0, le=1200)
     trim_per_s: float = Field(0.4, ge=0, le=5)  # integral of the position error
     trim_limit_m: float = Field(0.08, ge=0, le=0.5)

@@ -10,6 +10,7 @@ from perchctl.mission.types import PositionSetpoint
 from perchctl.mission.view import View
 
 HEIGHT_GAIN = 1.5
+HEIGHT_RATE_S = 0.25
 HEIGHT_LIMIT_M = 0.15
 POSITION_GAIN = 1.0
 VELOCITY_GAIN_S = 0.3
@@ -84,8 +85,9 @@ def corrected(v: View, reference: PositionSetpoint, *, lift: bool = True) -> Pos
     `zKp` of the firmware: a time constant of 4 s); adding a multiple of the height
     error takes that down to the multiple's part.
     """
-    rise = reference.z_m - v.obs.telemetry.position_m[2]
-    lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, HEIGHT_GAIN * rise)) if lift else 0.0
+    tel = v.obs.telemetry
+    rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
+    lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
     dx, dy = _stiffened(v, reference)
     return replace(
         reference,

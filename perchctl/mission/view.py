@@ -177,7 +177,7 @@ def _settled(v: View) -> bool:
     return (
         v.fresh
         and v.small_is_fresh
-        and abs(v.error_z_m - ascend.standoff_m) <= ascend.settle_z_m
+        and v.error_z_m <= ascend.standoff_m + ascend.settle_z_m
         and v.error_xy_m <= ascend.settle_xy_m
         and abs(v.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and v.speed_mps <= ascend.settle_speed_mps
@@ -186,7 +186,7 @@ def _settled(v: View) -> bool:
 
 def _near_standoff(v: View) -> bool:
     ascend = v.profile.planner.ascend
-    return v.tracked and abs(v.error_z_m - ascend.standoff_m) <= ascend.settle_z_m
+    return v.tracked and v.error_z_m <= ascend.standoff_m + ascend.settle_z_m
 
 
 def _contact(v: View) -> bool:
