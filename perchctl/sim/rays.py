@@ -30,7 +30,13 @@ class RayGrid:
     """
 
     stride: int
-    rays: NDArray[np.float32]  # (3, rows, cols)
+    xy: NDArray[np.float32]  # (rows, cols, 2)
+
+    @property
+    def rays(self) -> NDArray[np.float32]:
+        """(x, y, 1), shape (3, rows, cols)."""
+        x, y = self.xy[..., 0], self.xy[..., 1]
+        return np.stack([x, y, np.ones_like(x)])
 
 
 def undistorted_rays(camera: CameraModel, pixels: Array) -> Array:
@@ -50,9 +56,8 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     u = stride * (np.arange(cols) - 1) + (stride - 1) / 2.0
     v = stride * (np.arange(rows) - 1) + (stride - 1) / 2.0
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    xy = undistorted_rays(camera, pixels).T
-    rays = np.stack([xy[0], xy[1], np.ones(len(pixels))])
-    return RayGrid(stride, rays.reshape(3, rows, cols).astype(np.float32))
+    xy = undistorted_rays(camera, pixels)
+    return RayGrid(stride, np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32))
 
 
 def plane_map(T_target_cam: Array) -> Array:
@@ -68,18 +73,24 @@ def plane_map(T_target_cam: Array) -> Array:
 
 def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where the grid's rays meet the plane, (rows, cols, 2) m, and which do not."""
+    if _all_rise(grid, to_plane):
+        points = cv2.perspectiveTransform(grid.xy, to_plane)
+        return np.asarray(points, np.float32), np.zeros(grid.xy.shape[:2], np.bool_)
     rays = grid.rays
     q = to_plane.astype(np.float32) @ rays.reshape(3, -1)
     misses = q[2] < LEAST_RISE
-    any_miss = bool(misses.any())
-    if any_miss:
-        q[2, misses] = 1.0
-    points = np.empty((q.shape[1], 2), np.float32)
-    np.divide(q[0], q[2], out=points[:, 0])
-    np.divide(q[1], q[2], out=points[:, 1])
-    if any_miss:
-        points[misses] = FAR_AWAY_M
+    q[2, misses] = 1.0
+    points = np.stack([q[0] / q[2], q[1] / q[2]], axis=1)
+    points[misses] = FAR_AWAY_M
     return points.reshape(*rays.shape[1:], 2), misses.reshape(rays.shape[1:])
+
+
+def _all_rise(grid: RayGrid, to_plane: Array) -> bool:
+    """Whether every ray meets the plane. The rise is linear over the rays, so it is least
+    on the outline."""
+    xy = grid.xy
+    outline = np.concatenate([xy[0], xy[-1], xy[:, 0], xy[:, -1]])
+    return bool((outline @ to_plane[2, :2] + to_plane[2, 2]).min() >= LEAST_RISE)
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:

@@ -208,9 +208,7 @@ class Renderer:
         j, i = int(rows.mean()), int(cols.mean())
         texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
         k = COARSE_PX // FINE_PX
-        grid = RayGrid(
-            FINE_PX, self._fine.rays[:, top * k : bottom * k + 2, left * k : right * k + 2]
-        )
+        grid = RayGrid(FINE_PX, self._fine.xy[top * k : bottom * k + 2, left * k : right * k + 2])
         value, alpha = _Mean(len(maps)), _Mean(len(maps))
         for each in maps:
             points, _ = trace(grid, each)
@@ -234,12 +232,12 @@ class Renderer:
         """Path of the ceiling's image during the exposure at five places, (5, n, 2) px."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
-        rays = self._coarse.rays
-        rows, cols = rays.shape[1:]
+        xy = self._coarse.xy
+        rows, cols = xy.shape[:2]
         places = [(rows // 2, cols // 2)] + [
             (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
         ]
-        seen = np.stack([rays[:, r, c] for r, c in places], axis=1).astype(np.float64)  # (3, 5)
+        seen = np.array([[*xy[r, c], 1.0] for r, c in places], np.float64).T  # (3, 5)
         middle = poses[len(poses) // 2]
         points = plane_map(middle) @ seen
         height = np.maximum(points[2], LEAST_RISE)
