@@ -18,8 +18,8 @@ from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
 from perchctl.link.sender import Sender
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
+    BATTERY_BLOCK,
     NEEDED,
-    SLOW_BLOCK,
     STATE_BLOCK,
     VARIANCE_BLOCK,
     telemetry_from,
@@ -38,6 +38,7 @@ SENDER_STUCK_S = 0.5
 PARAMETER_TIMEOUT_S = 2.0
 CONNECT_TRIES = 2
 SLOW_PERIOD_MS = 100
+AWAIT_SLOW_S = 1.0
 
 
 class CflibLink:
@@ -56,6 +57,8 @@ class CflibLink:
         self._state_s: float | None = None
         self._samples: deque[Telemetry] = deque(maxlen=2000)
         self._first_sample = threading.Event()
+        self._awaited: set[str] = set()  # slow blocks that have not spoken yet
+        self._logging_s = 0.0
         self._lost: str | None = None
         self._last_arrival_s = 0.0
         self._newest: Telemetry | None = None
@@ -173,13 +176,15 @@ class CflibLink:
             )
 
     def _start_logging(self) -> None:
+        self._logging_s = self._clock()
         fast_ms = max(10, 10 * round(self._config.telemetry_period_s * 100))
         self._add_block("state", STATE_BLOCK, fast_ms, self._on_state)
         self._add_block("attitude", ATTITUDE_BLOCK, fast_ms, self._on_attitude)
-        self._add_block("slow", SLOW_BLOCK, SLOW_PERIOD_MS, self._on_values)
         toc = self._cf.log.toc
-        if all(toc.get_element_by_complete_name(n) is not None for n in VARIANCE_BLOCK):
-            self._add_block("variance", VARIANCE_BLOCK, SLOW_PERIOD_MS, self._on_values)
+        for name, variables in (("battery", BATTERY_BLOCK), ("variance", VARIANCE_BLOCK)):
+            if all(toc.get_element_by_complete_name(n) is not None for n in variables):
+                self._awaited.add(f"perch_{name}")
+                self._add_block(name, variables, SLOW_PERIOD_MS, self._on_values)
         if not self._first_sample.wait(3.0):
             missing = [n for n in NEEDED if n not in self._values]
             raise TimedOut(
@@ -227,9 +232,10 @@ class CflibLink:
 
     # --- cflib's callbacks: take the values and go ----------------------------
 
-    def _on_values(self, _stamp: int, data: dict[str, float], _block: Any) -> None:
+    def _on_values(self, _stamp: int, data: dict[str, float], block: Any) -> None:
         self._last_arrival_s = self._clock()
         self._values.update(data)
+        self._awaited.discard(block.name)
 
     def _on_state(self, stamp: int, data: dict[str, float], _block: Any) -> None:
         now_s = self._clock()
@@ -244,6 +250,8 @@ class CflibLink:
         t_s = self._timebase.to_loop_s(stamp, now_s)
         if self._state_s is None or any(name not in self._values for name in NEEDED):
             return
+        if self._awaited and now_s < self._logging_s + AWAIT_SLOW_S:
+            return  # the first sample shall speak of the battery too
         sample = telemetry_from(_carried(self._values, t_s - self._state_s), t_s)
         self._newest = sample
         self._samples.append(sample)

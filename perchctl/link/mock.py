@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link.telemetry import NEEDED, VARIANCE_BLOCK, telemetry_from
+from perchctl.link.telemetry import NEEDED, OPTIONAL, telemetry_from
 from perchctl.mission import types as say
 from perchctl.mission.types import FLYING, Command, Telemetry
 from perchctl.sim.firmware import commands as cf
@@ -89,7 +89,7 @@ class MockLink:
 
     def _sample(self) -> Telemetry:
         firmware = self.vehicle.firmware
-        values = {name: firmware.log_value(name) for name in (*NEEDED, *VARIANCE_BLOCK)}
+        values = {name: firmware.log_value(name) for name in (*NEEDED, *OPTIONAL)}
         return telemetry_from(values, firmware.t_s)
 
 

@@ -31,7 +31,9 @@ ATTITUDE_BLOCK: dict[str, str] = {
 }
 """22 bytes."""
 
-SLOW_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
+BATTERY_BLOCK: dict[str, str] = {"pm.vbat": "float", "pm.state": "int8_t"}
+"""Without it the battery is unknown, which the flight copes with (fault 7)."""
+
 VARIANCE_BLOCK: dict[str, str] = {
     "kalman.varPX": "float",
     "kalman.varPY": "float",
@@ -39,7 +41,8 @@ VARIANCE_BLOCK: dict[str, str] = {
 }
 """Only where the Kalman estimator runs; a firmware without it is not refused."""
 
-NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK, *SLOW_BLOCK)
+NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
+OPTIONAL = (*BATTERY_BLOCK, *VARIANCE_BLOCK)
 
 
 def telemetry_from(values: Mapping[str, float], t_s: float) -> Telemetry:
@@ -62,8 +65,8 @@ def telemetry_from(values: Mapping[str, float], t_s: float) -> Telemetry:
         yaw_rad=math.radians(values["stateEstimate.yaw"]),
         acc_z_g=values["acc.z"],
         thrust=values["stabilizer.thrust"],
-        battery_v=values["pm.vbat"],
+        battery_v=values.get("pm.vbat", 0.0),
         supervisor=int(values["supervisor.info"]),
-        battery_state=int(values["pm.state"]),
+        battery_state=int(values.get("pm.state", 0)),
         position_variance_m2=max(variances) if variances else None,
     )

@@ -25,7 +25,9 @@ def diagram() -> str:
             continue
         for phase in sorted(row.phases, key=_order):
             lines.append(f"    {phase.value} --> {row.to.value}: {row.name}")
-    lines += [f"    {phase.value} --> [*]" for phase in (Phase.PERCHED, Phase.LANDED, Phase.ABORTED)]
+    lines += [
+        f"    {phase.value} --> [*]" for phase in (Phase.PERCHED, Phase.LANDED, Phase.ABORTED)
+    ]
     return "\n".join(lines)
 
 

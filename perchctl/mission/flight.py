@@ -20,6 +20,7 @@ from perchctl.mission.history import History, attitude_at, extended
 from perchctl.mission.preflight import Readiness, refuse, still_waiting_for
 from perchctl.mission.state import Observation, Operator, Outcome, Phase, PlannerState
 from perchctl.mission.types import FLYING, LOCKED, Command, Idle, Land, Telemetry
+from perchctl.mission.view import NO_BATTERY_READING_V
 from perchctl.pipeline import PipelineSetup
 from perchctl.pipeline import step as pipeline_step
 from perchctl.profile import Profile
@@ -166,6 +167,9 @@ def _mission(parts: FlightParts, senses: _Senses) -> FlightReport:
             state = planner.start(obs)
             passed.append((now_s, state.phase.value, state.reason))
             _tell(parts, now_s, f"{state.phase.value}: {state.reason}")
+            if obs.telemetry.battery_v < NO_BATTERY_READING_V:
+                grace_s = parts.profile.safety.battery_stale_s
+                _tell(parts, now_s, f"no battery reading: landing after {grace_s:.0f} s at most")
         before = state
         state, command = planner.step(state, obs, parts.profile)
         if not isinstance(command, Idle):

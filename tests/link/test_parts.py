@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
 from perchctl.link.sender import Sender
-from perchctl.link.telemetry import ATTITUDE_BLOCK, NEEDED, SLOW_BLOCK, STATE_BLOCK, telemetry_from
+from perchctl.link.telemetry import (
+    ATTITUDE_BLOCK,
+    BATTERY_BLOCK,
+    NEEDED,
+    STATE_BLOCK,
+    telemetry_from,
+)
 from perchctl.link.timebase import WRAP_MS, Timebase
 from perchctl.link.uri import UDEV_HELP, check_uri
 from perchctl.mission.types import Command, PositionSetpoint, StopMotors
@@ -19,7 +25,7 @@ from perchctl.mission.types import Command, PositionSetpoint, StopMotors
 SIZES = {"float": 4, "uint16_t": 2, "int8_t": 1}
 
 
-@pytest.mark.parametrize("block", [STATE_BLOCK, ATTITUDE_BLOCK, SLOW_BLOCK])
+@pytest.mark.parametrize("block", [STATE_BLOCK, ATTITUDE_BLOCK, BATTERY_BLOCK])
 def test_blocks_fit_into_a_packet(block: dict[str, str]) -> None:
     """Firmware facts, "Link": at most 26 bytes a log block."""
     assert sum(SIZES[ctype] for ctype in block.values()) <= 26
@@ -40,6 +46,7 @@ def test_pitch_and_degrees_turn_at_the_edge() -> None:
     assert sample.supervisor == 0x021E
     assert sample.t_s == 1.5
     assert sample.position_variance_m2 is None
+    assert sample.battery_v == 0.0  # unknown, which the planner tells from empty
 
 
 @given(
