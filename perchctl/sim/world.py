@@ -5,16 +5,17 @@ origin on the floor under the start. One `World.step` is one `CONTROL_PERIOD_S`.
 
 Assumptions of the model, each with its source:
 
-- 0.12 N a motor at full command with a fresh battery, thrust proportional to the
-  command, because the firmware compensates for the battery (firmware facts, "Thrust
-  budget"). What compensation cannot give back is the loss of `THRUST_LOSS_PER_V`:
-  100 % at 4.2 V at rest, 95 % at 3.7 V.
-- Drag is linear in the airspeed; a draught is a wind of the scenario's mean with
-  smooth gusts of the same order.
+- Thrust and battery: `perchctl.sim.powertrain`.
+- Drag is linear in the airspeed. Of a Crazyflie's four rotors 9.2e-7 N/(m/s) level and
+  10.3e-7 vertically a rad/s of their summed speed have been identified (Foerster, ETH
+  Zurich, 2015); lifting 42 g they turn at 7600 rad/s together (2.9e-8 N/(rad/s)^2
+  each), which makes 0.007 and 0.008. The camera, its board and the gear are some
+  10 cm^2 of bluff body (c_d 1.2): 0.0015 more at 1 m/s. The rounded sums are `DRAG_*`.
+- A draught is a wind whose speed steady part and smooth gusts reach together, at two
+  standard deviations of the gusts (`perchctl.sim.wind`).
 - Near the ceiling the rotors pull themselves towards it (a few per cent of thrust).
-- The magnet pulls the gear tip towards the ceiling within 25 mm of the target's
-  centre. Its pull falls to zero over `MAGNET_RANGE_M`; the gear's tip is a flat disc,
-  so a held vehicle hangs level and friction keeps the tip in its place.
+- The magnet: `perchctl.sim.magnet`. The gear's tip is a flat disc, so a held vehicle
+  hangs level and friction keeps the tip in its place.
 """
 
 from __future__ import annotations
@@ -26,34 +27,23 @@ import mujoco
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
+from perchctl.sim.magnet import MAGNET_RANGE_M, Magnet
+from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.wind import Wind
 
-FULL_COMMAND = 65535.0
-MOTOR_FORCE_N = 0.12
-MOTOR_LAG_S = 0.05
 ARM_M = 0.046  # hub to motor axis, X configuration
 YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
-FRESH_BATTERY_V = 4.2
-THRUST_LOSS_PER_V = 0.10
-DRAG_LEVEL_NSPM = 0.025
-DRAG_VERTICAL_NSPM = 0.012
+DRAG_LEVEL_NSPM = 0.009
+DRAG_VERTICAL_NSPM = 0.009
 FRAME_HALF_M = (0.035, 0.035, 0.012)
 REST_HEIGHT_M = FRAME_HALF_M[2]
 GEAR_RADIUS_M = 0.006
-MAGNET_RADIUS_M = 0.025
-MAGNET_RANGE_M = 0.003
-MAGNET_TOUCH_M = 0.001
 SUCTION_GAIN = 0.10
 SUCTION_LENGTH_M = 0.02
 # Crazyflie 2.1 at 27 g; scaled by mass.
 INERTIA_REFERENCE_KG = 0.027
 INERTIA_REFERENCE_KGM2 = (1.66e-5, 1.67e-5, 2.93e-5)
-# A 250 mAh cell: about 4.4 A at full thrust, and what that does to its voltage.
-MOTOR_CURRENT_A = 1.1
-CELL_RESISTANCE_OHM = 0.11
-CELL_CHARGE_C = 900.0
-CELL_SLOPE_V = 0.8  # resting voltage lost over the whole charge
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
 
@@ -126,16 +116,12 @@ class World:
         # Farther than this below the ceiling the gear cannot touch it.
         self._reach_m = math.dist(gear, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._steps = 0
-        self._forces_n = [0.0, 0.0, 0.0, 0.0]
-        self._lag = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_LAG_S)
+        self._powertrain = Powertrain(scenario.battery_rest_v)
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
         self._held = False
-        self._magnet_broken = False
+        self._magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
-        self.magnet_engaged = False
-        self.battery_rest_v = scenario.battery_rest_v
-        self.battery_v = scenario.battery_rest_v
         mujoco.mj_forward(self._model, self._data)
         self._read()
         self._set_specific_force(0.0, 0.0, 0.0)
@@ -144,16 +130,33 @@ class World:
     def t_s(self) -> float:
         return self._steps * CONTROL_PERIOD_S
 
+    @property
+    def magnet_engaged(self) -> bool:
+        """The gear's tip hangs on the magnet."""
+        return self._magnet.engaged
+
+    @property
+    def battery_v(self) -> float:
+        """The battery's voltage under the load of now."""
+        return self._powertrain.battery_v
+
+    @property
+    def battery_rest_v(self) -> float:
+        return self._powertrain.rest_v
+
+    @battery_rest_v.setter
+    def battery_rest_v(self, rest_v: float) -> None:
+        self._powertrain.rest_v = rest_v
+
     def step(self, motors: tuple[float, float, float, float]) -> None:
         """Advance by `CONTROL_PERIOD_S` under four motor commands 0..65535."""
         self._steps += 1
-        self._drive(motors)
+        f1, f2, f3, f4 = self._powertrain.step(motors)
         if self._held:
             self._set_specific_force(0.0, 0.0, 0.0)
             return
         if self._steps % _WIND_EVERY == 1:
             self._wind_mps = self._wind.at(self.t_s)
-        f1, f2, f3, f4 = self._forces_n
         thrust_n = f1 + f2 + f3 + f4
         height_m = self._scenario.ceiling_z_m - self.z_m
         if height_m < 0.2:
@@ -171,7 +174,10 @@ class World:
         force_x = thrust_n * r02 - DRAG_LEVEL_NSPM * (self.vx_mps - wind[0]) + push[0]
         force_y = thrust_n * r12 - DRAG_LEVEL_NSPM * (self.vy_mps - wind[1]) + push[1]
         force_z = thrust_n * r22 - DRAG_VERTICAL_NSPM * (self.vz_mps - wind[2]) + push[2]
-        pull_n = self._magnet_pull() if height_m < self._reach_m else self._far_from_magnet()
+        if height_m < self._reach_m:
+            pull_n = self._magnet.pull_n(self.gear_tip_m(), upright=r22 > 0.0)
+        else:
+            pull_n = self._magnet.out_of_reach()
         if pull_n > 0.0:
             force_z += pull_n
             gx, gy, gz = self._scenario.gear_body_m
@@ -237,7 +243,10 @@ class World:
         velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0),
         hold: bool = False,
     ) -> None:
-        """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`."""
+        """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`.
+
+        No gyroscope sees it happen (see `perchctl.sim.firmware.estimator`).
+        """
         R = rotation_from_rpy(*rpy_rad)
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
@@ -270,48 +279,6 @@ class World:
         self.fx_mps2 = (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y + w * z) * ay + r20 * az
         self.fy_mps2 = 2 * (x * y - w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + r21 * az
         self.fz_mps2 = r02 * ax + r12 * ay + r22 * az
-
-    def _drive(self, motors: tuple[float, float, float, float]) -> None:
-        loss = THRUST_LOSS_PER_V * (FRESH_BATTERY_V - self.battery_rest_v)
-        unit_n = MOTOR_FORCE_N * (1.0 - loss) / FULL_COMMAND
-        forces, lag = self._forces_n, self._lag
-        current_a = 0.0
-        for i in range(4):
-            force = forces[i] + lag * (unit_n * motors[i] - forces[i])
-            forces[i] = force
-            share = force / MOTOR_FORCE_N
-            current_a += share * math.sqrt(share) if share > 0.0 else 0.0
-        current_a *= MOTOR_CURRENT_A
-        spent = current_a * CONTROL_PERIOD_S / CELL_CHARGE_C
-        self.battery_rest_v -= spent * CELL_SLOPE_V
-        self.battery_v = self.battery_rest_v - CELL_RESISTANCE_OHM * current_a
-
-    def _far_from_magnet(self) -> float:
-        self._note_touch(MAGNET_RANGE_M)
-        return 0.0
-
-    def _magnet_pull(self) -> float:
-        scenario = self._scenario
-        if scenario.no_target:
-            return 0.0
-        tip = self.gear_tip_m()
-        gap_m = max(0.0, scenario.ceiling_z_m - tip[2])
-        miss = math.hypot(tip[0] - scenario.target_xy_m[0], tip[1] - scenario.target_xy_m[1])
-        if gap_m >= MAGNET_RANGE_M or miss > MAGNET_RADIUS_M or self._up[2] <= 0.0:
-            return self._far_from_magnet()
-        self._note_touch(gap_m)
-        first_n = scenario.first_contact_force_n
-        hold_n = scenario.magnet_force_n
-        if first_n is not None and not self._magnet_broken:
-            hold_n = first_n
-        return hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
-
-    def _note_touch(self, gap_m: float) -> None:
-        if gap_m < MAGNET_TOUCH_M:
-            self.magnet_engaged = True
-        elif self.magnet_engaged and gap_m > 2 * MAGNET_TOUCH_M:
-            self.magnet_engaged = False
-            self._magnet_broken = True
 
     def _contacts(self) -> tuple[float, bool]:
         ceiling_n, floor = 0.0, False

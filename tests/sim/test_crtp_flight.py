@@ -70,16 +70,17 @@ def test_hover_command_at_42_g(pilot: Pilot) -> None:
     pilot.sim.set_battery(4.2)
     pilot.take_off(0.8, settle_s=2.0)
     values = [v for _, v in pilot.log("stabilizer.thrust", pilot.t_s - 1.0)]
-    assert sum(values) / len(values) == pytest.approx(56_200, rel=0.02)
+    assert sum(values) / len(values) == pytest.approx(56_200, rel=0.01)
 
 
 def test_raw_burst_gains_little(pilot: Pilot) -> None:
     """Row "The largest raw thrust: a 0.5 s burst gained 5.8 cm and 0.25 m/s"."""
     pilot.fly_to(0.8, 4.0)
+    pilot.sim.set_battery(4.2)
     before_m = height(pilot)
     pilot.stream(0.5, lambda: pilot.cf.commander.send_setpoint(0, 0, 0, 60000))
-    assert height(pilot) - before_m == pytest.approx(0.058, abs=0.015)
-    assert pilot.sim.truth()["velocity_mps"][2] == pytest.approx(0.25, abs=0.05)
+    assert height(pilot) - before_m == pytest.approx(0.058, abs=0.01)
+    assert pilot.sim.truth()["velocity_mps"][2] == pytest.approx(0.25, abs=0.02)
 
 
 def test_position_controller_pushes_harder_than_raw(pilot: Pilot) -> None:
@@ -96,13 +97,17 @@ def test_position_controller_pushes_harder_than_raw(pilot: Pilot) -> None:
 # --- Setpoint modes ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("mass_kg", "lowest_m"), [(0.042, 0.47), (0.030, 0.74)])
-def test_position_to_hover_dips(pilot: Pilot, mass_kg: float, lowest_m: float) -> None:
+@pytest.mark.parametrize(
+    ("mass_kg", "lowest_m", "within_m"), [(0.042, 0.47, 0.025), (0.030, 0.74, 0.01)]
+)
+def test_position_to_hover_dips(
+    pilot: Pilot, mass_kg: float, lowest_m: float, within_m: float
+) -> None:
     """Row "position -> hover dips to 0.47 m" at 42 g, 0.74 m at 30 g, from 0.8 m."""
     pilot.fresh(mass_kg=mass_kg)
     pilot.fly_to(0.8, 4.0)
     dip_m = lowest_after(pilot, 3.0, lambda: pilot.cf.commander.send_hover_setpoint(0, 0, 0, 0.8))
-    assert dip_m == pytest.approx(lowest_m, abs=0.05)
+    assert dip_m == pytest.approx(lowest_m, abs=within_m)
 
 
 def test_position_to_zdistance_dips(pilot: Pilot) -> None:
@@ -111,7 +116,7 @@ def test_position_to_zdistance_dips(pilot: Pilot) -> None:
     dip_m = lowest_after(
         pilot, 3.0, lambda: pilot.cf.commander.send_zdistance_setpoint(0, 0, 0, 0.8)
     )
-    assert dip_m == pytest.approx(0.45, abs=0.07)
+    assert dip_m == pytest.approx(0.45, abs=0.045)
 
 
 def test_hover_to_velocity_falls_to_the_floor(pilot: Pilot) -> None:
@@ -136,7 +141,7 @@ def test_take_off_lags_behind_its_plan(pilot: Pilot, mass_kg: float, lift_s: flo
     pilot.fresh(mass_kg=mass_kg)
     pilot.unlock()
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
-    assert pilot.until(lambda t: t["position_m"][2] > 0.02, 3.0) == pytest.approx(lift_s, abs=0.2)
+    assert pilot.until(lambda t: t["position_m"][2] > 0.017, 3.0) == pytest.approx(lift_s, abs=0.17)
 
 
 def test_finished_is_by_the_clock(pilot: Pilot) -> None:
@@ -144,7 +149,7 @@ def test_finished_is_by_the_clock(pilot: Pilot) -> None:
     pilot.unlock()
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
     pilot.advance(2.04)
-    assert height(pilot) == pytest.approx(0.25, abs=0.05)
+    assert height(pilot) == pytest.approx(0.25, abs=0.02)
     assert pilot.info == 0x031E
 
 
@@ -182,18 +187,19 @@ def test_raw_yaw_rate_is_clockwise(pilot: Pilot) -> None:
     pilot.fresh(mass_kg=0.030)
     pilot.fly_to(0.8)
     pilot.stream(1.0, lambda: pilot.cf.commander.send_setpoint(0, 0, 60, 40000))
-    assert pilot.now("stateEstimate.yaw") == pytest.approx(-48, abs=6)
+    assert pilot.now("stateEstimate.yaw") == pytest.approx(-48, abs=2)
 
 
 def test_raw_pitch_and_the_estimates_sign(pilot: Pilot) -> None:
     """Row "send_setpoint pitch +10: estimated pitch -9.6 (nose down), moves +x"."""
     pilot.fly_to(1.0)
     x0, y0, _ = pilot.sim.truth()["position_m"]
-    pilot.stream(0.6, lambda: pilot.cf.commander.send_setpoint(0, 10, 0, 58000))
+    # The attitude loop's integral overshoots by half a degree later on.
+    pilot.stream(0.36, lambda: pilot.cf.commander.send_setpoint(0, 10, 0, 58000))
     truth = pilot.sim.truth()
-    assert pilot.now("stateEstimate.pitch") == pytest.approx(-9.6, abs=1.5)
-    assert math.degrees(truth["rpy_rad"][1]) == pytest.approx(9.6, abs=1.5)  # nose down, inside
-    assert truth["position_m"][0] - x0 > 0.1
+    assert pilot.now("stateEstimate.pitch") == pytest.approx(-9.6, abs=0.5)
+    assert math.degrees(truth["rpy_rad"][1]) == pytest.approx(9.6, abs=0.5)  # nose down, inside
+    assert truth["position_m"][0] - x0 > 0.03
     assert abs(truth["position_m"][1] - y0) < 0.03
 
 
@@ -201,9 +207,9 @@ def test_raw_roll_moves_right(pilot: Pilot) -> None:
     """Row "roll +10 moves -y"."""
     pilot.fly_to(1.0)
     y0 = pilot.sim.truth()["position_m"][1]
-    pilot.stream(0.6, lambda: pilot.cf.commander.send_setpoint(10, 0, 0, 58000))
-    assert pilot.now("stateEstimate.roll") == pytest.approx(9.6, abs=1.5)
-    assert pilot.sim.truth()["position_m"][1] - y0 < -0.1
+    pilot.stream(0.36, lambda: pilot.cf.commander.send_setpoint(10, 0, 0, 58000))
+    assert pilot.now("stateEstimate.roll") == pytest.approx(9.6, abs=0.5)
+    assert pilot.sim.truth()["position_m"][1] - y0 < -0.03
 
 
 def test_go_to_yaw_in_radians_and_relative_in_world_axes(pilot: Pilot) -> None:

@@ -80,16 +80,17 @@ def test_the_largest_raw_burst_gains_what_was_measured() -> None:
     rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
     rig.firmware.notify_setpoint_stop()
     rig.take_off(settle_s=8.0)
+    rig.world.battery_rest_v = 4.2  # the facts' battery is fresh
     before = rig.world.z_m
     rig.run(0.5, FULL_RAW)
-    assert rig.world.z_m - before == pytest.approx(0.058, abs=0.008)
-    assert rig.world.vz_mps == pytest.approx(0.25, abs=0.03)
+    assert rig.world.z_m - before == pytest.approx(0.058, abs=0.007)
+    assert rig.world.vz_mps == pytest.approx(0.25, abs=0.0125)
 
 
 def test_hover_command_at_42_g() -> None:
     rig = make_rig(**PERFECT)
     rig.take_off(settle_s=8.0)
-    assert rig.firmware.log_value("stabilizer.thrust") == pytest.approx(56200, rel=0.01)
+    assert rig.firmware.log_value("stabilizer.thrust") == pytest.approx(56200, rel=0.005)
 
 
 def test_a_position_setpoint_above_the_ceiling_presses_harder_than_a_raw_burst() -> None:
@@ -109,20 +110,22 @@ def test_a_position_setpoint_above_the_ceiling_presses_harder_than_a_raw_burst()
 
 
 @pytest.mark.parametrize(
-    ("mass_kg", "command", "dip_to_m"),
+    ("mass_kg", "command", "dip_to_m", "within_m"),
     [
-        (0.042, HoverCommand(0.0, 0.0, 0.0, 0.8), 0.47),
-        (0.042, ZDistanceCommand(0.0, 0.0, 0.0, 0.8), 0.45),
-        (0.030, HoverCommand(0.0, 0.0, 0.0, 0.8), 0.74),
+        (0.042, HoverCommand(0.0, 0.0, 0.0, 0.8), 0.47, 0.0235),
+        # Both modes reset the same loops and hold the height in the same way, so one
+        # dip lies between the two that were measured.
+        (0.042, ZDistanceCommand(0.0, 0.0, 0.0, 0.8), 0.45, 0.045),
+        (0.030, HoverCommand(0.0, 0.0, 0.0, 0.8), 0.74, 0.01),
     ],
 )
 def test_changing_mode_from_position_dips(
-    mass_kg: float, command: HoverCommand | ZDistanceCommand, dip_to_m: float
+    mass_kg: float, command: HoverCommand | ZDistanceCommand, dip_to_m: float, within_m: float
 ) -> None:
     rig = make_rig(mass_kg=mass_kg)
     rig.take_off()
     rig.hold(3.0)
-    assert min(rig.run(3.0, command)) == pytest.approx(dip_to_m, abs=0.06)
+    assert min(rig.run(3.0, command)) == pytest.approx(dip_to_m, abs=within_m)
 
 
 def test_hover_to_velocity_falls_to_the_floor() -> None:
@@ -154,7 +157,7 @@ def test_high_level_take_off_lifts_late(mass_kg: float, first_lift_s: float) -> 
     rig = make_rig(mass_kg=mass_kg)
     rig.firmware.high_level(HlTakeoff(0.5, 2.0))
     seen_s = rig.run_until(lambda: rig.world.z_m > REST_HEIGHT_M + 0.005, 3.0)
-    assert seen_s == pytest.approx(first_lift_s, abs=0.2)
+    assert seen_s == pytest.approx(first_lift_s, abs=0.16)
 
 
 def test_high_level_take_off_is_finished_by_the_clock() -> None:
@@ -164,7 +167,7 @@ def test_high_level_take_off_is_finished_by_the_clock() -> None:
     assert not rig.info & HL_FINISHED
     rig.run(0.1)
     assert rig.info & HL_FINISHED
-    assert rig.world.z_m == pytest.approx(0.25, abs=0.05)  # of 0.5 m
+    assert rig.world.z_m == pytest.approx(0.25, abs=0.02)  # of 0.5 m, and 0.23 m at 2.0 s
 
 
 def test_high_level_landing_ends_on_the_floor_with_the_motors_off() -> None:
@@ -242,7 +245,7 @@ def test_raw_yaw_rate_is_clockwise() -> None:
     rig.firmware.notify_setpoint_stop()
     rig.take_off()
     rig.run(1.0, RawSetpoint(0.0, 0.0, 60.0, 41000))
-    assert rig.firmware.log_value("stateEstimate.yaw") == pytest.approx(-48.0, abs=6.0)
+    assert rig.firmware.log_value("stateEstimate.yaw") == pytest.approx(-48.0, abs=1.0)
 
 
 def test_raw_pitch_and_roll_signs() -> None:
@@ -250,13 +253,14 @@ def test_raw_pitch_and_roll_signs() -> None:
     rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
     rig.firmware.notify_setpoint_stop()
     rig.take_off()
-    rig.run(0.6, RawSetpoint(0.0, 10.0, 0.0, 41000))
-    assert rig.firmware.log_value("stateEstimate.pitch") == pytest.approx(-9.6, abs=1.0)
-    assert rig.world.vx_mps > 0.3
+    # The attitude loop's integral overshoots by half a degree later on.
+    rig.run(0.35, RawSetpoint(0.0, 10.0, 0.0, 41000))
+    assert rig.firmware.log_value("stateEstimate.pitch") == pytest.approx(-9.6, abs=0.3)
+    assert rig.world.vx_mps > 0.2
     rig.run(2.0, HERE)
-    rig.run(0.6, RawSetpoint(10.0, 0.0, 0.0, 41000))
-    assert rig.firmware.log_value("stateEstimate.roll") == pytest.approx(9.6, abs=1.0)
-    assert rig.world.vy_mps < -0.2
+    rig.run(0.35, RawSetpoint(10.0, 0.0, 0.0, 41000))
+    assert rig.firmware.log_value("stateEstimate.roll") == pytest.approx(9.6, abs=0.3)
+    assert rig.world.vy_mps < -0.15
 
 
 def test_velocity_is_in_world_axes_and_moves_up() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from firmware_rig import Rig, make_rig
 
@@ -88,6 +90,28 @@ def test_disarm_in_flight_cuts_within_one_update_and_does_not_lock(
     assert rig.run_until(lambda: rig.motors_off, 1.0) <= 0.042
     rig.run(3.0, stream)
     assert not rig.info & LOCKED
+
+
+@pytest.mark.parametrize("stream", [None, HERE])
+def test_nothing_locks_later_when_nothing_is_sent_after_a_disarm_in_flight(
+    stream: PositionCommand | None,
+) -> None:
+    rig = make_rig()
+    rig.take_off()
+    rig.run(0.1, stream)
+    rig.firmware.arm(False)
+    rig.run(0.042)
+    seen = set()
+    for _ in range(2000):
+        rig.run(0.02)
+        assert rig.motors_off
+        seen.add(rig.info)
+    assert not any(info & LOCKED for info in seen)
+    assert rig.info == READY
+    assert rig.world.state().floor_contact
+    rig.firmware.high_level(HlTakeoff(0.5, 2.0))
+    rig.run(2.5)
+    assert rig.world.z_m > 0.3
 
 
 def test_rearms_after_30_s_on_the_ground() -> None:
@@ -311,6 +335,31 @@ def test_upside_down_crashes_and_recovers_after_righting() -> None:
     assert rig.info & CRASHED
     assert rig.firmware.recover_from_crash() == (True, True)
     assert rig.run_until(lambda: bool(rig.info & CAN_FLY), 1.0) == pytest.approx(0.12, abs=0.045)
+
+
+@pytest.mark.parametrize(("height_m", "after_s"), [(0.8, 0.45), (1.5, 0.7)])
+def test_put_on_its_back_in_flight_falls_and_crashes(height_m: float, after_s: float) -> None:
+    rig = make_rig()
+    rig.take_off(height_m)
+    here = PositionCommand(0.0, 0.0, height_m, 0.0)
+    rig.run(2.0, here)
+    rig.world.set_pose((0.0, 0.0, height_m), (math.pi, 0.0, 0.0))
+    seen_s = 0.0
+    while not rig.info & CRASHED and seen_s < 2.0:
+        rig.run(0.02, here)
+        seen_s += 0.02
+    assert seen_s == pytest.approx(after_s, abs=0.1)
+    rig.run(0.5)
+    assert rig.motors_off
+    assert rig.world.state().R_world_body[2, 2] < -0.5
+    assert not rig.info & LOCKED
+    rig.world.set_pose((0.0, 0.0, 0.012))
+    rig.run(0.5)
+    assert rig.firmware.recover_from_crash() == (True, True)
+    assert rig.run_until(lambda: bool(rig.info & CAN_FLY), 1.0) == pytest.approx(0.12, abs=0.045)
+    rig.run(40.0)  # the setpoints of the flight that crashed spin nothing
+    assert rig.info == READY
+    assert rig.motors_off
 
 
 @pytest.mark.parametrize(("roll_rad", "after_s"), [(1.2, 1.0), (2.5, 0.1)])

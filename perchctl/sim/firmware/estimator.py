@@ -3,6 +3,10 @@
 Drift runs from the moment the motors first turn. With outside positions (scenario
 `extra["external_position"]` and parameter `stabilizer.estimator` = 2) the estimate
 follows those instead, and slides away once they stop coming.
+
+The attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
+the filter's other measurements can: a vehicle that is put on its back by hand, faster
+than any gyroscope sees, goes on believing that it is level.
 """
 
 from __future__ import annotations
@@ -23,9 +27,11 @@ _POSITION_MEMORY_S = 0.3
 _VELOCITY_MEMORY_S = 0.1
 _VELOCITY_NOISE_PER_S = 2.5  # m/s of noise a metre of position noise
 _GYRO_NOISE_DPS = 0.08
+_ATTITUDE_MEMORY_S = 2.0
 _ACC_NOISE_G = 0.004
 _ACC_VIBRATION_G = 0.04  # added by turning motors
 _ACC_CUTOFF_HZ = 30.0
+_ATTITUDE_GAIN = CONTROL_PERIOD_S / _ATTITUDE_MEMORY_S
 _EXTERNAL_GAIN = 0.3
 _EXTERNAL_STALE_S = 0.2
 _EXTERNAL_SLIDE_MPS2 = 0.04
@@ -58,6 +64,7 @@ class Estimator:
         self._rng = np.random.default_rng([scenario.seed, _STREAM])
         self._white: list[float] = []
         self.now = Estimate()
+        self.quaternion: tuple[float, float, float, float] | None = None
         self.acc_g = (0.0, 0.0, 1.0)
         self._steps = 0
         self._drift = (0.0, 0.0, 0.0)
@@ -128,7 +135,7 @@ class Estimator:
         now.vx_mps = world.vx_mps + dx + nx
         now.vy_mps = world.vy_mps + dy + ny
         now.vz_mps = world.vz_mps + dz + nz
-        w, x, y, z = world.quaternion
+        w, x, y, z = self._integrate(world)
         bias = self._scenario.estimate_tilt_bias_rad
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - x * z))))
@@ -150,6 +157,27 @@ class Estimator:
             ay + lag * (world.fy_mps2 * unit + shake * take() - ay),
             az + lag * (world.fz_mps2 * unit + shake * take() - az),
         )
+
+    def _integrate(self, world: Sensed) -> tuple[float, float, float, float]:
+        """The attitude after one more control period of turning."""
+        truth = world.quaternion
+        if self.quaternion is None:
+            self.quaternion = truth
+            return truth
+        w, x, y, z = self.quaternion
+        tw, tx, ty, tz = truth
+        half = 0.5 * CONTROL_PERIOD_S
+        p, q, r = half * world.p_radps, half * world.q_radps, half * world.r_radps
+        # The tangent's step, then towards the truth, then back on the unit sphere.
+        gain = _ATTITUDE_GAIN if w * tw + x * tx + y * ty + z * tz >= 0.0 else -_ATTITUDE_GAIN
+        keep = 1.0 - _ATTITUDE_GAIN
+        nw = keep * (w - x * p - y * q - z * r) + gain * tw
+        nx = keep * (x + w * p + y * r - z * q) + gain * tx
+        ny = keep * (y + w * q + z * p - x * r) + gain * ty
+        nz = keep * (z + w * r + x * q - y * p) + gain * tz
+        scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
+        self.quaternion = turned = (scale * nw, scale * nx, scale * ny, scale * nz)
+        return turned
 
     def _walk(self) -> None:
         sigma = self._scenario.estimate_noise_m

@@ -49,6 +49,7 @@ class State(Enum):
 
 
 MOTORS_ALLOWED = frozenset({State.READY, State.FLYING, State.LEVEL_OUT, State.LANDED})
+_IN_FLIGHT = frozenset({State.FLYING, State.LEVEL_OUT})
 
 
 class Supervisor:
@@ -94,7 +95,8 @@ class Supervisor:
         motors_running: bool,
         setpoint_age_s: float,
         acc_g: tuple[float, float, float],
-    ) -> None:
+    ) -> bool:
+        """True when this update ended a flight by a crash or a disarm."""
         if motors_running:
             self._thrust_s = t_s
         flying = self._thrust_s is not None and t_s - self._thrust_s < FLYING_MEMORY_S - _TICK_S
@@ -107,6 +109,7 @@ class Supervisor:
         if self.state is not before:
             self._entered(t_s)
         self.motors_allowed = self.state in MOTORS_ALLOWED
+        return before in _IN_FLIGHT and self.state in (State.CRASHED, State.RESET)
 
     def info(self, *, hl_active: bool, hl_finished: bool) -> int:
         """The `supervisor.info` bit field."""
@@ -126,7 +129,7 @@ class Supervisor:
 
     @property
     def is_flying(self) -> bool:
-        return self.state is State.FLYING or self.state is State.LEVEL_OUT
+        return self.state in _IN_FLIGHT
 
     def _next(self, t_s: float, flying: bool, emergency: bool, age_s: float) -> State:
         match self.state:

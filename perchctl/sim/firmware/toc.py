@@ -43,9 +43,9 @@ _LOG_GROUPS: dict[str, str] = {
     " pitch_outD pitch_outFF yaw_outP yaw_outI yaw_outD yaw_outFF",
     "ctrlMel": "float: cmd_thrust cmd_roll cmd_pitch cmd_yaw r_roll r_pitch r_yaw accelz"
     " zdx zdy zdz i_err_x i_err_y i_err_z",
-    "ctrlINDI": "float: cmd_thrust cmd_roll cmd_pitch cmd_yaw r_roll r_pitch r_yaw u_act_dot.p"
-    " u_act_dot.q u_act_dot.r du.p du.q du.r ang_accel_ref.p ang_accel_ref.q ang_accel_ref.r"
-    " rate_d[0] rate_d[1] rate_d[2] uf.p uf.q uf.r Omega_f.p Omega_f.q Omega_f.r n.p n.q n.r",
+    "ctrlINDI": "float: cmd_thrust cmd_roll cmd_pitch cmd_yaw r_roll r_pitch r_yaw u_act_dot_p"
+    " u_act_dot_q u_act_dot_r du_p du_q du_r ang_accel_ref_p ang_accel_ref_q ang_accel_ref_r"
+    " rate_d_p rate_d_q rate_d_r uf_p uf_q uf_r Omega_f_p Omega_f_q Omega_f_r n_p n_q n_r",
     "ctrlBrescianini": "float: thrust tau_x tau_y tau_z",
     "ctrlLee": "float: KR_x KR_y KR_z Kw_x Kw_y Kw_z thrustSI torquex torquey torquez rpyx rpyy"
     " rpyz rpydx rpydy rpydz omegax omegay omegaz omegarx omegary omegarz",

@@ -88,12 +88,16 @@ class Firmware:
         if step % PLANNER_EVERY == 0:
             self._consult_planner(t_s)
         if step % SUPERVISOR_EVERY == 0:
-            supervisor.update(
+            ended = supervisor.update(
                 t_s,
                 motors_running=self.motors is not MOTORS_OFF and max(self.motors) > 0.0,
                 setpoint_age_s=t_s - self._setpoint.stamp_s,
                 acc_g=self.estimator.acc_g,
             )
+            if ended:
+                # The setpoint of a flight that is over must not fly the next one: after
+                # re-arming only a new packet, or the planner, spins the motors.
+                self._low_level = False
             self.planner.block(not supervisor.motors_allowed)
             self.power.update(t_s, self.world.battery_v, self._parameters)
         setpoint = self._setpoint
