@@ -40,8 +40,9 @@ def resolve(
     options = FlyOptions(
         profile=profile,
         profile_path=find_profile(profile_name),
-        uri=uri or profile.link.uri,
-        source=source or profile.camera.source,
+        # An empty one is an unset shell variable, not a wish for the simulated vehicle.
+        uri=profile.link.uri if uri is None else uri,
+        source=profile.camera.source if source is None else source,
         seed=seed,
         log_dir=log_dir or Path(profile.log.directory),
     )
@@ -114,7 +115,7 @@ def run(options: FlyOptions, *, as_json: bool = False) -> int:
     try:
         result = fly_session(options, (log, DisplayWatcher(reporter)))
     except BaseException as error:
-        log.writer.close({"outcome": "failed", "reason": str(error) or type(error).__name__})
+        log.abandon(str(error) or type(error).__name__)
         raise
     finally:
         reporter.close()

@@ -75,7 +75,11 @@ class CflibLink:
             self._arm_if_needed()
             self._unlock_thrust()
         except BaseException:
-            self._close_link()
+            # As long as nothing is known of the vehicle, it may be flying for another.
+            if self._newest is None or self._still_flying():
+                self._abandon()
+            else:
+                self._close_link()
             raise
         self._sender = Sender(self._hand_over)
 
@@ -91,7 +95,7 @@ class CflibLink:
             if not cause:
                 self._lost = None
                 return
-            self._close_link()
+            self._abandon()
             if "answer" not in cause:
                 break
         raise ConnectionFailed(f"no Crazyflie at {self._uri}: {cause}")
@@ -335,11 +339,20 @@ class CflibLink:
         closer.join(timeout=3.0)
 
     def _abandon(self) -> None:
-        """Stop listening and release the driver, sending nothing more."""
+        """Release the driver and clean up, sending nothing more."""
         cf, self._cf = self._cf, None
-        if cf is not None and cf.link is not None:
-            cf.link.close()
-            cf.link = None
+        if cf is None:
+            return
+        driver, cf.link = cf.link, None  # without it close_link has no setpoint to send
+        closers = [cf.close_link] if driver is None else [driver.close, cf.close_link]
+
+        def close() -> None:
+            for each in closers:
+                each()
+
+        closer = threading.Thread(target=close, daemon=True)
+        closer.start()
+        closer.join(timeout=3.0)
 
 
 def _carried(values: dict[str, float], ahead_s: float) -> dict[str, float]:

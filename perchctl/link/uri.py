@@ -35,5 +35,8 @@ def check_uri(uri: str) -> str:
     """The URI's scheme; InvalidValue says what is allowed."""
     scheme = uri.split("://", 1)[0]
     if scheme in FORMS and re.fullmatch(FORMS[scheme], uri):
-        return scheme
+        port = uri.rpartition(":")[2] if scheme in ("udp", "tcp") else "1"
+        if 0 < int(port) <= 65535:
+            return scheme
+        raise InvalidValue(f"URI {uri!r} has no port of 1 to 65535; examples: {EXAMPLES}")
     raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")

@@ -216,8 +216,8 @@ def _landing(v: View) -> Acted:
     landing, state = v.profile.planner.landing, v.state
     if state.motors_stopped or v.held("hanging") >= HANGING_S:
         return _stop_motors(v)
-    if not v.flying and v.obs.telemetry.thrust < 1:
-        return state, Idle()
+    if v.obs.telemetry.thrust < 1 and (state.orders or not v.flying):
+        return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0
     floor = ground_z - landing.undershoot_m
     waited = math.inf if state.ordered_s is None else v.obs.t_s - state.ordered_s

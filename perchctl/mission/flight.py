@@ -13,18 +13,30 @@ from typing import Protocol
 
 from perchctl.camera.health import HealthState, assess
 from perchctl.camera.source import FrameSource, check_size
-from perchctl.errors import Interrupted
+from perchctl.errors import Interrupted, NotFound
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
 from perchctl.mission.history import History, attitude_at, extended
 from perchctl.mission.preflight import Readiness, refuse, still_waiting_for
 from perchctl.mission.state import Observation, Operator, Outcome, Phase, PlannerState
-from perchctl.mission.types import FLYING, LOCKED, Command, Idle, Land, Telemetry
+from perchctl.mission.types import (
+    FLYING,
+    HL_ACTIVE,
+    LOCKED,
+    Command,
+    EmergencyStop,
+    Idle,
+    Land,
+    Telemetry,
+)
 from perchctl.mission.view import NO_BATTERY_READING_V
 from perchctl.pipeline import PipelineSetup
 from perchctl.pipeline import step as pipeline_step
 from perchctl.profile import Profile
 from perchctl.vision.types import Frame, PipelineOutput, PipelineState, TargetPose
+
+RESCUE_LOOK_S = 0.5
+"""For so long a vehicle must be seen with its motors off before a rescue leaves it."""
 
 
 class Clock(Protocol):
@@ -104,35 +116,56 @@ def fly(parts: FlightParts) -> FlightReport:
     """Connect is done: wait until ready, fly the mission, return how it ended.
 
     Whatever is raised on the way, the vehicle is landed first. Errors:
-    `SafetyAbort` and `TimedOut` before take-off, `Interrupted` before take-off,
-    and anything unforeseen after the rescue.
+    `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted` before take-off, and
+    anything unforeseen after the rescue.
     """
     senses = _Senses()
+    _wait_until_ready(parts, senses)  # nothing is started before it returns
     try:
-        _wait_until_ready(parts, senses)
         return _mission(parts, senses)
     except BaseException:
-        rescue(parts.link, parts.clock, parts.profile)
+        rescue(parts, senses.history.newest)
         raise
 
 
-def rescue(link: Link, clock: Clock, profile: Profile) -> None:
+def rescue(parts: FlightParts, known: Telemetry | None) -> None:
     """Land whatever still flies and wait for it, bounded; the last resort of every
-    error path. The landing needs no further packet once it is under way."""
-    landing = profile.planner.landing
-    newest: Telemetry | None = None
-    end_s = clock.now() + landing.timeout_s
-    ordered = False
-    while clock.now() < end_s:
+    error path. The landing needs no further packet once it is under way.
+
+    `known` is the newest telemetry the loop has taken in. On the ground it is looked at
+    again for `RESCUE_LOOK_S`: a take-off just ordered does not show at once.
+    """
+    link, clock, landing = parts.link, parts.clock, parts.profile.planner.landing
+    newest = known
+    start_s = clock.now()
+    ordered_s: float | None = None
+    while clock.now() < start_s + landing.timeout_s:
+        if parts.operator() is Operator.STOP:
+            link.send(EmergencyStop())
+            return
         samples = link.telemetry()
         newest = samples[-1] if samples else newest
-        if newest is None or not newest.has(FLYING):
-            return
-        if not ordered:
+        flies = newest is not None and _motors_run(newest)
+        if flies and newest is not None and _shall_order(newest, ordered_s, clock.now()):
             duration_s = max(1.0, newest.position_m[2] / landing.speed_mps)
             link.send(Land(-landing.undershoot_m, duration_s))
-            ordered = True
+            ordered_s = clock.now()
+        if not flies and clock.now() >= start_s + RESCUE_LOOK_S:
+            return
         clock.wait_until(clock.now() + 0.1)
+
+
+def _motors_run(telemetry: Telemetry) -> bool:
+    """In the air, or about to be. The flying bit alone outlives the motors by 2 s, and a
+    vehicle that hangs with its motors off shall not start them again."""
+    return telemetry.has(HL_ACTIVE) or (telemetry.has(FLYING) and telemetry.thrust >= 1)
+
+
+def _shall_order(telemetry: Telemetry, ordered_s: float | None, now_s: float) -> bool:
+    """Once, and again while the order shows no effect."""
+    if ordered_s is None:
+        return True
+    return not telemetry.has(HL_ACTIVE) and now_s - ordered_s > 1.0
 
 
 def _wait_until_ready(parts: FlightParts, senses: _Senses) -> None:
@@ -147,6 +180,11 @@ def _wait_until_ready(parts: FlightParts, senses: _Senses) -> None:
         waiting = still_waiting_for(
             readiness, newest, senses.frames > 0, senses.camera_problem, now_s, parts.profile
         )
+        if parts.source.finished:
+            raise NotFound(
+                f"{parts.source.describe()} ended before take-off: a flight needs pictures that "
+                f"go on, from a camera or a longer recording"
+            )
         if not waiting:
             return
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
@@ -207,6 +245,8 @@ def _sense(parts: FlightParts, senses: _Senses, now_s: float) -> bool:
     frame = parts.source.newest(now_s)
     problem = parts.source.problem(now_s)
     if frame is None:
+        if problem is None and parts.source.finished:
+            problem = f"{parts.source.describe()} has ended"
         if problem is not None:
             senses.camera_problem = problem
         return False
@@ -272,9 +312,10 @@ def _report(
     telemetry: Telemetry,
     passed: tuple[tuple[float, str, str], ...],
 ) -> FlightReport:
-    reason = next((r for _, phase, r in reversed(passed) if phase == "LANDING"), state.reason)
-    if state.phase is not Phase.LANDED:
-        reason = state.reason
+    reason = state.reason
+    if state.phase is Phase.LANDED:
+        why = next((r for _, phase, r in reversed(passed) if phase == "LANDING"), "")
+        reason = f"{why}; {state.reason}" if why else state.reason
     return FlightReport(
         phase=state.phase,
         outcome=state.outcome or Outcome.SAFETY,

@@ -62,6 +62,10 @@ def _attempts_used(v: View) -> bool:
     return v.state.attempts >= v.profile.planner.attempts
 
 
+def _is_high(v: View) -> bool:
+    return v.height_m > 0.3 and abs(v.error_z_m) < 0.15
+
+
 def _settling_too_long(v: View) -> bool:
     ascend = v.profile.planner.ascend
     return v.held("near_standoff") > ascend.settle_timeout_s
@@ -93,7 +97,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "operator-land", FLYING_PHASES, lambda v: v.obs.operator >= Operator.LAND, P.LANDING,
-        "Ctrl-C: landing", S.LAND, O.OPERATOR,
+        "the operator asked to land", S.LAND, O.OPERATOR,
     ),
     Row(
         "link-lost", FLYING_PHASES, lambda v: v.obs.link_problem is not None, P.LANDING,
@@ -278,7 +282,10 @@ TABLE: tuple[Row, ...] = (
         "the vehicle does not become steady", S.LAND, O.SAFETY,
     ),
     # --- landing ---------------------------------------------------------------
-    Row("landed", _only(P.LANDING), lambda v: v.held("down") >= 0.1, P.LANDED, "motors off"),
+    Row(
+        "landed", _only(P.LANDING), lambda v: v.held("down") >= 0.1, P.LANDED,
+        lambda v: "motors off, hanging on the magnet" if _is_high(v) else "motors off",
+    ),
     Row(
         "landing-timeout", _only(P.LANDING),
         lambda v: v.in_phase_s > v.profile.planner.landing.timeout_s, P.ABORTED,

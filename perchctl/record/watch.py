@@ -35,6 +35,7 @@ class LogWatcher:
         self.writer = writer
         self.truth: Callable[[], Truth] | None = None
         self._battery_min_v: float | None = None
+        self._ticks = 0
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int) -> LogWatcher:
@@ -59,6 +60,7 @@ class LogWatcher:
         return self.writer.path
 
     def tick(self, tick: Tick) -> None:
+        self._ticks += 1
         battery_v = tick.telemetry.battery_v
         if battery_v >= NO_BATTERY_READING_V:
             self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
@@ -90,6 +92,12 @@ class LogWatcher:
         )
         self.writer.close(summary.as_record())
         return summary
+
+    def abandon(self, reason: str) -> None:
+        """Close the log of a flight that failed. One that never began leaves no file."""
+        self.writer.close({"outcome": "failed", "reason": reason})
+        if not self._ticks:
+            self.path.unlink(missing_ok=True)
 
     @property
     def problem(self) -> str | None:

@@ -16,6 +16,7 @@ from perchctl.sim.scenario import Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vision.types import CameraModel, Frame
 
+MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 HARD_LANDING_MPS = 1.0
 """Sinking faster than this into the floor is a fall, whatever the log calls it."""
 
@@ -83,7 +84,7 @@ class Truth:
 
     def tick(self, tick: Tick) -> None:
         state = self._vehicle.world.state()
-        on_purpose = tick.state.phase in (Phase.APPROACH, Phase.LANDING, Phase.LANDED)
+        on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
         if state.floor_contact and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
             self.fell = True
         self._sink_mps = -float(state.velocity_mps[2])

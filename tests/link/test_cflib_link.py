@@ -1,0 +1,268 @@
+"""`CflibLink` on an unmodified cflib, against the simulated Crazyflie in real time.
+
+Waiting is always for the vehicle's own simulated time or state, and bounded.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
+from perchctl.link.cflib_link import SILENCE_S, CflibLink
+from perchctl.mission.types import (
+    CAN_FLY,
+    FLYING,
+    LOCKED,
+    EmergencyStop,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+    TakeOff,
+    Telemetry,
+)
+from perchctl.profile import LinkConfig
+from perchctl.sim.process import SimProcess
+from perchctl.sim.scenario import Scenario
+
+CONFIG = LinkConfig(parameters={"stabilizer.estimator": 2})
+LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
+WAIT_S = 20.0
+PAUSE = threading.Event()
+PITCH_PORT = 3  # raw setpoints: attitude and thrust
+
+
+def until(true: Callable[[], Any], limit_s: float = WAIT_S) -> Any:
+    """Wait, bounded, until something becomes true."""
+    end_s = time.monotonic() + limit_s
+    while not (value := true()):
+        assert time.monotonic() < end_s
+        PAUSE.wait(0.01)
+    return value
+
+
+def let_pass(sim: SimProcess, dt_s: float, meanwhile: Callable[[], None] = lambda: None) -> None:
+    """Let simulated time pass."""
+    end_s = sim.truth()["t_s"] + dt_s
+
+    def over() -> bool:
+        meanwhile()
+        return bool(sim.truth()["t_s"] >= end_s)
+
+    until(over)
+
+
+def info(sim: SimProcess) -> int:
+    return int(sim.truth()["supervisor_info"])
+
+
+@pytest.fixture(scope="module")
+def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
+    with pytest.MonkeyPatch.context() as patch, SimProcess.start(LOW_CEILING) as process:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+        yield process
+
+
+@contextmanager
+def linked(sim: SimProcess, config: LinkConfig = CONFIG) -> Iterator[CflibLink]:
+    """A connection to a vehicle new on the floor; closed at the end if the test has not."""
+    sim.replace_vehicle(LOW_CEILING)
+    link = CflibLink(sim.uri, config, time.monotonic)
+    until(lambda: info(sim) & CAN_FLY)
+    link.connect()
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+def newest(link: CflibLink) -> Telemetry:
+    samples: list[Telemetry] = until(link.telemetry)
+    return samples[-1]
+
+
+def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
+    """Collects the supervisor's bits at each raw setpoint that goes out from now on."""
+    bits: list[int] = []
+
+    def note(packet: Any) -> None:
+        if packet.port == PITCH_PORT:
+            bits.append(info(sim))
+
+    link._cf.packet_sent.add_callback(note)
+    return bits
+
+
+def take_off(link: CflibLink, sim: SimProcess) -> None:
+    link.send(TakeOff(0.4, 1.5))
+    until(lambda: sim.truth()["position_m"][2] > 0.3)
+
+
+# --- On the ground ----------------------------------------------------------------------------
+
+
+def test_connecting_sets_parameters_and_reads_them_back(sim: SimProcess) -> None:
+    config = LinkConfig(parameters={"stabilizer.estimator": 1, "ctrlMel.mass": 0.031})
+    with linked(sim, config) as link:
+        assert link._cf.param.get_value("stabilizer.estimator") == "1"
+        assert float(link._cf.param.get_value("ctrlMel.mass")) == pytest.approx(0.031)
+        assert link.alive(time.monotonic()) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error", "words"),
+    [
+        ("no.such", 1, NotFound, "no parameter no.such"),
+        ("stabilizer.estimator", 2.5, InvalidValue, "stabilizer.estimator"),
+    ],
+)
+def test_wrong_parameters_are_refused(
+    sim: SimProcess, name: str, value: float, error: type[Exception], words: str
+) -> None:
+    config = LinkConfig(parameters={name: value})
+    with pytest.raises(error, match=words), linked(sim, config):
+        pass
+    assert max(sim.truth()["motors"]) == 0
+
+
+def test_telemetry_is_si_and_right_handed(sim: SimProcess) -> None:
+    """Firmware facts, "Signs and units": the Crazyflie's pitch is nose up, ours nose down."""
+    with linked(sim) as link:
+        assert newest(link).has(CAN_FLY)
+        sim.set_pose((0.1, -0.2, 0.5), (0.15, 0.25, 0.6), hold=True)
+        true = until(lambda: sim.truth())
+        assert true["rpy_rad"] == pytest.approx((0.15, 0.25, 0.6), abs=1e-3)
+
+        def arrived() -> bool:
+            told = newest(link)
+            return (
+                math.dist(told.position_m, true["position_m"]) < 0.02
+                # The estimate of a vehicle turned by hand follows slowly, but the right way.
+                and 0.03 < told.roll_rad < 0.18
+                and 0.06 < told.pitch_rad < 0.28
+                and 0.12 < told.yaw_rad < 0.65
+            )
+
+        until(arrived)
+        told = newest(link)
+        assert told.battery_v == pytest.approx(true["battery_v"], abs=0.02)
+        assert told.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
+
+
+def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None:
+    with linked(sim) as link:
+        let_pass(sim, 0.5)
+        samples = link.telemetry()
+        times = [s.t_s for s in samples]
+        assert len(times) > 20
+        assert times == sorted(times)
+        assert max(times) <= time.monotonic()
+        assert link.telemetry() == [] or link.telemetry()[0].t_s > times[-1]
+
+
+def test_a_silent_link_says_so(sim: SimProcess) -> None:
+    with linked(sim) as link:
+        assert link.alive(time.monotonic()) is None
+        sim.silence(SILENCE_S + 2.0)
+        began_s = time.monotonic()
+        said = until(lambda: link.alive(time.monotonic()))
+        assert "nothing heard for" in said
+        assert time.monotonic() - began_s >= SILENCE_S - 0.2
+        until(lambda: link.alive(time.monotonic()) is None)
+
+
+def test_idle_sends_nothing(sim: SimProcess) -> None:
+    with linked(sim) as link:
+        sent: list[int] = []
+        link._cf.packet_sent.add_callback(
+            lambda packet: sent.append(packet.port) if packet.port in (3, 7, 8) else None
+        )
+        link.send(Idle())
+        let_pass(sim, 0.2)
+        assert sent == []
+
+
+# --- In the air -------------------------------------------------------------------------------
+
+
+def test_raw_thrust_works_and_a_perched_vehicle_is_left_unlocked(sim: SimProcess) -> None:
+    """Firmware facts: raw thrust is forced to 0 until unlocked, and a first raw packet in the
+    air would cut the motors; stop + notify + a close after the flying bit clears do not lock."""
+    with linked(sim) as link:
+        take_off(link, sim)
+        let_pass(sim, 0.6, lambda: link.send(PositionSetpoint(0.0, 0.0, 0.5, 0.0)))
+        link.send(RawThrust(52000))
+        motors: list[int] = []
+
+        def press() -> None:
+            link.send(RawThrust(52000))
+            motors.append(min(sim.truth()["motors"]))
+
+        let_pass(sim, 0.2, press)
+        assert min(motors) > 20000
+        assert motors[-1] == pytest.approx(52000, abs=8000)
+
+        def rise() -> bool:
+            link.send(PositionSetpoint(0.0, 0.0, 1.2, 0.0))
+            return bool(sim.truth()["magnet_engaged"])
+
+        until(rise)
+        link.send(StopMotors())
+        until(lambda: max(sim.truth()["motors"]) == 0)
+        assert info(sim) & FLYING
+        raw = sent_raw(link, sim)
+        link.close()
+        assert raw  # cflib's farewell
+        assert not any(bits & FLYING for bits in raw)
+        let_pass(sim, 2.5)
+        assert not info(sim) & LOCKED
+        assert sim.truth()["magnet_engaged"]
+
+
+def test_closing_waits_for_the_landing(sim: SimProcess) -> None:
+    with linked(sim) as link:
+        take_off(link, sim)
+        raw = sent_raw(link, sim)
+        link.send(Land(-0.05, 1.0))
+        link.close()
+        assert not any(bits & FLYING for bits in raw)
+        truth = sim.truth()
+        assert truth["floor_contact"]
+        assert max(truth["motors"]) == 0
+        let_pass(sim, 2.2)
+        assert not info(sim) & LOCKED
+
+
+def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> None:
+    """Firmware facts: high-level hover never times out; the zero setpoint of close_link would
+    end it at once, and so neither a close that gives up waiting nor a refused connection
+    may send one."""
+    with linked(sim) as link:
+        take_off(link, sim)
+        raw = sent_raw(link, sim)
+        link.close()  # nobody lands it: waits, gives up
+        assert raw == []
+        assert sim.truth()["position_m"][2] > 0.3
+        second = CflibLink(sim.uri, CONFIG, time.monotonic)
+        with pytest.raises(ConnectionFailed, match="flying already: land it"):
+            second.connect()
+        let_pass(sim, 1.0)
+        assert sim.truth()["position_m"][2] > 0.3
+        assert not info(sim) & LOCKED
+
+
+def test_the_emergency_stop_cuts_and_locks(sim: SimProcess) -> None:
+    with linked(sim) as link:
+        take_off(link, sim)
+        link.send(EmergencyStop())
+        until(lambda: max(sim.truth()["motors"]) == 0 and info(sim) & LOCKED)

@@ -1,0 +1,425 @@
+"""The command line: its help, its exit codes, and one sentence for each bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl import __version__, cli
+from perchctl.cli import app
+from perchctl.errors import EXIT_CODES
+from perchctl.sim.crtp_server import LinkOptions
+from perchctl.sim.process import SimProcess
+from tests.flying import ROOT, SEED, SHORT
+
+HEAVY = ("cv2", "numpy", "cflib", "matplotlib", "mujoco", "pydantic", "filterpy", "scipy")
+NOWHERE = "udp://127.0.0.1:9"
+ESCAPE = "\x1b"
+
+
+@dataclass(frozen=True)
+class Said:
+    code: int
+    stdout: str
+    stderr: str
+
+    @property
+    def complaint(self) -> str:
+        """The one sentence on stderr."""
+        lines = [s for s in self.stderr.splitlines() if not s.startswith("perchctl: connecting")]
+        assert len(lines) == 1, self.stderr
+        assert lines[0].startswith("perchctl: ")
+        return lines[0].removeprefix("perchctl: ")
+
+
+def run(*arguments: str) -> Said:
+    """The application in this process."""
+    result = CliRunner().invoke(app, arguments)
+    assert "Traceback" not in result.output
+    return Said(result.exit_code, result.stdout, result.stderr)
+
+
+def run_apart(*arguments: str, **environment: str) -> Said:
+    """The application in a process of its own, on pipes, without a terminal."""
+    clean = {k: v for k, v in os.environ.items() if k not in ("CFLIB_URI", "NO_COLOR")}
+    done = subprocess.run(
+        [sys.executable, "-m", "perchctl", *arguments],
+        env=clean | {"PYTHONPATH": str(ROOT)} | environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert "Traceback" not in done.stderr
+    return Said(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Logs and the table cache stay out of the user's folders."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CFLIB_URI", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+@pytest.fixture
+def profile(tmp_path: Path) -> str:
+    """The short profile, impatient with peers that do not answer."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"extends: {SHORT}\nlink: {{connect_timeout_s: 1.0}}\n")
+    return str(path)
+
+
+def pictures(folder: Path, size_px: tuple[int, int] = (640, 480), count: int = 200) -> str:
+    """A folder of pictures that show nothing, as a source; `count` copies of one."""
+    folder.mkdir()
+    noise = np.random.default_rng(0).normal(120, 6, size_px[::-1]).astype(np.uint8)
+    cv2.imwrite(str(folder / "p0.png"), noise, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    for i in range(1, count):
+        os.link(folder / "p0.png", folder / f"p{i}.png")
+    return f"images:{folder}"
+
+
+# --- Help --------------------------------------------------------------------------------
+
+
+def test_help_loads_nothing_heavy() -> None:
+    """It answers in under 0.3 s because of what it does not import."""
+    code = (
+        "import sys\nsys.argv = ['perchctl', '--help']\n"
+        "from perchctl.cli import main\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert "simulate" in done.stdout
+    assert done.stderr.strip() == "[]"
+
+
+def test_fly_help_lists_every_exit_code() -> None:
+    text = run("fly", "--help").stdout
+    for code, meaning in EXIT_CODES.items():
+        assert re.search(rf"\b{code}  ?{re.escape(meaning[:20])}", text), (code, meaning)
+    for option in ("--uri", "--profile", "--source", "--seed", "--log-dir", "--json", "--dry-run"):
+        assert option in text
+    assert "CFLIB_URI" in text
+
+
+def test_version() -> None:
+    assert run("--version").stdout.strip() == f"perchctl {__version__}"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("fly", "--bogus"), ("perch",), ("simulate", "-n", "0"), ("simulate", "--seed", "-1")],
+    ids=" ".join,
+)
+def test_wrong_usage_is_2(arguments: tuple[str, ...]) -> None:
+    assert run(*arguments).code == 2
+
+
+# --- Bad input, before anything is opened ---------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("kalman: {alfa: 0.85}", ["mine.yaml: kalman.alfa", "unknown", "alpha"]),
+        (
+            "target: {large: {dictionary: DICT_4X4_100, id: 997, side_m: 0.15}}",
+            ["target.large", "997", "0..99", "DICT_4X4_1000"],
+        ),
+        (
+            "target: {large: {dictionary: DICT_4X4_1000, id: 1000, side_m: 0.15}}",
+            ["target.large", "1000", "0..999"],
+        ),
+    ],
+    ids=["misspelt key", "the paper's dictionary", "id outside"],
+)
+def test_a_wrong_profile(tmp_path: Path, text: str, words: list[str]) -> None:
+    (tmp_path / "mine.yaml").write_text(f"extends: sim\n{text}\n")
+    said = run("fly", "-p", str(tmp_path / "mine.yaml"))
+    assert said.code == 30
+    for word in words:
+        assert word in said.complaint
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["fly", "-p", "smi"], 20, ["'smi'", "sim"]),
+        (["fly", "-p", "./none.yaml"], 20, ["none.yaml", "does not exist"]),
+        (["simulate", "-p", "smi"], 20, ["'smi'", "sim"]),
+        (["fly", "--uri", "bogus"], 30, ["'bogus'", "radio://0/80/2M"]),
+        (["fly", "--uri", ""], 30, ["radio://0/80/2M"]),
+        (["fly", "--uri", "udp://127.0.0.1:99999", "--yes"], 30, ["65535"]),
+        (["fly", "--uri", NOWHERE], 2, ["sim:", "--source"]),
+        (["fly", "--uri", NOWHERE, "--source", "sim:", "--yes"], 2, ["sim:", "--source"]),
+        (["fly", "--source", "webcam"], 30, ["'webcam'", "camera:N"]),
+        (["fly", "--source", ""], 30, ["camera:N"]),
+        (["fly", "--dry-run", "--source", "webcam"], 30, ["'webcam'", "camera:N"]),
+        (["fly", "--seed", "-1"], 30, ["-1", "negative"]),
+        (["fly", "--uri", NOWHERE, "--source", "camera:x", "--yes"], 30, ["camera:0"]),
+        (["fly", "--uri", NOWHERE, "--source", "camera:9", "--yes"], 20, ["camera:9"]),
+        (["fly", "--uri", NOWHERE, "--source", "video:none.mp4", "--yes"], 20, ["none.mp4"]),
+        (["fly", "--uri", NOWHERE, "--source", "images:none", "--yes"], 20, ["none"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else str(value),
+)
+def test_bad_input(arguments: list[str], code: int, words: list[str]) -> None:
+    said = run(*arguments)
+    assert said.code == code, said
+    for word in words:
+        assert word in said.complaint
+
+
+def test_the_uri_of_the_environment_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CFLIB_URI", "bogus")
+    assert run("fly", "--dry-run").code == 30
+    assert "udp://h:1" in run("fly", "--dry-run", "-u", "udp://h:1", "--source", "camera:0").stdout
+
+
+def test_nobody_to_ask_is_no_consent() -> None:
+    said = run_apart("fly", "--uri", NOWHERE, "--source", "camera:9")
+    assert said.code == 2
+    assert "--yes" in said.complaint
+    assert NOWHERE in said.complaint
+
+
+@pytest.mark.parametrize(("answer", "asked"), [("n", True), ("", True), ("y", False)])
+def test_only_a_yes_is_consent(
+    answer: str, asked: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A yes goes on, here to the missing camera."""
+    monkeypatch.setattr("builtins.input", lambda _prompt: answer)
+    monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    with pytest.raises(SystemExit) as left:
+        app(["fly", "--uri", NOWHERE, "--source", "camera:9"])
+    assert left.value.code == (2 if asked else 20)
+    assert ("not confirmed" in capsys.readouterr().err) is asked
+
+
+@pytest.mark.parametrize("where", ["a file", "a folder that may not be made"])
+def test_a_log_that_cannot_be_written(where: str, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    folder = tmp_path / "taken" if where == "a file" else Path("/proc/none")
+    said = run("fly", "--log-dir", str(folder), "--uri", NOWHERE, "--source", "camera:9", "--yes")
+    assert said.code == 30
+    assert str(folder) in said.complaint
+    assert "log" in said.complaint
+
+
+# --- The plan ------------------------------------------------------------------------------
+
+
+def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
+    said = run("fly", "-p", SHORT, "--seed", "7", "--dry-run")
+    assert said.code == 0
+    assert said.stderr == ""
+    for word in ("sim://, seed 7", "DICT_4X4_1000/997", "1 APPROACH", "7 COMPLETE", "short.yaml"):
+        assert word in said.stdout
+    assert list(tmp_path.iterdir()) == []  # no log either
+
+
+def test_dry_run_as_json_holds_the_whole_profile() -> None:
+    plan = json.loads(run("fly", "-p", SHORT, "--dry-run", "--json").stdout)
+    assert plan["uri"] == "sim://"
+    assert plan["seed"] == 0
+    assert plan["profile"]["simulation"]["camera_rate_hz"] == 20
+    assert plan["profile"]["kalman"]["n_max"] == 8
+    assert Path(plan["calibration_file"]).is_file()
+
+
+# --- Bad peers ------------------------------------------------------------------------------
+
+
+def test_a_silent_peer(profile: str, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
+        mute.bind(("127.0.0.1", 0))
+        uri = f"udp://127.0.0.1:{mute.getsockname()[1]}"
+        source = pictures(tmp_path / "p", count=2)
+        said = run("fly", "-p", profile, "--uri", uri, "--source", source, "--yes")
+    assert said.code == 10
+    assert uri in said.complaint
+    assert "no answer within" in said.complaint
+
+
+def test_a_radio_that_is_not_there(profile: str, tmp_path: Path) -> None:
+    source = pictures(tmp_path / "p", count=2)
+    uri = "radio://0/80/2M/E7E7E7E7E7"
+    said = run("fly", "-p", profile, "--uri", uri, "--source", source, "--yes")
+    assert said.code == 10
+    assert uri in said.stderr
+    assert 'ATTRS{idVendor}=="1915", ATTRS{idProduct}=="7777"' in said.stderr
+    assert "no Crazyradio is plugged in" in said.stderr
+
+
+@pytest.mark.parametrize(
+    ("link", "code", "words"),
+    [
+        (
+            LinkOptions(missing_log_variables=("stateEstimate.vz",)),
+            20,
+            ["stateEstimate.vz", "update the firmware"],
+        ),
+        (LinkOptions(protocol_version=11), 10, ["protocol 11", "12", "update the firmware"]),
+    ],
+    ids=["a log variable is missing", "old protocol"],
+)
+def test_an_unfit_firmware(link: LinkOptions, code: int, words: list[str], tmp_path: Path) -> None:
+    source = pictures(tmp_path / "p", count=2)
+    with SimProcess.start(link=link) as sim:
+        said = run("fly", "-p", SHORT, "--uri", sim.uri, "--source", source, "--yes")
+        assert max(sim.truth()["motors"]) == 0
+    assert said.code == code
+    for word in words:
+        assert word in said.complaint
+
+
+@pytest.fixture(scope="module")
+def grounded() -> Iterator[SimProcess]:
+    """A vehicle without a camera of its own, that should never take off."""
+    with SimProcess.start() as sim:
+        yield sim
+        assert sim.truth()["position_m"][2] < 0.05
+
+
+def test_a_calibration_of_another_size(grounded: SimProcess, tmp_path: Path) -> None:
+    source = pictures(tmp_path / "p", (320, 240))
+    said = run("fly", "-p", SHORT, "--uri", grounded.uri, "--source", source, "--yes")
+    assert said.code == 30
+    for word in ("320x240", "640x480", "calibrat"):
+        assert word in said.complaint
+    assert max(grounded.truth()["motors"]) == 0
+
+
+def test_a_recording_that_ends_before_take_off(grounded: SimProcess, tmp_path: Path) -> None:
+    source = pictures(tmp_path / "p", count=1)
+    said = run("fly", "-p", SHORT, "--uri", grounded.uri, "--source", source, "--yes")
+    assert said.code == 20
+    assert "ended before take-off" in said.complaint
+    assert max(grounded.truth()["motors"]) == 0
+
+
+def test_an_unknown_parameter(grounded: SimProcess, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(f"extends: {SHORT}\nlink: {{parameters: {{no.such: 1}}}}\n")
+    source = pictures(tmp_path / "p", count=2)
+    arguments = ["-p", str(tmp_path / "mine.yaml"), "--uri", grounded.uri, "--source", source]
+    said = run("fly", *arguments, "--yes")
+    assert said.code == 20
+    assert "no.such" in said.complaint
+    assert "link.parameters" in said.complaint
+
+
+# --- Unforeseen failures ----------------------------------------------------------------------
+
+
+def test_what_nobody_foresaw_is_one_sentence_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        with cli.reported():
+            raise ZeroDivisionError("oh")
+
+    monkeypatch.delenv("PERCHCTL_DEBUG", raising=False)
+    with pytest.raises(cli.typer.Exit) as left:
+        fail()
+    assert left.value.exit_code == 1
+    assert "unforeseen ZeroDivisionError: oh" in capsys.readouterr().err
+    monkeypatch.setenv("PERCHCTL_DEBUG", "1")
+    with pytest.raises(ZeroDivisionError):
+        fail()
+
+
+def test_ctrl_c_before_the_flight_is_130(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(cli.typer.Exit) as left, cli.reported():
+        raise KeyboardInterrupt
+    assert left.value.exit_code == 130
+    assert "Ctrl-C" in capsys.readouterr().err
+
+
+# --- Campaigns ----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def campaign() -> Said:
+    """Two seeds, two at a time."""
+    arguments = ("-p", SHORT, "-n", "2", "--seed", str(SEED), "--jobs", "2", "--json")
+    return run_apart("simulate", *arguments)
+
+
+def test_simulate_prints_one_object(campaign: Said) -> None:
+    assert campaign.code == 0
+    said = json.loads(campaign.stdout)
+    assert set(said) == {
+        "flights", "perched", "landed", "aborted", "locked", "fell",
+        "miss_m", "realtime_factor", "worst_seeds",
+    }  # fmt: skip
+    assert set(said["miss_m"]) == {"median", "p95", "max"}
+    assert [said[k] for k in ("flights", "perched", "landed", "aborted", "locked", "fell")] == [
+        2, 2, 0, 0, 0, 0,
+    ]  # fmt: skip
+    assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
+    assert said["realtime_factor"] > 0
+    assert sorted(said["worst_seeds"]) == [SEED, SEED + 1]
+
+
+@pytest.fixture(scope="module")
+def repeated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, bytes]:
+    """The one flight of the seed, printed for people, with its log."""
+    folder = tmp_path_factory.mktemp("only")
+    arguments = ("-p", SHORT, "--only", str(SEED), "--log-dir", str(folder))
+    said = run_apart("simulate", *arguments, PYTHONHASHSEED="7")
+    return said, (folder / f"flight_seed{SEED}.jsonl").read_bytes()
+
+
+def test_one_seed_repeats_its_flight(
+    campaign: Said, repeated: tuple[Said, bytes], tmp_path: Path
+) -> None:
+    """The same miss alone as beside another, and the same log from another process."""
+    arguments = ("-p", SHORT, "--json", "--only")
+    here = run("simulate", *arguments, str(SEED), "--log-dir", str(tmp_path))
+    misses = [json.loads(here.stdout)["miss_m"]["max"]]
+    misses.append(json.loads(run("simulate", *arguments, str(SEED + 1)).stdout)["miss_m"]["max"])
+    both = json.loads(campaign.stdout)
+    assert both["miss_m"]["max"] == max(misses)
+    assert both["miss_m"]["median"] == pytest.approx(sum(misses) / 2, abs=2e-6)
+    assert both["worst_seeds"][0] == SEED + misses.index(max(misses))
+    assert (tmp_path / f"flight_seed{SEED}.jsonl").read_bytes() == repeated[1]
+
+
+def test_a_pipe_gets_no_colour(repeated: tuple[Said, bytes], campaign: Said) -> None:
+    said, _ = repeated
+    assert said.code == 0
+    assert re.search(r"perched +1\b", said.stdout)
+    for text in (said.stdout, said.stderr, campaign.stdout, campaign.stderr):
+        assert ESCAPE not in text
+
+
+def test_no_color_is_heeded() -> None:
+    forced = run_apart("--help", FORCE_COLOR="1")
+    assert ESCAPE in forced.stdout
+    plain = run_apart("--help", FORCE_COLOR="1", NO_COLOR="1")
+    assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", plain.stdout)
