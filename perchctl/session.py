@@ -17,16 +17,20 @@ from types import FrameType
 from typing import Any
 
 from perchctl.calibration.files import load_calibration
-from perchctl.camera.open import open_source
+from perchctl.camera.mirror import UnmirroredSource
+from perchctl.camera.open import ALLOWED, open_source
 from perchctl.camera.source import FrameSource
-from perchctl.errors import Interrupted, InvalidValue, UsageError
+from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, TimedOut, UsageError
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.uri import check_uri
 from perchctl.mission.flight import FlightParts, FlightReport, Watcher, fly
 from perchctl.mission.state import Operator
 from perchctl.pipeline import PipelineSetup, make_setup
 from perchctl.profile import Profile, find_calibration
+from perchctl.view.flight import FlightView, flight_view
 from perchctl.vision.types import CameraModel
+
+SOURCE_SCHEMES = ("camera", "video", "images", "http", "https", "sim")
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ class FlyOptions:
     source: str
     seed: int = 0
     log_dir: Path = Path("perchctl-logs")
+    view: bool = False
+    view_port: int = 0
 
     @property
     def simulated(self) -> bool:
@@ -69,16 +75,23 @@ class WallClock:
 class OperatorSwitch:
     """Ctrl-C as the planner understands it: once lands, twice stops.
 
+    `land` is the word of the live page's STOP button: it lands as one Ctrl-C does, however
+    often it is pressed, and never adds up to a stop of the motors.
+
     Until the flight loop listens there is nothing to land, and the first Ctrl-C
     leaves by `Interrupted`.
     """
 
     listening: bool = False
     presses: int = 0
+    landing_asked: bool = False
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def read(self) -> Operator:
-        return Operator(min(self.presses, 2))
+        return Operator(min(max(self.presses, int(self.landing_asked)), 2))
+
+    def land(self) -> None:
+        self.landing_asked = True
 
     def press(self, _signal: int = 0, _frame: FrameType | None = None) -> None:
         if not self.listening:
@@ -120,6 +133,8 @@ def pipeline_setup(profile: Profile, camera: CameraModel) -> PipelineSetup:
 def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
+    if options.source.partition(":")[0] not in SOURCE_SCHEMES:
+        raise InvalidValue(f"camera source {options.source!r} is unknown; allowed are {ALLOWED}")
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
             f"source {options.source} belongs to the simulated vehicle, but the URI is "
@@ -137,6 +152,7 @@ def fly_session(options: FlyOptions, watchers: tuple[Watcher, ...] = ()) -> Sess
     clock = WallClock()
     switch = OperatorSwitch()
     with switch.installed(), contextlib.ExitStack() as stack:
+        view = stack.enter_context(live_page(options, camera, switch))
         uri, spec, simulated = options.uri, options.source, None
         if options.simulated:
             simulated = stack.enter_context(_simulated_vehicle(options, camera))
@@ -150,6 +166,10 @@ def fly_session(options: FlyOptions, watchers: tuple[Watcher, ...] = ()) -> Sess
             options.profile.camera.start_timeout_s,
         )
         stack.callback(source.close)
+        if options.profile.camera.mirrored:
+            source = UnmirroredSource(source)
+        if view is not None:
+            source, watchers = view.watched(source), (*watchers, view)
         link = CflibLink(uri, options.profile.link, clock.now)
         try:
             link.connect()
@@ -159,8 +179,35 @@ def fly_session(options: FlyOptions, watchers: tuple[Watcher, ...] = ()) -> Sess
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
-        miss_m = simulated.truth()["gear_miss_m"] if simulated is not None else None
+        miss_m = _true_miss_m(simulated)
     return SessionResult(report, miss_m=miss_m)
+
+
+def _true_miss_m(simulated: Any | None) -> float | None:
+    """What the simulator knows; a simulator that is gone does not spoil the report."""
+    if simulated is None:
+        return None
+    with contextlib.suppress(ConnectionFailed, TimedOut):
+        return float(simulated.truth()["gear_miss_m"])
+    return None
+
+
+def live_page(
+    options: FlyOptions, camera: CameraModel, switch: OperatorSwitch
+) -> contextlib.AbstractContextManager[FlightView | None]:
+    """The page of `--view`, with STOP wired to the switch; None without it.
+
+    Errors: InvalidValue for a port in use."""
+    if not options.view:
+        return contextlib.nullcontext()
+    return flight_view(
+        camera,
+        f"perchctl fly {options.uri}",
+        options.profile.target.large.side_m,
+        options.view_port,
+        switch.land,
+        lambda text: print(f"perchctl: {text}", file=sys.stderr),
+    )
 
 
 def _simulated_vehicle(options: FlyOptions, camera: CameraModel) -> Any:

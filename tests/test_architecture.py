@@ -47,6 +47,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "perchctl.record",
         "perchctl.calibration",
         "perchctl.target",
+        "perchctl.view",
         "perchctl.mission.flight",  # the conductor: it drives camera, link and pipeline
     ),
     # A command's work, opened by the command line; so is any other single module

@@ -1,5 +1,5 @@
 """Reading camera calibrations: the ROS camera_info YAML that perchctl ships and writes,
-and OpenCV's own FileStorage files."""
+OpenCV's own FileStorage files (YAML, XML, JSON), and Kalibr's camchain YAML."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import yaml
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision.types import CameraModel
 
+KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
+"""Kalibr's distortion models and their names in ROS; its radtan is k1 k2 p1 p2, k3 = 0."""
 MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,), "equidistant": (4,)}
 
 
@@ -24,28 +26,72 @@ def load_calibration(path: Path) -> CameraModel:
         raise NotFound(f"calibration file {path} does not exist") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidValue(f"{path}: cannot be read as a calibration: {error}") from None
-    values = _opencv_values(path) if "!!opencv-matrix" in text else _yaml_values(path, text)
+    if "opencv-matrix" in text or "<opencv_storage>" in text:
+        return _checked(path, _opencv_values(path))
+    raw = _mapping(path, text)
+    cameras = [key for key in raw if str(key).startswith("cam") and str(key)[3:].isdigit()]
+    try:
+        values = _kalibr_values(path, raw, cameras) if cameras else _ros_values(raw)
+    except KeyError as error:
+        raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"{path}: a value is not a number: {error}") from None
     return _checked(path, values)
 
 
-def _yaml_values(path: Path, text: str) -> dict[str, Any]:
+def _mapping(path: Path, text: str) -> dict[Any, Any]:
     try:
         raw = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise InvalidValue(f"{path}: not YAML ({error.__class__.__name__})") from None
     if not isinstance(raw, dict):
-        raise InvalidValue(f"{path}: must hold camera_info keys (image_width, camera_matrix, ...)")
-    try:
-        return {
-            "size": (int(raw["image_width"]), int(raw["image_height"])),
-            "K": np.array(raw["camera_matrix"]["data"], dtype=float),
-            "dist": np.array(raw["distortion_coefficients"]["data"], dtype=float),
-            "model": str(raw.get("distortion_model", "plumb_bob")),
-        }
-    except KeyError as error:
-        raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
-    except (TypeError, ValueError) as error:
-        raise InvalidValue(f"{path}: a value is not a number: {error}") from None
+        raise InvalidValue(
+            f"{path}: must hold camera_info keys (image_width, camera_matrix, ...) or a Kalibr "
+            f"camchain (cam0: ...)"
+        )
+    return raw
+
+
+def _ros_values(raw: dict[Any, Any]) -> dict[str, Any]:
+    return {
+        "size": (int(raw["image_width"]), int(raw["image_height"])),
+        "K": np.array(raw["camera_matrix"]["data"], dtype=float),
+        "dist": np.array(raw["distortion_coefficients"]["data"], dtype=float),
+        "model": str(raw.get("distortion_model", "plumb_bob")),
+    }
+
+
+def _kalibr_values(path: Path, raw: dict[Any, Any], cameras: list[Any]) -> dict[str, Any]:
+    """The one camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
+    if len(cameras) > 1:
+        raise InvalidValue(
+            f"{path}: holds {len(cameras)} cameras ({', '.join(cameras)}); leave only the "
+            f"upward one"
+        )
+    camera = raw[cameras[0]]
+    if not isinstance(camera, dict):
+        raise InvalidValue(f"{path}: {cameras[0]} must hold keys (intrinsics, resolution, ...)")
+    projection = camera.get("camera_model", "pinhole")
+    if projection != "pinhole":
+        raise InvalidValue(f"{path}: camera_model {projection!r} is not supported; use pinhole")
+    lens = str(camera.get("distortion_model", "none"))
+    if lens not in KALIBR_MODELS:
+        raise InvalidValue(
+            f"{path}: Kalibr's distortion_model {lens!r} is not supported; calibrate as "
+            f"pinhole-radtan or pinhole-equi"
+        )
+    intrinsics = np.array(camera["intrinsics"], dtype=float)
+    if intrinsics.shape != (4,):
+        raise InvalidValue(f"{path}: intrinsics needs fu, fv, pu, pv, found {intrinsics.size}")
+    fu, fv, pu, pv = intrinsics
+    width, height = camera["resolution"]
+    dist = np.zeros(4) if lens == "none" else np.array(camera["distortion_coeffs"], dtype=float)
+    return {
+        "size": (int(width), int(height)),
+        "K": np.array([fu, 0.0, pu, 0.0, fv, pv, 0.0, 0.0, 1.0]),
+        "dist": dist,
+        "model": KALIBR_MODELS[lens],
+    }
 
 
 def _opencv_values(path: Path) -> dict[str, Any]:
@@ -64,7 +110,15 @@ def _opencv_values(path: Path) -> dict[str, Any]:
             int(storage.getNode("image_width").real()),
             int(storage.getNode("image_height").real()),
         )
-        return {"size": size, "K": K, "dist": dist, "model": "plumb_bob"}
+        # Written by OpenCV's calibration program where the lens is its fisheye's.
+        fisheye = storage.getNode("fisheye_model")
+        is_fisheye = not fisheye.empty() and fisheye.real() != 0
+        return {
+            "size": size,
+            "K": K,
+            "dist": dist,
+            "model": "fisheye" if is_fisheye else "plumb_bob",
+        }
     finally:
         storage.release()
 

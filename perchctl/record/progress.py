@@ -1,4 +1,4 @@
-"""The campaign's progress: a bar on a terminal, nothing in a pipe or a file."""
+"""Progress of a campaign or a recording: a bar on a terminal, nothing in a pipe or a file."""
 
 from __future__ import annotations
 
@@ -42,3 +42,20 @@ def progress_bar(
             progress.update(task, advance=1, description=text)
 
         yield advance
+
+
+@contextlib.contextmanager
+def count_bar(
+    what: str, total: int | None, wanted: bool = True, stream: TextIO | None = None
+) -> Iterator[Callable[[], None]]:
+    """Yields the function to call for each one done; `total` None is an unknown number."""
+    console = Console(file=stream or sys.stderr)
+    if not (wanted and console.is_terminal):
+        yield lambda: None
+        return
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(
+        *columns, console=console, refresh_per_second=4, redirect_stdout=False
+    ) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda: progress.advance(task)

@@ -1,0 +1,90 @@
+"""The picture with what was found in it: outlines, the target's axes, numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.vision.camera_model import project
+from perchctl.vision.types import CameraModel
+
+# Blue, green, red.
+_OUTLINE = {"large": (0, 200, 255), "small": (255, 200, 0)}
+_AXES = ((60, 60, 255), (60, 220, 60), (255, 120, 60))
+_TEXT, _SHADOW = (255, 255, 255), (0, 0, 0)
+_SUBPIXEL_BITS = 4
+_FAR_PX = 8000.0  # beyond this a line's end says nothing, and would overflow
+
+
+@dataclass(frozen=True, eq=False)
+class Sketch:
+    """One picture and what to draw into it; made in the loop, drawn elsewhere.
+
+    Attributes:
+        image: grey (h, w) uint8; not changed by drawing.
+        outlines: marker's name and its corners (4, 2) px.
+        pose: rvec (3,) and tvec (3,) of the axes to draw, and their length in m.
+        text: lines for the lower left corner.
+    """
+
+    image: NDArray[np.uint8]
+    outlines: tuple[tuple[str, Array], ...] = ()
+    pose: tuple[Array, Array, float] | None = None
+    text: tuple[str, ...] = ()
+
+
+def draw(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
+    """The picture in colour (blue, green, red), (h, w, 3) uint8."""
+    picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    for name, corners in sketch.outlines:
+        if not np.isfinite(corners).all() or np.abs(corners).max() > _FAR_PX:
+            continue
+        colour = _OUTLINE.get(name, _TEXT)
+        cv2.polylines(
+            picture, [_fixed(corners)], True, colour, 1, cv2.LINE_AA, shift=_SUBPIXEL_BITS
+        )
+        # The first corner, so that the marker's turn can be read.
+        x, y = (int(v) for v in _fixed(corners[:1])[0])
+        cv2.circle(picture, (x, y), 3 << _SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+    if sketch.pose is not None:
+        _draw_axes(picture, *sketch.pose, camera)
+    _draw_text(picture, sketch.text)
+    return picture
+
+
+def _draw_axes(
+    picture: NDArray[np.uint8], rvec: Array, tvec: Array, length_m: float, camera: CameraModel
+) -> None:
+    ends = np.vstack([np.zeros(3), np.eye(3) * length_m])
+    depth = (ends @ np.asarray(cv2.Rodrigues(rvec)[0]).T + tvec)[:, 2]
+    if not (depth > 1e-3).all():
+        return  # a tip behind the camera has no place in the picture
+    points = project(ends, rvec, tvec, camera)
+    if not np.isfinite(points).all() or np.abs(points).max() > _FAR_PX:
+        return
+    fixed = _fixed(points)
+    start = (int(fixed[0, 0]), int(fixed[0, 1]))
+    for end, colour in zip(fixed[1:], _AXES, strict=True):
+        tip = (int(end[0]), int(end[1]))
+        cv2.line(picture, start, tip, colour, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _draw_text(picture: NDArray[np.uint8], lines: tuple[str, ...]) -> None:
+    scale = max(picture.shape[0] / 480.0, 0.5)
+    step = round(17 * scale)
+    y = picture.shape[0] - step * len(lines) + round(9 * scale)
+    for line in lines:
+        for colour, width in ((_SHADOW, 3), (_TEXT, 1)):
+            where = (round(6 * scale), y)
+            font = cv2.FONT_HERSHEY_SIMPLEX
+            cv2.putText(picture, line, where, font, 0.45 * scale, colour, width, cv2.LINE_AA)
+        y += step
+
+
+def _fixed(points_px: Array) -> NDArray[np.int32]:
+    """Pixels as OpenCV's drawing takes them with `shift`."""
+    return np.rint(points_px * (1 << _SUBPIXEL_BITS)).astype(np.int32)
