@@ -423,3 +423,25 @@ def test_no_color_is_heeded() -> None:
     assert ESCAPE in forced.stdout
     plain = run_apart("--help", FORCE_COLOR="1", NO_COLOR="1")
     assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", plain.stdout)
+
+
+def test_the_library_s_tracebacks_stay_away(profile: str, tmp_path: Path) -> None:
+    """cflib logs them to the terminal unless it is told not to: seen by a process of its own."""
+    source = pictures(tmp_path / "p", count=2)
+    for uri, cause in (
+        ("radio://0/80/2M/E7E7E7E7E7", "no Crazyradio is plugged in"),
+        ("udp://127.0.0.1:9", "nothing listens there"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-m", "perchctl", "fly", "-p", profile, "--yes"]
+            + ["--uri", uri, "--source", source],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 10, done.stderr
+        assert cause in done.stderr
+        assert "Traceback" not in done.stderr
+        assert "link error callback" not in done.stderr

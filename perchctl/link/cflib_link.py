@@ -7,7 +7,9 @@ zero setpoint, which drops a flying vehicle (firmware facts, "When setpoints sto
 
 from __future__ import annotations
 
+import logging
 import math
+import os
 import threading
 import time
 from collections import deque
@@ -86,6 +88,7 @@ class CflibLink:
     def _open(self) -> None:
         import cflib.crtp
 
+        _hush_cflib()
         if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
             cflib.crtp.init_drivers()
         share_s = self._config.connect_timeout_s / CONNECT_TRIES
@@ -364,13 +367,23 @@ def _carried(values: dict[str, float], ahead_s: float) -> dict[str, float]:
     return carried
 
 
+def _hush_cflib() -> None:
+    """cflib logs tracebacks of what it reports by callback as well; one sentence is enough."""
+    logger = logging.getLogger("cflib")
+    logger.addHandler(logging.NullHandler())
+    logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
+
+
 def _plain_cause(message: str) -> str:
     """cflib's message without its traceback, and with the remedy where there is one."""
     line = message.strip().splitlines()[0] if message.strip() else "unknown cause"
+    line = line.removeprefix("Couldn't load link driver: ")
     if "Crazyradio" in message or "Access denied" in message or "insufficient" in message.lower():
         missing = "Cannot find" in message
         what = "no Crazyradio is plugged in, or " if missing else ""
         return f"{what}there is no permission to use it ({line}).\n{UDEV_HELP}"
+    if "Connection refused" in message:
+        return "nothing listens there (connection refused)"
     if "No driver found" in message:
         return "cflib has no driver for this kind of URI"
-    return line.removeprefix("Couldn't load link driver: ")
+    return line
