@@ -194,31 +194,36 @@ def draw_bitmap(drawing: TargetDrawing, px_per_m: float) -> Bitmap:
 
 
 def black_rectangles(drawing: TargetDrawing) -> list[Rectangle]:
-    """The black area as few, large, non-overlapping rectangles (for a PDF).
+    """The black area as few, large, non-overlapping rectangles (for a PDF)."""
+    return merged_rectangles(drawing.black, drawing.edges_m, -drawing.edges_m)
 
-    Few and large, because viewers draw hair lines between rectangles that touch.
+
+def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
+    """Black cells of a grid as few, large, non-overlapping rectangles.
+
+    `xs_m` ascends over the columns' edges, `ys_m` descends over the rows'. Few and
+    large, because viewers draw hair lines between rectangles that touch.
     """
-    left = drawing.black.copy()
-    edges = drawing.edges_m
-    n = len(left)
+    left = black.copy()
+    rows, cols = left.shape
     found = []
-    for row in range(n):
-        for col in range(n):
+    for row in range(rows):
+        for col in range(cols):
             if not left[row, col]:
                 continue
             right = col
-            while right + 1 < n and left[row, right + 1]:
+            while right + 1 < cols and left[row, right + 1]:
                 right += 1
             bottom = row
-            while bottom + 1 < n and left[bottom + 1, col : right + 1].all():
+            while bottom + 1 < rows and left[bottom + 1, col : right + 1].all():
                 bottom += 1
             left[row : bottom + 1, col : right + 1] = False
             found.append(
                 Rectangle(
-                    float(edges[col]),
-                    float(-edges[bottom + 1]),
-                    float(edges[right + 1]),
-                    float(-edges[row]),
+                    float(xs_m[col]),
+                    float(ys_m[bottom + 1]),
+                    float(xs_m[right + 1]),
+                    float(ys_m[row]),
                 )
             )
     return found

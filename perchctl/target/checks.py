@@ -1,0 +1,201 @@
+"""What is checked before ink is spent: that the target, as drawn, can be read and used."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.errors import InvalidValue
+from perchctl.profile import MarkerConfig, TargetConfig
+from perchctl.target.dictionaries import id_count, predefined
+from perchctl.target.drawing import (
+    RING_MIN_PER_LARGE_SIDE,
+    draw_bitmap,
+    draw_target,
+    marker_cells,
+)
+from perchctl.target.lengths import millimetres
+from perchctl.target.reading import PlainReader
+from perchctl.vision.types import MARKERS
+
+RING_RANGE_PER_LARGE_SIDE = (RING_MIN_PER_LARGE_SIDE, 9.0 / 150.0)
+"""White ring around the small marker, per side of the large one, where the large one's
+own centre is not white (measured: at 0 mm of 150 the small marker is never found, from
+10 mm on the large one fails)."""
+MIN_DISTANCE = 3
+"""Cells in which two patterns of one size must differ: one more than the wrong bits that
+are corrected in both."""
+LISTED_IDS, MOST_TRIED = 6, 20
+_READ_SIDE_PX = 480.0
+
+
+@dataclass(frozen=True)
+class TargetCheck:
+    """What the checks found: `ring_m` of white around the small marker, whether the large
+    marker's centre is white by itself, and the ids of its dictionary of which that is so."""
+
+    ring_m: float
+    white_centre: bool
+    white_ids: tuple[int, ...]
+
+    def text(self, target: TargetConfig) -> str:
+        if self.white_centre:
+            white = f"id {target.large.id} is white in the middle"
+        else:
+            white = f"a ring of {self.ring_m * 1e3:.1f} mm is white around the small marker"
+        return f"{white}; both markers are read from the drawing"
+
+
+def check_target(target: TargetConfig, magnet_m: float) -> TargetCheck:
+    """Raises InvalidValue, in one sentence, for the first thing that is wrong."""
+    _check_magnet(target, magnet_m)
+    large, small = target.large, target.small
+    for name, marker in (("large", large), ("small", small)):
+        if _turns_onto_itself(marker):
+            raise InvalidValue(
+                f"{name} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
+                f"so that its heading cannot be told: take another id"
+            )
+    white_ids = white_centre_ids(large.dictionary, small.side_m / large.side_m)
+    check = TargetCheck(draw_target(target).ring_m, large.id in white_ids, white_ids)
+    if not check.white_centre:
+        low, high = (r * large.side_m for r in RING_RANGE_PER_LARGE_SIDE)
+        if not low - 1e-9 <= check.ring_m <= high + 1e-9:
+            raise InvalidValue(
+                f"the white ring around the small marker would be {check.ring_m * 1e3:.1f} mm, "
+                f"and {low * 1e3:.1f} to {high * 1e3:.1f} mm are needed: "
+                f"{_white_hint(target, white_ids)}"
+            )
+    _check_reading(target, white_ids)
+    return check
+
+
+def white_centre_ids(dictionary: str, ratio: float) -> tuple[int, ...]:
+    """Ids whose cells under a small marker of `ratio` times the side, with the least ring
+    of white around it, are all white."""
+    source = predefined(dictionary)
+    n = int(source.markerSize)
+    reach = (ratio / 2.0 + RING_MIN_PER_LARGE_SIDE) * (n + 2)  # cells from the centre
+    edges = np.arange(-n / 2.0, n / 2.0 + 0.5)
+    under = (edges[:-1] < reach - 1e-9) & (edges[1:] > -reach + 1e-9)
+    if reach > n / 2.0:
+        return ()
+    bits = all_bits(dictionary)
+    return tuple(int(i) for i in np.flatnonzero(bits[:, under][:, :, under].all(axis=(1, 2))))
+
+
+def all_bits(dictionary: str) -> NDArray[np.bool_]:
+    """Inner bits of every id, True is white, (ids, n, n)."""
+    source = predefined(dictionary)
+    n = int(source.markerSize)
+    rows = [
+        cv2.aruco.Dictionary.getBitsFromByteList(
+            np.ascontiguousarray(source.bytesList[i : i + 1]), n
+        )
+        for i in range(id_count(dictionary))
+    ]
+    return np.array(rows, dtype=np.uint8) > 0
+
+
+def _check_magnet(target: TargetConfig, magnet_m: float) -> None:
+    if magnet_m > target.large.side_m:
+        raise InvalidValue(
+            f"the magnet ({millimetres(magnet_m)} mm) does not fit behind the large marker "
+            f"({millimetres(target.large.side_m)} mm): take a smaller one (--magnet)"
+        )
+    diagonal = math.sqrt(2.0) * target.small.side_m
+    if diagonal > magnet_m:
+        raise InvalidValue(
+            f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) is not inside the magnet "
+            f"({millimetres(magnet_m)} mm), so the gear could touch where no magnet is: at most "
+            f"--small {math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g}mm, or a larger --magnet"
+        )
+
+
+def _turns_onto_itself(marker: MarkerConfig) -> bool:
+    cells = marker_cells(marker)
+    return any(np.array_equal(cells, np.rot90(cells, turn)) for turn in (1, 2, 3))
+
+
+def _check_reading(target: TargetConfig, white_ids: tuple[int, ...]) -> None:
+    """Reads the drawing: both markers must be found, and each whole dictionary must find
+    nothing else in it."""
+    large, small = target.large, target.small
+    if _distance(large, small) < MIN_DISTANCE:
+        raise InvalidValue(
+            f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
+            f"nearly the same pattern, so one marker would be taken for the other: take another "
+            f"id for one of them"
+        )
+    image = _picture(target)
+    seen = PlainReader(target).read(image)
+    for name in MARKERS:
+        if name not in seen:
+            raise InvalidValue(
+                f"the {name} marker cannot be read from this drawing: "
+                f"{_white_hint(target, white_ids)}"
+            )
+    same_size = predefined(large.dictionary).markerSize == predefined(small.dictionary).markerSize
+    for marker, other in ((large, small), (small, large)):
+        ids = {marker.id, other.id} if same_size else {marker.id}
+        extra = _ids_read(image, predefined(marker.dictionary)) - ids
+        if extra:
+            raise InvalidValue(
+                f"{marker.dictionary} also reads id {min(extra)} from this drawing, so the two "
+                f"dictionaries would be confused: take another id or dictionary"
+            )
+
+
+def _picture(target: TargetConfig) -> NDArray[np.uint8]:
+    return draw_bitmap(draw_target(target), _READ_SIDE_PX / target.large.side_m).image
+
+
+def largest_small_m(target: TargetConfig) -> float | None:
+    """The largest small marker, in whole mm, with which both are read; None without one."""
+    for millimetre in range(math.floor(target.small.side_m * 1e3), 3, -1):
+        smaller = target.model_copy(
+            update={"small": target.small.model_copy(update={"side_m": millimetre / 1e3})}
+        )
+        if len(PlainReader(smaller).read(_picture(smaller))) == 2:
+            return millimetre / 1e3
+    return None
+
+
+def _ids_read(image: NDArray[np.uint8], dictionary: Any) -> set[int]:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerDistanceRate = 0.01
+    _, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    return set() if ids is None else {int(i) for i in np.asarray(ids).ravel()}
+
+
+def _distance(a: MarkerConfig, b: MarkerConfig) -> int:
+    """Fewest cells in which one, in any turn, differs from the other; patterns of another
+    size differ in all."""
+    first, second = marker_cells(a), marker_cells(b)
+    if first.shape != second.shape:
+        return first.size
+    return min(int((np.rot90(first, turn) != second).sum()) for turn in range(4))
+
+
+def _white_hint(target: TargetConfig, white_ids: tuple[int, ...]) -> str:
+    fits = largest_small_m(target)
+    small = "take a smaller --small" + ("" if fits is None else f" (up to {millimetres(fits)}mm)")
+    if target.large.id in white_ids:
+        return small
+    readable = [i for i in white_ids[:MOST_TRIED] if _reads_with(target, i)]
+    if not readable:
+        return small
+    return (
+        f"{small}, or a --large-id that is white in the middle "
+        f"({target.large.dictionary}: {', '.join(str(i) for i in readable[:LISTED_IDS])})"
+    )
+
+
+def _reads_with(target: TargetConfig, large_id: int) -> bool:
+    other = target.model_copy(update={"large": target.large.model_copy(update={"id": large_id})})
+    return len(PlainReader(other).read(_picture(other))) == 2

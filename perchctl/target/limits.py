@@ -1,0 +1,116 @@
+"""The smallest marker that is still read through a given blur and noise, by trial.
+
+A formula would hold for one id and one detector; a few hundred small pictures through
+the detector itself take a second and hold for the target at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.profile import TargetConfig
+from perchctl.target.drawing import TargetDrawing, draw_target, ink_coverage, sheet_coverage
+from perchctl.target.reading import PlainReader
+from perchctl.vision.types import MarkerName
+
+FOUND_RATE = 0.9
+TRIALS = 24
+STEP = 1.04
+"""Ratio of neighbouring sides that are tried."""
+SIDE_RANGE_PX = (6.0, 400.0)
+_STREAM = 801
+_PAPER, _INK, _CEILING = 225.0, 30.0, 140.0
+_MIN_PICTURE_PX = 64
+_PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What the picture suffers: `blur_px` is the sigma of lens, focus and link together,
+    `noise` the sigma of the grey levels (0..255)."""
+
+    blur_px: float = 1.0
+    noise: float = 5.0
+
+
+def smallest_side_px(
+    target: TargetConfig, marker: MarkerName, optics: Optics, picture_px: int
+) -> float | None:
+    """Side in px from which on the marker, seen straight on at any turn, is found in
+    `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.
+
+    `picture_px` is the larger side of the camera's picture.
+    """
+    drawing, reader = draw_target(target), PlainReader(target)
+    count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
+
+    @cache
+    def rate(i: int) -> float:
+        return _rate(drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px)
+
+    def found(i: int) -> bool:
+        # Three neighbours together: between 0.8 and 1 the rate rises slowly.
+        return (rate(i - 1) + rate(i) + rate(i + 1)) / 3.0 >= FOUND_RATE
+
+    # Trying the largest sides first would be slow: large pictures. Upwards by doubling,
+    # then bisection.
+    low, high, stride = -1, 0, 4
+    while not found(high):
+        low, high, stride = high, high + stride, min(2 * stride, 16)
+        if high > count:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if found(middle) else (middle, high)
+    return float(SIDE_RANGE_PX[0] * STEP**high)
+
+
+def _rate(
+    drawing: TargetDrawing,
+    reader: PlainReader,
+    marker: MarkerName,
+    side_px: float,
+    optics: Optics,
+    picture_px: int,
+) -> float:
+    side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
+    pictures = sample_pictures(drawing, side_px / side_m, side_px, optics, TRIALS)
+    least_px = _PERIMETER_RATE * picture_px
+    hits = 0
+    for picture in pictures:
+        quad = reader.read(picture).get(marker)
+        if quad is not None and cv2.arcLength(quad, True) >= least_px:
+            hits += 1
+    return hits / TRIALS
+
+
+def sample_pictures(
+    drawing: TargetDrawing, px_per_m: float, side_px: float, optics: Optics, count: int
+) -> list[NDArray[np.uint8]]:
+    """`count` pictures around the target's centre, 3 times `side_px` wide, at any turn and
+    any place between the pixels."""
+    fine = 2 if optics.blur_px >= 1.0 else 4
+    size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
+    n = size * fine
+    ink = ink_coverage(drawing, px_per_m * fine, n)
+    sheet = sheet_coverage(drawing, px_per_m * fine, n)
+    flat = (_CEILING * (1.0 - sheet) + _PAPER * (sheet - ink) + _INK * ink).astype(np.float32)
+    rng = np.random.default_rng([_STREAM, round(1e3 * side_px)])
+    pictures = []
+    for _ in range(count):
+        shift = rng.uniform(-0.5, 0.5, 2)
+        turn = cv2.getRotationMatrix2D(((n - 1) / 2.0, (n - 1) / 2.0), rng.uniform(0.0, 360.0), 1.0)
+        turn = np.asarray(turn, np.float64) + np.outer(shift * fine, (0.0, 0.0, 1.0))
+        turned = cv2.warpAffine(flat, turn, (n, n), borderMode=cv2.BORDER_REPLICATE)
+        if optics.blur_px > 0.05:
+            turned = cv2.GaussianBlur(turned, (0, 0), optics.blur_px * fine)
+        picture = cv2.resize(turned, (size, size), interpolation=cv2.INTER_AREA)
+        noisy = np.asarray(picture, np.float64) + rng.normal(0.0, optics.noise, picture.shape)
+        pictures.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    return pictures

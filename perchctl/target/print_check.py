@@ -1,0 +1,165 @@
+"""Whether the small marker was printed in the right proportion to the large one.
+
+Seen together, both markers lie in one plane at one distance: the ratio of their apparent
+sizes is the ratio of their prints, whatever the distance and the focal length.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from perchctl.geometry import Array
+from perchctl.profile import TargetConfig
+from perchctl.target.drawing import marker_corners_m
+from perchctl.vision.camera_model import undistort_px
+from perchctl.vision.types import CameraModel
+
+CORNER_BIAS_PX = 0.02
+"""What a refined corner errs inwards or outwards in all frames alike; no number of frames
+averages it away."""
+MIN_ERROR = 0.003
+"""Errors smaller than this are not named: 0.3 % of a 25 mm marker is 0.08 mm, the width of
+a printer's dot."""
+SIGMAS = 3.0
+MIN_FRAMES = 5
+_STEPS = 12
+_SETTLED = 1e-10
+
+
+@dataclass(frozen=True)
+class SizeRatio:
+    """`value` is the small marker's size, relative to the large one's, over what the
+    profile says: 1.01 is printed 1 % too large. `sigma` is its spread; `bias` what the
+    corners may err systematically. `small_px` is the small marker's side in the picture."""
+
+    value: float
+    sigma: float
+    bias: float
+    frames: int
+    small_px: float
+
+
+@dataclass(frozen=True)
+class PrintVerdict:
+    """`wrong` names a print error beyond the noise; `text` is one sentence."""
+
+    wrong: bool
+    text: str
+
+
+def size_ratio(
+    large_px: Array,
+    small_px: Array,
+    sigma_px: tuple[float, float],
+    camera: CameraModel,
+    target: TargetConfig,
+) -> SizeRatio | None:
+    """From one frame's corners, (4, 2) px each, with the spread of the large and of the
+    small marker's: pose and ratio are solved together by least squares.
+
+    None where the corners give no pose, or spread so far that they say nothing.
+    """
+    X_large, X_small = (marker_corners_m(m.side_m) for m in (target.large, target.small))
+    seen = undistort_px(np.concatenate([large_px, small_px]), camera)
+    if not np.isfinite(seen).all() or not all(math.isfinite(s) and s > 0.0 for s in sigma_px):
+        return None
+    try:
+        ok, rvec, tvec = cv2.solvePnP(
+            X_large, np.ascontiguousarray(seen[:4]), camera.K, None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:
+        return None
+    if not ok or not (np.isfinite(rvec).all() and np.isfinite(tvec).all()) or tvec[2, 0] <= 0.0:
+        return None
+    p = np.concatenate([np.ravel(rvec), np.ravel(tvec), [1.0]])
+    weight = np.repeat([1.0 / sigma_px[0] ** 2, 1.0 / sigma_px[1] ** 2], 8)
+    information = np.eye(7)
+    for _ in range(_STEPS):
+        error, J = _linearised(p, X_large, X_small, seen, camera.K)
+        information = J.T @ (J * weight[:, None])
+        try:
+            step = -np.linalg.solve(information, J.T @ (weight * error))
+        except np.linalg.LinAlgError:
+            return None
+        p = p + step
+        if not np.isfinite(p).all() or p[6] <= 0.0 or p[5] <= 0.0:
+            return None
+        if abs(step[6]) < _SETTLED:
+            break
+    error, _ = _linearised(p, X_large, X_small, seen, camera.K)
+    chi2 = float((weight * error**2).sum()) / (len(error) - 7)
+    sigma = math.sqrt(float(np.linalg.inv(information)[6, 6]) * max(1.0, chi2))
+    sides = [_side_px(quad) for quad in (seen[:4], seen[4:])]
+    bias = math.hypot(*(2.0 * CORNER_BIAS_PX / side for side in sides))
+    return SizeRatio(float(p[6]), sigma, bias, 1, sides[1])
+
+
+def combined(ratios: Sequence[SizeRatio]) -> SizeRatio | None:
+    """The weighted mean of many frames; its spread is the larger of what the frames claim
+    and what they show. None of no frames."""
+    if not ratios:
+        return None
+    value = np.array([r.value for r in ratios])
+    weight = np.array([1.0 / max(r.sigma, 1e-9) ** 2 for r in ratios])
+    share = weight / weight.sum()
+    mean = float(share @ value)
+    sigma = float(1.0 / math.sqrt(weight.sum()))
+    if len(ratios) > 1:
+        shown = float(share**2 @ (value - mean) ** 2) * len(ratios) / (len(ratios) - 1)
+        sigma = max(sigma, math.sqrt(shown))
+    return SizeRatio(
+        mean,
+        sigma,
+        float(share @ np.array([r.bias for r in ratios])),
+        sum(r.frames for r in ratios),
+        float(share @ np.array([r.small_px for r in ratios])),
+    )
+
+
+def verdict(ratio: SizeRatio | None, target: TargetConfig) -> PrintVerdict:
+    """Names a print error only where it is beyond noise and bias."""
+    if ratio is None or ratio.frames < MIN_FRAMES:
+        count = 0 if ratio is None else ratio.frames
+        return PrintVerdict(
+            False,
+            f"print not judged: both markers were seen in {count} frames, {MIN_FRAMES} needed",
+        )
+    off, total = ratio.value - 1.0, math.hypot(ratio.sigma, ratio.bias)
+    nominal = target.small.side_m / target.large.side_m
+    said = (
+        f"the small marker is {ratio.value * nominal:.4f} of the large one, the profile says "
+        f"{nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
+    )
+    if abs(off) <= max(SIGMAS * total, MIN_ERROR):
+        return PrintVerdict(False, f"print good within its noise: {said}")
+    return PrintVerdict(
+        True,
+        f"print error: {said}; measure both black squares and give them to "
+        f"perchctl make-target --measured-large MM --measured-small MM",
+    )
+
+
+def _linearised(
+    p: Array, X_large: Array, X_small: Array, seen: Array, K: Array
+) -> tuple[Array, Array]:
+    """Errors (16,) px and their Jacobian (16, 7) by rvec, tvec and the ratio."""
+    scaled = X_small * p[6]
+    image, jacobian = cv2.projectPoints(np.concatenate([X_large, scaled]), p[:3], p[3:6], K, None)
+    R = cv2.Rodrigues(p[:3])[0]
+    cam = scaled @ R.T + p[3:6]
+    d = X_small @ R.T
+    x, y, z = cam.T
+    by_ratio = np.zeros((8, 2))
+    by_ratio[4:, 0] = K[0, 0] * (d[:, 0] / z - x * d[:, 2] / z**2)
+    by_ratio[4:, 1] = K[1, 1] * (d[:, 1] / z - y * d[:, 2] / z**2)
+    J = np.column_stack([np.asarray(jacobian[:, :6], np.float64), by_ratio.ravel()])
+    return (image.reshape(-1, 2) - seen).ravel(), J
+
+
+def _side_px(quad: Array) -> float:
+    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean())

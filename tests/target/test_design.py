@@ -1,0 +1,193 @@
+"""The designer against the renderer, the paper and the bound; its suggestions hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import math
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.profile import Profile, TargetConfig, load_profile
+from perchctl.record.design_plot import plot_design
+from perchctl.target.bound import pose_bound
+from perchctl.target.checks import check_target
+from perchctl.target.design import Design, Ranges, error_curve, make_design
+from perchctl.target.design_text import design_record, design_text
+from perchctl.target.drawing import marker_corners_m
+from perchctl.target.limits import Optics
+from perchctl.target.suggest import suggest
+from perchctl.target.view import View, square_outline, turned_outline
+from perchctl.vision.types import CameraModel
+
+TARGET = TargetConfig()
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def camera_of(focal_px: float, dist: tuple[float, ...] = (0.0,) * 5) -> CameraModel:
+    K = np.array([[focal_px, 0.0, 319.5], [0.0, focal_px, 239.5], [0.0, 0.0, 1.0]])
+    return CameraModel((640, 480), K, np.array(dist))
+
+
+PAPER_CAMERA = camera_of(380.0)
+
+
+@pytest.fixture(scope="module")
+def profile() -> Profile:
+    return load_profile("sim")
+
+
+@pytest.fixture(scope="module")
+def bench() -> ModuleType:
+    path = ROOT / "benchmarks" / "ranges_by_design.py"
+    spec = importlib.util.spec_from_file_location("ranges_by_design", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    vars(module)["START"] = 1.2  # beyond what may be wrong, and quick
+    return module
+
+
+@pytest.fixture(scope="module")
+def paper_design(profile: Profile) -> Design:
+    return make_design(TARGET, PAPER_CAMERA, Optics(2.5), profile, 2.4)
+
+
+@pytest.mark.parametrize(("focal_px", "blur_px"), [(250.0, 2.5), (380.0, 1.5)])
+def test_ranges_agree_with_the_renderer(bench: ModuleType, focal_px: float, blur_px: float) -> None:
+    """The other cameras and blurs: benchmarks/ranges_by_design.py."""
+    for name, designed, measured in bench.measure(focal_px, blur_px, TARGET):
+        assert designed == pytest.approx(measured, rel=0.15), name
+
+
+def test_the_paper_s_ranges_and_where_they_differ(paper_design: Design) -> None:
+    """z2 and z3 agree; a blur that explains z1 = 115 cm would be 3.5 px, not 2.5."""
+    r = paper_design.ranges
+    assert r.z2_m == pytest.approx(0.25, rel=0.15)
+    assert r.z3_upright_m == pytest.approx(0.12, rel=0.05)
+    assert r.z3_m == pytest.approx(0.17, rel=0.05), "facing across, the marker needs more room"
+    assert r.z1_m is not None
+    assert 1.15 < r.z1_m < 1.75
+    text = design_text(paper_design, error_curve(paper_design), "paper.yaml")
+    assert "z1 115 cm" in text
+    assert "a blur of 3." in text
+    assert "at any turn it is 17" in text
+
+
+def test_z3_is_the_geometry_s() -> None:
+    view = View(PAPER_CAMERA, margin_px=0.0)
+    ahead = (np.eye(3), np.zeros(3))
+    assert view.nearest_m(square_outline(0.15), *ahead) == pytest.approx(
+        0.15 * 380.0 / 480.0, rel=2e-3
+    )
+    assert view.nearest_m(turned_outline(0.15), *ahead) == pytest.approx(
+        0.15 * math.sqrt(2.0) * 380.0 / 480.0, rel=2e-3
+    )
+
+
+def test_barrel_distortion_shows_more(profile: Profile) -> None:
+    ahead = (np.eye(3), np.zeros(3))
+    barrel = View(camera_of(380.0, (-0.17, 0.04, 0.0, 0.0, 0.0))).nearest_m(
+        turned_outline(0.15), *ahead
+    )
+    plain = View(PAPER_CAMERA).nearest_m(turned_outline(0.15), *ahead)
+    assert barrel is not None
+    assert plain is not None
+    assert barrel < 0.99 * plain
+
+
+def test_what_is_behind_the_camera_is_never_seen() -> None:
+    turn_back = np.diag([1.0, -1.0, -1.0])
+    assert View(PAPER_CAMERA).nearest_m(turned_outline(0.1), turn_back, np.zeros(3)) is None
+
+
+@pytest.mark.parametrize(("sides", "z_m"), [([0.15], 0.6), ([0.15, 0.025], 0.2), ([0.025], 0.1)])
+def test_the_bound_is_what_least_squares_spreads(sides: list[float], z_m: float) -> None:
+    """Poses solved from noisy corners spread as the bound says, within the draws' own spread."""
+    rng = np.random.default_rng(3)
+    X = np.concatenate([marker_corners_m(s) for s in sides])
+    rvec, tvec = np.array([math.pi, 0.0, 0.0]), np.array([0.0, 0.0, z_m])
+    image, _ = cv2.projectPoints(X, rvec, tvec, PAPER_CAMERA.K, None)
+    solved = []
+    for _ in range(400):
+        noisy = image.reshape(-1, 2) + rng.normal(0.0, 0.02, (len(X), 2))
+        r, t = cv2.solvePnPRefineLM(
+            X, noisy, PAPER_CAMERA.K, None, rvec.reshape(3, 1).copy(), tvec.reshape(3, 1).copy()
+        )
+        R = cv2.Rodrigues(r)[0]
+        solved.append([*t.ravel(), math.atan2(R[1, 0], R[0, 0])])
+    spread = np.std(solved, axis=0)
+    bound = pose_bound(sides, z_m, 380.0, 0.02)
+    assert spread == pytest.approx([bound.x_m, bound.y_m, bound.z_m, bound.yaw_rad], rel=0.15)
+
+
+def test_the_curve_holds_what_is_seen(paper_design: Design) -> None:
+    curve = error_curve(paper_design)
+    r = paper_design.ranges
+    assert r.z2_m is not None
+    assert r.z3_m is not None
+    both = np.isfinite(curve.bounds["both"][:, 0])
+    assert curve.z_m[both].min() == pytest.approx(r.z3_m, rel=0.05)
+    assert curve.z_m[both].max() == pytest.approx(r.z2_m, rel=0.05)
+    assert (curve.bounds["both"][both] <= curve.bounds["large"][both] + 1e-12).all()
+
+
+def warnings_of(profile: Profile, ranges: Ranges, **changes: Any) -> str:
+    design = make_design(
+        TARGET, PAPER_CAMERA, Optics(), profile, 2.4, dataclasses.replace(ranges, **changes)
+    )
+    return " | ".join(design.warnings)
+
+
+def test_gaps_are_named(profile: Profile, paper_design: Design) -> None:
+    ranges = paper_design.ranges
+    assert warnings_of(profile, ranges) == ""
+    assert "gap at the search height" in warnings_of(profile, ranges, z1_m=0.9)
+    assert "gap between the markers" in warnings_of(profile, ranges, z2_m=0.15)
+    assert "overlap is short" in warnings_of(profile, ranges, z2_m=0.18)
+    assert "never read" in warnings_of(profile, ranges, z1_m=None)
+    aside = profile.model_copy(
+        update={"camera": profile.camera.model_copy(
+            update={"T_body_cam": profile.camera.T_body_cam.model_copy(
+                update={"position_m": (0.09, 0.0, 0.0)})})}
+    )  # fmt: skip
+    assert "gap before contact" in warnings_of(aside, ranges)
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "blur_px", "ceiling_m"), [(380.0, 2.0, 2.4), (250.0, 0.6, None)]
+)
+def test_what_is_suggested_covers_the_way(
+    profile: Profile, focal_px: float, blur_px: float, ceiling_m: float | None
+) -> None:
+    found, design = suggest(camera_of(focal_px), Optics(blur_px), profile, 0.05, ceiling_m)
+    assert design.warnings == ()
+    assert found.notes == ()
+    assert design.ranges.z1_m is not None
+    assert design.ranges.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
+    check_target(found.target, 0.05)
+    assert f"--large {found.target.large.side_m * 1e3:g}mm" in found.command()
+
+
+def test_what_no_target_can_cover_is_said(profile: Profile) -> None:
+    found, _ = suggest(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
+    assert any("small marker would have to be" in note for note in found.notes)
+
+
+def test_the_plot_and_the_record(paper_design: Design, tmp_path: Path) -> None:
+    path = tmp_path / "design.png"
+    plot_design(paper_design, error_curve(paper_design), path)
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    assert min(picture.shape[:2]) > 500
+    record = design_record(paper_design)
+    assert record["z1_m"] == paper_design.ranges.z1_m
+    assert record["warnings"] == []

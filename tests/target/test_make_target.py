@@ -1,0 +1,204 @@
+"""`perchctl make-target` as it is called: files, profiles, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from perchctl.cli import app
+from perchctl.profile import load_profile
+
+CAMERA = "example_640x480.yaml"
+
+
+@pytest.fixture(autouse=True)
+def _in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def call(*words: str, code: int = 0) -> tuple[str, str]:
+    """stdout and stderr of the command, whose exit code must be this."""
+    done = CliRunner().invoke(app, ["make-target", *words])
+    assert done.exit_code == code, (done.stdout, done.stderr)
+    return done.stdout, done.stderr
+
+
+def files() -> set[str]:
+    return {path.name for path in Path().iterdir()}
+
+
+def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
+    out, _ = call()
+    assert "wrote target.pdf" in out
+    first = Path("target.pdf").read_bytes()
+    call("-o", "target.pdf")
+    assert files() == {"target.pdf"}
+    assert Path("target.pdf").read_bytes() == first
+
+
+def test_pictures_beside_the_pdf() -> None:
+    call("-o", "mine.pdf", "--png", "100", "--svg", "--large", "12cm", "--page", "letter")
+    assert files() == {"mine.pdf", "mine.png", "mine.svg", "mine_back.png", "mine_back.svg"}
+
+
+def test_a_board() -> None:
+    out, _ = call("--board", "chessboard:9x6:25mm", "-o", "board.pdf", "--json")
+    assert json.loads(out) == {"files": ["board.pdf"], "board": "chessboard:9x6:25mm"}
+
+
+def test_the_profile_s_own_date_is_on_the_sheet() -> None:
+    Path("mine.yaml").write_text("extends: sim\ndate: 2026-03-01\n")
+    call("-p", "mine.yaml", "--svg")
+    assert "(profile mine, 2026-03-01)" in Path("target.svg").read_text()
+    call("-p", "mine.yaml", "--svg", "--large", "140mm")
+    assert "2026" not in Path("target.svg").read_text()
+
+
+def test_the_design_and_its_plot() -> None:
+    out, _ = call("--camera", CAMERA, "--ceiling", "2.4", "--blur", "2.0", "-o", "t.pdf")
+    assert "z1" in out
+    assert files() == {"design.png", "t.pdf"}
+    out, _ = call("--camera", CAMERA, "--blur", "2", "--suggest", "--plot", "s.png", "--json")
+    assert json.loads(out)["command"].startswith("perchctl make-target --large ")
+    assert "s.png" in files()
+
+
+REFUSALS = [
+    (["--large", "150"], 30, "has no unit; write 150mm"),
+    (["--large", "1mm"], 30, "outside of 4 mm"),
+    (["--small", "80mm"], 30, "less than half"),
+    (["--large-id", "5000"], 30, "--large-id, --large-dict: id 5000 is outside"),
+    (["--large-dict", "DICT_4X4_50"], 2, "needs --large-id"),
+    (["--small", "36mm"], 30, "diagonal"),
+    (["--magnet", "20mm"], 30, "not inside the magnet"),
+    (["--page", "150x150mm"], 30, "--page a4 holds it"),
+    (["--page", "a9"], 30, "allowed are a4, letter, a3"),
+    (["--png", "9"], 30, "50 to 1200 dpi"),
+    (["-o", "target.txt"], 2, "must end in .pdf"),
+    (["-o", "nowhere/target.pdf"], 20, "does not exist"),
+    (["-p", "nothing"], 20, "profile 'nothing' not found"),
+    (["--board", "chessboard:9x6"], 30, "COLUMNSxROWS:SQUARE"),
+    (["--board", "chessboard:9x6:25mm", "--camera", CAMERA], 2, "different tasks"),
+    (["--camera", "nothing.yaml"], 20, "not found"),
+    (["--camera", CAMERA, "--blur", "-1"], 30, "--blur -1: allowed are 0 to 20 px"),
+    (["--camera", CAMERA, "--ceiling", "nan"], 30, "--ceiling"),
+    (["--camera", CAMERA, "--suggest", "--ceiling", "1"], 30, "below the highest search position"),
+    (["--camera", CAMERA, "--suggest", "-o", "t.pdf"], 2, "prints a command"),
+    (["--ceiling", "2.4"], 2, "--ceiling needs --camera"),
+    (["--suggest"], 2, "--suggest needs --camera"),
+    (["--measured-large", "149.6"], 2, "name the profile"),
+    (["--measured-large", "149.6", "-p", "crazyflie"], 2, "-p crazyflie -o my_vehicle.yaml"),
+    (["--measured-large", "0.1496", "-p", "m.yaml"], 30, "measure the black square, in mm"),
+    (["--measured-large", "150in", "-p", "m.yaml"], 30, "unit 'in'"),
+    (["--measured-large", "149.6", "-o", "m.pdf"], 2, "a .yaml file"),
+]
+
+
+@pytest.mark.parametrize(("words", "code", "said"), REFUSALS)
+def test_a_refusal_is_one_sentence_and_leaves_nothing(
+    words: list[str], code: int, said: str
+) -> None:
+    _, err = call(*words, code=code)
+    assert said in err
+    assert err.count("\n") == 1
+    assert files() == set()
+
+
+def test_a_file_that_cannot_be_written_leaves_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("t.png").mkdir()
+    _, err = call("-o", "t.pdf", "--png", "60", code=30)
+    assert "t.png is a folder" in err
+    assert files() == {"t.png"}
+
+
+def test_a_full_disk_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = Path.write_bytes
+
+    def full(path: Path, data: bytes) -> int:
+        if ".png" in path.name:
+            whole(path, data[: len(data) // 2])
+            raise OSError(28, "No space left on device")
+        return whole(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    _, err = call("-o", "t.pdf", "--png", "60", code=30)
+    assert "No space left on device" in err
+    assert files() == set()
+
+
+def test_measured_sizes_make_a_small_profile() -> None:
+    out, _ = call("-p", "crazyflie", "--measured-large", "149.6", "--measured-small", "24.9",
+                  "-o", "mine.yaml")  # fmt: skip
+    assert "-0.27 %" in out
+    assert "small against large: -0.13 %" in out
+    found = load_profile("./mine.yaml")
+    assert found.target.large.side_m == 0.1496
+    assert found.target.small.side_m == 0.0249
+    assert found.vehicle == load_profile("crazyflie").vehicle
+    assert Path("mine.yaml").read_text().startswith("extends: crazyflie\n")
+
+
+def test_a_new_file_named_by_p_extends_the_real_vehicle_s_profile() -> None:
+    call("-p", "new.yaml", "--measured-small", "25.1")
+    assert load_profile("./new.yaml").target.small.side_m == 0.0251
+    assert load_profile("./new.yaml").link == load_profile("crazyflie").link
+
+
+PROFILES = {
+    "flow": "extends: sim\ntarget:\n  # measured\n  large: {dictionary: DICT_4X4_1000, id: 997, "
+    "side_m: 0.150}  # keep\n  small: {dictionary: DICT_ARUCO_ORIGINAL, id: 5, side_m: 0.025}\n",
+    "block": "extends: sim\n# keep\ntarget:\n  large:\n    side_m: 15.0e-2\n    dictionary: "
+    "DICT_4X4_1000\n    id: 997\n",
+    "no target": "# keep\nextends: sim\nlog: {plot: false}",
+    "no side": "extends: crazyflie  # keep\ntarget:\n    large:\n        id: 16\n"
+    "    small: {id: 6}\n",
+    "all flow": "{extends: crazyflie, target: {large: {id: 45}}}  # keep\n",
+    "all flow, no target": "{extends: crazyflie}  # keep\n",
+}
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> None:
+    path = Path("mine.yaml")
+    path.write_text(PROFILES[name])
+    before = load_profile("./mine.yaml")
+    words = ("-p", "mine.yaml", "--measured-large", "149.6", "--measured-small", "24.9mm")
+    _, err = call(*words, code=2)
+    assert "--force" in err
+    assert path.read_text() == PROFILES[name]
+    call(*words, "--force")
+    after = load_profile("./mine.yaml")
+    assert (after.target.large.side_m, after.target.small.side_m) == (0.1496, 0.0249)
+    assert after.target.large.id == before.target.large.id
+    assert after.model_copy(update={"target": before.target}) == before
+    assert "keep" in path.read_text()
+    assert files() == {"mine.yaml"}
+
+
+def test_a_small_profile_of_a_file_in_another_folder_finds_it() -> None:
+    Path("base").mkdir()
+    Path("base/mine.yaml").write_text("extends: crazyflie\nlog: {plot: false}\n")
+    call("-p", "base/mine.yaml", "--measured-large", "149.6", "-o", "measured.yaml")
+    assert load_profile("./measured.yaml").log.plot is False
+    _, err = call("-p", "base/mine.yaml", "--measured-large", "150", "-o", "measured.yaml", code=2)
+    assert "measured.yaml exists" in err
+
+
+def test_a_side_that_stands_elsewhere_in_the_file_is_not_changed_there() -> None:
+    text = (
+        "extends: crazyflie\nplanner:\n  search: {step_m: &side 0.15}\n"
+        "target:\n  large: {side_m: *side}\n"
+    )
+    Path("mine.yaml").write_text(text)
+    _, err = call("-p", "mine.yaml", "--measured-large", "149.6", "--force", code=30)
+    assert "edit target by hand" in err
+    assert Path("mine.yaml").read_text() == text
+    assert files() == {"mine.yaml"}
+
+
+def test_a_scaled_page_is_noticed() -> None:
+    out, _ = call("-p", "m.yaml", "--measured-large", "145.5", "--measured-small", "24.25")
+    assert "was the page scaled" in out
