@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,14 @@ from perchctl.errors import (
     TargetNotFound,
 )
 from perchctl.mission.state import Outcome, Phase
-from perchctl.profile import Profile, find_calibration, find_profile, load_profile
+from perchctl.profile import (
+    Profile,
+    find_calibration,
+    find_profile,
+    find_weights,
+    load_profile,
+    read_weights,
+)
 from perchctl.record.log_file import read_log
 from perchctl.record.panel import make_reporter
 from perchctl.record.summary import summary_text
@@ -74,7 +82,7 @@ def plan_text(options: FlyOptions) -> str:
     search, ascend, perch = planner.search, planner.ascend, planner.perch
     target = options.profile.target
     merge = options.profile.merge
-    how = "joint solve" if merge.method == "joint" else f"weights {merge.weights.model_dump()}"
+    how = weights_text(options) if merge.method == "weights" else "joint solve"
     press = (
         f"raw thrust {perch.thrust}" if perch.mode == "raw" else f"press {perch.press_m} m above"
     )
@@ -103,6 +111,21 @@ def plan_text(options: FlyOptions) -> str:
     return "\n".join(lines)
 
 
+def weights_text(options: FlyOptions) -> str:
+    """Which merge weights fly, and where they are from: date, method, data."""
+    merge = options.profile.merge
+    numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
+    if merge.weights_file is None:
+        return f"weights {numbers} (of the profile)"
+    path = find_weights(merge.weights_file, options.profile_path)
+    fitted = read_weights(path)
+    origin = [fitted.date and f"of {fitted.date}", fitted.method]
+    if fitted.data.sha256:
+        origin.append(f"data {fitted.data.sha256[:12]}")
+    said = ", ".join(part for part in origin if part)
+    return f"weights {numbers} (from {path}{': ' + said if said else ''})"
+
+
 def run(options: FlyOptions, *, as_json: bool = False) -> int:
     """Fly, log, plot, say how it ended; returns the exit code. Errors before the flight
     and unforeseen ones are raised, after the vehicle has been landed."""
@@ -111,7 +134,11 @@ def run(options: FlyOptions, *, as_json: bool = False) -> int:
         options.log_dir, options.profile, options.uri, options.source, simulated_seed
     )
     reporter = make_reporter(stream=sys.stderr)
-    print(f"perchctl: connecting to {options.uri}", file=sys.stderr)
+    merges = ""
+    if options.profile.merge.method == "weights":
+        merges = f"; merges with {weights_text(options)}"
+        log.event(time.monotonic(), merges.removeprefix("; "))
+    print(f"perchctl: connecting to {options.uri}{merges}", file=sys.stderr)
     try:
         result = fly_session(options, (log, DisplayWatcher(reporter)))
     except BaseException as error:

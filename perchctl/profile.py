@@ -7,6 +7,7 @@ frozen `Profile`. Every fault is one `InvalidValue` sentence of the form
 
 from __future__ import annotations
 
+import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array, make_T, rotation_from_rpy
-from perchctl.locations import data_file, data_folder, listing
+from perchctl.locations import data_file, data_folder, listing, user_config_folder
 from perchctl.target.dictionaries import check_marker_id
 
 Vector3 = tuple[float, float, float]
@@ -94,6 +95,7 @@ class TargetConfig(Section):
 class DetectorConfig(Section):
     refinement: Literal["none", "subpix", "line"] = "line"
     window: bool = True  # search around the last pose first
+    blurred: bool = True  # look once more where blur may hide the target
     correction_bits_large: int = Field(0, ge=0, le=3)
     correction_bits_small: int = Field(1, ge=0, le=3)
 
@@ -106,13 +108,20 @@ class PoseConfig(Section):
 
 class KalmanConfig(Section):
     """The paper's filter. k1 and k2 are variances in cm^2 and deg^2, as the paper's
-    error vector is in centimetres and degrees."""
+    error vector is in centimetres and degrees.
+
+    `noise`: ``fixed`` takes k1 for every measurement, as the paper does; ``measured``
+    the covariance of the very pose, plus what `attitude_sigma_deg` of error in the
+    vehicle's roll and pitch does at the target's distance.
+    """
 
     k1: float = Field(0.04, gt=0)
     k2: float = Field(0.004, gt=0)
     alpha: float = Field(0.85, gt=0, le=1)
     n_max: int = Field(8, ge=0, le=100)
     frame: Literal["level", "world"] = "world"
+    noise: Literal["fixed", "measured"] = "fixed"
+    attitude_sigma_deg: float = Field(0.5, ge=0, le=10)
 
 
 class WeightsConfig(Section):
@@ -125,6 +134,7 @@ class WeightsConfig(Section):
 class MergeConfig(Section):
     method: Literal["weights", "joint"] = "joint"
     weights: WeightsConfig = WeightsConfig()
+    weights_file: str | None = None  # of `perchctl fit-weights`; replaces `weights`
     stages: Literal["seen", "range"] = "seen"  # range: by z2 and z3, equations 4, 6, 11
     z1_m: float = Field(1.15, gt=0)
     z2_m: float = Field(0.25, gt=0)
@@ -137,6 +147,36 @@ class MergeConfig(Section):
         if not self.z3_m < self.z2_m < self.z1_m:
             raise ValueError("z3_m < z2_m < z1_m must hold (metres)")
         return self
+
+
+class FittedData(BaseModel):
+    """The data that weights were fitted to."""
+
+    file: str = ""
+    sha256: str = ""
+    rows: int = 0
+    positions: int = 0
+
+
+class FittedWeights(BaseModel):
+    """A weights file, as far as a flight needs it (`perchctl.weights.files` writes more)."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+    date: str = ""
+    method: str = ""
+    weights: WeightsConfig
+    data: FittedData = FittedData()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _all_axes(cls, values: dict[str, Any]) -> dict[str, Any]:
+        given = values.get("weights")
+        if isinstance(given, dict):
+            missing = [axis for axis in WeightsConfig.model_fields if axis not in given]
+            if missing:
+                raise ValueError(f"weights.{missing[0]} is missing; needed are x, y, z and yaw")
+        return values
 
 
 class SearchConfig(Section):
@@ -333,6 +373,7 @@ class Profile(Section):
 
     name: str = "unnamed"
     description: str = ""
+    date: datetime.date | None = None  # of the measurements in it; printed on the target
     camera: CameraConfig = CameraConfig()
     vehicle: VehicleConfig = VehicleConfig()
     target: TargetConfig = TargetConfig()
@@ -375,13 +416,44 @@ def find_profile(name: str) -> Path:
     return found
 
 
-def load_profile(name: str) -> Profile:
-    """Read, resolve `extends` and check a profile. Errors: NotFound, InvalidValue."""
+def load_profile(name: str, *, with_weights: bool = True) -> Profile:
+    """Read, resolve `extends` and check a profile; the weights of its `merge.weights_file`
+    take the place of `merge.weights` unless told otherwise. Errors: NotFound, InvalidValue."""
     path = find_profile(name)
     values = _resolved(path, seen=())
     values.setdefault("name", path.stem)
     try:
-        return Profile.model_validate(values)
+        profile = Profile.model_validate(values)
+    except ValidationError as error:
+        raise InvalidValue(_one_sentence(path, error)) from None
+    if profile.merge.weights_file is None or not with_weights:
+        return profile
+    fitted = read_weights(find_weights(profile.merge.weights_file, path))
+    merge = profile.merge.model_copy(update={"weights": fitted.weights})
+    return profile.model_copy(update={"merge": merge})
+
+
+def find_weights(name: str, profile_path: Path) -> Path:
+    """A weights file by its whole path, beside the profile, or in the user's folder."""
+    given = Path(name).expanduser()
+    for candidate in (given, profile_path.parent / name):
+        if candidate.is_absolute() and candidate.is_file():
+            return candidate
+    beside = profile_path.resolve().parent / name
+    found = beside if beside.is_file() else data_file("weights", name)
+    if found is None:
+        raise NotFound(
+            f"{profile_path}: merge.weights_file: {name} is neither beside the profile nor in "
+            f"{user_config_folder() / 'weights'}; perchctl fit-weights makes one, or remove the key"
+        )
+    return found
+
+
+def read_weights(path: Path) -> FittedWeights:
+    """Read and check a weights file. Errors: NotFound, InvalidValue."""
+    values = _read_yaml(path)
+    try:
+        return FittedWeights.model_validate(values)
     except ValidationError as error:
         raise InvalidValue(_one_sentence(path, error)) from None
 
@@ -411,6 +483,7 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
     values = _read_yaml(path)
+    _place_weights(values, path)
     base_name = values.pop("extends", None)
     if base_name is None:
         return values
@@ -419,6 +492,14 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     beside = path.parent / base_name
     base = beside if beside.is_file() else find_profile(base_name)
     return _merged(_resolved(base, (*seen, path)), values)
+
+
+def _place_weights(values: dict[str, Any], path: Path) -> None:
+    """A weights file beside the profile that names it, whichever extends that one."""
+    merge = values.get("merge")
+    name = merge.get("weights_file") if isinstance(merge, dict) else None
+    if isinstance(name, str) and (beside := path.resolve().parent / name).is_file():
+        values["merge"] = {**merge, "weights_file": str(beside)}  # type: ignore[dict-item]
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

@@ -21,6 +21,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "filterpy": ("perchctl.vision.filter",),
     "mujoco": ("perchctl.sim",),
     "matplotlib": ("perchctl.record",),
+    "motioncapture": ("perchctl.weights.truth",),
 }
 
 # Time is an argument here.
@@ -37,7 +38,7 @@ CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.errors", "perchctl.geometry", "perchctl.locations", "perchctl.target.dictionaries"),
     ("perchctl.profile",),
-    ("perchctl.vision",),
+    ("perchctl.vision", "perchctl.weights"),
     ("perchctl.mission",),
     ("perchctl.pipeline",),
     (
@@ -48,6 +49,12 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "perchctl.calibration",
         "perchctl.target",
         "perchctl.view",
+        # where data come from; the rest of the package is arithmetic
+        "perchctl.weights.collect",
+        "perchctl.weights.dialogue",
+        "perchctl.weights.flight_logs",
+        "perchctl.weights.simulated",
+        "perchctl.weights.truth",
         "perchctl.mission.flight",  # the conductor: it drives camera, link and pipeline
     ),
     # A command's work, opened by the command line; so is any other single module

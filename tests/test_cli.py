@@ -433,8 +433,19 @@ def test_the_library_s_tracebacks_stay_away(profile: str, tmp_path: Path) -> Non
         ("udp://127.0.0.1:9", "nothing listens there"),
     ):
         done = subprocess.run(
-            [sys.executable, "-m", "perchctl", "fly", "-p", profile, "--yes"]
-            + ["--uri", uri, "--source", source],
+            [
+                sys.executable,
+                "-m",
+                "perchctl",
+                "fly",
+                "-p",
+                profile,
+                "--yes",
+                "--uri",
+                uri,
+                "--source",
+                source,
+            ],
             cwd=tmp_path,
             capture_output=True,
             text=True,

@@ -11,12 +11,21 @@ from pathlib import Path
 
 import pytest
 
+from perchctl.calibration.files import load_calibration
 from perchctl.errors import EXIT_CODES
 from perchctl.mission.diagram import diagram, rows_table
+from tests.calibration.synthetic import CHARUCO, render_folder
 from tests.recording import make_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+CAMCHAIN = """cam0:
+  camera_model: pinhole
+  distortion_model: radtan
+  distortion_coeffs: [-0.2, 0.05, 0.001, -0.002]
+  intrinsics: [400.5, 401.5, 320.25, 240.75]
+  resolution: [640, 480]
+"""
 
 
 def _command_lines() -> list[str]:
@@ -35,6 +44,8 @@ def _cheap(line: str) -> list[str]:
         words.append("--dry-run")
     if words[0] == "simulate" and "-n" in words:
         words[words.index("-n") + 1] = "1"
+    if words[0] == "fit-weights" and "--collect" in words:
+        words += ["--positions", "3", "--frames", "10"]
     if words[0] == "track":  # without a camera
         words = ["video:flight.mp4" if word == "camera:0" else word for word in words]
     return words
@@ -45,6 +56,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the commands name: pictures, a video and its calibration."""
     folder = tmp_path_factory.mktemp("recording")
     make_recording(folder)
+    render_folder(folder / "board", load_calibration(folder / "camera.yaml"), CHARUCO, 8, seed=1)
+    (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
     return folder
 
 

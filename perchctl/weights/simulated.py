@@ -1,0 +1,112 @@
+"""The paper's experiment in the simulator: a camera that stands still at seeded places.
+
+Places lie between z3 and z2 under the target, where both markers are seen whole; heading
+and offset are drawn. The picture is the simulator's, noise and blur are the experiment's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from perchctl.errors import InvalidValue
+from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, wrap_rad
+from perchctl.profile import Profile
+from perchctl.sim.renderer import Renderer
+from perchctl.sim.scenario import Scenario
+from perchctl.vision.camera_model import project
+from perchctl.vision.pose import rotation_vector, square
+from perchctl.vision.types import CameraModel, Frame
+
+MARGIN_PX = 4.0
+FRAME_S = 1.0 / 30.0
+_TRIES = 400
+_STREAM = 611
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """`actual`: the target relative to the gear in the level frame, (4,)."""
+
+    T_world_cam: Array
+    actual: Array
+
+
+class Stand:
+    """The simulated camera on its stand. Same seed, same places, same pictures."""
+
+    def __init__(
+        self,
+        profile: Profile,
+        camera: CameraModel,
+        positions: int,
+        seed: int,
+        noise_sigma: float,
+        blur_px: float,
+    ) -> None:
+        self._profile, self._camera, self._seed = profile, camera, seed
+        self._positions = positions
+        self._scenario = Scenario(
+            seed=seed,
+            large_side_m=profile.target.large.side_m,
+            small_side_m=profile.target.small.side_m,
+            camera_noise_sigma=noise_sigma,
+            camera_defocus_px=blur_px,
+        )
+        self._renderer = Renderer(self._scenario, camera, profile.target, seed)
+        self._corners = square(profile.target.large.side_m)
+
+    def place(self, position: int) -> Place:
+        """The place of a position, counted from 1: its distance falls into its own share of
+        z3 to z2, so that few positions cover the range. Errors: InvalidValue."""
+        merge = self._profile.merge
+        rng = np.random.default_rng([self._seed, _STREAM, position])
+        share = (position - 1) % self._positions
+        step = (merge.z2_m - merge.z3_m) / self._positions
+        for _ in range(_TRIES):
+            z_m = merge.z3_m + (share + float(rng.random())) * step
+            yaw = float(rng.uniform(-math.pi, math.pi))
+            reach = 0.35 * z_m
+            x_m, y_m = (float(v) for v in rng.uniform(-reach, reach, 2))
+            place = self._at(x_m, y_m, z_m, yaw)
+            if self._in_picture(place):
+                return place
+        raise InvalidValue(
+            f"no place between z3 ({merge.z3_m:g} m) and z2 ({merge.z2_m:g} m) shows the whole "
+            f"large marker to this camera: correct merge.z3_m and z2_m in the profile"
+        )
+
+    def frames(self, position: int, place: Place, count: int) -> Iterator[Frame]:
+        for k in range(count):
+            index = position * 100_000 + k
+            image = self._renderer.render([place.T_world_cam], frame_index=index)
+            yield Frame(k, k * FRAME_S, image, k * FRAME_S)
+
+    def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> Place:
+        """The camera `z_m` under the target and off it by x, y in its own level axes."""
+        T_body_cam = self._profile.camera.T_body_cam.T_body_cam
+        lens = np.array([x_m, y_m, z_m])  # target relative to the camera, level axes
+        gear = np.asarray(self._profile.vehicle.gear_body_m)
+        target_world = np.array([*self._scenario.target_xy_m, self._scenario.ceiling_z_m])
+        body = target_world - rot_z(yaw) @ (lens + T_body_cam[:3, 3])
+        T_world_body = make_T(rot_z(yaw), body)
+        e_m = lens + T_body_cam[:3, 3] - gear
+        heading = wrap_rad(self._scenario.target_yaw_rad - yaw)
+        return Place(T_world_body @ T_body_cam, np.array([*e_m, heading]))
+
+    def _in_picture(self, place: Place) -> bool:
+        T_world_marker = self._renderer.T_world_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
+        T_cam_marker = invert_T(place.T_world_cam) @ T_world_marker
+        corners = project(
+            self._corners, rotation_vector(T_cam_marker[:3, :3]), T_cam_marker[:3, 3], self._camera
+        )
+        width, height = self._camera.size_px
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        return bool(
+            (low > MARGIN_PX).all()
+            and high[0] < width - 1 - MARGIN_PX
+            and high[1] < height - 1 - MARGIN_PX
+        )

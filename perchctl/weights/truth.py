@@ -1,0 +1,262 @@
+"""Where a collected position's actual pose comes from: a person, motion capture, or the
+vehicle's state estimate.
+
+The actual pose is what the pipeline measures: the target relative to the gear's tip in
+the level frame, (x, y, z, yaw).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut, UsageError
+from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
+from perchctl.mission.types import Telemetry
+from perchctl.vision.types import Attitude
+
+SAMPLES = 30
+WITHIN_S = 5.0
+MOVED_M, MOVED_RAD = 0.003, math.radians(1.0)
+"""A body that moved farther than this while its frames were taken was not held still."""
+
+Ask = Callable[[str], str]
+
+
+@dataclass(frozen=True, eq=False)
+class Actual:
+    """The pose (4,), and the attitude of the vehicle, None where it stands level."""
+
+    pose: Array
+    attitude: Attitude | None = None
+
+
+class Truth(Protocol):
+    def actual(self, ask: Ask) -> Actual:
+        """The pose now; may ask the person. Errors: InvalidValue for an answer that is none."""
+
+    def close(self) -> None: ...
+
+    @property
+    def repeatable(self) -> bool:
+        """Whether asking again tells if the body moved."""
+
+
+def relative(
+    position_m: Array, rpy_rad: tuple[float, float, float], target: Array, gear_body_m: Array
+) -> Actual:
+    """The target (x, y, z, yaw in the world) relative to the gear of a body in the world."""
+    roll, pitch, yaw = rpy_rad
+    level = rot_z(-yaw) @ (target[:3] - position_m)
+    e_m = level - rotation_from_rpy(roll, pitch, 0.0) @ gear_body_m
+    attitude = Attitude(0.0, roll, pitch, yaw, (position_m[0], position_m[1], position_m[2]))
+    return Actual(np.array([*e_m, wrap_rad(float(target[3]) - yaw)]), attitude)
+
+
+def four_numbers(text: str, scale: tuple[float, float]) -> Array:
+    """``x y z yaw`` as typed; lengths times scale[0], the angle times scale[1].
+
+    Errors: InvalidValue."""
+    cells = text.replace(",", " ").split()
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError:
+        values = []
+    if len(values) != 4 or not all(math.isfinite(v) for v in values):
+        raise InvalidValue(
+            f"{text.strip()!r} is not a pose: four numbers are needed, x y z and yaw"
+        )
+    return np.array([*(v * scale[0] for v in values[:3]), wrap_rad(values[3] * scale[1])])
+
+
+class TypedTruth:
+    """A person with a ruler: centimetres and degrees, as in the paper's tables."""
+
+    repeatable = False
+
+    def actual(self, ask: Ask) -> Actual:
+        text = ask("actual pose of the target from the gear, x y z [cm] and yaw [deg]: ")
+        return Actual(four_numbers(text, (0.01, math.pi / 180.0)))
+
+    def close(self) -> None:
+        return None
+
+
+class MocapTruth:
+    """Motion capture through the library `motioncapture` (the extra [mocap]).
+
+    Args:
+        system: ``TYPE:HOST``, as in ``vicon:192.168.1.2``.
+        body: rigid body of the vehicle, in `perchctl.geometry`'s body axes.
+        target: that of the target (its x axis is the heading), or the pose itself, (4,).
+    """
+
+    repeatable = True
+
+    def __init__(self, system: str, body: str, target: str | Array, gear_body_m: Array) -> None:
+        kind, _, host = system.partition(":")
+        try:
+            import motioncapture
+        except ImportError:
+            raise UsageError(
+                f"--truth mocap needs the library motioncapture; install it with: "
+                f"{sys.executable} -m pip install 'perchctl[mocap]'"
+            ) from None
+        self._system, self._body, self._target, self._gear = system, body, target, gear_body_m
+        try:
+            client = motioncapture.connect(kind, {"hostname": host})
+        except Exception as error:
+            raise ConnectionFailed(f"no motion capture at {system}: {error}") from None
+        self._frames: queue.Queue[dict[str, Any] | Exception] = queue.Queue(maxsize=SAMPLES)
+        self._stop = threading.Event()
+        # Waiting for a frame has no bound of its own.
+        self._thread = threading.Thread(target=self._listen, args=(client,), daemon=True)
+        self._thread.start()
+
+    def _listen(self, client: Any) -> None:
+        while not self._stop.is_set():
+            try:
+                client.waitForNextFrame()
+                frame: dict[str, Any] | Exception = {
+                    name: (np.array(body.position, dtype=np.float64), _rpy(body.rotation))
+                    for name, body in client.rigidBodies.items()
+                }
+            except Exception as error:
+                frame = error
+            if self._frames.full():
+                with contextlib.suppress(queue.Empty):
+                    self._frames.get_nowait()
+            self._frames.put(frame)
+            if isinstance(frame, Exception):
+                return
+
+    def actual(self, ask: Ask) -> Actual:
+        while not self._frames.empty():
+            self._frames.get_nowait()
+        poses: dict[str, list[tuple[Array, tuple[float, float, float]]]] = {}
+        wanted = [self._body] + ([self._target] if isinstance(self._target, str) else [])
+        seen: set[str] = set()
+        until_s = time.monotonic() + WITHIN_S
+        while min((len(poses.get(name, [])) for name in wanted), default=0) < SAMPLES:
+            try:
+                frame = self._frames.get(timeout=max(0.0, until_s - time.monotonic()))
+            except queue.Empty:
+                frame = {}
+            if isinstance(frame, Exception):
+                raise ConnectionFailed(f"motion capture at {self._system} failed: {frame}")
+            seen |= set(frame)
+            for name in wanted:
+                if name in frame:
+                    poses.setdefault(name, []).append(frame[name])
+            if time.monotonic() > until_s:
+                missing = next(name for name in wanted if len(poses.get(name, [])) < SAMPLES)
+                raise NotFound(
+                    f"motion capture at {self._system} does not see the rigid body {missing!r}; "
+                    f"it sees {', '.join(sorted(seen)) or 'none'}"
+                )
+        position, rpy = _median(poses[self._body])
+        target = self._target
+        if isinstance(target, str):
+            place, turned = _median(poses[target])
+            target = np.array([*place, turned[2]])
+        return relative(position, rpy, target, self._gear)
+
+    def close(self) -> None:
+        self._stop.set()
+        while not self._frames.empty():  # it may wait for room
+            self._frames.get_nowait()
+        self._thread.join(1.0)  # a library that is still at work when Python ends aborts it
+
+
+def _rpy(q: Any) -> tuple[float, float, float]:
+    x, y, z, w = q.x, q.y, q.z, q.w
+    return rpy_from_rotation(
+        np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+    )
+
+
+def _median(
+    samples: list[tuple[Array, tuple[float, float, float]]],
+) -> tuple[Array, tuple[float, float, float]]:
+    position = np.median(np.array([p for p, _ in samples]), axis=0)
+    angles = np.unwrap(np.array([a for _, a in samples]), axis=0)
+    roll, pitch, yaw = (float(a) for a in np.median(angles, axis=0))
+    return position, (roll, pitch, wrap_rad(yaw))
+
+
+class EstimateTruth:
+    """The vehicle's own state estimate; `telemetry` gives what arrived since the last call.
+
+    Where the target is in the world of that estimate is given, or learned once by holding
+    the gear's tip to the target's centre, nose along the target's x axis.
+    """
+
+    repeatable = True
+
+    def __init__(
+        self,
+        telemetry: Callable[[], list[Telemetry]],
+        target: Array | None,
+        gear_body_m: Array,
+        close: Callable[[], None] = lambda: None,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._telemetry, self._target, self._gear = telemetry, target, gear_body_m
+        self._close, self._wait = close, wait
+
+    def actual(self, ask: Ask) -> Actual:
+        if self._target is None:
+            ask(
+                "hold the gear's tip to the target's centre, nose along the target's x axis, "
+                "then press Enter: "
+            )
+            position, rpy = self._now()
+            tip = position + rotation_from_rpy(*rpy) @ self._gear
+            self._target = np.array([*tip, rpy[2]])
+            ask("learned where the target is; now put the vehicle in place and press Enter: ")
+        position, rpy = self._now()
+        return relative(position, rpy, self._target, self._gear)
+
+    def _now(self) -> tuple[Array, tuple[float, float, float]]:
+        self._telemetry()
+        samples: list[Telemetry] = []
+        waited_s = 0.0
+        while len(samples) < SAMPLES:
+            if waited_s >= WITHIN_S:
+                raise TimedOut(f"the vehicle sends no state estimate (waited {WITHIN_S:g} s)")
+            self._wait(0.02)
+            waited_s += 0.02
+            samples += self._telemetry()
+        return _median(
+            [(np.asarray(s.position_m), (s.roll_rad, s.pitch_rad, s.yaw_rad)) for s in samples]
+        )
+
+    def close(self) -> None:
+        self._close()
+
+
+def moved(before: Actual, after: Actual) -> str | None:
+    """One sentence if the body moved in between."""
+    way_m = float(np.linalg.norm(after.pose[:3] - before.pose[:3]))
+    turn_rad = abs(wrap_rad(float(after.pose[3] - before.pose[3])))
+    if way_m <= MOVED_M and turn_rad <= MOVED_RAD:
+        return None
+    return (
+        f"shaken: the vehicle moved by {way_m * 1e3:.1f} mm and {math.degrees(turn_rad):.1f} deg "
+        f"while the frames were taken; hold still"
+    )

@@ -1,0 +1,83 @@
+"""Synthetic sessions whose best weights are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from perchctl.geometry import Array
+from perchctl.weights.table import NEEDED, row_text
+from perchctl.weights.types import Measurements, wrap
+
+BEST = np.array([0.275, 0.306, 0.728, 0.469])
+"""The weights that `known` data are made with."""
+
+
+def places(rng: np.random.Generator, positions: int, per_position: int) -> tuple[Array, Array]:
+    """Positions' numbers (n,) and the truth (n, 4)."""
+    number = np.repeat(np.arange(1, positions + 1), per_position)
+    low, high = np.array([-0.05, -0.05, 0.12, -3.1]), np.array([0.05, 0.05, 0.25, 3.1])
+    return number, rng.uniform(low, high, (positions, 4))[number - 1]
+
+
+def known(
+    seed: int = 0, best: Array = BEST, turn_rad: float = 0.0, positions: int = 10, per: int = 100
+) -> Measurements:
+    """The truth is the merge by `best` of two noisy markers, but for a tenth of a hair."""
+    rng = np.random.default_rng(seed)
+    number, actual = places(rng, positions, per)
+    apart = rng.normal(0.0, [2e-3, 2e-3, 3e-3, 0.05], actual.shape)
+    rest = rng.normal(0.0, [1e-5, 1e-5, 1e-5, 2e-4], actual.shape)
+    return measured(number, actual, (1.0 - best) * apart + rest, -best * apart + rest, turn_rad)
+
+
+def independent(
+    seed: int = 0,
+    large: tuple[float, ...] = (1e-3, 1e-3, 2e-3, 0.02),
+    small: tuple[float, ...] = (2e-3, 1e-3, 1e-3, 0.01),
+    positions: int = 10,
+    per: int = 100,
+) -> Measurements:
+    """Two markers with independent normal errors of these standard deviations."""
+    rng = np.random.default_rng(seed)
+    number, actual = places(rng, positions, per)
+    return measured(
+        number, actual, rng.normal(0.0, large, actual.shape), rng.normal(0.0, small, actual.shape)
+    )
+
+
+def measured(
+    number: Array, actual: Array, a: Array, b: Array, turn_rad: float = 0.0
+) -> Measurements:
+    """Errors a and b on the truth, all of it turned."""
+
+    def turned(pose: Array) -> Array:
+        out = pose.copy()
+        out[:, 3] = wrap(out[:, 3] + turn_rad)
+        return out
+
+    n = len(actual)
+    return Measurements(
+        name="synthetic.csv",
+        sha256="0" * 64,
+        position=number.astype(np.int64),
+        t_s=np.arange(n) / 30.0,
+        large=turned(actual + a),
+        small=turned(actual + b),
+        actual=turned(actual),
+        joint=None,
+        line=np.arange(n) + 2,
+    )
+
+
+def write(data: Measurements, path: Path) -> Path:
+    """As the documented CSV, without the optional columns."""
+    rows = [
+        row_text(int(p), float(t), [a, b, c, None]).removesuffix(",,,,\n")
+        for p, t, a, b, c in zip(
+            data.position, data.t_s, data.large, data.small, data.actual, strict=True
+        )
+    ]
+    path.write_text("\n".join([",".join(NEEDED), *rows, ""]), encoding="utf-8")
+    return path
