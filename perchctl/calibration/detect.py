@@ -1,0 +1,115 @@
+"""A board in a picture: found, its corners refined, or the reason why not."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.calibration.saddle import fit_saddles
+from perchctl.calibration.types import Grey, View
+from perchctl.geometry import Array
+from perchctl.target.boards import Board
+
+MIN_CORNERS = 6
+"""Fewer give a pose, but nothing about the lens."""
+SEARCH_PX = 1600
+"""Larger pictures are scaled down to it for the search; corners are fitted at full size."""
+_CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+_SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
+
+
+def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -> View | str:
+    """The view of a board, or why there is none.
+
+    Args:
+        image: grey, uint8 (h, w).
+        refine: fit the corners (`perchctl.calibration.saddle`); otherwise they are
+            OpenCV's, with `cv2.cornerSubPix` and a window of 11x11 for chessboards.
+    """
+    h, w = image.shape
+    scale = min(1.0, SEARCH_PX / max(h, w))
+    small = image
+    if scale < 1.0:
+        small = np.asarray(
+            cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
+    found = _charuco(small, board) if board.kind == "charuco" else _chessboard(small, board)
+    if isinstance(found, str):
+        return found
+    ids, corners = found
+    # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
+    corners = (corners + 0.5) / scale - 0.5
+    cells = _cells(board, ids)
+    object_m = board.corners_m()[ids]
+    if not refine:
+        if board.kind == "chessboard":
+            corners = _fixed_window(image, corners)
+        return View(name, (w, h), ids, object_m, corners)
+    along, down = _local_axes(cells, corners)
+    margin = 0.5 * (1.0 - board.marker_m / board.square_m) if board.marker_m else 1.0
+    fit = fit_saddles(image, corners, along, down, margin)
+    if fit.ok.sum() < MIN_CORNERS:
+        return f"only {int(fit.ok.sum())} corners are sharp enough to be measured"
+    good = View(name, (w, h), ids, object_m, fit.corners_px, float(np.median(fit.width_px[fit.ok])))
+    return good.keep(fit.ok)
+
+
+def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
+    # A detector of its own for each call: pictures are searched on several threads.
+    detector = cv2.aruco.CharucoDetector(board.cv2_board())
+    finding = detector.getDetectorParameters()
+    finding.minMarkerPerimeterRate = 0.01
+    finding.minDistanceToBorder = 0
+    detector.setDetectorParameters(finding)
+    # Markers missed at first are looked for where the board has them: far more corners.
+    completing = detector.getCharucoParameters()
+    completing.tryRefineMarkers = True
+    detector.setCharucoParameters(completing)
+    corners, ids, _, marker_ids = detector.detectBoard(image)
+    seen = 0 if marker_ids is None else len(marker_ids)
+    if ids is None or len(ids) < MIN_CORNERS:
+        found = 0 if ids is None else len(ids)
+        if seen == 0:
+            return "no board found"
+        return f"{seen} markers but only {found} corners of the board found"
+    numbers = np.array(ids, dtype=np.intp).ravel()
+    if np.linalg.matrix_rank(np.column_stack([_cells(board, numbers), np.ones(len(ids))])) < 3:
+        return "the corners seen lie on one line"
+    return numbers, np.asarray(corners, dtype=np.float64).reshape(-1, 2)
+
+
+def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
+    size = board.corner_count
+    found, corners = cv2.findChessboardCorners(image, size, flags=_CHESS)
+    if not found:
+        found, corners = cv2.findChessboardCornersSB(image, size, flags=_SECTORS)
+    if not found:
+        return "no board found"
+    return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
+
+
+def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
+    """Column and row of inner corners, (n, 2)."""
+    columns = board.corner_count[0]
+    return np.column_stack([ids % columns, ids // columns]).astype(np.float64)
+
+
+def _fixed_window(image: Grey, corners: Array) -> Array:
+    points = np.ascontiguousarray(corners, dtype=np.float32).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
+    moved = cv2.cornerSubPix(image, points, (11, 11), (-1, -1), criteria)
+    return np.asarray(moved, dtype=np.float64).reshape(-1, 2)
+
+
+def _local_axes(cells: Array, corners: Array) -> tuple[Array, Array]:
+    """A square's two sides at each corner, as seen: the derivative of the homography from
+    board to picture, which smooths over single bad corners; (n, 2) each."""
+    H, _ = cv2.findHomography(cells, corners, cv2.RANSAC, 5.0)
+    if H is None:
+        H, _ = cv2.findHomography(cells, corners)
+    homogeneous = np.column_stack([cells, np.ones(len(cells))]) @ H.T
+    at, w = homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2:]
+    along = (H[:2, 0] - at * H[2, 0]) / w
+    down = (H[:2, 1] - at * H[2, 1]) / w
+    return along, down

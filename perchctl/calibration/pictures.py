@@ -1,0 +1,144 @@
+"""Views of the board from recorded pictures: folders, globs, videos."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from perchctl.calibration.detect import find_board
+from perchctl.calibration.novelty import pick
+from perchctl.calibration.types import Grey, Rejection, View
+from perchctl.camera.files import VideoSource, image_files, read_grey
+from perchctl.errors import InvalidValue
+from perchctl.target.boards import Board
+
+VIDEO_WINDOW = 8
+"""Of so many frames in a row only the sharpest is searched for the board."""
+_SHARPNESS_WIDTH = 480
+Told = Callable[[int, int | None], None]
+
+
+def views_of_images(
+    where: str, board: Board, refine: bool = True, told: Told = lambda done, total: None
+) -> tuple[list[View], list[Rejection]]:
+    """Every picture of a folder or glob: the views, and those without a board.
+
+    Raises:
+        NotFound: no pictures. InvalidValue: an unreadable one, or unequal sizes.
+    """
+    paths = image_files(str(Path(where).expanduser()))
+    names = _names(paths)
+
+    def look(job: tuple[str, Path]) -> tuple[str, tuple[int, int], View | str]:
+        name, path = job
+        image = read_grey(path)
+        size_px = (image.shape[1], image.shape[0])
+        return name, size_px, find_board(image, board, name, refine)
+
+    views: list[View] = []
+    missing: list[Rejection] = []
+    first: tuple[str, tuple[int, int]] | None = None
+    with _pool() as pool:
+        for done, (name, size_px, seen) in enumerate(
+            pool.map(look, zip(names, paths, strict=True)), start=1
+        ):
+            first = first or (name, size_px)
+            if size_px != first[1]:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise InvalidValue(
+                    f"{name} is {size_px[0]}x{size_px[1]} px but {first[0]} is "
+                    f"{first[1][0]}x{first[1][1]} px: a calibration belongs to one size, "
+                    f"keep pictures of one only"
+                )
+            _sort(seen, name, views, missing)
+            told(done, len(paths))
+    return views, missing
+
+
+def views_of_video(
+    path: Path, board: Board, refine: bool = True, told: Told = lambda done, total: None
+) -> tuple[list[View], list[Rejection]]:
+    """The sharp and different views of a video.
+
+    Raises NotFound or InvalidValue for a file that is none.
+    """
+    source = VideoSource(path)
+    try:
+        found: list[View] = []
+        searched = 0
+
+        def look(job: tuple[str, Grey]) -> View | str:
+            return find_board(job[1], board, job[0], refine)
+
+        with _pool() as pool:
+            for batch in _batches(_sharpest(source), 4 * _workers()):
+                for seen in pool.map(look, batch):
+                    searched += 1
+                    if isinstance(seen, View):
+                        found.append(seen)
+                told(searched, None)
+    finally:
+        source.close()
+    if not found:
+        return [], [Rejection(f"{searched} frames", "no board found")]
+    return pick(found, board), []
+
+
+def _sharpest(source: VideoSource) -> Iterator[tuple[str, Grey]]:
+    """The sharpest frame of each window, with its name."""
+    best: tuple[float, str, Grey] | None = None
+    count = 0
+    while (frame := source.newest(0.0)) is not None:
+        sharpness = _sharpness(frame.image)
+        if best is None or sharpness > best[0]:
+            best = (sharpness, f"frame {frame.index}", frame.image)
+        count += 1
+        if count == VIDEO_WINDOW:
+            yield best[1], best[2]
+            best, count = None, 0
+    if best is not None:
+        yield best[1], best[2]
+
+
+def _sharpness(image: Grey) -> float:
+    step = max(1, image.shape[1] // _SHARPNESS_WIDTH)
+    small = np.ascontiguousarray(image[::step, ::step])
+    return float(cv2.Laplacian(small, cv2.CV_32F).var())
+
+
+def _batches(items: Iterable[tuple[str, Grey]], size: int) -> Iterator[list[tuple[str, Grey]]]:
+    batch: list[tuple[str, Grey]] = []
+    for item in items:
+        batch.append(item)
+        if len(batch) == size:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+def _sort(seen: View | str, name: str, views: list[View], missing: list[Rejection]) -> None:
+    if isinstance(seen, View):
+        views.append(seen)
+    else:
+        missing.append(Rejection(name, seen))
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """File names, or whole paths where a glob reached into several folders."""
+    names = [p.name for p in paths]
+    return names if len(set(names)) == len(names) else [str(p) for p in paths]
+
+
+def _workers() -> int:
+    return max(1, min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2))
+
+
+def _pool() -> ThreadPoolExecutor:
+    """OpenCV and numpy leave the interpreter free while they work."""
+    return ThreadPoolExecutor(_workers())

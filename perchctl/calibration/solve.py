@@ -1,0 +1,143 @@
+"""From views of a board to a camera that knows its own error."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from perchctl.calibration.bundle import Fit, NoSolution, as_solution, start_fit
+from perchctl.calibration.compare import recommend, score
+from perchctl.calibration.covariance import lens_covariance
+from perchctl.calibration.enough import (
+    GOOD_COVERED,
+    GOOD_VIEWS,
+    check_focal,
+    check_variety,
+    check_views,
+    coverage,
+    uncovered_text,
+)
+from perchctl.calibration.lens import MODEL_NAMES, pixel_grid
+from perchctl.calibration.predict import predict_errors, ray_errors_px
+from perchctl.calibration.robust import Robust, keep_all, reject, weighted_fit
+from perchctl.calibration.types import Calibration, ModelScore, Rejection, View
+from perchctl.errors import InvalidValue
+from perchctl.vision.camera_model import distort, undistort
+
+AUTO = "auto"
+FOLDS_BACK = "folds back inside of the picture"
+_EASIER = 0.95  # a richer model must leave at most this part of the simpler one's spread
+
+
+def calibrate(
+    views: Sequence[View],
+    board: str,
+    model: str = AUTO,
+    rejecting: bool = True,
+    missing: Sequence[Rejection] = (),
+    told: Callable[[str], None] = lambda step: None,
+) -> Calibration:
+    """Solve, reject, compare, predict.
+
+    Args:
+        model: a name of `MODEL_NAMES`, or ``auto`` for the recommended one.
+        rejecting: leave out outliers (`perchctl.calibration.robust`).
+        missing: pictures in which no board was found, for the report.
+        told: called with the name of each step, for progress.
+
+    Raises:
+        InvalidValue: too few views, all frontal, most of the image empty, focal length
+        not fixed, or too many views that fit no camera.
+    """
+    check_views(views, len(views) + len(missing))
+    told("outliers")
+    robust = _without_outliers(views, rejecting)
+    check_views(robust.views, len(views) + len(missing))
+    # Tilt and coverage first: they say best what to add.
+    check_variety(robust.views, robust.fit.poses)
+    fits, scores = {}, []
+    for name in MODEL_NAMES:
+        told(name)
+        try:
+            fit = robust.fit if robust.fit.model == name else start_fit(robust.views, name)
+        except NoSolution as error:
+            scores.append(ModelScore(name, None, None, note=str(error)))
+            continue
+        fits[name] = fit
+        judged = score(robust.views, fit)
+        if not usable(fit):
+            judged = dataclasses.replace(judged, note=FOLDS_BACK)
+        scores.append(judged)
+    recommended = recommend(scores)
+    chosen = recommended if model == AUTO else model
+    if chosen not in fits:
+        notes = {s.model: s.note for s in scores}
+        raise InvalidValue(f"the lens model {chosen} cannot be fitted: {notes[chosen]}")
+    told("prediction")
+    fit = fits[chosen]
+    covariance = lens_covariance(fit)
+    solution = as_solution(fit, covariance)
+    check_focal(solution.std, solution.parameters)
+    rms95, max95, _ = ray_errors_px(solution.camera, covariance)
+    map_ = coverage(robust.views)
+    warnings = []
+    if not usable(fit):
+        warnings.append(
+            f"the lens model {FOLDS_BACK}, where no corners were seen: add views at its rims"
+        )
+    if len(robust.views) < GOOD_VIEWS:
+        warnings.append(f"only {len(robust.views)} views: {GOOD_VIEWS} or more are better")
+    if map_.mean() < GOOD_COVERED:
+        warnings.append(
+            f"{100 * (1 - map_.mean()):.0f} % of the picture is uncovered: add views with the "
+            f"board {uncovered_text(map_)}"
+        )
+    return Calibration(
+        board=board,
+        solution=solution,
+        views=robust.views,
+        seen=tuple(views),
+        rejections=robust.rejections,
+        missing=tuple(missing),
+        scores=tuple(scores),
+        recommended=recommended,
+        errors=predict_errors(solution.camera, covariance),
+        ray_rms_px95=rms95,
+        ray_max_px95=max95,
+        covered=map_,
+        warnings=tuple(warnings),
+    )
+
+
+def _without_outliers(views: Sequence[View], rejecting: bool) -> Robust:
+    """Outliers are judged by the simplest model that follows the lens: a model that cannot
+    would call the views at the picture's rim outliers."""
+    try:
+        if not rejecting:
+            return keep_all(views, MODEL_NAMES[0])
+        best, best_spread = weighted_fit(views, MODEL_NAMES[0])
+    except NoSolution as error:
+        raise InvalidValue(f"{error}: is --board the true layout of the board?") from None
+    for name in MODEL_NAMES[1:]:
+        try:
+            fit, spread = weighted_fit(views, name)
+        except NoSolution:
+            continue
+        if spread < _EASIER * best_spread and usable(fit):
+            best, best_spread = fit, spread
+    return reject(views, best)
+
+
+def usable(fit: Fit) -> bool:
+    """Whether the lens is one-to-one over the image and its centre lies inside."""
+    camera = fit.camera
+    w, h = camera.size_px
+    if not (0 < camera.K[0, 2] < w and 0 < camera.K[1, 2] < h):
+        return False
+    grid = pixel_grid(camera.size_px)
+    rays = undistort(grid, camera)
+    if not np.isfinite(rays).all():
+        return False
+    return bool(np.abs(distort(rays, camera) - grid).max() < 0.05)

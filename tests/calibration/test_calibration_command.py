@@ -1,0 +1,287 @@
+"""`perchctl calibrate`: sources, refusals, files, exit codes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner, Result
+
+from perchctl.calibration.files import load_calibration
+from perchctl.calibration.guided import Moment, capture
+from perchctl.calibration.lens import parameters_of
+from perchctl.calibration.novelty import Capture, consider
+from perchctl.calibration.types import View
+from perchctl.cli import app
+from perchctl.errors import TimedOut
+from perchctl.record.calibration_progress import coverage_bars
+from perchctl.vision.types import CameraModel, Frame
+from tests.calibration.synthetic import (
+    CHARUCO,
+    CHESSBOARD,
+    BoardRenderer,
+    corner_view,
+    draw_camera,
+    draw_poses,
+)
+
+BOARD = CHARUCO.notation()
+Rendered = tuple[Path, CameraModel]
+
+
+def calibrate(*words: str) -> Result:
+    return CliRunner().invoke(app, ["calibrate", *map(str, words)])
+
+
+def refused(result: Result, code: int) -> str:
+    """The one sentence of a refusal."""
+    assert result.exit_code == code, result.output
+    lines = [line for line in result.stderr.splitlines() if not line.endswith("of the board")]
+    assert len(lines) == 1, result.stderr
+    assert not result.stdout
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def calibrated(rendered: Rendered, tmp_path_factory: pytest.TempPathFactory) -> Result:
+    output = tmp_path_factory.mktemp("out") / "camera.yaml"
+    result = calibrate(f"images:{rendered[0]}", "-b", BOARD, "-o", str(output), "--json")
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def test_pictures_become_a_file_and_a_report(calibrated: Result, rendered: Rendered) -> None:
+    told = json.loads(calibrated.stdout)
+    truth = rendered[1]
+    camera = load_calibration(Path(told["file"]))
+    assert [told["fx"], told["fy"]] == [camera.K[0, 0], camera.K[1, 1]]
+    assert told["distortion"] == camera.dist.tolist()
+    assert (told["model"], told["size_px"]) == ("plumb_bob", [480, 360])
+    error = np.abs(parameters_of(camera) - parameters_of(truth))
+    assert (error < 3.5 * np.array(list(told["std"].values()))).all()
+    assert error[:2].max() < 0.5
+    assert told["views_used"] == 10
+    assert told["views_rejected"] == []
+    assert all(e["mm95"] > 0 and e["axis_mm95"] > 0 for e in told["error_mm"])
+    assert (told["error_mm"][0]["z_m"], told["error_mm"][-1]["z_m"]) == (0.05, 1.5)
+    assert told["verdict"] == "fly"
+    report = cv2.imread(told["report"])
+    assert report is not None
+    assert min(report.shape[:2]) > 800
+    assert "GOOD TO FLY" in calibrated.stderr
+
+
+def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
+    calibrated: Result, rendered: Rendered, tmp_path: Path
+) -> None:
+    file = Path(json.loads(calibrated.stdout)["file"])
+    source = f"images:{rendered[0]}"
+    passed = calibrate(source, "-b", BOARD, "--check", str(file), "--json")
+    assert passed.exit_code == 0
+    assert json.loads(passed.stdout)["pass"] is True
+    raw = yaml.safe_load(file.read_text())
+    data = raw["camera_matrix"]["data"]
+    data[0], data[4] = 1.01 * data[0], 1.01 * data[4]
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text(yaml.safe_dump(raw))
+    failed = calibrate(source, "-b", BOARD, "--check", str(wrong), "--json")
+    assert failed.exit_code == 1
+    told = json.loads(failed.stdout)
+    assert told["pass"] is False
+    assert max(e["mm"] for e in told["error_mm"]) > 5
+    other = tmp_path / "other.yaml"
+    other.write_text(file.read_text().replace("image_width: 480", "image_width: 481"))
+    assert "calibrat" in refused(calibrate(source, "-b", BOARD, "--check", str(other)), 30)
+
+
+def test_an_existing_file_needs_force(rendered: Rendered, tmp_path: Path) -> None:
+    output = tmp_path / "camera.yaml"
+    output.write_text("mine")
+    result = calibrate(f"images:{rendered[0]}", "-b", BOARD, "-o", str(output))
+    assert "--force" in refused(result, 30)
+    assert output.read_text() == "mine"
+
+
+def test_a_picture_file_is_spoilt(rendered: Rendered, tmp_path: Path) -> None:
+    for path in sorted(rendered[0].iterdir())[:4]:
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "board_99.png").write_bytes(b"no picture")
+    result = calibrate(f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o.yaml"))
+    assert "board_99.png cannot be read" in refused(result, 30)
+    assert not (tmp_path / "o.yaml").exists()
+
+
+def test_pictures_of_two_sizes(rendered: Rendered, tmp_path: Path) -> None:
+    for i, path in enumerate(sorted(rendered[0].iterdir())[:4]):
+        picture = cv2.imread(str(path))
+        cv2.imwrite(str(tmp_path / path.name), picture[: 300 if i == 2 else 360])
+    sentence = refused(calibrate(f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o")), 30)
+    assert "480x300" in sentence
+    assert "480x360" in sentence
+
+
+@pytest.mark.parametrize(
+    ("board", "hint"),
+    [
+        ("charuco:8x6:25mm:18mm:DICT_5X5_100", "10x7 squares"),
+        ("charuco:10x6:25mm:18mm:DICT_5X5_100", "charuco:10x7:25mm:18mm:DICT_5X5_100"),
+        ("charuco:10x7:25mm:18mm:DICT_6X6_100", "DICT_5X5_100"),
+        ("chessboard:9x6:25mm", "charuco"),
+    ],
+)
+def test_the_wrong_board_says_what_was_seen(
+    rendered: Rendered, tmp_path: Path, board: str, hint: str
+) -> None:
+    result = calibrate(f"images:{rendered[0]}", "-b", board, "-o", str(tmp_path / "o.yaml"))
+    assert hint in refused(result, 30)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("named", ["chessboard:8x6:25mm", "chessboard:11x8:25mm"])
+def test_the_wrong_chessboard_says_what_was_seen(
+    chessboard_folder: Path, tmp_path: Path, named: str
+) -> None:
+    result = calibrate(f"{chessboard_folder}/left0[13].jpg", "-b", named, "-o", f"{tmp_path}/o")
+    assert "chessboard:9x6:25mm" in refused(result, 30)
+
+
+def test_no_board_at_all(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((120, 160), 90, np.uint8))
+    result = calibrate(f"images:{tmp_path}", "-o", str(tmp_path / "o.yaml"))
+    assert "none of 1 pictures" in refused(result, 30)
+
+
+def test_two_views_only(rendered: Rendered, tmp_path: Path) -> None:
+    pattern = f"{rendered[0]}/board_0[01].png"
+    sentence = refused(calibrate(pattern, "-b", BOARD, "-o", str(tmp_path / "o.yaml")), 30)
+    assert "only 2 pictures" in sentence
+    assert "add 3" in sentence
+
+
+def test_usage() -> None:
+    refused(calibrate(), 2)
+    refused(calibrate("camera:0", "--convert", "x.yaml"), 2)
+    refused(calibrate("images:/nowhere"), 20)
+    refused(calibrate("images:.", "-b", "chess:9x6"), 30)
+    refused(calibrate("images:.", "--model", "cubic"), 30)
+
+
+def test_convert(tmp_path: Path) -> None:
+    kalibr = tmp_path / "camchain.yaml"
+    kalibr.write_text(
+        "cam0:\n  camera_model: pinhole\n  distortion_model: equidistant\n"
+        "  distortion_coeffs: [0.01, 0.02, -0.01, 0.002]\n"
+        "  intrinsics: [300.5, 301.5, 320.25, 240.75]\n  resolution: [640, 480]\n"
+    )
+    output = tmp_path / "new" / "camera.yaml"
+    result = calibrate("--convert", str(kalibr), "-o", str(output), "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["fx"] == 300.5
+    camera = load_calibration(output)
+    assert camera.model == "fisheye"
+    assert camera.dist.tolist() == [0.01, 0.02, -0.01, 0.002]
+    assert "--force" in refused(calibrate("--convert", str(kalibr), "-o", str(output)), 30)
+
+
+def test_a_video_s_sharp_and_different_frames(tmp_path: Path) -> None:
+    camera = draw_camera(np.random.default_rng(3), (320, 240))
+    rng = np.random.default_rng(7)
+    renderer = BoardRenderer(camera, CHESSBOARD)
+    video = tmp_path / "board.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"MJPG"), 30, (320, 240))
+    for pose in draw_poses(rng, camera, CHESSBOARD, 9):
+        sharp = renderer.render(pose, rng, noise=1.5)
+        smeared = cv2.blur(sharp, (9, 9))
+        for k in range(8):
+            writer.write(cv2.cvtColor(sharp if k in (3, 4) else smeared, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    result = calibrate(
+        str(video), "-b", CHESSBOARD.notation(), "-o", f"{tmp_path}/c.yaml", "--json"
+    )
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert 7 <= told["views_used"] <= 9
+    assert told["fx"] == pytest.approx(camera.K[0, 0], abs=4 * told["std"]["fx"] + 0.5)
+
+
+class _Frames:
+    """A live source that shows prepared pictures, one at a time."""
+
+    live, finished, size_px = True, False, (320, 240)
+
+    def __init__(self, images: list[np.ndarray]) -> None:  # type: ignore[type-arg]
+        self._frames = [Frame(i, float(i), image) for i, image in enumerate(images)]
+
+    def newest(self, now_s: float) -> Frame | None:
+        return self._frames.pop(0) if self._frames else None
+
+    def problem(self, now_s: float) -> str | None:
+        return None if self._frames else "the camera is unplugged"
+
+    def describe(self) -> str:
+        return "test"
+
+    def close(self) -> None:
+        pass
+
+
+def _clock() -> Callable[[], float]:
+    ticks = iter(range(10**9))
+    return lambda: float(next(ticks))
+
+
+def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
+    camera = draw_camera(np.random.default_rng(3), (320, 240))
+    rng = np.random.default_rng(2)
+    renderer = BoardRenderer(camera, CHESSBOARD)
+    images = []
+    for pose in draw_poses(rng, camera, CHESSBOARD, 7):
+        image = renderer.render(pose, rng, noise=1.0)
+        images += [image, image, image]  # comes in, is still, stays
+    moments: list[Moment] = []
+    views, pictures = capture(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
+    assert 5 <= len(views) <= 7
+    assert len(pictures) == len(views)
+    shots = [m.index for m in moments if m.shot]
+    assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
+    assert moments[0].advice == "hold still"
+    assert 0 < moments[-1].covered["x"] <= 1
+    with pytest.raises(TimedOut, match="only 1 views"):
+        capture(_Frames(images[:3]), CHESSBOARD, moments.append, _clock(), lambda s: None)
+
+
+def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> None:
+    rng = np.random.default_rng(4)
+    camera = draw_camera(rng)
+    state = Capture()
+    poses = draw_poses(rng, camera, CHARUCO, 60)
+    views = [corner_view(rng, camera, CHARUCO, pose, 0.05, "v") for pose in poses]
+    shown = 0
+    for view in views:
+        if state.finished:
+            break
+        state = consider(consider(state, view, CHARUCO), view, CHARUCO)
+        shown += 1
+    assert state.finished
+    assert 15 <= len(state.taken) <= shown <= 40
+    again = consider(state, state.taken[-1], CHARUCO)
+    assert not again.shot
+    blurred = View(*(getattr(views[-1], n) for n in ("name", "size_px", "ids", "object_m")),
+                   views[-1].corners_px, 8.0)  # fmt: skip
+    before = consider(Capture(), blurred, CHARUCO)
+    assert "blurred" in consider(before, blurred, CHARUCO).advice
+
+
+def test_bars_in_a_pipe_are_one_line_a_view(capsys: pytest.CaptureFixture[str]) -> None:
+    with coverage_bars() as show:
+        for taken in (0, 0, 1):
+            show({"x": 0.5, "tilt": 0.0}, taken, "hold still")
+    assert capsys.readouterr().err.splitlines() == [
+        "perchctl: 0 views; x 50 %, tilt 0 %",
+        "perchctl: 1 views; x 50 %, tilt 0 %",
+    ]

@@ -1,0 +1,104 @@
+"""Corners: their bias, their spread, and what the window takes in."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.calibration.detect import find_board
+from perchctl.calibration.saddle import fit_saddles
+from perchctl.calibration.types import Grey, View
+from perchctl.geometry import Array
+from perchctl.vision.camera_model import project
+from tests.calibration.synthetic import CHARUCO, CHESSBOARD, BoardRenderer, draw_camera
+
+CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
+
+
+def crossing(
+    at: tuple[float, float], square_px: float, angle_deg: float, slant_deg: float, blur_px: float
+) -> tuple[Grey, Array, Array]:
+    """A checker of that square around one corner, drawn at 12 samples a pixel."""
+    n, s = 64, 12
+    t = (np.arange(n * s) + 0.5) / s - 0.5
+    x, y = np.meshgrid(t - at[0], t - at[1])
+    a, b = np.radians(angle_deg), np.radians(angle_deg + 90 + slant_deg)
+    along, down = np.array([np.cos(a), np.sin(a)]), np.array([np.cos(b), np.sin(b)])
+    inverse = np.linalg.inv(np.column_stack([along, down]) * square_px)
+    u, v = inverse[0, 0] * x + inverse[0, 1] * y, inverse[1, 0] * x + inverse[1, 1] * y
+    white = (np.floor(u) + np.floor(v)) % 2 == 0
+    fine = np.where(white, 200.0, 40.0)
+    picture = fine.reshape(n, s, n, s).mean(axis=(1, 3))
+    picture = cv2.GaussianBlur(picture, (0, 0), blur_px)
+    return np.rint(picture).astype(np.uint8), along * square_px, down * square_px
+
+
+@pytest.mark.parametrize("square_px", [7.0, 12.0, 30.0])
+@pytest.mark.parametrize("slant_deg", [0.0, 25.0])
+def test_a_corner_is_found_without_bias(square_px: float, slant_deg: float) -> None:
+    errors = []
+    for k in range(8):
+        at = (31.0 + 0.13 * k, 32.4 - 0.11 * k)
+        image, along, down = crossing(at, square_px, 7.0 + 11.0 * k, slant_deg, 0.8)
+        start = np.array([at]) + 0.4 * np.array([np.cos(k), np.sin(k)])
+        fit = fit_saddles(image, start, along[None], down[None])
+        assert fit.ok.all()
+        errors.append(fit.corners_px[0] - at)
+    assert np.abs(errors).max() < (0.12 if square_px < 10 else 0.03)
+
+
+def test_a_flat_patch_is_refused() -> None:
+    image = np.full((64, 64), 120, np.uint8)
+    axes = np.array([[12.0, 0.0]]), np.array([[0.0, 12.0]])
+    fit = fit_saddles(image, np.array([[32.0, 32.0]]), *axes)
+    assert not fit.ok.any()
+
+
+def test_light_that_falls_off_does_not_pull() -> None:
+    image, along, down = crossing((32.3, 31.6), 20.0, 20.0, 0.0, 1.2)
+    fall = 1.0 - 0.01 * np.arange(64)
+    shaded = np.rint(image * fall).astype(np.uint8)
+    fit = fit_saddles(shaded, np.array([[32.0, 32.0]]), along[None], down[None])
+    assert fit.corners_px[0] == pytest.approx((32.3, 31.6), abs=0.02)
+
+
+def _errors(board_pose: Array, chess: bool, refine: bool, seed: int = 0) -> Array:
+    board = CHESSBOARD if chess else CHARUCO
+    rng = np.random.default_rng(seed)
+    picture = BoardRenderer(CAMERA, board).render(board_pose, rng, noise=2.0)
+    view = find_board(picture, board, refine=refine)
+    assert isinstance(view, View)
+    there = project(board.corners_m(), board_pose[:3], board_pose[3:], CAMERA)
+    if chess and np.linalg.norm(view.corners_px[0] - there[0]) > 20:
+        there = there[::-1]  # found from its other end
+    return np.asarray(view.corners_px - there[view.ids])
+
+
+@pytest.mark.parametrize("chess", [True, False])
+def test_small_squares_of_a_tilted_board(chess: bool) -> None:
+    """Squares of 9 and 18 px: a window of 11x11 takes in the neighbours."""
+    pose = np.array([0.35, -0.5, 0.1, -0.1, -0.07, 0.85 if chess else 0.42])
+    fitted = np.sqrt((_errors(pose, chess, True) ** 2).sum(axis=1).mean())
+    plain = np.sqrt((_errors(pose, chess, False) ** 2).sum(axis=1).mean())
+    assert fitted < 0.08
+    assert fitted < 0.6 * plain
+
+
+def test_a_partly_seen_charuco_board_is_used() -> None:
+    pose = np.array([0.2, 0.3, 0.0, -0.02, -0.03, 0.22])
+    errors = _errors(pose, False, True)
+    assert 12 < len(errors) < 54
+    assert np.sqrt((errors**2).sum(axis=1).mean()) < 0.08
+
+
+def test_a_large_picture_keeps_the_places_of_its_pixels() -> None:
+    """The search runs on a smaller picture; the corners belong to the full one."""
+    pose = np.array([0.3, -0.2, 0.1, -0.11, -0.07, 0.42])
+    picture = BoardRenderer(CAMERA, CHARUCO).render(pose, np.random.default_rng(0), noise=1.0)
+    large = np.asarray(cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC))
+    view = find_board(large, CHARUCO)
+    assert isinstance(view, View)
+    there = project(CHARUCO.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
+    expected = (there + 0.5) * 4 - 0.5
+    assert np.abs((view.corners_px - expected).mean(axis=0)).max() < 0.1

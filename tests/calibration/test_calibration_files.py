@@ -1,0 +1,139 @@
+"""Files: written for three readers, read from three writers, whole or not at all."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.calibration.files import load_calibration
+from perchctl.calibration.lens import COEFFICIENTS, MODEL_NAMES, parameters_of
+from perchctl.calibration.solve import calibrate
+from perchctl.calibration.writing import calibration_text, camera_text, check_free, write_all
+from perchctl.errors import InvalidValue, PerchError
+from perchctl.vision.types import CameraModel
+from tests.calibration.synthetic import corner_views, draw_camera
+
+ODD = [1e-05, -0.1, 0.30000000000000004, 1e-17, -123.456, 5e-324, 1 / 3, 0.0]
+
+
+def _camera(model: str) -> CameraModel:
+    K = np.array([[400.1, 0.0, 321 + 1 / 3], [0.0, 401.7, 1e-7 + 238], [0.0, 0.0, 1.0]])
+    return CameraModel((640, 480), K, np.array(ODD[: COEFFICIENTS[model]]), model)
+
+
+@pytest.mark.parametrize("model", MODEL_NAMES)
+def test_all_numbers_come_back_equal(tmp_path: Path, model: str) -> None:
+    camera = _camera(model)
+    path = tmp_path / "camera.yaml"
+    path.write_text(camera_text(camera, 'odd "name"\n$', {"date": "2026-01-02", "rms_px": 1e-05}))
+    assert path.read_text().splitlines()[0] == "%YAML 1.0"
+
+    own = load_calibration(path)
+    assert (own.size_px, own.model) == (camera.size_px, model)
+    assert (own.K == camera.K).all()
+    assert (own.dist == camera.dist).all()
+
+    plain = yaml.safe_load(path.read_text())
+    assert plain["camera_matrix"]["data"] == camera.K.ravel().tolist()
+    assert plain["distortion_coefficients"]["data"] == camera.dist.tolist()
+    assert plain["projection_matrix"]["data"][:3] == camera.K[0].tolist()
+    assert plain["rms_px"] == 1e-05
+
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    assert (storage.getNode("camera_matrix").mat() == camera.K).all()
+    assert (storage.getNode("distortion_coefficients").mat().ravel() == camera.dist).all()
+    assert storage.getNode("image_width").real() == 640
+    ros = {"fisheye": "equidistant"}.get(model, model)
+    assert storage.getNode("distortion_model").string() == plain["distortion_model"] == ros
+    storage.release()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_any_number_is_written_as_a_number(value: float) -> None:
+    text = camera_text(_camera("plumb_bob"), "c", {"value": value})
+    assert yaml.safe_load(text)["value"] == value
+
+
+def test_a_calibration_s_file_holds_its_quality(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    camera = draw_camera(rng)
+    result = calibrate(corner_views(rng, camera), "charuco:10x7:25mm:18mm:DICT_5X5_100")
+    path = tmp_path / "camera.yaml"
+    path.write_text(calibration_text(result, "camera", "2026-01-02T03:04:05+00:00"))
+    plain = yaml.safe_load(path.read_text())
+    assert (load_calibration(path).K == result.camera.K).all()
+    assert plain["views_used"] == len(result.views)
+    assert plain["rms_px"] == result.solution.rms_px
+    assert plain["date"] == "2026-01-02T03:04:05+00:00"
+    assert plain["parameter_std"]["data"] == result.solution.std.tolist()
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    covariance = storage.getNode("parameter_covariance").mat()
+    assert (covariance == result.solution.covariance).all()
+    storage.release()
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".xml", ".json"])
+def test_opencv_s_own_files_are_read(tmp_path: Path, suffix: str) -> None:
+    camera = _camera("plumb_bob")
+    path = tmp_path / f"opencv{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    storage.write("camera_matrix", camera.K)
+    storage.write("distortion_coefficients", camera.dist[:, None])
+    storage.release()
+    read = load_calibration(path)
+    np.testing.assert_allclose(read.K, camera.K, rtol=1e-15)
+    np.testing.assert_allclose(read.dist, camera.dist, rtol=1e-15)
+
+
+def test_kalibr_s_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "camchain.yaml"
+    path.write_text(
+        "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [-0.2, 0.05, 0.001, -0.002]\n"
+        "  intrinsics: [400.5, 401.5, 320.25, 240.75]\n  resolution: [640, 480]\n"
+    )
+    read = load_calibration(path)
+    again = tmp_path / "again.yaml"
+    again.write_text(camera_text(read, "camera", {}))
+    written = load_calibration(again)
+    assert parameters_of(written).tolist() == [
+        400.5, 401.5, 320.25, 240.75, -0.2, 0.05, 0.001, -0.002, 0.0,
+    ]  # fmt: skip
+
+
+def test_an_existing_file_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text("mine")
+    with pytest.raises(InvalidValue, match="exists already; add --force"):
+        check_free(path, force=False)
+    check_free(path, force=True)
+    with pytest.raises(InvalidValue, match="is a folder"):
+        check_free(tmp_path, force=True)
+
+
+def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
+    old = tmp_path / "camera.yaml"
+    old.write_text("old")
+    small, large = (old, b"new"), (tmp_path / "made" / "report.png", bytes(400_000))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))  # as a disk that is full
+    try:
+        with pytest.raises(PerchError, match=r"cannot be written.*nothing was changed"):
+            write_all([small, large])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert old.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["camera.yaml"]
+    write_all([small, large])
+    assert old.read_bytes() == b"new"
+    assert large[0].stat().st_size == 400_000

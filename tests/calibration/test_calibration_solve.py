@@ -1,0 +1,258 @@
+"""The solution, its rejections, its refusals, its own prediction of its error."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.calibration.bundle import start_fit
+from perchctl.calibration.check import check
+from perchctl.calibration.covariance import lens_covariance
+from perchctl.calibration.lens import make_camera, parameters_of, pixel_derivatives, rays_of
+from perchctl.calibration.pictures import views_of_images
+from perchctl.calibration.predict import position_errors_mm, predict_errors, ray_difference_px
+from perchctl.calibration.solve import calibrate
+from perchctl.calibration.types import View
+from perchctl.calibration.verdict import limit_mm
+from perchctl.errors import InvalidValue
+from perchctl.geometry import Array
+from perchctl.vision.camera_model import project
+from perchctl.vision.types import CameraModel
+from tests.calibration.synthetic import CHARUCO, CHESSBOARD, corner_views, draw_camera
+
+
+def drawn(seed: int, **options: float) -> tuple[list[View], CameraModel]:
+    rng = np.random.default_rng(seed)
+    camera = draw_camera(rng)
+    return corner_views(rng, camera, **options), camera  # type: ignore[arg-type]
+
+
+def moved(view: View, which: Array, by: tuple[float, float]) -> View:
+    corners = view.corners_px.copy()
+    corners[which] += by
+    return dataclasses.replace(view, corners_px=corners)
+
+
+@pytest.fixture(scope="module")
+def plain_corners(chessboard_folder: Path) -> list[View]:
+    """The photographs' views with OpenCV's own corners."""
+    views, missing = views_of_images(str(chessboard_folder), CHESSBOARD, refine=False)
+    assert (len(views), missing) == (13, [])
+    return views
+
+
+def test_photographs_as_opencv_has_them(plain_corners: list[View]) -> None:
+    result = calibrate(plain_corners, "", "plumb_bob", rejecting=False)
+    assert len(result.views) == 13
+    assert result.solution.rms_px == pytest.approx(0.4087, abs=0.005)
+
+
+def test_photographs_with_the_better_corners(chessboard_folder: Path) -> None:
+    views, _ = views_of_images(str(chessboard_folder), CHESSBOARD)
+    result = calibrate(views, "")
+    assert len(result.views) >= 11
+    assert result.solution.rms_px <= 0.24
+    assert 532 <= result.camera.K[0, 0] <= 537
+    assert 532 <= result.camera.K[1, 1] <= 537
+    assert result.recommended == "plumb_bob"
+    rms = dict(zip([v.name for v in result.views], result.solution.view_rms_px(), strict=True))
+    named = {r.view for r in result.rejections}
+    for faulty in ("left02.jpg", "left13.jpg"):
+        assert rms.get(faulty, 1.0) < 0.25 or faulty in named
+
+
+def test_opencv_s_faulty_corners_are_rejected_and_named(plain_corners: list[View]) -> None:
+    result = calibrate(plain_corners, "")
+    named = {r.view: r for r in result.rejections}
+    assert {"left02.jpg", "left13.jpg"} <= set(named)
+    assert len(result.views) >= 11
+    assert result.solution.rms_px <= 0.24
+    assert 532 <= result.camera.K[0, 0] <= 537
+
+
+def test_rendered_boards_and_their_truth(scenes_folder: Path) -> None:
+    text = json.loads((scenes_folder / "truth.json").read_text())
+    K, dist = np.array(text["camera_matrix"]), np.array(text["dist_coeffs"])
+    truth = CameraModel(tuple(text["image_size"]), K, dist)
+    views, _ = views_of_images(str(scenes_folder / "calib"), CHARUCO)
+    result = calibrate(views, "")
+    error = result.solution.parameters - parameters_of(truth)
+    assert np.abs(error[:2]).max() < 0.3
+    assert np.abs(error[2:4]).max() < 0.6
+    assert (np.abs(error) < 3 * result.solution.std).all()
+    rays = ray_difference_px(result.camera, truth)
+    assert np.sqrt((rays**2).mean()) < result.ray_rms_px95
+    assert rays.max() < result.ray_max_px95
+    for e in result.errors:
+        true_mm = position_errors_mm(result.camera, truth, e.z_m)
+        assert true_mm.max() < e.mm95
+        assert true_mm[0] < e.axis_mm95
+
+
+def test_the_minimum_is_opencv_s() -> None:
+    views, camera = drawn(3, noise_px=0.2)
+    fit = start_fit(views, "plumb_bob")
+    objects = [v.object_m.astype(np.float32) for v in views]
+    images = [v.corners_px.astype(np.float32) for v in views]
+    rms, K, *_ = cv2.calibrateCamera(objects, images, camera.size_px, None, None)
+    assert fit.rms_px == pytest.approx(rms, abs=1e-4)
+    assert np.abs(fit.camera.K - K).max() < 0.02
+
+
+def test_the_error_lies_below_its_95_percent_line_about_as_often() -> None:
+    below = []
+    for seed in range(8):
+        views, truth = drawn(seed, views=10, noise_px=0.1)
+        fit = start_fit(views, "plumb_bob")
+        [e] = predict_errors(fit.camera, lens_covariance(fit), [1.0])
+        true_mm = position_errors_mm(fit.camera, truth, 1.0)
+        below.append(true_mm.max() < e.mm95 and true_mm[0] < e.axis_mm95)
+        # Neither is the line so far out that it says nothing.
+        assert e.axis_mm95 < 12 * max(true_mm[0], 0.2)
+    assert sum(below) >= 7
+
+
+def test_errors_that_go_together_widen_the_prediction() -> None:
+    """A shift common to a view's corners hides in its pose; a bend does not."""
+    views, truth = drawn(11, noise_px=0.02)
+    rng = np.random.default_rng(0)
+    bent = []
+    for view in views:
+        middle = view.object_m[:, :2].mean(axis=0)
+        bow = ((view.object_m[:, :2] - middle) ** 2).sum(axis=1) / 0.01
+        bent.append(
+            dataclasses.replace(
+                view, corners_px=view.corners_px + 0.3 * bow[:, None] * rng.normal(size=2)
+            )
+        )
+    fit = start_fit(bent, "plumb_bob")
+    error = fit.parameters - parameters_of(truth)
+    std = np.sqrt(np.diag(lens_covariance(fit)))
+    assert (np.abs(error) < 3 * std).all()
+
+
+def test_a_wrong_camera_moves_the_target_as_predicted() -> None:
+    """The linear prediction against a solved pose, for a small known error."""
+    _, truth = drawn(2)
+    off = parameters_of(truth) + np.array([0.5, 0.5, -0.3, 0.2, 0, 0, 0, 0, 0])
+    camera = make_camera("plumb_bob", truth.size_px, off)
+    d = parameters_of(camera) - parameters_of(truth)
+    [e] = predict_errors(truth, np.outer(d, d), [0.8])
+    true_mm = position_errors_mm(camera, truth, 0.8)
+    # Draws of a single direction: the 95 % line is 1.96 times the error itself.
+    assert e.axis_mm95 == pytest.approx(1.96 * true_mm[0], rel=0.1)
+    # 0.5 px of 1 in the focal length at 0.8 m, and the centre's own part.
+    assert true_mm[0] > 0.5 * 800 * 0.5 / truth.K[0, 0]
+
+
+def test_derivatives_are_those_of_the_projection() -> None:
+    _, camera = drawn(4)
+    rays = rays_of(np.array([[0.3, -0.2], [0.0, 0.1], [-0.4, 0.35]]))
+    L = pixel_derivatives(camera, rays)
+    p = parameters_of(camera)
+    for k in range(len(p)):
+        step = np.zeros(len(p))
+        step[k] = 1e-6
+        zero = np.zeros(3)
+        ahead = project(rays, zero, zero, make_camera("plumb_bob", camera.size_px, p + step))
+        behind = project(rays, zero, zero, make_camera("plumb_bob", camera.size_px, p - step))
+        assert L[:, :, k] == pytest.approx((ahead - behind) / 2e-6, abs=1e-3)
+
+
+def test_outliers_are_named_and_the_rest_stays() -> None:
+    views, truth = drawn(6, noise_px=0.05)
+    rng = np.random.default_rng(1)
+    noise = rng.normal(0, 0.8, views[4].corners_px.shape)
+    views[4] = dataclasses.replace(views[4], corners_px=views[4].corners_px + noise)
+    views[9] = moved(views[9], np.array([3, 7]), (2.0, -1.0))
+    result = calibrate(views, "", "plumb_bob")
+    whole = [r.view for r in result.rejections if not r.corners]
+    corners = {r.view: r.corners for r in result.rejections if r.corners}
+    assert whole == [views[4].name]
+    assert corners == {views[9].name: (int(views[9].ids[3]), int(views[9].ids[7]))}
+    assert len(result.views) == len(views) - 1
+    assert np.abs(result.camera.K - truth.K).max() < 1.5
+
+
+def test_good_views_are_all_kept() -> None:
+    for seed in range(2):
+        views, _ = drawn(20 + seed, noise_px=0.1)
+        assert calibrate(views, "", "plumb_bob").rejections == ()
+
+
+def test_views_that_fit_no_camera_are_refused() -> None:
+    views, _ = drawn(6)
+    rng = np.random.default_rng(3)
+    for i in range(0, 12, 2):
+        noise = rng.normal(0, 4, views[i].corners_px.shape)
+        views[i] = dataclasses.replace(views[i], corners_px=views[i].corners_px + noise)
+    with pytest.raises(InvalidValue, match="do not fit one camera"):
+        calibrate(views, "", "plumb_bob")
+
+
+def test_too_few_views_say_how_many_to_add() -> None:
+    views, _ = drawn(0)
+    with pytest.raises(InvalidValue, match=r"only 2 pictures show the board.*add 3 or more"):
+        calibrate(views[:2], "")
+
+
+def test_frontal_views_are_refused() -> None:
+    views, _ = drawn(1, max_tilt_deg=4.0)
+    with pytest.raises(InvalidValue, match=r"tilted by more than.*add .* 20 to 45 deg"):
+        calibrate(views, "")
+
+
+def test_boards_in_one_corner_of_the_picture_are_refused() -> None:
+    views, camera = drawn(2)
+    near = np.array(camera.size_px) * (0.5, 0.6)
+    cut = [v.keep((v.corners_px < near).all(axis=1)) for v in views]
+    with pytest.raises(InvalidValue, match=r"cover .* %.*add views with the board at the .*right"):
+        calibrate([v for v in cut if len(v) >= 8], "")
+
+
+def test_the_lens_model_is_recommended_by_views_held_out() -> None:
+    rng = np.random.default_rng(8)
+    plain = draw_camera(rng)
+    fisheye = CameraModel(plain.size_px, plain.K, np.array([0.25, -0.35, 0.3, -0.2]), "fisheye")
+    views = corner_views(rng, fisheye, views=12, noise_px=0.02)
+    result = calibrate(views, "")
+    scores = {s.model: s.held_out_px for s in result.scores}
+    assert set(scores) == {"plumb_bob", "rational_polynomial", "fisheye"}
+    assert scores["fisheye"] < 1.2 * min(s for s in scores.values() if s)  # type: ignore[operator]
+    views = corner_views(rng, plain, views=12, noise_px=0.05)
+    assert calibrate(views, "").recommended == "plumb_bob"
+
+
+def test_a_strong_fisheye_is_not_taken_for_a_pinhole() -> None:
+    rng = np.random.default_rng(9)
+    K = np.array([[330.0, 0, 322], [0, 331.0, 238], [0, 0, 1]])
+    camera = CameraModel((640, 480), K, np.array([0.05, -0.02, 0.01, -0.003]), "fisheye")
+    views = corner_views(rng, camera, views=15, noise_px=0.03)
+    result = calibrate(views, "")
+    assert result.recommended in ("fisheye", "rational_polynomial")
+    if result.recommended == "fisheye":
+        assert np.abs(result.camera.K - K).max() < 1.0
+
+
+def test_a_check_passes_the_camera_and_fails_another() -> None:
+    views, camera = drawn(12, noise_px=0.05)
+    assert check(camera, views).passed
+    longer = CameraModel(camera.size_px, camera.K * [[1.01], [1.01], [1.0]], camera.dist)
+    result = check(longer, views)
+    assert not result.passed
+    assert any(d.mm > 0.5 * limit_mm(d.z_m) for d in result.deviations)
+    straight = CameraModel(camera.size_px, camera.K, np.zeros(5))
+    assert not check(straight, views).passed
+
+
+def test_a_check_by_frontal_views_says_that_it_cannot_tell() -> None:
+    views, camera = drawn(12, noise_px=0.3, max_tilt_deg=2.0, views=4)
+    with pytest.raises(InvalidValue, match=r"too little to judge|do not fit"):
+        check(camera, views)
+    with pytest.raises(InvalidValue, match="at least 3"):
+        check(camera, views[:2])
