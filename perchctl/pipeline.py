@@ -28,6 +28,7 @@ from perchctl.vision.filter import (
     YAW,
     FilterSetup,
     make_filter,
+    measured_noise,
     step_track,
 )
 from perchctl.vision.merge import (
@@ -45,6 +46,8 @@ from perchctl.vision.pose import (
     make_pose_setup,
     normal_cam,
 )
+from perchctl.vision.poses import Poses
+from perchctl.vision.predict import expected_corners
 from perchctl.vision.types import (
     MARKERS,
     Attitude,
@@ -55,6 +58,7 @@ from perchctl.vision.types import (
     MarkerTrack,
     PipelineOutput,
     PipelineState,
+    Sight,
     Stage,
     TargetPose,
 )
@@ -118,14 +122,17 @@ def step(
     Without an attitude the vehicle counts as level and at rest: the filter then works
     in the level frame, whatever `kalman.frame` says.
     """
-    detections = detect(frame, state.last, setup.detector, setup.camera)
+    expected, near = expected_corners(state.sight, frame.t_s, attitude, setup.pose)
+    detections = detect(frame, state.last, setup.detector, setup.camera, expected)
     normal = state.normal_cam
-    poses = _poses(detections, attitude, setup, normal)
-    large, small = poses.get("large"), poses.get("small")
+    poses = _poses(detections, attitude, setup, normal, near)
     disagreeing = state.disagreeing_frames
     contradiction = False
-    if large is not None and small is not None:
-        contradiction = disagree(large, small, setup.merge.disagreement_m)
+    if detections.large is not None and detections.small is not None:
+        if not poses.consistent:
+            large, small = poses.get("large"), poses.get("small")
+            if large is not None and small is not None:
+                contradiction = disagree(large, small, setup.merge.disagreement_m)
         disagreeing = disagreeing + 1 if contradiction else 0
 
     in_world = setup.kalman.frame == "world" and attitude is not None
@@ -139,13 +146,14 @@ def step(
         target = _target(merged, frame.t_s, fresh, attitude, in_world, setup)
 
     anything = detections.large is not None or detections.small is not None
-    first = next((poses[k] for k in ("joint", "large", "small") if k in poses), None)
+    first = poses.first
     new_state = PipelineState(
         tracks=tracks,
         last=detections if anything else _still_useful(state.last, frame.t_s),
         disagreeing_frames=disagreeing,
         in_world=in_world,
         normal_cam=normal_cam(first) if first is not None else (normal if tracks else None),
+        sight=Sight(first, attitude) if first is not None else (state.sight if tracks else None),
     )
     output = PipelineOutput(
         detections=detections,
@@ -162,29 +170,37 @@ def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
 
 
 def _poses(
-    detections: Detections, attitude: Attitude | None, setup: PipelineSetup, normal: Array | None
-) -> dict[str, MarkerPose]:
+    detections: Detections,
+    attitude: Attitude | None,
+    setup: PipelineSetup,
+    normal: Array | None,
+    near: MarkerPose | None,
+) -> Poses:
     seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
-    groups = [[d] for d in seen]
+    joint = None
     if len(seen) == 2 and setup.merge.method == "joint":
-        groups.insert(0, seen)
-    poses: dict[str, MarkerPose] = {}
-    for group in groups:
+        joint = estimate_pose(seen, detections.t_s, attitude, setup.pose, normal, near)
+
+    def singles() -> dict[str, MarkerPose]:
         # The joint tilt is the surest: the single markers of its frame start from it.
-        start = poses.get("joint")
-        pose = estimate_pose(group, detections.t_s, attitude, setup.pose, normal, start)
-        if pose is not None:
-            poses[pose.source] = pose
-    return poses
+        found = (
+            estimate_pose([d], detections.t_s, attitude, setup.pose, normal, joint or near)
+            for d in seen
+        )
+        return {pose.source: pose for pose in found if pose is not None}
+
+    return Poses(singles()) if joint is None else Poses({"joint": joint}, singles)
 
 
 def _chosen(
-    poses: dict[str, MarkerPose],
+    poses: Poses,
     contradiction: bool,
     attitude: Attitude | None,
     setup: PipelineSetup,
 ) -> dict[str, MarkerPose]:
     """Which pose feeds which track in this frame."""
+    if poses.consistent and setup.merge.stages == "seen":
+        return {"joint": poses["joint"]}
     kept: dict[str, MarkerPose] = {name: poses[name] for name in MARKERS if name in poses}
     if len(kept) == 2:
         use = better(kept["large"], kept["small"])
@@ -219,7 +235,8 @@ def _step_tracks(
     for name in ("joint",) if setup.merge.method == "joint" else MARKERS:
         pose = chosen.get(name)
         z = None if pose is None else _measurement(pose, world, setup)
-        track = step_track(tracks.get(name), z, t_s, constants)
+        R = None if pose is None else _noise(pose, world, constants, setup)
+        track = step_track(tracks.get(name), z, t_s, constants, R)
         if track is not None:
             stepped[name] = track
     return stepped
@@ -231,6 +248,21 @@ def _measurement(pose: MarkerPose, world: Attitude | None, setup: PipelineSetup)
         return np.array([pose.e_yaw_rad, *pose.e_m])
     position, yaw = _to_world(pose.e_m, pose.e_yaw_rad, world, setup)
     return np.array([yaw, *position])
+
+
+def _noise(
+    pose: MarkerPose, world: Attitude | None, constants: FilterSetup, setup: PipelineSetup
+) -> Array | None:
+    """Covariance (4, 4) of `_measurement`, None for the fixed one."""
+    if pose.cov is None or constants.attitude_sigma_rad is None:
+        return None
+    cov, arm = pose.cov, setup.pose.T_body_cam[:3, :3] @ pose.tvec_m
+    if world is not None:
+        arm = level_rotation(world) @ arm
+        turn = np.eye(4)
+        turn[:3, :3] = rot_z(world.yaw_rad)
+        cov, arm = turn @ cov @ turn.T, turn[:3, :3] @ arm
+    return measured_noise(cov, arm, constants)
 
 
 def _to_world(

@@ -31,7 +31,15 @@ from perchctl.view.files import CsvFile, OverlayFile, check_output
 from perchctl.view.flight import AXES_OF_SIDE
 from perchctl.view.page import LivePage
 from perchctl.view.tracked import Tracked, record_of, text_line, text_rows
-from perchctl.view.tracker import Notes, Tally, Tracker, camera_setup, sketch_of, track_state
+from perchctl.view.tracker import (
+    Notes,
+    PrintCheck,
+    Tally,
+    Tracker,
+    camera_setup,
+    sketch_of,
+    track_state,
+)
 from perchctl.vision.types import CameraModel, Frame
 
 POLL_S = 0.002
@@ -145,7 +153,7 @@ def run(
     """
     out = sys.stdout if out is None else out
     camera = load_calibration(options.calibration)
-    setup = camera_setup(options.profile, camera)
+    setup = camera_setup(options.profile, camera, options.stills)
     start_s = clock()
     tally = Tally()
 
@@ -178,6 +186,7 @@ def run(
         pace = _Pace(now) if page is not None and not source.live else None
         if page is not None and not source.live:
             _await_reader(page, stop)
+        prints = PrintCheck(camera, options.profile.target)
         say = Notes()
         axis_m = AXES_OF_SIDE * options.profile.target.large.side_m
         tally.started_s = now()
@@ -189,6 +198,7 @@ def run(
             if tracked is None:
                 continue
             tally.add(tracked, tracker.notes)
+            prints.add(tracker.output)
             say.changes(shown, tracker.notes)
             sketch = sketch_of(frame, tracked, axis_m)
             sinks.add(tracked, sketch)
@@ -203,6 +213,8 @@ def run(
             raise NotFound(f"{source.describe()} gave no frame at all")
         sinks.keep()
     print(f"perchctl: {tally.text(ended_s)}", file=sys.stderr)
+    if prints.judged:
+        print(f"perchctl: {prints.verdict().text}", file=sys.stderr)
     if stop.asked.is_set():
         raise Interrupted("Ctrl-C: stopped; what was written is complete")
     return tally

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import math
@@ -456,8 +457,9 @@ def test_csv_and_overlay_can_be_read(
         read += 1
     assert read == MOVING
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.csv", "out.mp4"]
-    summary = capsys.readouterr().err.strip()
+    summary, prints = capsys.readouterr().err.strip().splitlines()
     assert re.fullmatch(rf"perchctl: {MOVING} frames in .* large 100 %, small \d+ %", summary)
+    assert prints.startswith("perchctl: print good within its noise")
 
 
 class PressingOut(io.StringIO):
@@ -573,3 +575,16 @@ def test_help_says_what_the_fields_are() -> None:
     text = " ".join(out.split())
     for word in ("atan2(R[1,0], R[0,0])", "corners_px", "sigma_yaw_rad", "Kalibr"):
         assert word in text
+
+
+def test_a_print_error_is_named(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The profile says a small marker 4 % smaller than the one in the picture."""
+    profile = load_profile("sim")
+    small = profile.target.small.model_copy(update={"side_m": 0.024})
+    target = profile.target.model_copy(update={"small": small})
+    options = resolve(str(video), "sim", CALIBRATION, as_json=True)
+    wrong = options.profile.model_copy(update={"target": target})
+    run(dataclasses.replace(options, profile=wrong), io.StringIO())
+    said = capsys.readouterr().err
+    assert "print error: the small marker is 0.16" in said
+    assert "make-target --measured-large" in said

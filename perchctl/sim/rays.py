@@ -82,7 +82,8 @@ def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[
     q[2, misses] = 1.0
     points = np.stack([q[0] / q[2], q[1] / q[2]], axis=1)
     points[misses] = FAR_AWAY_M
-    return points.reshape(*rays.shape[1:], 2), misses.reshape(rays.shape[1:])
+    shape = rays.shape[1:]
+    return np.asarray(points.reshape(*shape, 2), np.float32), np.asarray(misses.reshape(shape))
 
 
 def _all_rise(grid: RayGrid, to_plane: Array) -> bool:

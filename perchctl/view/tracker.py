@@ -10,13 +10,22 @@ import numpy as np
 
 from perchctl.camera.health import HealthState, Verdict, assess
 from perchctl.pipeline import PipelineSetup, make_setup, step
-from perchctl.profile import Profile
+from perchctl.profile import Profile, TargetConfig
+from perchctl.target.print_check import (
+    MIN_FRAMES,
+    PrintVerdict,
+    SizeRatio,
+    combined,
+    size_ratio,
+    verdict,
+)
 from perchctl.view.draw import Sketch
 from perchctl.view.page import State
 from perchctl.view.tracked import Tracked, record_of, text_rows, tracked_of
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
 
 MOST_NOTES = 20
+FOLD_RATIOS = 500  # frames whose size ratios are kept one by one
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
@@ -25,11 +34,14 @@ _MIRRORED = (
 )
 
 
-def camera_setup(profile: Profile, camera: CameraModel) -> PipelineSetup:
+def camera_setup(profile: Profile, camera: CameraModel, stills: bool = False) -> PipelineSetup:
     """The profile's pipeline with the camera in the place of vehicle and gear, so that
-    its target is in the camera frame."""
+    its target is in the camera frame. Stills are each searched as thoroughly as can be."""
+    detector = profile.detector
+    if stills:
+        detector = detector.model_copy(update={"blurred_every": 1})
     return make_setup(
-        profile.detector,
+        detector,
         profile.pose,
         profile.kalman,
         profile.merge,
@@ -60,12 +72,12 @@ class Tracker:
 
     def track(self, frame: Frame, name: str | int) -> Tracked | None:
         """The frame's result; None for a live source's repetition of the last picture."""
-        verdict = self._assess(frame)
-        if self.live and verdict.kind == "repeated":
+        judged = self._assess(frame)
+        if self.live and judged.kind == "repeated":
             return None
         self.output = None
-        self.notes = () if verdict.kind in ("ok", "repeated") else (verdict.text,)
-        if self.live and verdict.kind in _NO_PICTURE:
+        self.notes = () if judged.kind in ("ok", "repeated") else (judged.text,)
+        if self.live and judged.kind in _NO_PICTURE:
             return Tracked(name, frame.t_s)
         before = PipelineState() if self.stills else self._state
         self._state, output = step(before, frame, None, self.setup)
@@ -80,8 +92,8 @@ class Tracker:
 
     def _assess(self, frame: Frame) -> Verdict:
         alike_is_frozen = self.live or not (self.stills or self.recorded_stills)
-        self._health, verdict = assess(self._health, frame, alike_is_frozen)
-        return verdict
+        self._health, judged = assess(self._health, frame, alike_is_frozen)
+        return judged
 
 
 @dataclass(eq=False)
@@ -109,6 +121,42 @@ class Tally:
             f"{self.frames} {plural} in {took_s:.1f} s ({self.frames / took_s:.0f} a second): "
             f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{said}"
         )
+
+
+@dataclass(eq=False)
+class PrintCheck:
+    """The ratio of the two markers' apparent sizes over the frames that show both."""
+
+    camera: CameraModel
+    target: TargetConfig
+    _ratios: list[SizeRatio] = field(default_factory=list)
+
+    def add(self, output: PipelineOutput | None) -> None:
+        if output is None:
+            return
+        large, small = output.detections.large, output.detections.small
+        if large is None or small is None or not (large.refined and small.refined):
+            return
+        ratio = size_ratio(
+            large.corners_px,
+            small.corners_px,
+            (large.sigma_px, small.sigma_px),
+            self.camera,
+            self.target,
+        )
+        if ratio is not None:
+            self._ratios.append(ratio)
+        if len(self._ratios) >= FOLD_RATIOS:
+            mean = combined(self._ratios)
+            self._ratios = [] if mean is None else [mean]
+
+    @property
+    def judged(self) -> bool:
+        """Whether enough frames showed both markers."""
+        return sum(ratio.frames for ratio in self._ratios) >= MIN_FRAMES
+
+    def verdict(self) -> PrintVerdict:
+        return verdict(combined(self._ratios), self.target)
 
 
 class Notes:

@@ -13,7 +13,7 @@ from perchctl.geometry import Array
 from perchctl.vision.types import CameraModel
 
 # OpenCV's default stops five iterations in, up to 0.12 px off at the corners of the picture.
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)  # px
 _ZERO = np.zeros(3)
 
 

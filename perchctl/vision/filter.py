@@ -30,6 +30,7 @@ H[range(4), MEASURED] = 1.0  # equation 2
 
 _CM = 0.01
 _DEG = math.radians(1.0)
+_LEAST_NOISE = np.array([1e-4, 1e-4, 1e-4, 1e-4]) ** 2  # 0.1 mm, 0.006 deg: lens and print
 _UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # of the paper, per state
 
 
@@ -43,6 +44,7 @@ class FilterSetup:
     P0: Array
     alpha: float
     n_max: int
+    attitude_sigma_rad: float | None = None  # None: R for every measurement
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
@@ -58,7 +60,29 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
         P0=np.diag(first * squares),
         alpha=config.alpha,
         n_max=config.n_max,
+        attitude_sigma_rad=(
+            math.radians(config.attitude_sigma_deg) if config.noise == "measured" else None
+        ),
     )
+
+
+def measured_noise(cov: Array, arm_m: Array, setup: FilterSetup) -> Array | None:
+    """R (4, 4) of a measured (yaw, x, y, z) from the pose's covariance of (x, y, z, yaw)
+    and the way from camera to target (3,), all in the same axes; None where R is fixed.
+
+    An error of roll and pitch turns the way about level axes: heights change with the
+    horizontal way, places with the height. The heading is the vehicle's own matter.
+    """
+    if setup.attitude_sigma_rad is None or not np.isfinite(cov).all():
+        return None
+    x, y, z = arm_m
+    turned = np.array([[0.0, z], [-z, 0.0], [y, -x]]) * setup.attitude_sigma_rad
+    R = np.empty((4, 4))
+    order = [3, 0, 1, 2]
+    R[:] = cov[np.ix_(order, order)]
+    R[1:, 1:] += turned @ turned.T
+    R[range(4), range(4)] += _LEAST_NOISE
+    return R
 
 
 def transition(dt_s: float) -> Array:
@@ -68,16 +92,23 @@ def transition(dt_s: float) -> Array:
     return F
 
 
-def start_track(z: Array, t_s: float, setup: FilterSetup) -> MarkerTrack:
+def start_track(z: Array, t_s: float, setup: FilterSetup, R: Array | None = None) -> MarkerTrack:
     """A track at its first measurement z = (yaw, x, y, z), SI."""
     x = np.zeros(8)
     x[MEASURED] = z
     x[YAW] = wrap_rad(float(z[0]))
-    return MarkerTrack(t_s=t_s, x=x, P=setup.P0.copy(), unseen=0)
+    P = setup.P0.copy()
+    if R is not None:
+        P[np.ix_(MEASURED, MEASURED)] = R
+    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0)
 
 
 def step_track(
-    track: MarkerTrack | None, z: Array | None, t_s: float, setup: FilterSetup
+    track: MarkerTrack | None,
+    z: Array | None,
+    t_s: float,
+    setup: FilterSetup,
+    R: Array | None = None,
 ) -> MarkerTrack | None:
     """One frame's predict and, where the marker was seen, update.
 
@@ -86,6 +117,7 @@ def step_track(
         z: measured (yaw, x, y, z) in SI, (4,), or None where nothing was seen. A
             measurement that is not finite counts as nothing seen.
         t_s: the frame's time.
+        R: the measurement's covariance (4, 4); the setup's if None.
 
     Returns None when there is nothing (left) to track: never seen, or unseen for more
     than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the
@@ -96,10 +128,10 @@ def step_track(
     if not math.isfinite(t_s):
         return track
     if track is None:
-        return None if z is None else start_track(z, t_s, setup)
+        return None if z is None else start_track(z, t_s, setup, R)
     dt_s = t_s - track.t_s
     if abs(dt_s) > MAX_GAP_S or not np.isfinite(track.x).all():
-        return None if z is None else start_track(z, t_s, setup)
+        return None if z is None else start_track(z, t_s, setup, R)
     if dt_s <= 0.0:
         return track
     if z is None:
@@ -107,7 +139,7 @@ def step_track(
     x, P = predict(track.x, track.P, F=transition(dt_s), Q=setup.Q)
     on_branch = np.array(z, dtype=np.float64)  # the yaw nearest to the prediction
     on_branch[0] = x[YAW] + wrap_rad(float(z[0]) - float(x[YAW]))
-    x, P = update(x, P, on_branch, setup.R, H)
+    x, P = update(x, P, on_branch, setup.R if R is None else R, H)
     x[YAW] = wrap_rad(float(x[YAW]))
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
@@ -68,6 +69,7 @@ class Detection:
     corners_px: Array
     sigma_px: float
     refined: bool
+    shift_sigma_px: float = 0.0  # of what moved all of a picture's edges alike, outwards
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +81,7 @@ class Detections:
     full_frame: bool = True  # False: found in the predicted window
     mirrored: bool = False  # the small marker decoded as its mirror image
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
+    flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
 
     def get(self, marker: MarkerName) -> Detection | None:
         return self.large if marker == "large" else self.small
@@ -108,6 +111,8 @@ class MarkerPose:
         e_yaw_rad: heading of the target's x axis in the level frame.
         sigma_m: standard deviation of `e_m`, (3,); sigma_yaw_rad likewise.
         reprojection_px: RMS over the corners used.
+        chi2: their squared errors in units of their spread, per degree of freedom.
+        cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
     """
 
     source: Literal["large", "small", "joint"]
@@ -119,6 +124,8 @@ class MarkerPose:
     sigma_m: Array
     sigma_yaw_rad: float
     reprojection_px: float
+    chi2: float = 0.0
+    cov: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +174,14 @@ class TargetPose:
 
 
 @dataclass(frozen=True, eq=False)
+class Sight:
+    """A pose of the target and the vehicle's attitude at that time, if it was known."""
+
+    pose: MarkerPose
+    attitude: Attitude | None
+
+
+@dataclass(frozen=True, eq=False)
 class PipelineState:
     """All the memory of the pipeline; `PipelineState()` is a fresh start."""
 
@@ -175,6 +190,7 @@ class PipelineState:
     disagreeing_frames: int = 0
     in_world: bool = False  # the tracks' frame: world of the state estimate, or level
     normal_cam: Array | None = None  # the target's last normal, camera axes, (3,)
+    sight: Sight | None = None  # the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +198,7 @@ class PipelineOutput:
     """Everything one frame gave, for the planner and the log."""
 
     detections: Detections
-    poses: dict[str, MarkerPose]
+    poses: Mapping[str, MarkerPose]
     target: TargetPose | None
     stage: Stage  # by this frame's detections
     disagreeing_frames: int = 0  # frames in a row in which the two markers contradict

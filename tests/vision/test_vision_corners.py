@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from target_picture import CAMERA, bits_of, pose_of, render
@@ -80,6 +82,32 @@ def test_sigma_follows_the_noise() -> None:
     clean, noisy, noisier = sigma(0.0), sigma(8.0), sigma(20.0)
     assert clean < 0.03
     assert clean < noisy < noisier < 0.4
+
+
+def spoilt(image: Array, light: str) -> Array:
+    if light == "gamma":
+        return np.rint(255.0 * (image / 255.0) ** 0.5).astype(np.uint8)
+    return np.clip(image * 1.7, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("light", ["gamma", "clipped"])
+def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
+    """White that grows over black: the border's width tells by how much."""
+    biases, raw_biases = [], []
+    closed = {n: replace(rim, open=np.zeros_like(rim.open)) for n, rim in RIMS.items()}
+    for values in POSES:
+        rvec, tvec = pose_of(*values)
+        image = spoilt(render(rvec, tvec, blur_px=0.9), light)
+        true = true_corners(rvec, tvec, 0.150)
+        out = true - true.mean(axis=0)
+        out /= np.linalg.norm(out, axis=1, keepdims=True)
+        for rims, rows in ((RIMS, biases), (closed, raw_biases)):
+            result = refine(image, true[None], [rims[6]], CAMERA, "line")[0]
+            assert result.refined
+            rows.append(((result.corners_px - true) * out).sum(axis=1).mean())
+            assert abs(rows[-1]) < 4.0 * np.hypot(result.shift_sigma_px, result.sigma_px)
+    assert abs(np.mean(raw_biases)) > 0.12
+    assert abs(np.mean(biases)) < 0.03
 
 
 def test_an_occluded_part_of_a_side_is_left_out() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -27,7 +28,16 @@ from perchctl.profile import (
     PoseConfig,
     TargetConfig,
 )
-from perchctl.vision.types import Attitude, Frame, PipelineOutput, PipelineState, Stage
+from perchctl.vision.pose import estimate_pose
+from perchctl.vision.predict import expected_corners
+from perchctl.vision.types import (
+    Attitude,
+    Frame,
+    PipelineOutput,
+    PipelineState,
+    Sight,
+    Stage,
+)
 
 Build = Callable[..., PipelineSetup]
 MOUNT = make_T(rotation_from_rpy(0.03, -0.02, 0.4), (0.02, 0.0, 0.01))
@@ -289,3 +299,61 @@ def test_velocity_is_in_level_axes(build: Build) -> None:
     assert np.abs(output.target.world_velocity_mps[1:]).max() < 0.01
     assert output.target.velocity_mps[1] == pytest.approx(-output.target.world_velocity_mps[0])
     assert np.abs(output.target.velocity_mps[[0, 2]]).max() < 0.01
+
+
+def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
+    """They are computed when asked for, and only then."""
+    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    attitude = fly(0)
+    _, output = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
+    joint = output.poses["joint"]
+    for name in ("large", "small"):
+        detection = output.detections.get(name)  # type: ignore[arg-type]
+        assert detection is not None
+        alone = estimate_pose([detection], attitude.t_s, attitude, setup.pose, None, joint)
+        assert alone is not None
+        assert np.array_equal(output.poses[name].e_m, alone.e_m)
+    assert list(output.poses) == ["joint", "large", "small"]
+    assert output.poses["joint"] is joint
+    assert output.poses.get("none") is None
+
+
+def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
+    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    then, now = fly(0), fly(6)  # far, and turned, within one gap
+    _, output = step(PipelineState(), Frame(0, then.t_s, view(then)), then, setup)
+    sight = Sight(output.poses["joint"], then)
+    expected, near = expected_corners(sight, now.t_s, now, setup.pose)
+    assert expected is not None
+    assert near is not None
+    _, later = step(PipelineState(), Frame(1, now.t_s, view(now)), now, setup)
+    for name in ("large", "small"):
+        seen = later.detections.get(name)  # type: ignore[arg-type]
+        assert seen is not None
+        assert np.abs(expected[name] - seen.corners_px).max() < 1.0  # type: ignore[index]
+    assert np.allclose(near.tvec_m, later.poses["joint"].tvec_m, atol=0.002)
+    assert expected_corners(sight, now.t_s, None, setup.pose) == (None, sight.pose)
+    assert expected_corners(None, now.t_s, now, setup.pose) == (None, None)
+    assert expected_corners(sight, then.t_s + 5.0, now, setup.pose) == (None, None)
+
+
+@pytest.mark.parametrize("method", ["joint", "weights"])
+def test_measured_noise_follows_the_pose_and_fixed_noise_does_not(
+    build: Build, method: str
+) -> None:
+    """Near, the measurement is worth more than k1 says: the filter's spread shows it."""
+
+    def sigma(noise: str, z_m: float) -> Array:
+        kalman = KalmanConfig(noise=noise, attitude_sigma_deg=0.2)  # type: ignore[arg-type]
+        setup = build(kalman=kalman, merge=MergeConfig(method=method))  # type: ignore[arg-type]
+        state = PipelineState()
+        attitude = Attitude(0.0, 0.0, 0.0, 0.0)
+        for k in range(4):
+            frame = Frame(k, k / 30, render(*pose_of(0.0, 0.0, z_m), noise=3.0, seed=k))
+            state, output = step(state, frame, replace(attitude, t_s=k / 30), setup)
+        assert output.target is not None
+        assert np.abs(output.target.e_m - [0.0, 0.0, z_m]).max() < 0.004
+        return output.target.sigma_m
+
+    assert sigma("measured", 0.24)[0] < 0.8 * sigma("measured", 0.7)[0]
+    assert np.allclose(sigma("fixed", 0.24), sigma("fixed", 0.7), rtol=0.01)

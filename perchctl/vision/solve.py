@@ -1,0 +1,254 @@
+"""Rotation and translation from corners: closed forms, then least squares in which each
+corner counts as it was measured.
+
+Corners that are intersections of fitted lines do not err on their own: a line is off
+by an offset and a tilt, and moves the corners at both of its ends. Its two ends have
+errors across it of variance s^2 with a correlation of -1/2, so half the line's offset
+is known to s/2 and its tilt to s sqrt(3)/2. `whitening` turns corner errors into these
+independent ones. A shift of all edges by the same number of pixels (clipped white, ink)
+is left out of the fit, where small markers' own faults would feed it, but not out of the
+covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from perchctl.geometry import Array
+from perchctl.vision.types import Detection
+
+Solver = Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
+Candidate = tuple[Array, Array]  # rvec, tvec
+Scored = tuple[Array, Array, Array, Array]  # and errors (n, 2), Jacobian (2n, 6)
+
+_FLAGS = {
+    "sqpnp": cv2.SOLVEPNP_SQPNP,
+    "iterative": cv2.SOLVEPNP_ITERATIVE,
+    "epnp": cv2.SOLVEPNP_EPNP,
+    "ippe": cv2.SOLVEPNP_IPPE,
+    "ippe_square": cv2.SOLVEPNP_IPPE_SQUARE,
+}
+_MIN_FLIP_RAD = math.radians(2.0)  # closer solutions are one
+_MIN_SCORE_SIGMA_PX = 0.05  # lens and print set a floor to what residuals can tell
+_MAX_STEPS = 8
+_TRUST = 8.0  # degrees of freedom that the claimed spread is worth beside the residuals
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """object_m (n, 3) and image_px (n, 2) of a pinhole K; sigma_px (n,); whitening
+    (2n, 2n) makes errors independent and of unit spread; shift (2n,) is one standard
+    deviation of the shift that all edges share, whitened."""
+
+    object_m: Array
+    image_px: Array
+    sigma_px: Array
+    whitening: Array
+    shift: Array
+    K: Array
+
+
+def make_points(
+    detections: Sequence[Detection], object_m: Array, image_px: Array, K: Array
+) -> Points:
+    n = len(image_px)
+    W = np.zeros((2 * n, 2 * n))
+    shift = np.zeros(2 * n)
+    sigma_px = np.empty(n)
+    for i, d in enumerate(detections):
+        rows = slice(8 * i, 8 * i + 8)
+        corners = image_px[4 * i : 4 * i + 4]
+        sigma_px[4 * i : 4 * i + 4] = d.sigma_px
+        nx, ny = _outward_normals(corners)
+        if d.refined:
+            W[rows, rows] = _line_whitening(nx, ny, d.sigma_px)
+        else:
+            W[range(8 * i, 8 * i + 8), range(8 * i, 8 * i + 8)] = 1.0 / d.sigma_px
+        if d.shift_sigma_px > 0.0:
+            # A corner moves a pixel along the normals of both of its sides.
+            moved = np.empty((4, 2))
+            moved[:, 0], moved[:, 1] = nx + nx[_BEFORE], ny + ny[_BEFORE]
+            shift[rows] = d.shift_sigma_px * moved.ravel()
+    return Points(object_m, image_px, sigma_px, W, W @ shift, K)
+
+
+_BEFORE = [3, 0, 1, 2]
+_START = np.arange(4)  # side k runs from corner k ...
+_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
+
+
+def _outward_normals(corners: Array) -> tuple[Array, Array]:
+    """Unit normals of the four sides, out of the square whichever way round it is."""
+    side = corners[_END] - corners
+    length = np.maximum(np.hypot(side[:, 0], side[:, 1]), 1e-9)
+    nx, ny = side[:, 1] / length, -side[:, 0] / length
+    turn = side[0, 0] * side[1, 1] - side[0, 1] * side[1, 0]
+    return (nx, ny) if turn > 0.0 else (-nx, -ny)
+
+
+def _line_whitening(nx: Array, ny: Array, sigma_px: float) -> Array:
+    """(8, 8): offset and tilt of each side from the corners' errors."""
+    W = np.zeros((8, 8))
+    offset, tilt = 1.0 / sigma_px, 1.0 / (math.sqrt(3.0) * sigma_px)
+    rows = 2 * _START
+    for ends, sign in ((_START, -1.0), (_END, 1.0)):
+        W[rows, 2 * ends], W[rows, 2 * ends + 1] = offset * nx, offset * ny
+        W[rows + 1, 2 * ends], W[rows + 1, 2 * ends + 1] = sign * tilt * nx, sign * tilt * ny
+    return W
+
+
+def solve(
+    points: Points,
+    solver: Solver,
+    refine: bool,
+    expected_cam: Array | None,
+    spread_rad: float,
+) -> Scored | None:
+    """The better of both tilts, None without a finite one in front of the camera.
+
+    `expected_cam` (3,) is the marker's normal as far as it is known, to `spread_rad`.
+    """
+    candidates = _closed_form(points, solver)
+    if refine:
+        candidates = [_refined(points, c) for c in candidates]
+    scored = [_scored(c, points) for c in candidates if _usable(c)]
+    if not scored:
+        return None
+
+    def cost(s: Scored) -> float:
+        return _cost(s, points.sigma_px, expected_cam, spread_rad)
+
+    best = min(scored, key=cost) if len(scored) > 1 else scored[0]
+    if refine and (expected_cam is None or tilt_rad(best[0], expected_cam) > spread_rad):
+        other = flipped(best[0], best[1])
+        turned = None if other is None else _refined(points, (other, best[1]))
+        if turned is not None and _usable(turned):
+            best = min(best, _scored(turned, points), key=cost)
+    if refine:
+        # The unweighted optimum is near enough for errors to be linear.
+        best = descended(points, (best[0], best[1])) or best
+    return best
+
+
+def descended(points: Points, start: Candidate) -> Scored | None:
+    """Gauss-Newton with each corner's own spread, from a start that is near (the frame
+    before); None where it does not settle within some steps."""
+    candidate, before = start, math.inf
+    W = points.whitening
+    for _ in range(_MAX_STEPS):
+        scored = _scored(candidate, points)
+        A, error = W @ scored[3], W @ scored[2].ravel()
+        cost = float(error @ error)
+        if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
+            return None
+        g = A.T @ error
+        try:
+            step = np.linalg.solve(A.T @ A, g)
+        except np.linalg.LinAlgError:
+            return None
+        # What the step would still gain, in squared standard deviations.
+        if float(step @ g) < 1e-4 + 1e-6 * cost:
+            return scored
+        candidate, before = (candidate[0] - step[:3], candidate[1] - step[3:]), cost
+        if not _usable(candidate):
+            return None
+    return None
+
+
+def covariance(points: Points, scored: Scored) -> tuple[Array, float]:
+    """Of (rvec, tvec), (6, 6), and the squared error per degree of freedom: the inverse
+    information, grown as far as the residuals say that the corners spread more than
+    they claim, and what the common shift does to the pose."""
+    A, error = points.whitening @ scored[3], points.whitening @ scored[2].ravel()
+    freedom = len(error) - 6
+    try:
+        inverse = np.linalg.inv(A.T @ A)
+    except np.linalg.LinAlgError:
+        return np.full((6, 6), np.inf), math.inf
+    chi2 = float(error @ error)
+    growth = max((_TRUST + chi2) / (_TRUST + freedom), 0.7)
+    common = inverse @ (A.T @ points.shift)
+    return inverse * growth + np.outer(common, common), chi2 / freedom
+
+
+def flipped(rvec: Array, tvec: Array) -> Array | None:
+    """The other tilt: the normal mirrored at the line of sight; None where both agree."""
+    R = cv2.Rodrigues(rvec)[0]
+    normal, sight = R[:, 2], tvec / np.linalg.norm(tvec)
+    other = 2.0 * float(normal @ sight) * sight - normal
+    axis = np.array(  # normal x other
+        [
+            normal[1] * other[2] - normal[2] * other[1],
+            normal[2] * other[0] - normal[0] * other[2],
+            normal[0] * other[1] - normal[1] * other[0],
+        ]
+    )
+    sine, cosine = float(np.linalg.norm(axis)), float(normal @ other)
+    angle = math.atan2(sine, cosine)
+    if angle < _MIN_FLIP_RAD or sine < 1e-9:
+        return None
+    turn = cv2.Rodrigues(axis / sine * angle)[0]
+    return flat(cv2.Rodrigues(turn @ R)[0])
+
+
+def flat(values: Any) -> Array:
+    return np.asarray(values, dtype=np.float64).ravel()
+
+
+def rms(error_px: Array) -> float:
+    return math.sqrt(float((error_px * error_px).sum()) / len(error_px))
+
+
+def tilt_rad(rvec: Array, expected_cam: Array) -> float:
+    """Angle between the marker's normal and the expected one."""
+    normal = cv2.Rodrigues(rvec)[0][:, 2]
+    return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
+
+
+def _closed_form(points: Points, solver: Solver) -> list[Candidate]:
+    if solver == "ippe_square" and len(points.object_m) != 4:
+        solver = "ippe"
+    try:
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+            points.object_m, points.image_px, points.K, None, flags=_FLAGS[solver]
+        )
+    except cv2.error:
+        return []  # degenerate corners: all on one line, or on one point
+    pairs = [(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
+    return [pair for pair in pairs if _usable(pair)]
+
+
+def _usable(candidate: Candidate) -> bool:
+    rvec, tvec = candidate
+    return bool(np.isfinite(rvec).all() and np.isfinite(tvec).all() and tvec[2] > 0.0)
+
+
+def _refined(points: Points, start: Candidate) -> Candidate:
+    rvec, tvec = start[0].reshape(3, 1).copy(), start[1].reshape(3, 1).copy()
+    try:
+        moved = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, rvec, tvec)
+    except cv2.error:
+        return start
+    return flat(moved[0]), flat(moved[1])
+
+
+def _scored(candidate: Candidate, points: Points) -> Scored:
+    rvec, tvec = candidate
+    projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
+    error: Array = projected.reshape(-1, 2) - points.image_px
+    return rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64)
+
+
+def _cost(scored: Scored, sigma_px: Array, expected_cam: Array | None, spread_rad: float) -> float:
+    rvec, _, error_px, _ = scored
+    sigma = np.maximum(sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
+    cost = float(((error_px / sigma) ** 2).sum())
+    if expected_cam is not None:
+        cost += (tilt_rad(rvec, expected_cam) / spread_rad) ** 2
+    return cost
