@@ -123,7 +123,9 @@ def step(
     in the level frame, whatever `kalman.frame` says.
     """
     expected, near = expected_corners(state.sight, frame.t_s, attitude, setup.pose)
-    detections = detect(frame, state.last, setup.detector, setup.camera, expected)
+    # A first picture is looked at thoroughly, and of a stream without the target every Nth.
+    thorough = state.empty_frames % setup.detector.blurred_every == 0
+    detections = detect(frame, state.last, setup.detector, setup.camera, expected, thorough)
     normal = state.normal_cam
     poses = _poses(detections, attitude, setup, normal, near)
     disagreeing = state.disagreeing_frames
@@ -154,6 +156,7 @@ def step(
         in_world=in_world,
         normal_cam=normal_cam(first) if first is not None else (normal if tracks else None),
         sight=Sight(first, attitude) if first is not None else (state.sight if tracks else None),
+        empty_frames=0 if anything else state.empty_frames + 1,
     )
     output = PipelineOutput(
         detections=detections,

@@ -28,7 +28,7 @@ from perchctl.geometry import Array
 from perchctl.vision.camera_model import distort, undistort
 from perchctl.vision.edges import PROFILES, locate, places, sample, side_profiles
 from perchctl.vision.shift import edge_shift
-from perchctl.vision.types import CameraModel
+from perchctl.vision.types import CameraModel, EdgeShift
 
 RAW_SIGMA_PX = 0.6
 SUBPIX_SIGMA_PX = 0.25
@@ -53,13 +53,15 @@ _UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
     """corners_px (4, 2), their spread, whether lines were fitted, the spread of a shift
-    that is common to all sides (outwards), and the edges' blur, in px."""
+    that is common to all sides (outwards), the edges' blur, in px, and the shift that was
+    taken out."""
 
     corners_px: Array
     sigma_px: float
     refined: bool
     shift_sigma_px: float = 0.0
     blur_px: float = 0.0
+    edge_shift: EdgeShift | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +149,15 @@ def _fallback(image: NDArray[np.uint8], raw_px: Array, cells: int, method: str) 
 
 
 def refine_lines(
-    image: NDArray[np.uint8], raw_px: Array, rims: Sequence[Rim], camera: CameraModel
+    image: NDArray[np.uint8],
+    raw_px: Array,
+    rims: Sequence[Rim],
+    camera: CameraModel,
+    known: EdgeShift | None = None,
 ) -> list[RefinedCorners | None]:
     """The line fit alone, for m markers (m, 4, 2); None where its residual, inliers,
-    contrast, blur or shift say that these are not a marker's sides."""
+    contrast, blur or movement say that these are not a marker's sides. The shift of all
+    edges is measured unless it is known."""
     m = len(raw_px)
     sides_px = side_lengths_px(raw_px)  # (m, 4)
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
@@ -164,7 +171,7 @@ def refine_lines(
     # Rows: every marker's sides; then the inner edge of the border with the largest
     # cells, which tells best by how much all edges are shifted.
     best = int(cell_px.argmax())
-    tells = float(cell_px[best]) > _MIN_SHIFT_CELL_PX
+    tells = known is None and float(cell_px[best]) > _MIN_SHIFT_CELL_PX
     starts, ends, lengths, depth = corners, corners[:, _NEXT], sides_px, depth_px
     of = np.arange(m).repeat(4)
     if tells:
@@ -217,6 +224,10 @@ def refine_lines(
             rims[best].tolerance,
             prior_px,
         )
+        known = EdgeShift(shift_px, shift_sigma_px)
+    elif known is not None:
+        shift_px, shift_sigma_px = known.shift_px, known.sigma_px
+    if shift_px != 0.0:
         # The line's normal may point either way.
         out = (corners - corners.mean(axis=1)[:, None]).reshape(-1, 2)
         outwards = np.sign(fitted[:, 0] * out[:, 0] + fitted[:, 1] * out[:, 1])
@@ -258,6 +269,7 @@ def refine_lines(
             True,
             shift_sigma_px,
             float(blur_px[4 * i : 4 * i + 4].max()),
+            known,
         )
         if accepted[i]
         else None

@@ -39,7 +39,15 @@ from perchctl.vision.search import (
     search,
     search_window,
 )
-from perchctl.vision.types import MARKERS, CameraModel, Detection, Detections, Frame, MarkerName
+from perchctl.vision.types import (
+    MARKERS,
+    CameraModel,
+    Detection,
+    Detections,
+    EdgeShift,
+    Frame,
+    MarkerName,
+)
 
 __all__ = [
     "DetectorSetup",
@@ -52,6 +60,7 @@ __all__ = [
 ]
 
 _MAX_SPEED_GAP_S = 0.25  # older motion says nothing about where to look
+_SHIFT_PICTURES = 5
 _SEARCHED_SIDE_PX = 13.0  # smaller markers are not found by a search
 
 
@@ -61,12 +70,15 @@ def detect(
     setup: DetectorSetup,
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
+    thorough: bool = True,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
     `previous` is what an earlier frame gave (the last one that saw something is best);
     it says where to look first and decides between look-alikes. `expected` are better
     predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
+    `thorough` looks once more, all over a picture in which nothing was found and nothing
+    is expected, for a target hidden by blur.
     """
     image = frame.image
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
@@ -75,7 +87,7 @@ def detect(
     by_lines = setup.refinement == "line"
     if setup.window and expected and by_lines:
         guess = completed(expected, setup.ratio, camera)
-        seen = follow(image, guess, setup.patterns, camera)
+        seen = follow(image, guess, setup.patterns, camera, _known_shift(previous))
         if seen and not any(_good(r, setup.patterns[name]) for name, r in seen.items()):
             seen = _with_other(image, seen, setup, camera)
     if not seen or _worse(seen, expected, image.shape):
@@ -85,7 +97,7 @@ def detect(
         if not seen and setup.blurred and by_lines:
             if expected:
                 seen = expected_in_blur(image, expected, setup.patterns, camera)
-            elif frame.index % setup.blurred_every == 0:
+            elif thorough:
                 seen = hidden_in_blur(image, setup, camera)
             seen = _with_other(image, seen, setup, camera)
     result = Detections(
@@ -95,8 +107,17 @@ def detect(
         small=_detection("small", seen),
         full_frame=full_frame,
         mirrored=mirrored and not seen,
+        edge_shift=next((r.edge_shift for r in seen.values() if r.edge_shift is not None), None),
     )
     return replace(result, **_motion(previous, result))
+
+
+def _known_shift(previous: Detections | None) -> EdgeShift | None:
+    """Light, lens and ink change slowly: what one picture told holds for some more."""
+    shift = None if previous is None else previous.edge_shift
+    if shift is None or shift.age + 1 >= _SHIFT_PICTURES:
+        return None
+    return replace(shift, age=shift.age + 1)
 
 
 def _detection(name: MarkerName, seen: dict[MarkerName, RefinedCorners]) -> Detection | None:

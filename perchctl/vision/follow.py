@@ -27,7 +27,7 @@ from perchctl.vision.corners import (
     side_lengths_px,
 )
 from perchctl.vision.marker_drawing import Drawing
-from perchctl.vision.types import MARKERS, CameraModel, MarkerName
+from perchctl.vision.types import MARKERS, CameraModel, EdgeShift, MarkerName
 
 LEAST_SIDE_PX = 7.0  # below it a marker is a spot
 LEAST_LINE_CELL_PX = 2.5
@@ -108,8 +108,10 @@ def follow(
     expected: Mapping[MarkerName, Array],
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
+    shift: EdgeShift | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """The expected markers (corners (4, 2) px) that are proven by sides and cells."""
+    """The expected markers (corners (4, 2) px) that are proven by sides and cells; `shift` is
+    what an earlier picture told of its edges."""
     names = [
         name
         for name in MARKERS
@@ -120,7 +122,7 @@ def follow(
     if not names:
         return {}
     raw = np.stack([expected[name] for name in names])
-    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera)
+    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
     seen = {
         name: result
         for name, result in zip(names, fitted, strict=True)

@@ -123,10 +123,10 @@ def pattern_seen(
     half = float(axis[1] - axis[0]) / 2
     square = blurred(drawn(plain, axis, half), sigma, axis).value
     # The sheet's end, where there is one, is the last column of the light.
-    known = np.column_stack([light[:, :3], square, light[:, 7:]])
-    left = np.stack([light[:, 3], mixed(light, coefficients) + error], axis=1)
+    known: Array = np.column_stack([light[:, :3], square, light[:, 7:]])
+    left: Array = np.stack([light[:, 3], mixed(light, coefficients) + error], axis=1)
     A = gram(known, known) + 1e-9 * np.eye(known.shape[1])
-    mix = np.linalg.solve(A, gram(known, left))
+    mix = np.asarray(np.linalg.solve(A, gram(known, left)), dtype=np.float64)
     bits, seen = (left[:, k] - mixed(known, mix[:, k]) for k in (0, 1))
     energy, product = float((bits * bits).sum()), float((bits * seen).sum())
     both = math.sqrt(energy * float((seen * seen).sum()))

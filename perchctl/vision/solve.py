@@ -96,11 +96,13 @@ def _line_whitening(nx: Array, ny: Array, sigma_px: float) -> Array:
     """(8, 8): offset and tilt of each side from the corners' errors."""
     W = np.zeros((8, 8))
     offset, tilt = 1.0 / sigma_px, 1.0 / (math.sqrt(3.0) * sigma_px)
-    rows = 2 * _START
-    for ends, sign in ((_START, -1.0), (_END, 1.0)):
-        W[rows, 2 * ends], W[rows, 2 * ends + 1] = offset * nx, offset * ny
-        W[rows + 1, 2 * ends], W[rows + 1, 2 * ends + 1] = sign * tilt * nx, sign * tilt * ny
+    across = np.concatenate([nx, ny])
+    W[_ROWS, _COLUMNS] = np.concatenate([offset * across] * 2 + [-tilt * across, tilt * across])
     return W
+
+
+_ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
+_COLUMNS = np.concatenate([2 * _START, 2 * _START + 1, 2 * _END, 2 * _END + 1] * 2)
 
 
 def solve(
@@ -110,7 +112,8 @@ def solve(
     expected_cam: Array | None,
     spread_rad: float,
 ) -> Scored | None:
-    """The better of both tilts, None without a finite one in front of the camera.
+    """The better of both tilts, None without a finite one in front of the camera, or where
+    a solver other than ``sqpnp`` gives a start from which nothing settles.
 
     `expected_cam` (3,) is the marker's normal as far as it is known, to `spread_rad`.
     """
@@ -131,8 +134,12 @@ def solve(
         if turned is not None and _usable(turned):
             best = min(best, _scored(turned, points), key=cost)
     if refine:
-        # The unweighted optimum is near enough for errors to be linear.
-        best = descended(points, (best[0], best[1])) or best
+        # The unweighted optimum is near enough for errors to be linear; where they are not,
+        # a weaker solver than SQPnP has led astray.
+        settled = descended(points, (best[0], best[1]))
+        if settled is None and solver != "sqpnp":
+            return None
+        best = settled or best
     return best
 
 

@@ -72,6 +72,16 @@ class Detection:
     shift_sigma_px: float = 0.0  # of what moved all of a picture's edges alike, outwards
 
 
+@dataclass(frozen=True)
+class EdgeShift:
+    """By how many pixels white had grown over black in a picture, the spread of that
+    estimate, and how many pictures ago it was made."""
+
+    shift_px: float
+    sigma_px: float
+    age: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Detections:
     frame_index: int
@@ -82,6 +92,7 @@ class Detections:
     mirrored: bool = False  # the small marker decoded as its mirror image
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
+    edge_shift: EdgeShift | None = None
 
     def get(self, marker: MarkerName) -> Detection | None:
         return self.large if marker == "large" else self.small
@@ -191,6 +202,7 @@ class PipelineState:
     in_world: bool = False  # the tracks' frame: world of the state estimate, or level
     normal_cam: Array | None = None  # the target's last normal, camera axes, (3,)
     sight: Sight | None = None  # the last
+    empty_frames: int = 0  # in a row, without either marker
 
 
 @dataclass(frozen=True, eq=False)

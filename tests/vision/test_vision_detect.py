@@ -204,3 +204,18 @@ def test_choice_among_candidates(large, small, expected, result) -> None:  # typ
     assert set(chosen) == set(result)
     for name, index in result.items():
         assert chosen[name] is pools[name][index]  # type: ignore[index]
+
+
+def test_what_one_picture_told_of_its_edges_holds_for_some_more() -> None:
+    pose = pose_of(0.02, 0.01, 0.5, 0.6)
+    bright = np.clip(render(*pose, blur_px=0.9) * 1.7, 0, 255).astype(np.uint8)
+    true = project(square(0.150), *pose, CAMERA)
+    before, ages = None, []
+    for k in range(7):
+        before = detect(frame(bright, k), before, SETUP, CAMERA)
+        assert before.edge_shift is not None
+        assert before.edge_shift.shift_px > 0.1
+        assert before.large is not None
+        assert np.abs(before.large.corners_px - true).max() < 0.08
+        ages.append(before.edge_shift.age)
+    assert ages == [0, 1, 2, 3, 4, 0, 1]

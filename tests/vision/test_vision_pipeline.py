@@ -357,3 +357,18 @@ def test_measured_noise_follows_the_pose_and_fixed_noise_does_not(
 
     assert sigma("measured", 0.24)[0] < 0.8 * sigma("measured", 0.7)[0]
     assert np.allclose(sigma("fixed", 0.24), sigma("fixed", 0.7), rtol=0.01)
+
+
+def test_a_stream_without_the_target_is_looked_at_thoroughly_every_nth_frame(build: Build) -> None:
+    """What only the thorough look finds: a target run together by blur."""
+    sharp = render(*pose_of(0.1, 0.05, 2.3, 0.4)).astype(np.float32)
+    hidden = np.clip(np.rint(cv2.GaussianBlur(sharp, (0, 0), 3.0)), 0, 255).astype(np.uint8)
+    setup = build(detector=DetectorConfig(blurred_every=3))
+    _, first = step(PipelineState(), Frame(7, 0.0, hidden), None, setup)
+    assert first.detections.large is not None
+    state, found = PipelineState(), []
+    for k in range(4):
+        state, output = step(state, Frame(k, k / 30, EMPTY if k == 0 else hidden), None, setup)
+        found.append(output.detections.large is not None)
+    assert found == [False, False, False, True]
+    assert state.empty_frames == 0
