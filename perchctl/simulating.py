@@ -38,9 +38,7 @@ def run(
             if jobs > 1 and len(seeds) > 1:
                 context = multiprocessing.get_context("spawn")
                 executor = stack.enter_context(
-                    ProcessPoolExecutor(
-                        min(jobs, len(seeds)), mp_context=context, max_tasks_per_child=20
-                    )
+                    ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=context)
                 )
             results = run_campaign(profile, seeds, executor, advance)
     print(json.dumps(campaign_summary(results)) if as_json else campaign_table(results))
