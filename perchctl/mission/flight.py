@@ -199,7 +199,7 @@ def _mission(parts: FlightParts, senses: _Senses) -> FlightReport:
     while True:
         now_s = clock.now()
         late_s = max(0.0, now_s - due_s)
-        fresh_output = _sense(parts, senses, now_s)
+        fresh_output = _sense(parts, senses, now_s, look=not _is_blind(state))
         obs = _observe(parts, senses, now_s, late_s, fresh_output)
         if state is None:
             state = planner.start(obs)
@@ -238,8 +238,15 @@ def _mission(parts: FlightParts, senses: _Senses) -> FlightReport:
         clock.wait_until(due_s)
 
 
-def _sense(parts: FlightParts, senses: _Senses, now_s: float) -> bool:
-    """Take in telemetry and at most one frame; True when a good frame was processed."""
+def _is_blind(state: PlannerState | None) -> bool:
+    """Against the ceiling nothing is steered by the picture, and it shows no target."""
+    return state is not None and state.phase is Phase.COMPLETE
+
+
+def _sense(parts: FlightParts, senses: _Senses, now_s: float, *, look: bool = True) -> bool:
+    """Take in telemetry and at most one frame; True when a good frame was processed.
+
+    Without `look` the frame only counts as a sign of the camera's life."""
     safety = parts.profile.safety
     senses.history = extended(senses.history, parts.link.telemetry(), safety)
     frame = parts.source.newest(now_s)
@@ -256,11 +263,14 @@ def _sense(parts: FlightParts, senses: _Senses, now_s: float) -> bool:
     senses.camera_problem = rejection or senses.camera_note
     if rejection is not None:
         return False
+    senses.last_good_frame_s = now_s
+    senses.frames += 1
+    if not look:
+        senses.target = None
+        return False
     attitude = attitude_at(senses.history, frame.t_s)
     senses.pipeline, senses.output = pipeline_step(senses.pipeline, frame, attitude, parts.pipeline)
     senses.target = senses.output.target
-    senses.last_good_frame_s = now_s
-    senses.frames += 1
     return True
 
 
