@@ -152,3 +152,35 @@ class LiveSource:
         with self._lock:
             self._failure = sentence
         self._first.set()
+
+
+class SourceAround:
+    """A source around another one: everything is the inner one's, but for what a subclass
+    does to its frames."""
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+
+    @property
+    def live(self) -> bool:
+        return self._source.live
+
+    @property
+    def finished(self) -> bool:
+        return self._source.finished
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        return self._source.size_px
+
+    def newest(self, now_s: float) -> Frame | None:
+        return self._source.newest(now_s)
+
+    def problem(self, now_s: float) -> str | None:
+        return self._source.problem(now_s)
+
+    def describe(self) -> str:
+        return self._source.describe()
+
+    def close(self) -> None:
+        self._source.close()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
-from perchctl.camera.source import FrameSource
+from perchctl.camera.source import FrameSource, SourceAround
 from perchctl.record.status import status_rows
 from perchctl.record.watch import status_of
 from perchctl.view.draw import Sketch
@@ -63,37 +63,16 @@ class FlightView:
             self.page.show(frame.index, Sketch(frame.image))
 
 
-class _Watched:
+class _Watched(SourceAround):
     def __init__(self, source: FrameSource, seen: Callable[[Frame], None]) -> None:
-        self._source = source
+        super().__init__(source)
         self._seen = seen
 
-    @property
-    def live(self) -> bool:
-        return self._source.live
-
-    @property
-    def finished(self) -> bool:
-        return self._source.finished
-
-    @property
-    def size_px(self) -> tuple[int, int] | None:
-        return self._source.size_px
-
     def newest(self, now_s: float) -> Frame | None:
-        frame = self._source.newest(now_s)
+        frame = super().newest(now_s)
         if frame is not None:
             self._seen(frame)
         return frame
-
-    def problem(self, now_s: float) -> str | None:
-        return self._source.problem(now_s)
-
-    def describe(self) -> str:
-        return self._source.describe()
-
-    def close(self) -> None:
-        self._source.close()
 
 
 def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Sketch:
