@@ -24,7 +24,7 @@ from perchctl.calibration.lens import parameters_of
 from perchctl.calibration.predict import position_errors_mm, ray_difference_px
 from perchctl.calibration.solve import calibrate
 from perchctl.calibration.types import View
-from tests.calibration.synthetic import (
+from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
     BoardRenderer,

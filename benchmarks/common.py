@@ -35,9 +35,9 @@ from perchctl.profile import (  # noqa: E402
     PoseConfig,
     TargetConfig,
 )
+from perchctl.profile.dictionaries import predefined  # noqa: E402
 from perchctl.sim.renderer import Renderer  # noqa: E402
 from perchctl.sim.scenario import Scenario  # noqa: E402
-from perchctl.target.dictionaries import predefined  # noqa: E402
 from perchctl.vision.camera_model import project  # noqa: E402
 from perchctl.vision.pose import square  # noqa: E402
 from perchctl.vision.types import CameraModel  # noqa: E402

@@ -16,9 +16,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from perchctl.log.read import read_log
 from perchctl.mission.state import SEVEN
-from perchctl.mission.types import LOCKED
-from perchctl.record.log_file import read_log
+from perchctl.vehicle import LOCKED
 
 TIMEOUT_S = 120.0
 

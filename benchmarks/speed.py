@@ -23,7 +23,7 @@ from common import (
 
 from perchctl.geometry import Array
 from perchctl.pipeline import step
-from perchctl.vision.detect import detect
+from perchctl.vision.markers.detect import detect
 from perchctl.vision.types import Attitude, Detections, Frame, PipelineOutput, PipelineState
 
 RATE_HZ = 30.0

@@ -122,16 +122,16 @@ def fly(
     Without options it flies the simulated vehicle. Ctrl-C once lands, twice cuts the motors.
     """
     with reported():
-        from perchctl import flying
+        from perchctl.commands import fly as work
 
-        options = flying.resolve(profile, uri, source, seed, log_dir)
+        options = work.resolve(profile, uri, source, seed, log_dir)
         if dry_run:
-            print(flying.plan_json(options) if as_json else flying.plan_text(options))
+            print(work.plan_json(options) if as_json else work.plan_text(options))
             return
         if not (yes or options.simulated):
             _ask_before_arming(options.uri)
         options = dataclasses.replace(options, view=view or view_port > 0, view_port=view_port)
-        code = flying.run(options, as_json=as_json)
+        code = work.run(options, as_json=as_json)
         raise typer.Exit(code)
 
 
@@ -159,9 +159,9 @@ def simulate(
 ) -> None:
     """Fly many seeded scenarios in lockstep, faster than real time, and count."""
     with reported():
-        from perchctl import simulating
+        from perchctl.commands import simulate as work
 
-        simulating.run(
+        work.run(
             profile,
             seeds=[only] if only is not None else list(range(seed, seed + flights)),
             jobs=jobs,
@@ -209,9 +209,9 @@ def track(
     along the camera's x, y, z.
     """
     with reported():
-        from perchctl import tracking
+        from perchctl.commands import track as work
 
-        options = tracking.resolve(
+        options = work.resolve(
             source,
             profile,
             calibration,
@@ -222,7 +222,7 @@ def track(
             view=view or view_port > 0,
             view_port=view_port,
         )
-        tracking.run(options)
+        work.run(options)
 
 
 @app.command()
@@ -287,18 +287,18 @@ def calibrate(
     by more than 5 times its view's spread; both are named. --check exits with 1 on a fail.
     """
     with reported():
-        from perchctl import calibrating
+        from perchctl.commands import calibrate as work
 
         if convert is not None:
             if source is not None or check is not None:
                 raise UsageError("--convert takes a file and no source or --check")
-            calibrating.run_convert(convert, output, name, force, as_json)
+            work.run_convert(convert, output, name, force, as_json)
             return
         if source is None:
             raise UsageError(
                 "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N or http://..."
             )
-        options = calibrating.resolve(
+        options = work.resolve(
             source,
             board,
             output=output,
@@ -313,8 +313,8 @@ def calibrate(
             pictures=keep_pictures,
         )
         if check is None:
-            calibrating.run(options)
-        elif not calibrating.run_check(options, check):
+            work.run(options)
+        elif not work.run_check(options, check):
             raise typer.Exit(PerchError.exit_code)
 
 
@@ -398,9 +398,9 @@ def make_target(
     checked before it is written. With --camera: from where to where each marker is seen.
     """
     with reported():
-        from perchctl import targeting
+        from perchctl.commands import make_target as work
 
-        request = targeting.TargetRequest(
+        request = work.TargetRequest(
             profile=profile,
             output=output,
             page=page,
@@ -425,7 +425,7 @@ def make_target(
             force=force,
             as_json=as_json,
         )
-        print(targeting.run(request))
+        print(work.run(request))
 
 
 @app.command("fit-weights")
@@ -496,9 +496,9 @@ def fit_weights(
     the gear in the level frame.
     """
     with reported():
-        from perchctl import fitting
+        from perchctl.commands import fit_weights as work
 
-        options = fitting.resolve(
+        options = work.resolve(
             [*(data or []), *([session] if session else [])],
             profile,
             method=method,
@@ -513,10 +513,10 @@ def fit_weights(
             anyway=anyway,
         )
         if session is not None:
-            from perchctl import collecting
+            from perchctl.commands import collect_weights
 
-            collecting.collect(
-                collecting.CollectOptions(
+            collect_weights.collect(
+                collect_weights.CollectOptions(
                     session,
                     profile,
                     positions,
@@ -532,7 +532,7 @@ def fit_weights(
                     blur,
                 )
             )
-        fitting.run(options)
+        work.run(options)
 
 
 def main() -> Any:

@@ -20,7 +20,6 @@ from perchctl.profile import (
     PoseConfig,
     TargetConfig,
 )
-from perchctl.vision.detect import DetectorSetup, detect, make_detector
 from perchctl.vision.filter import (
     MAX_GAP_S,
     POSITION,
@@ -31,6 +30,7 @@ from perchctl.vision.filter import (
     measured_noise,
     step_track,
 )
+from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
 from perchctl.vision.merge import (
     better,
     choose_stage,
@@ -58,7 +58,7 @@ from perchctl.vision.types import (
     MarkerTrack,
     PipelineOutput,
     PipelineState,
-    Sight,
+    Sighting,
     Stage,
     TargetPose,
 )
@@ -155,7 +155,7 @@ def step(
         disagreeing_frames=disagreeing,
         in_world=in_world,
         normal_cam=normal_cam(first) if first is not None else (normal if tracks else None),
-        sight=Sight(first, attitude) if first is not None else (state.sight if tracks else None),
+        sight=Sighting(first, attitude) if first is not None else (state.sight if tracks else None),
         empty_frames=0 if anything else state.empty_frames + 1,
     )
     output = PipelineOutput(

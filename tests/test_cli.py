@@ -22,9 +22,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl import __version__, cli
 from perchctl.cli import app
 from perchctl.errors import EXIT_CODES
-from perchctl.sim.crtp_server import LinkOptions
-from perchctl.sim.process import SimProcess
-from tests.flying import ROOT, SEED, SHORT
+from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.process.handle import SimProcess
+from tests.helpers.flights import ROOT, SEED, SHORT
 
 HEAVY = ("cv2", "numpy", "cflib", "matplotlib", "mujoco", "pydantic", "filterpy", "scipy")
 NOWHERE = "udp://127.0.0.1:9"

@@ -14,8 +14,8 @@ import pytest
 from perchctl.calibration.files import load_calibration
 from perchctl.errors import EXIT_CODES
 from perchctl.mission.diagram import diagram, rows_table
-from tests.calibration.synthetic import CHARUCO, render_folder
-from tests.recording import make_recording
+from tests.helpers.boards import CHARUCO, render_folder
+from tests.helpers.recording import make_recording
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -53,7 +53,7 @@ def capture(
     pictures: list[Grey] = []
     last_s = clock()
     while not (state.finished or stopped()):
-        frame = source.newest(clock())
+        frame = source.poll(clock())
         if frame is None:
             gone = source.problem(clock())
             if source.finished or (gone and clock() - last_s > GONE_AFTER_S):

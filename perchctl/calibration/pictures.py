@@ -93,7 +93,7 @@ def _sharpest(source: VideoSource) -> Iterator[tuple[str, Grey]]:
     """The sharpest frame of each window, with its name."""
     best: tuple[float, str, Grey] | None = None
     count = 0
-    while (frame := source.newest(0.0)) is not None:
+    while (frame := source.poll(0.0)) is not None:
         sharpness = _sharpness(frame.image)
         if best is None or sharpness > best[0]:
             best = (sharpness, f"frame {frame.index}", frame.image)

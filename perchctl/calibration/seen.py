@@ -11,8 +11,8 @@ import numpy as np
 from perchctl.calibration.types import Grey
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
+from perchctl.profile.dictionaries import dictionary_names, predefined
 from perchctl.target.boards import Board
-from perchctl.target.dictionaries import dictionary_names, predefined
 
 _LARGER = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _MAX_SIDE = 20

@@ -41,7 +41,7 @@ class _Recording:
     def size_px(self) -> tuple[int, int] | None:
         return self._size_px
 
-    def newest(self, now_s: float) -> Frame | None:
+    def poll(self, now_s: float) -> Frame | None:
         """The next frame, with the recording's own time; None at the end."""
         if self._ahead is None:
             return None

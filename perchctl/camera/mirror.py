@@ -13,8 +13,8 @@ from perchctl.vision.types import Frame
 class UnmirroredSource(SourceAround):
     """Flips each picture left to right."""
 
-    def newest(self, now_s: float) -> Frame | None:
-        frame = super().newest(now_s)
+    def poll(self, now_s: float) -> Frame | None:
+        frame = super().poll(now_s)
         if frame is None:
             return None
         return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]))

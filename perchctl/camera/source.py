@@ -40,7 +40,7 @@ class FrameSource(Protocol):
     def size_px(self) -> tuple[int, int] | None:
         """Width and height of the frames, once the first has come."""
 
-    def newest(self, now_s: float) -> Frame | None:
+    def poll(self, now_s: float) -> Frame | None:
         """The newest frame, or None if there is none since the last call."""
 
     def problem(self, now_s: float) -> str | None:
@@ -106,7 +106,7 @@ class LiveSource:
     def size_px(self) -> tuple[int, int] | None:
         return self._size_px
 
-    def newest(self, now_s: float) -> Frame | None:
+    def poll(self, now_s: float) -> Frame | None:
         with self._lock:
             frame, self._newest = self._newest, None
         return frame
@@ -173,8 +173,8 @@ class SourceAround:
     def size_px(self) -> tuple[int, int] | None:
         return self._source.size_px
 
-    def newest(self, now_s: float) -> Frame | None:
-        return self._source.newest(now_s)
+    def poll(self, now_s: float) -> Frame | None:
+        return self._source.poll(now_s)
 
     def problem(self, now_s: float) -> str | None:
         return self._source.problem(now_s)

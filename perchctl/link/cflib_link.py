@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from perchctl import vehicle as say
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
 from perchctl.link.sender import Sender
 from perchctl.link.telemetry import (
@@ -28,10 +29,9 @@ from perchctl.link.telemetry import (
 )
 from perchctl.link.timebase import Timebase
 from perchctl.link.uri import UDEV_HELP, check_uri
-from perchctl.locations import user_cache_folder
-from perchctl.mission import types as say
-from perchctl.mission.types import ARMED, FLYING, Command, Telemetry
 from perchctl.profile import LinkConfig
+from perchctl.profile.places import user_cache_folder
+from perchctl.vehicle import ARMED, FLYING, Command, Telemetry
 
 NEEDED_PROTOCOL = 12
 """From firmware 2026.08 on: the supervisor's own port (firmware facts, "Link")."""
@@ -295,7 +295,7 @@ class CflibLink:
             case say.EmergencyStop():
                 self._cf.supervisor.send_emergency_stop()
 
-    def alive(self, now_s: float) -> str | None:
+    def problem(self, now_s: float) -> str | None:
         if self._lost is not None:
             return self._lost
         sender = self._sender

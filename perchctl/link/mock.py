@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from perchctl import vehicle as say
 from perchctl.errors import ConnectionFailed
 from perchctl.link.telemetry import NEEDED, OPTIONAL, telemetry_from
-from perchctl.mission import types as say
-from perchctl.mission.types import FLYING, Command, Telemetry
 from perchctl.sim.firmware import commands as cf
+from perchctl.vehicle import FLYING, Command, Telemetry
 
 if TYPE_CHECKING:
     from perchctl.sim.vehicle import SimulatedVehicle
@@ -78,7 +78,7 @@ class MockLink:
             case say.EmergencyStop():
                 firmware.emergency_stop()
 
-    def alive(self, now_s: float) -> str | None:
+    def problem(self, now_s: float) -> str | None:
         return None
 
     def close(self) -> None:
@@ -122,7 +122,7 @@ class ScriptedLink:
     def send(self, command: Command) -> None:
         self.sent.append((self.now_s, command))
 
-    def alive(self, now_s: float) -> str | None:
+    def problem(self, now_s: float) -> str | None:
         return "the script ended the link" if now_s >= self._dies_at_s else None
 
     def close(self) -> None:

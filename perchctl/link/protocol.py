@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from perchctl.mission.types import Command, Telemetry
+from perchctl.vehicle import Command, Telemetry
 
 
 class Link(Protocol):
@@ -23,7 +23,7 @@ class Link(Protocol):
     def send(self, command: Command) -> None:
         """Hand one command to the vehicle. Never blocks for long."""
 
-    def alive(self, now_s: float) -> str | None:
+    def problem(self, now_s: float) -> str | None:
         """None while the link works, otherwise one sentence that says why not."""
 
     def close(self) -> None:

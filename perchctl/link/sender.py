@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from perchctl.mission.types import Command, PositionSetpoint, RawThrust
+from perchctl.vehicle import Command, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
 

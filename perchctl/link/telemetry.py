@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from perchctl.mission.types import Telemetry
+from perchctl.vehicle import Telemetry
 
 STATE_BLOCK: dict[str, str] = {
     "stateEstimate.x": "float",

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from perchctl.mission.phases import AIR, BEFORE_CONTACT, BY_CAMERA, TABLE, Row
 from perchctl.mission.state import FLYING_PHASES, Phase
+from perchctl.mission.table import AIR, BEFORE_CONTACT, BY_CAMERA, TABLE, Row
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (AIR, "in the air"),

@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 
 from perchctl.geometry import rot_z, wrap_rad
-from perchctl.mission.types import PositionSetpoint
-from perchctl.mission.view import View
+from perchctl.mission.context import Context
+from perchctl.vehicle import PositionSetpoint
 
 HEIGHT_GAIN = 1.5
 HEIGHT_RATE_S = 0.25
@@ -20,17 +20,17 @@ STIFF_LIMIT_M = 0.1
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
 
 
-def hold_here(v: View) -> PositionSetpoint:
+def hold_here(c: Context) -> PositionSetpoint:
     """The present position and heading of the estimate."""
-    x, y, z = v.obs.telemetry.position_m
-    return PositionSetpoint(x, y, z, v.obs.telemetry.yaw_rad)
+    x, y, z = c.obs.telemetry.position_m
+    return PositionSetpoint(x, y, z, c.obs.telemetry.yaw_rad)
 
 
-def under_target_xy(v: View, yaw_rad: float) -> tuple[float, float]:
+def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
     """Where the body has to be so that the gear is under the target at that heading."""
-    target = v.target_world_m
+    target = c.target_world_m
     assert target is not None
-    gear = rot_z(yaw_rad) @ v.profile.vehicle.gear_body_m
+    gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
     return float(target[0] - gear[0]), float(target[1] - gear[1])
 
 
@@ -56,27 +56,27 @@ def walk(
     )
 
 
-def trimmed(v: View, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
+def integrated(c: Context, goal_xy: tuple[float, float], dt_s: float) -> tuple[float, float]:
     """Integral of the gear's position error, world axes, limited.
 
     The onboard position loop answers a steady draught with a steady offset; this
     slow integral takes it away. It rests while the error is large, so that a
     journey does not wind it up.
     """
-    planner = v.profile.planner
-    ex = goal_xy[0] - v.obs.telemetry.position_m[0]
-    ey = goal_xy[1] - v.obs.telemetry.position_m[1]
-    tx, ty = v.state.trim_m
+    planner = c.profile.planner
+    ex = goal_xy[0] - c.obs.telemetry.position_m[0]
+    ey = goal_xy[1] - c.obs.telemetry.position_m[1]
+    tx, ty = c.state.integral_m
     if math.hypot(ex, ey) < 0.06:
-        tx += planner.trim_per_s * ex * dt_s
-        ty += planner.trim_per_s * ey * dt_s
+        tx += planner.integral_per_s * ex * dt_s
+        ty += planner.integral_per_s * ey * dt_s
     size = math.hypot(tx, ty)
-    if size > planner.trim_limit_m:
-        tx, ty = tx * planner.trim_limit_m / size, ty * planner.trim_limit_m / size
+    if size > planner.integral_limit_m:
+        tx, ty = tx * planner.integral_limit_m / size, ty * planner.integral_limit_m / size
     return tx, ty
 
 
-def corrected(v: View, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
+def corrected(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> PositionSetpoint:
     """The setpoint that brings the vehicle to the reference.
 
     Horizontally the learned trim is added and, near the target, the position loop is
@@ -85,29 +85,29 @@ def corrected(v: View, reference: PositionSetpoint, *, lift: bool = True) -> Pos
     `zKp` of the firmware: a time constant of 4 s); adding a multiple of the height
     error takes that down to the multiple's part.
     """
-    tel = v.obs.telemetry
+    tel = c.obs.telemetry
     rise = HEIGHT_GAIN * (reference.z_m - tel.position_m[2]) - HEIGHT_RATE_S * tel.velocity_mps[2]
     lifted = max(-HEIGHT_LIMIT_M, min(HEIGHT_LIMIT_M, rise)) if lift else 0.0
-    dx, dy = _stiffened(v, reference)
+    dx, dy = _stiffened(c, reference)
     return replace(
         reference,
-        x_m=reference.x_m + v.state.trim_m[0] + dx,
-        y_m=reference.y_m + v.state.trim_m[1] + dy,
+        x_m=reference.x_m + c.state.integral_m[0] + dx,
+        y_m=reference.y_m + c.state.integral_m[1] + dy,
         z_m=reference.z_m + lifted,
     )
 
 
-def _stiffened(v: View, reference: PositionSetpoint) -> tuple[float, float]:
+def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
     """Position and velocity feedback on top of the onboard loop, near the target only.
 
     Far away an attitude that is some milliseconds beside its frame moves the seen
     target by centimetres, and a stiff loop would chase that into an oscillation.
     """
-    near = (STIFF_BELOW_M - v.error_z_m) / STIFF_RANGE_M
+    near = (STIFF_BELOW_M - c.error_z_m) / STIFF_RANGE_M
     gain = max(0.0, min(1.0, near))
     if gain == 0.0:
         return 0.0, 0.0
-    (x, y, _), (vx, vy, _) = v.obs.telemetry.position_m, v.obs.telemetry.velocity_mps
+    (x, y, _), (vx, vy, _) = c.obs.telemetry.position_m, c.obs.telemetry.velocity_mps
     dx = gain * (POSITION_GAIN * (reference.x_m - x) - VELOCITY_GAIN_S * vx)
     dy = gain * (POSITION_GAIN * (reference.y_m - y) - VELOCITY_GAIN_S * vy)
     size = math.hypot(dx, dy)
@@ -115,9 +115,9 @@ def _stiffened(v: View, reference: PositionSetpoint) -> tuple[float, float]:
     return part * dx, part * dy
 
 
-def limited(v: View, setpoint: PositionSetpoint) -> PositionSetpoint:
+def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     """The setpoint inside the fence and under the height limit (fault 36)."""
-    ground, safety = v.state.ground_m, v.profile.safety
+    ground, safety = c.state.ground_m, c.profile.safety
     if ground is None:
         return setpoint
     dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]

@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.mission.actions import act
-from perchctl.mission.phases import TABLE, Row, first_match
+from perchctl.mission.conditions import conditions_since, hold_reason
+from perchctl.mission.context import Context
 from perchctl.mission.state import (
     TERMINALS,
     Anchor,
@@ -20,9 +21,9 @@ from perchctl.mission.state import (
     PlannerState,
     Severity,
 )
-from perchctl.mission.types import Command
-from perchctl.mission.view import View, conditions_since, hold_reason
+from perchctl.mission.table import TABLE, Row, first_match
 from perchctl.profile import Profile
+from perchctl.vehicle import Command
 from perchctl.vision.types import Stage
 
 MAX_DRIFT_MPS = 0.05
@@ -48,11 +49,11 @@ def step(
 ) -> tuple[PlannerState, Command]:
     """One tick of the mission."""
     state = _remember(state, obs, profile)
-    row = first_match(View(state, obs, profile), table)
+    row = first_match(Context(state, obs, profile), table)
     if row is not None:
-        state = _enter(state, row, View(state, obs, profile))
-        state = replace(state, hold=hold_reason(View(state, obs, profile)))
-    new, command = act(View(state, obs, profile))
+        state = _enter(state, row, Context(state, obs, profile))
+        state = replace(state, hold=hold_reason(Context(state, obs, profile)))
+    new, command = act(Context(state, obs, profile))
     return replace(new, t_s=obs.t_s), command
 
 
@@ -64,7 +65,7 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     state = _with_anchor(state, obs)
     if obs.jumped and state.jump_s is None:
         state = replace(state, jump_s=obs.t_s)
-    view = View(state, obs, profile)
+    view = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(view))
     if state.hold:
         # A held vehicle proves nothing: the dwell times begin anew.
@@ -115,7 +116,7 @@ def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     return state.hover_thrust + part * (thrust - state.hover_thrust)
 
 
-def _enter(state: PlannerState, row: Row, view: View) -> PlannerState:
+def _enter(state: PlannerState, row: Row, view: Context) -> PlannerState:
     obs = view.obs
     keep = ("battery_low", "tilted")
     new = replace(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
-from perchctl.mission.types import PositionSetpoint, Telemetry
+from perchctl.vehicle import PositionSetpoint, Telemetry
 from perchctl.vision.types import TargetPose
 
 
@@ -140,7 +140,7 @@ class PlannerState:
     entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entry_yaw_rad: float = 0.0
     setpoint: PositionSetpoint | None = None
-    trim_m: tuple[float, float] = (0.0, 0.0)
+    integral_m: tuple[float, float] = (0.0, 0.0)
     hover_thrust: float = 0.0
     contact_z_m: float | None = None
     ordered_s: float | None = None  # last order of a take-off, landing or motor stop

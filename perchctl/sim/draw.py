@@ -38,7 +38,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     if sim.camera_burst_frames is not None:
         low, high = sim.camera_burst_frames
         burst = (burst_start_s, int(rng.integers(low, high + 1)))
-    T_body_cam = profile.camera.T_body_cam.T_body_cam @ _mounting_error(profile, rng)
+    T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
     drift = direction() * sim.drift_mps
     wind_angle = float(rng.uniform(-math.pi, math.pi))
     wind_mps = between(sim.draught_mps)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig
-from perchctl.target.dictionaries import id_count
+from perchctl.profile.dictionaries import id_count
 from perchctl.target.drawing import Rectangle, marker_cells, merged_rectangles
 from perchctl.target.lengths import millimetres, parse_length
 

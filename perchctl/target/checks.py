@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.dictionaries import id_count, predefined
+from perchctl.profile.dictionaries import id_count, predefined
 from perchctl.target.drawing import (
     RING_MIN_PER_LARGE_SIDE,
     draw_bitmap,

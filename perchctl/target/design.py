@@ -17,7 +17,7 @@ from perchctl.geometry import Array
 from perchctl.profile import Profile, TargetConfig
 from perchctl.target.bound import PoseBound, pose_bound
 from perchctl.target.limits import Optics, smallest_side_px
-from perchctl.target.view import View, square_outline, turned_outline
+from perchctl.target.visible import FieldOfView, square_outline, turned_outline
 from perchctl.vision.types import CameraModel
 
 CORNER_SIGMA_PX = 0.2
@@ -91,11 +91,15 @@ def design_ranges(target: TargetConfig, camera: CameraModel, optics: Optics) -> 
     picture_px = max(camera.size_px)
     large_px = smallest_side_px(target, "large", optics, picture_px)
     small_px = smallest_side_px(target, "small", optics, picture_px)
-    return _ranges(target, View(camera), f, large_px, small_px)
+    return _ranges(target, FieldOfView(camera), f, large_px, small_px)
 
 
 def _ranges(
-    target: TargetConfig, view: View, f: float, large_px: float | None, small_px: float | None
+    target: TargetConfig,
+    view: FieldOfView,
+    f: float,
+    large_px: float | None,
+    small_px: float | None,
 ) -> Ranges:
     large, small = target.large.side_m, target.small.side_m
     ahead = (np.eye(3), np.zeros(3))
@@ -113,10 +117,10 @@ def _ranges(
 
 def gear_ranges(target: TargetConfig, camera: CameraModel, profile: Profile) -> GearRanges:
     """With the camera where the profile says, the vehicle level."""
-    T_body_cam = profile.camera.T_body_cam.T_body_cam
+    T_body_cam = profile.camera.mount.T_body_cam
     R_cam_body = T_body_cam[:3, :3].T
     gear_cam = R_cam_body @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
-    view = View(camera)
+    view = FieldOfView(camera)
     return GearRanges(
         view.nearest_m(turned_outline(target.large.side_m), R_cam_body, gear_cam),
         view.nearest_m(turned_outline(target.small.side_m), R_cam_body, gear_cam),
@@ -139,7 +143,7 @@ def make_design(
     height = profile.planner.search.max_height_m
     search = None
     if ceiling_m is not None:
-        search = ceiling_m - height - profile.camera.T_body_cam.position_m[2]
+        search = ceiling_m - height - profile.camera.mount.position_m[2]
     warnings = _warnings(target, ranges, gear, standoff, height, ceiling_m, search)
     return Design(target, camera, optics, ranges, gear, standoff, search, height, tuple(warnings))
 

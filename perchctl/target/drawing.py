@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.dictionaries import predefined
+from perchctl.profile.dictionaries import predefined
 
 BORDER_BITS = 1
 """Width of a marker's black border in cells."""

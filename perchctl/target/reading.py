@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.dictionaries import predefined
+from perchctl.profile.dictionaries import predefined
 from perchctl.vision.types import MARKERS, MarkerName
 
 

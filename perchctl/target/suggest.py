@@ -14,7 +14,7 @@ from perchctl.target.checks import check_target
 from perchctl.target.design import Design, focal_px, make_design
 from perchctl.target.limits import Optics, smallest_side_px
 from perchctl.target.sheets import fitting_page
-from perchctl.target.view import View, turned_outline
+from perchctl.target.visible import FieldOfView, turned_outline
 from perchctl.vision.types import CameraModel
 
 DEFAULT_SEARCH_M = 1.15
@@ -67,7 +67,7 @@ def suggest(
             f"no marker is read through a blur of {optics.blur_px:g} px and noise "
             f"{optics.noise:g}: a sharper picture is needed"
         )
-    f, view, notes = focal_px(camera), View(camera), []
+    f, view, notes = focal_px(camera), FieldOfView(camera), []
     search_m = DEFAULT_SEARCH_M
     if ceiling_m is not None:
         search_m = ceiling_m - profile.planner.search.max_height_m
@@ -109,9 +109,9 @@ def _target(large_m: float, small_m: float) -> TargetConfig:
     )
 
 
-def _largest_at_standoff_m(view: View, profile: Profile) -> float:
+def _largest_at_standoff_m(view: FieldOfView, profile: Profile) -> float:
     """The largest side whose circle is in the picture with the gear at the stand-off."""
-    T_body_cam = profile.camera.T_body_cam.T_body_cam
+    T_body_cam = profile.camera.mount.T_body_cam
     R: Array = T_body_cam[:3, :3].T
     gear = R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
     low, high = 0.0, 1.0

@@ -23,10 +23,10 @@ from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.solve import (
     Scored,
     covariance,
-    descended,
     flat,
-    flipped,
+    gauss_newton,
     make_points,
+    mirror_solution,
     rms,
     solve,
     tilt_rad,
@@ -40,9 +40,9 @@ _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
 __all__ = [
     "PoseSetup",
     "estimate_pose",
-    "flipped",
     "level_rotation",
     "make_pose_setup",
+    "mirror_solution",
     "normal_cam",
     "rotation_matrix",
     "rotation_vector",
@@ -127,7 +127,7 @@ def estimate_pose(
     points = make_points(detections, object_m, image_px, setup.camera.K)
     solution = None
     if start is not None and config.refine:
-        solution = descended(points, (start.rvec_rad, start.tvec_m))
+        solution = gauss_newton(points, (start.rvec_rad, start.tvec_m))
         if solution is not None and (
             not _fits(solution, config.max_reprojection_px)
             or (expected_cam is not None and tilt_rad(solution[0], expected_cam) > spread_rad)

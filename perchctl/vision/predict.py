@@ -10,11 +10,11 @@ from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.vision.camera_model import project
 from perchctl.vision.filter import MAX_GAP_S
 from perchctl.vision.pose import PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.types import MARKERS, Attitude, MarkerName, MarkerPose, Sight
+from perchctl.vision.types import MARKERS, Attitude, MarkerName, MarkerPose, Sighting
 
 
 def expected_corners(
-    sight: Sight | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
+    sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, MarkerPose | None]:
     """Where both markers' corners should be: the last sight of the target, moved by the
     vehicle's own motion since; and that pose. None without an attitude at both times."""

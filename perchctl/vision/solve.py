@@ -129,21 +129,21 @@ def solve(
 
     best = min(scored, key=cost) if len(scored) > 1 else scored[0]
     if refine and (expected_cam is None or tilt_rad(best[0], expected_cam) > spread_rad):
-        other = flipped(best[0], best[1])
+        other = mirror_solution(best[0], best[1])
         turned = None if other is None else _refined(points, (other, best[1]))
         if turned is not None and _usable(turned):
             best = min(best, _scored(turned, points), key=cost)
     if refine:
         # The unweighted optimum is near enough for errors to be linear; where they are not,
         # a weaker solver than SQPnP has led astray.
-        settled = descended(points, (best[0], best[1]))
+        settled = gauss_newton(points, (best[0], best[1]))
         if settled is None and solver != "sqpnp":
             return None
         best = settled or best
     return best
 
 
-def descended(points: Points, start: Candidate) -> Scored | None:
+def gauss_newton(points: Points, start: Candidate) -> Scored | None:
     """Gauss-Newton with each corner's own spread, from a start that is near (the frame
     before); None where it does not settle within some steps."""
     candidate, before = start, math.inf
@@ -184,7 +184,7 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float]:
     return inverse * growth + np.outer(common, common), chi2 / freedom
 
 
-def flipped(rvec: Array, tvec: Array) -> Array | None:
+def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
     """The other tilt: the normal mirrored at the line of sight; None where both agree."""
     R = cv2.Rodrigues(rvec)[0]
     normal, sight = R[:, 2], tvec / np.linalg.norm(tvec)

@@ -185,7 +185,7 @@ class TargetPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class Sighting:
     """A pose of the target and the vehicle's attitude at that time, if it was known."""
 
     pose: MarkerPose
@@ -201,7 +201,7 @@ class PipelineState:
     disagreeing_frames: int = 0
     in_world: bool = False  # the tracks' frame: world of the state estimate, or level
     normal_cam: Array | None = None  # the target's last normal, camera axes, (3,)
-    sight: Sight | None = None  # the last
+    sight: Sighting | None = None  # the last
     empty_frames: int = 0  # in a row, without either marker
 
 

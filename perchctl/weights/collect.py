@@ -50,7 +50,7 @@ def collecting_setup(profile: Profile, camera: CameraModel) -> PipelineSetup:
         profile.kalman,
         profile.merge.model_copy(update={"method": "weights"}),
         profile.target,
-        profile.camera.T_body_cam.T_body_cam,
+        profile.camera.mount.T_body_cam,
         profile.vehicle.gear_body_m,
         camera,
     )

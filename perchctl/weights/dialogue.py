@@ -107,12 +107,12 @@ class Experiment:
 
     def _frames(self, count: int) -> Iterator[Frame]:
         if self._source.live:
-            self._source.newest(self._now())  # older than the person's word
+            self._source.poll(self._now())  # older than the person's word
         since_s = self._now()
         got = 0
         while got < count:
             now_s = self._now()
-            frame = self._source.newest(now_s)
+            frame = self._source.poll(now_s)
             if frame is not None:
                 if got == 0:
                     check_size(

@@ -18,8 +18,8 @@ from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, rotation_from_rpy
+from perchctl.log.read import FlightLog, read_log
 from perchctl.profile import Profile
-from perchctl.record.log_file import FlightLog, read_log
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.scenario import Scenario
 from perchctl.weights.types import AXES, UNITS, Measurements, wrap

@@ -87,7 +87,7 @@ class Stand:
 
     def _at(self, x_m: float, y_m: float, z_m: float, yaw: float) -> Place:
         """The camera `z_m` under the target and off it by x, y in its own level axes."""
-        T_body_cam = self._profile.camera.T_body_cam.T_body_cam
+        T_body_cam = self._profile.camera.mount.T_body_cam
         lens = np.array([x_m, y_m, z_m])  # target relative to the camera, level axes
         gear = np.asarray(self._profile.vehicle.gear_body_m)
         target_world = np.array([*self._scenario.target_xy_m, self._scenario.ceiling_z_m])

@@ -21,7 +21,7 @@ import numpy as np
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut, UsageError
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
-from perchctl.mission.types import Telemetry
+from perchctl.vehicle import Telemetry
 from perchctl.vision.types import Attitude
 
 SAMPLES = 30

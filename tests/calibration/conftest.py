@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from perchctl.vision.types import CameraModel
-from tests.calibration.synthetic import CHARUCO, draw_camera, render_folder
+from tests.helpers.boards import CHARUCO, draw_camera, render_folder
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

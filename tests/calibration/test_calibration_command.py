@@ -18,10 +18,10 @@ from perchctl.calibration.lens import parameters_of
 from perchctl.calibration.novelty import Capture, consider
 from perchctl.calibration.types import View
 from perchctl.cli import app
+from perchctl.commands.coverage import coverage_bars
 from perchctl.errors import TimedOut
-from perchctl.record.calibration_progress import coverage_bars
 from perchctl.vision.types import CameraModel, Frame
-from tests.calibration.synthetic import (
+from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
     BoardRenderer,
@@ -217,7 +217,7 @@ class _Frames:
     def __init__(self, images: list[np.ndarray]) -> None:  # type: ignore[type-arg]
         self._frames = [Frame(i, float(i), image) for i, image in enumerate(images)]
 
-    def newest(self, now_s: float) -> Frame | None:
+    def poll(self, now_s: float) -> Frame | None:
         return self._frames.pop(0) if self._frames else None
 
     def problem(self, now_s: float) -> str | None:

@@ -11,7 +11,7 @@ from perchctl.calibration.saddle import fit_saddles
 from perchctl.calibration.types import Grey, View
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
-from tests.calibration.synthetic import CHARUCO, CHESSBOARD, BoardRenderer, draw_camera
+from tests.helpers.boards import CHARUCO, CHESSBOARD, BoardRenderer, draw_camera
 
 CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
 

@@ -18,7 +18,7 @@ from perchctl.calibration.solve import calibrate
 from perchctl.calibration.writing import calibration_text, camera_text, check_free, write_all
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.vision.types import CameraModel
-from tests.calibration.synthetic import corner_views, draw_camera
+from tests.helpers.boards import corner_views, draw_camera
 
 ODD = [1e-05, -0.1, 0.30000000000000004, 1e-17, -123.456, 5e-324, 1 / 3, 0.0]
 

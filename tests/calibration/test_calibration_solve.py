@@ -23,7 +23,7 @@ from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
 from perchctl.vision.types import CameraModel
-from tests.calibration.synthetic import CHARUCO, CHESSBOARD, corner_views, draw_camera
+from tests.helpers.boards import CHARUCO, CHESSBOARD, corner_views, draw_camera
 
 
 def drawn(seed: int, **options: float) -> tuple[list[View], CameraModel]:

@@ -22,10 +22,10 @@ def clock() -> float:
 def drain(source: FrameSource) -> list[Frame]:
     frames = []
     while not source.finished:
-        frame = source.newest(0.0)
+        frame = source.poll(0.0)
         assert frame is not None, "a recording has a frame until it is finished"
         frames.append(frame)
-    assert source.newest(0.0) is None
+    assert source.poll(0.0) is None
     return frames
 
 

@@ -203,7 +203,7 @@ def next_frame(source: LiveSource) -> Frame:
     found: list[Frame] = []
 
     def ready() -> bool:
-        frame = source.newest(0.0)
+        frame = source.poll(0.0)
         if frame is not None:
             found.append(frame)
         return bool(found)
@@ -227,7 +227,7 @@ def test_frames_are_stamped_at_arrival_less_the_latency(
     assert first.t_arrival_s == 100.0
     assert first.t_s == pytest.approx(99.93)
     assert source.size_px == (64, 48)
-    assert source.newest(0.0) is None, "each frame once"
+    assert source.poll(0.0) is None, "each frame once"
     clock.t_s = 101.0
     go.set()
     second = next_frame(source)
@@ -240,14 +240,14 @@ def test_the_newest_frame_wins(server: Server, opened: list[LiveSource]) -> None
     seen = []
 
     def last_came() -> bool:
-        frame = source.newest(0.0)
+        frame = source.poll(0.0)
         if frame is not None:
             seen.append(level(frame))
         return 160 in seen
 
     wait_for(last_came)
     assert seen == sorted(seen)
-    assert source.newest(0.0) is None
+    assert source.poll(0.0) is None
 
 
 def test_a_truncated_picture_is_skipped(server: Server, opened: list[LiveSource]) -> None:

@@ -18,7 +18,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
 from perchctl.link.cflib_link import SILENCE_S, CflibLink
-from perchctl.mission.types import (
+from perchctl.profile import LinkConfig
+from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.scenario import Scenario
+from perchctl.vehicle import (
     CAN_FLY,
     FLYING,
     LOCKED,
@@ -31,9 +34,6 @@ from perchctl.mission.types import (
     TakeOff,
     Telemetry,
 )
-from perchctl.profile import LinkConfig
-from perchctl.sim.process import SimProcess
-from perchctl.sim.scenario import Scenario
 
 CONFIG = LinkConfig(parameters={"stabilizer.estimator": 2})
 LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
@@ -116,7 +116,7 @@ def test_connecting_sets_parameters_and_reads_them_back(sim: SimProcess) -> None
     with linked(sim, config) as link:
         assert link._cf.param.get_value("stabilizer.estimator") == "1"
         assert float(link._cf.param.get_value("ctrlMel.mass")) == pytest.approx(0.031)
-        assert link.alive(time.monotonic()) is None
+        assert link.problem(time.monotonic()) is None
 
 
 @pytest.mark.parametrize(
@@ -172,13 +172,13 @@ def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None
 
 def test_a_silent_link_says_so(sim: SimProcess) -> None:
     with linked(sim) as link:
-        assert link.alive(time.monotonic()) is None
+        assert link.problem(time.monotonic()) is None
         sim.silence(SILENCE_S + 2.0)
         began_s = time.monotonic()
-        said = until(lambda: link.alive(time.monotonic()))
+        said = until(lambda: link.problem(time.monotonic()))
         assert "nothing heard for" in said
         assert time.monotonic() - began_s >= SILENCE_S - 0.2
-        until(lambda: link.alive(time.monotonic()) is None)
+        until(lambda: link.problem(time.monotonic()) is None)
 
 
 def test_idle_sends_nothing(sim: SimProcess) -> None:

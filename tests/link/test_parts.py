@@ -20,7 +20,7 @@ from perchctl.link.telemetry import (
 )
 from perchctl.link.timebase import WRAP_MS, Timebase
 from perchctl.link.uri import UDEV_HELP, check_uri
-from perchctl.mission.types import Command, PositionSetpoint, StopMotors
+from perchctl.vehicle import Command, PositionSetpoint, StopMotors
 
 SIZES = {"float": 4, "uint16_t": 2, "int8_t": 1}
 

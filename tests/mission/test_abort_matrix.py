@@ -18,7 +18,7 @@ from perchctl.mission.state import (
     PlannerState,
     Severity,
 )
-from perchctl.mission.types import (
+from perchctl.vehicle import (
     CRASHED,
     LOCKED,
     TUMBLED,
@@ -30,7 +30,7 @@ from perchctl.mission.types import (
     StopMotors,
     TakeOff,
 )
-from tests.mission.flights import (
+from tests.helpers.mission import (
     AIRBORNE,
     CEILING_M,
     PROFILE,

@@ -18,9 +18,8 @@ def toc_cache(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="session")
 def shared_pilot(toc_cache: str) -> Iterator[object]:
-    from crtp_rig import Pilot
-
-    from perchctl.sim.process import SimProcess
+    from perchctl.sim.process.handle import SimProcess
+    from tests.helpers.crtp_rig import Pilot
 
     with SimProcess.start(pace="stepped") as sim:
         pilot = Pilot(sim, toc_cache)

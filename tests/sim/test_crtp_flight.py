@@ -6,7 +6,8 @@ import math
 from collections.abc import Callable
 
 import pytest
-from crtp_rig import HL_BIT, LOW_LEVEL, READY, Pilot
+
+from tests.helpers.crtp_rig import HL_BIT, LOW_LEVEL, READY, Pilot
 
 
 def height(pilot: Pilot) -> float:

@@ -17,11 +17,11 @@ from cflib.crazyflie.mem import MemoryElement
 from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.crtp.udpdriver import UdpDriver
 from cflib.utils.power_switch import PowerSwitch
-from crtp_rig import LOCKED_BIT, READY, WAIT_S, Client, Pilot
 
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.sim.crtp_server import LinkOptions
-from perchctl.sim.process import SimProcess
+from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.process.handle import SimProcess
+from tests.helpers.crtp_rig import LOCKED_BIT, READY, WAIT_S, Client, Pilot
 
 
 @pytest.fixture(scope="module")

@@ -18,18 +18,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from crtp_rig import Client
 
 import perchctl
 from perchctl.calibration.files import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.locations import data_file
-from perchctl.sim.crtp_runner import MAX_LAG_S, Runner
-from perchctl.sim.crtp_server import LinkOptions
-from perchctl.sim.mjpeg import MjpegServer
-from perchctl.sim.process import SimProcess, main
+from perchctl.profile.places import data_file
+from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.process.child import main
+from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.process.mjpeg import MjpegServer
+from perchctl.sim.process.runner import MAX_LAG_S, Runner
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.vision.types import CameraModel
+from tests.helpers.crtp_rig import Client
 
 ROOT = str(Path(perchctl.__file__).resolve().parents[1])
 WAIT_S = 20.0
@@ -205,7 +206,7 @@ _PARENT = """
 import sys, time
 sys.path.insert(0, {root!r})
 from pathlib import Path
-from perchctl.sim.process import SimProcess
+from perchctl.sim.process.handle import SimProcess
 sim = SimProcess.start(pace={pace!r}, truth_file=Path({truth!r}), linger_s={linger})
 print(sim.pid, sim.uri, flush=True)
 sys.stdin.readline()
@@ -245,7 +246,7 @@ def test_ctrl_c_does_not_reach_the_vehicle() -> None:
 
 def test_a_stranger_cannot_take_the_parents_place() -> None:
     """Who connects without the token is sent away before anything is unpickled."""
-    from perchctl.sim import crtp_control as control
+    from perchctl.sim.process import control
 
     with control.listen() as listener:
         stranger = socket.create_connection(listener.getsockname())

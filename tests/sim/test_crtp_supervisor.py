@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import pytest
-from crtp_rig import (
+
+from tests.helpers.crtp_rig import (
     ARMED_BIT,
     CAN_FLY_BIT,
     CRASHED_BIT,

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from firmware_rig import PERFECT, make_rig
 
-from perchctl.mission.types import HL_ACTIVE, HL_FINISHED
 from perchctl.sim.firmware.commands import (
     HlGoTo,
     HlLand,
@@ -20,6 +18,8 @@ from perchctl.sim.firmware.commands import (
     ZDistanceCommand,
 )
 from perchctl.sim.world import REST_HEIGHT_M
+from perchctl.vehicle import HL_ACTIVE, HL_FINISHED
+from tests.helpers.firmware_rig import PERFECT, make_rig
 
 HERE = PositionCommand(0.0, 0.0, 0.8, 0.0)
 FULL_RAW = RawSetpoint(0.0, 0.0, 0.0, 60000)

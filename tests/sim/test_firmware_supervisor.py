@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from firmware_rig import Rig, make_rig
 
-from perchctl.mission.types import ARMED, CAN_FLY, CRASHED, FLYING, HL_ACTIVE, LOCKED, TUMBLED
 from perchctl.sim.firmware.commands import (
     HlStop,
     HlTakeoff,
@@ -16,6 +14,8 @@ from perchctl.sim.firmware.commands import (
     RawSetpoint,
     StopCommand,
 )
+from perchctl.vehicle import ARMED, CAN_FLY, CRASHED, FLYING, HL_ACTIVE, LOCKED, TUMBLED
+from tests.helpers.firmware_rig import Rig, make_rig
 
 READY, HL_RUNNING, HL_HOVER, LOW_LEVEL, LOCK = 0x020E, 0x011E, 0x031E, 0x021E, 0x0244
 HERE = PositionCommand(0.0, 0.0, 0.8, 0.0)

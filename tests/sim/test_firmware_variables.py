@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from firmware_rig import PERFECT, make_rig
 
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.commands import HlGoTo, PositionCommand
 from perchctl.sim.firmware.controller import Pid
 from perchctl.sim.firmware.planner import AxisState, Polynomial
 from perchctl.sim.world import REST_HEIGHT_M
+from tests.helpers.firmware_rig import PERFECT, make_rig
 
 HERE = PositionCommand(0.0, 0.0, 0.8, 0.0)
 CTYPES = {"uint8_t", "uint16_t", "uint32_t", "int8_t", "int16_t", "int32_t", "float"}

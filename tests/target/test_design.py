@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 
 from perchctl.profile import Profile, TargetConfig, load_profile
-from perchctl.record.design_plot import plot_design
 from perchctl.target.bound import pose_bound
 from perchctl.target.checks import check_target
 from perchctl.target.design import Design, Ranges, error_curve, make_design
 from perchctl.target.design_text import design_record, design_text
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.limits import Optics
+from perchctl.target.plot import plot_design
 from perchctl.target.suggest import suggest
-from perchctl.target.view import View, square_outline, turned_outline
+from perchctl.target.visible import FieldOfView, square_outline, turned_outline
 from perchctl.vision.types import CameraModel
 
 TARGET = TargetConfig()
@@ -83,7 +83,7 @@ def test_the_paper_s_ranges_and_where_they_differ(paper_design: Design) -> None:
 
 
 def test_z3_is_the_geometry_s() -> None:
-    view = View(PAPER_CAMERA, margin_px=0.0)
+    view = FieldOfView(PAPER_CAMERA, margin_px=0.0)
     ahead = (np.eye(3), np.zeros(3))
     assert view.nearest_m(square_outline(0.15), *ahead) == pytest.approx(
         0.15 * 380.0 / 480.0, rel=2e-3
@@ -95,10 +95,10 @@ def test_z3_is_the_geometry_s() -> None:
 
 def test_barrel_distortion_shows_more(profile: Profile) -> None:
     ahead = (np.eye(3), np.zeros(3))
-    barrel = View(camera_of(380.0, (-0.17, 0.04, 0.0, 0.0, 0.0))).nearest_m(
+    barrel = FieldOfView(camera_of(380.0, (-0.17, 0.04, 0.0, 0.0, 0.0))).nearest_m(
         turned_outline(0.15), *ahead
     )
-    plain = View(PAPER_CAMERA).nearest_m(turned_outline(0.15), *ahead)
+    plain = FieldOfView(PAPER_CAMERA).nearest_m(turned_outline(0.15), *ahead)
     assert barrel is not None
     assert plain is not None
     assert barrel < 0.99 * plain
@@ -106,7 +106,7 @@ def test_barrel_distortion_shows_more(profile: Profile) -> None:
 
 def test_what_is_behind_the_camera_is_never_seen() -> None:
     turn_back = np.diag([1.0, -1.0, -1.0])
-    assert View(PAPER_CAMERA).nearest_m(turned_outline(0.1), turn_back, np.zeros(3)) is None
+    assert FieldOfView(PAPER_CAMERA).nearest_m(turned_outline(0.1), turn_back, np.zeros(3)) is None
 
 
 @pytest.mark.parametrize(("sides", "z_m"), [([0.15], 0.6), ([0.15, 0.025], 0.2), ([0.025], 0.1)])
@@ -156,7 +156,7 @@ def test_gaps_are_named(profile: Profile, paper_design: Design) -> None:
     assert "never read" in warnings_of(profile, ranges, z1_m=None)
     aside = profile.model_copy(
         update={"camera": profile.camera.model_copy(
-            update={"T_body_cam": profile.camera.T_body_cam.model_copy(
+            update={"mount": profile.camera.mount.model_copy(
                 update={"position_m": (0.09, 0.0, 0.0)})})}
     )  # fmt: skip
     assert "gap before contact" in warnings_of(aside, ranges)

@@ -21,7 +21,7 @@ from perchctl.target.png import png_bytes
 from perchctl.target.reading import PlainReader
 from perchctl.target.sheets import board_page, fitting_page, target_pages
 from perchctl.target.svg import svg_bytes
-from tests.target.raster import DPI, PX_PER_MM, black_runs_mm, page_picture
+from tests.helpers.raster import DPI, PX_PER_MM, black_runs_mm, page_picture
 
 TARGET = TargetConfig()
 MAGNET_M = 0.05

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from target_picture import CAMERA
 
 from perchctl.pipeline import PipelineSetup, make_setup
 from perchctl.profile import (
@@ -18,6 +17,7 @@ from perchctl.profile import (
     TargetConfig,
 )
 from perchctl.vision.types import CameraModel
+from tests.helpers.target_picture import CAMERA
 
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"
 

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from target_picture import CAMERA, bits_of, pose_of, render
 
 from perchctl.geometry import Array
-from perchctl.vision.align import align
 from perchctl.vision.camera_model import project
-from perchctl.vision.follow import proven
-from perchctl.vision.marker_drawing import Drawing, drawing_of
+from perchctl.vision.markers.align import align
+from perchctl.vision.markers.drawing import Drawing, drawing_of
+from perchctl.vision.markers.follow import proven
 from perchctl.vision.pose import square
+from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 LARGE_BITS, SMALL_BITS = bits_of("DICT_4X4_1000", 997), bits_of("DICT_ARUCO_ORIGINAL", 5)
 DRAWINGS: dict[str, Drawing] = {

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from target_picture import CAMERA
 
 from perchctl.vision.camera_model import distort, pinhole_px, project, undistort, undistort_px
 from perchctl.vision.types import CameraModel
+from tests.helpers.target_picture import CAMERA
 
 FISHEYE = CameraModel((640, 480), CAMERA.K, np.array([-0.02, 0.004, 0.001, -0.0005]), "fisheye")
 RATIONAL = CameraModel(

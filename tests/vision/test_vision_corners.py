@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from target_picture import CAMERA, bits_of, pose_of, render
 
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
-from perchctl.vision.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX, refine, rim_of_bits
+from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX, refine, rim_of_bits
 from perchctl.vision.pose import square
+from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 RIMS = {6: bits_of("DICT_4X4_1000", 997), 7: bits_of("DICT_ARUCO_ORIGINAL", 5)}
 RIMS = {cells: rim_of_bits(bits) for cells, bits in RIMS.items()}

@@ -6,13 +6,12 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from target_picture import CAMERA, pose_of, render
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.target.dictionaries import predefined
+from perchctl.profile.dictionaries import predefined
 from perchctl.vision.camera_model import project
-from perchctl.vision.detect import (
+from perchctl.vision.markers.detect import (
     choose,
     detect,
     make_detector,
@@ -22,6 +21,7 @@ from perchctl.vision.detect import (
 )
 from perchctl.vision.pose import square
 from perchctl.vision.types import Detection, Detections, Frame
+from tests.helpers.target_picture import CAMERA, pose_of, render
 
 SETUP = make_detector(DetectorConfig(), TargetConfig())
 RATIO = SETUP.ratio

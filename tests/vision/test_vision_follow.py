@@ -8,16 +8,23 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from target_picture import CAMERA, pose_of, render
 
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.vision.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.camera_model import project
-from perchctl.vision.detect import detect, make_detector
-from perchctl.vision.follow import around, cells_agree, completed, follow, nested, resemblance
+from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
+from perchctl.vision.markers.detect import detect, make_detector
+from perchctl.vision.markers.follow import (
+    around,
+    cells_agree,
+    completed,
+    follow,
+    nested,
+    resemblance,
+)
 from perchctl.vision.pose import square
 from perchctl.vision.types import MARKERS, Detection, Detections, Frame, MarkerName
+from tests.helpers.target_picture import CAMERA, pose_of, render
 
 SETUP = make_detector(DetectorConfig(), TargetConfig())
 SIDES: dict[MarkerName, float] = {"large": 0.150, "small": 0.025}

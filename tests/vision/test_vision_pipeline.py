@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from target_picture import CAMERA, pose_of, render
 
 from perchctl.geometry import (
     R_MARKER_TARGET,
@@ -35,9 +34,10 @@ from perchctl.vision.types import (
     Frame,
     PipelineOutput,
     PipelineState,
-    Sight,
+    Sighting,
     Stage,
 )
+from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Build = Callable[..., PipelineSetup]
 MOUNT = make_T(rotation_from_rpy(0.03, -0.02, 0.4), (0.02, 0.0, 0.01))
@@ -322,7 +322,7 @@ def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
     setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
     then, now = fly(0), fly(6)  # far, and turned, within one gap
     _, output = step(PipelineState(), Frame(0, then.t_s, view(then)), then, setup)
-    sight = Sight(output.poses["joint"], then)
+    sight = Sighting(output.poses["joint"], then)
     expected, near = expected_corners(sight, now.t_s, now, setup.pose)
     assert expected is not None
     assert near is not None

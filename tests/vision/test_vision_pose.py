@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from target_picture import CAMERA, pose_of
 
 from perchctl.geometry import (
     R_MARKER_TARGET,
@@ -23,12 +22,13 @@ from perchctl.vision.camera_model import project
 from perchctl.vision.pose import (
     PoseSetup,
     estimate_pose,
-    flipped,
     make_pose_setup,
+    mirror_solution,
     normal_cam,
     square,
 )
 from perchctl.vision.types import Attitude, Detection, MarkerPose
+from tests.helpers.target_picture import CAMERA, pose_of
 
 SIDES = {"large": 0.150, "small": 0.025}
 SOLVERS = ["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
@@ -164,9 +164,9 @@ def test_e_is_the_target_relative_to_the_gear_in_the_level_frame(  # type: ignor
 
 def test_the_other_tilt_looks_the_same_and_its_other_tilt_is_the_first() -> None:
     rvec, tvec = pose_of(0.05, 0.02, 1.2, 0.4, 0.15, -0.1)
-    other = flipped(rvec, tvec)
+    other = mirror_solution(rvec, tvec)
     assert other is not None
-    back = flipped(other, tvec)
+    back = mirror_solution(other, tvec)
     assert back is not None
     assert np.allclose(cv2.Rodrigues(back)[0], cv2.Rodrigues(rvec)[0], atol=1e-9)
     shift = project(square(0.025), other, tvec, CAMERA) - project(square(0.025), rvec, tvec, CAMERA)
@@ -175,7 +175,7 @@ def test_the_other_tilt_looks_the_same_and_its_other_tilt_is_the_first() -> None
     n, m = (cv2.Rodrigues(r)[0][:, 2] for r in (rvec, other))
     assert n @ sight == pytest.approx(m @ sight)
     frontal, ahead = pose_of(0.0, 0.0, 1.0)
-    assert flipped(frontal, ahead) is None
+    assert mirror_solution(frontal, ahead) is None
 
 
 def tilts_deg(attitude: bool, previous: bool, draws: int = 60) -> Array:

@@ -14,16 +14,16 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from perchctl import collecting
 from perchctl.cli import app
+from perchctl.commands import collect_weights
 from perchctl.errors import InvalidValue
+from perchctl.flight.session import camera_model
 from perchctl.geometry import rot_z
 from perchctl.profile import load_profile
-from perchctl.session import camera_model
 from perchctl.weights import truth
 from perchctl.weights.collect import Eye, SessionFile, collecting_setup, fault_of
 from perchctl.weights.table import HEADER, NEEDED, read_csv
-from tests.weights.data import BEST, independent, known, write
+from tests.helpers.weights_data import BEST, independent, known, write
 
 
 def run(*words: object, stdin: str | None = None) -> Result:
@@ -372,8 +372,8 @@ def test_motion_capture_gives_the_median_or_names_the_bodies(
         other.actual(lambda question: "")
     other.close()
     with pytest.raises(Exception, match="--mocap TYPE:HOST"):
-        collecting._truth(
-            collecting.CollectOptions(Path("s.csv"), "sim", truth="mocap"),
+        collect_weights._truth(
+            collect_weights.CollectOptions(Path("s.csv"), "sim", truth="mocap"),
             load_profile("sim"),
             lambda: 0.0,
         )

@@ -13,7 +13,7 @@ from perchctl.errors import InvalidValue
 from perchctl.weights import fit, lms
 from perchctl.weights.evidence import evidence, fit_all, gain_over
 from perchctl.weights.student import quantile
-from tests.weights.data import BEST, independent, known, measured
+from tests.helpers.weights_data import BEST, independent, known, measured
 
 
 def fitted(data: object) -> np.ndarray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from enum import Enum, auto
 
-from perchctl.mission.types import (
+from perchctl.vehicle import (
     ARMED,
     AUTO_ARM,
     CAN_ARM,

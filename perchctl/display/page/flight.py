@@ -1,0 +1,127 @@
+"""The live page of a flight: what the loop sees and does, and a STOP button that lands."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import TYPE_CHECKING
+
+from perchctl.camera.source import FrameSource, SourceAround
+from perchctl.display.page.live import LivePage, State
+from perchctl.display.page.sketch import Sketch
+from perchctl.display.status import status_rows
+from perchctl.display.watch import status_of
+from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput
+
+if TYPE_CHECKING:
+    from perchctl.mission.watch import Tick
+
+AXES_OF_SIDE = 0.5
+"""Length of the drawn axes, in sides of the large marker."""
+
+
+class FlightView:
+    """Looks on as a watcher, and sees the pictures through `watched`.
+
+    A page that fails is no reason to land: `problem` is None, ever; `page.problem` tells.
+    """
+
+    def __init__(self, page: LivePage, large_side_m: float) -> None:
+        self.page = page
+        self._axis_m = AXES_OF_SIDE * large_side_m
+        self._frame: Frame | None = None
+        self._flying = False
+        page.tell(lambda: {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]})
+
+    @property
+    def problem(self) -> str | None:
+        return None
+
+    def watched(self, source: FrameSource) -> FrameSource:
+        """The same source; each frame it gives is remembered for the page."""
+        return _Watched(source, self._seen)
+
+    def tick(self, tick: Tick) -> None:
+        try:
+            self._flying = True
+            frame = self._frame
+            if frame is not None:
+                self._frame = None
+                self.page.show(frame.index, sketch_of(frame, tick.output, self._axis_m))
+            self.page.tell(partial(flight_state, tick))
+        except Exception as error:
+            self.page.remember(error)
+
+    def event(self, t_s: float, text: str) -> None:
+        return None
+
+    def _seen(self, frame: Frame) -> None:
+        self._frame = frame
+        if not self._flying:  # no ticks yet that would show it
+            self.page.show(frame.index, Sketch(frame.image))
+
+
+class _Watched(SourceAround):
+    def __init__(self, source: FrameSource, seen: Callable[[Frame], None]) -> None:
+        super().__init__(source)
+        self._seen = seen
+
+    def poll(self, now_s: float) -> Frame | None:
+        frame = super().poll(now_s)
+        if frame is not None:
+            self._seen(frame)
+        return frame
+
+
+def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Sketch:
+    """The frame with what the pipeline found in it; bare where it was not looked at."""
+    if output is None or output.detections.frame_index != frame.index:
+        return Sketch(frame.image)
+    found = ((name, output.detections.get(name)) for name in MARKERS)
+    poses = output.poses
+    pose = next((poses[name] for name in ("joint", "large", "small") if name in poses), None)
+    return Sketch(
+        frame.image,
+        tuple((name, seen.corners_px) for name, seen in found if seen is not None),
+        None if pose is None else (pose.rvec_rad, pose.tvec_m, axis_m),
+    )
+
+
+def flight_state(tick: Tick) -> State:
+    """The tick for the page: phase, battery and the rows of the terminal's panel."""
+    status = status_of(tick)
+    volts = status.battery_v
+    return {
+        "phase": status.phase,
+        "battery": f"{volts:.2f} V" if math.isfinite(volts) else "battery unknown",
+        "battery_v": volts if math.isfinite(volts) else None,
+        "rows": [list(row) for row in status_rows(status)],
+        "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
+    }
+
+
+def _seen_note(output: PipelineOutput | None) -> str:
+    mirrored = output is not None and output.detections.mirrored
+    return "the picture is mirrored (camera.mirrored in the profile)" if mirrored else ""
+
+
+@contextlib.contextmanager
+def flight_view(
+    camera: CameraModel,
+    title: str,
+    large_side_m: float,
+    port: int,
+    land: Callable[[], None],
+    say: Callable[[str], None],
+) -> Iterator[FlightView]:
+    """A page for one flight; `land` is what STOP does. Errors: InvalidValue (the port)."""
+    page = LivePage(camera, title, port, on_stop=land)
+    say(f"live page with a STOP button: {page.url}")
+    try:
+        yield FlightView(page, large_side_m)
+    finally:
+        page.close()
+        if page.problem is not None:
+            say(f"the live page failed: {page.problem}")

@@ -1,0 +1,165 @@
+"""The live page: newest picture and numbers, on 127.0.0.1, from threads of its own.
+
+The loop only leaves references in a newest-value slot; drawing, JPEG and HTTP happen in
+the page's threads, and what fails there is remembered in `problem`, never raised.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+
+from perchctl.display.page.server import PageServer
+from perchctl.display.page.sketch import Sketch, draw
+from perchctl.errors import InvalidValue
+from perchctl.vision.types import CameraModel
+
+JPEG_QUALITY = 80
+WAIT_S = 0.5
+_RATE_FRAMES = 30  # over which the frame rate is taken
+_RATE_STALE_S = 1.0
+
+State = dict[str, Any]
+
+
+class LivePage:
+    """Serves one page until closed.
+
+    Args:
+        camera: for drawing the axes.
+        title: heading of the page.
+        port: 0 lets the operating system choose.
+        on_stop: called by the STOP button, from a thread of the page; None: no button.
+
+    `url` holds the token that STOP asks for. Errors: InvalidValue for a port in use.
+    """
+
+    def __init__(
+        self,
+        camera: CameraModel,
+        title: str,
+        port: int = 0,
+        on_stop: Callable[[], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.camera = camera
+        self.title = title
+        self.token = secrets.token_urlsafe(16)
+        self.problem: str | None = None
+        self.closed = False
+        self.opened = threading.Event()
+        self._on_stop = on_stop
+        self._stop_asked = False
+        self._clock = clock
+        self._changed = threading.Condition()
+        self._drawing = threading.Lock()
+        self._sketch: Sketch | None = None
+        self._number = 0
+        self._frame: int | None = None
+        self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
+        self._jpeg: tuple[int, bytes] = (0, b"")
+        self._describe: Callable[[], State] = dict
+        try:
+            self._server = PageServer(self, port)
+        except (OSError, OverflowError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise InvalidValue(
+                f"port {port} on 127.0.0.1 cannot be used ({reason}); choose another with "
+                f"--view-port, or leave that out"
+            ) from None
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}/?token={self.token}"
+        self._thread = threading.Thread(
+            target=self._server.serve_forever,
+            kwargs={"poll_interval": 0.1},
+            name="view",
+            daemon=True,
+        )
+        self._thread.start()
+
+    # --- for the loop: neither waits nor raises ------------------------------
+
+    def show(self, frame: int, sketch: Sketch) -> None:
+        """The newest picture; the same `frame` again replaces it."""
+        with self._changed:
+            if frame != self._frame:
+                self._times.append(self._clock())
+            self._frame, self._sketch = frame, sketch
+            self._number += 1
+            self._changed.notify_all()
+
+    def tell(self, describe: Callable[[], State]) -> None:
+        """The newest numbers, put into words only when somebody looks."""
+        self._describe = describe
+
+    # --- for the server's threads --------------------------------------------
+
+    def state(self) -> State:
+        """What the page polls: `describe`'s keys (rows, note, phase, battery), and title,
+        rate_hz, stop (``none``, ``ready``, ``asked``)."""
+        try:
+            told = self._describe()
+        except Exception as error:
+            self.remember(error)
+            told = {}
+        stop = "none" if self._on_stop is None else "asked" if self._stop_asked else "ready"
+        fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
+        return told | fixed | {"page_problem": self.problem}
+
+    def rate_hz(self) -> float:
+        """Frames a second, 0 once none has come for a second."""
+        with self._changed:
+            times, now_s = list(self._times), self._clock()
+        if len(times) < 2 or now_s - times[-1] > _RATE_STALE_S or times[-1] <= times[0]:
+            return 0.0
+        return (len(times) - 1) / (times[-1] - times[0])
+
+    def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
+        """The newest picture if newer than `number`, drawn; None when none came for a while."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._number > number, WAIT_S)
+            newest, sketch = self._number, self._sketch
+        if sketch is None or newest <= number:
+            return None
+        with self._drawing:  # once, for all who look
+            if self._jpeg[0] < newest:
+                quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+                ok, jpeg = cv2.imencode(".jpg", draw(sketch, self.camera), quality)
+                if not ok:
+                    return None
+                self._jpeg = (newest, jpeg.tobytes())
+            return self._jpeg
+
+    def pause(self, seconds: float) -> bool:
+        """Wait, less when the page closes; True when it has."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self.closed, seconds)
+
+    def may_stop(self, token: str) -> bool:
+        given, own = token.encode("utf-8", "replace"), self.token.encode()
+        return self._on_stop is not None and hmac.compare_digest(given, own)
+
+    def stop(self) -> None:
+        """The STOP button; pressing it again changes nothing."""
+        with self._changed:
+            first, self._stop_asked = not self._stop_asked, True
+        if first and self._on_stop is not None:
+            self._on_stop()
+
+    def remember(self, error: BaseException) -> None:
+        self.problem = f"{type(error).__name__}: {error}"
+
+    def close(self) -> None:
+        """End the streams and free the port; bounded."""
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join(2.0)

@@ -1,0 +1,95 @@
+"""The vehicle's recent past: its attitude and position at a frame's time."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass
+
+from perchctl.geometry import wrap_rad
+from perchctl.profile import SafetyConfig
+from perchctl.vehicle import Telemetry
+from perchctl.vision.types import Attitude
+
+KEEP_S = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """Telemetry of the last `KEEP_S`, oldest first, and what a look at it told."""
+
+    samples: tuple[Telemetry, ...] = ()
+    jumped: bool = False
+    battery_changed_s: float | None = None
+
+    @property
+    def newest(self) -> Telemetry | None:
+        return self.samples[-1] if self.samples else None
+
+
+def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> History:
+    """The history with new samples; `jumped` speaks of these samples only.
+
+    Samples with NaN or out of order are left out (fault 35).
+    """
+    samples = list(history.samples)
+    jumped, changed = False, history.battery_changed_s
+    for sample in new:
+        if not _is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
+            continue
+        if samples:
+            jumped = jumped or _is_jump(samples[-1], sample, safety.jump_m)
+        if changed is None or sample.battery_v != samples[-1].battery_v:
+            changed = sample.t_s
+        samples.append(sample)
+    if samples:
+        oldest = samples[-1].t_s - KEEP_S
+        first = bisect.bisect_left([s.t_s for s in samples], oldest)
+        samples = samples[first:]
+    return History(tuple(samples), jumped, changed)
+
+
+def attitude_at(history: History, t_s: float) -> Attitude | None:
+    """Attitude and position at `t_s`, linear between samples (yaw on the circle).
+
+    Before the oldest sample the oldest counts; beyond the newest the newest is
+    carried on by its velocity for at most 0.1 s. None without samples.
+    """
+    samples = history.samples
+    if not samples:
+        return None
+    times = [s.t_s for s in samples]
+    i = bisect.bisect_right(times, t_s)
+    if i == 0:
+        return _attitude(samples[0], 0.0)
+    if i == len(samples):
+        return _attitude(samples[-1], min(t_s - times[-1], 0.1))
+    a, b = samples[i - 1], samples[i]
+    part = (t_s - a.t_s) / (b.t_s - a.t_s)
+    return Attitude(
+        t_s,
+        a.roll_rad + part * wrap_rad(b.roll_rad - a.roll_rad),
+        a.pitch_rad + part * wrap_rad(b.pitch_rad - a.pitch_rad),
+        wrap_rad(a.yaw_rad + part * wrap_rad(b.yaw_rad - a.yaw_rad)),
+        (
+            a.position_m[0] + part * (b.position_m[0] - a.position_m[0]),
+            a.position_m[1] + part * (b.position_m[1] - a.position_m[1]),
+            a.position_m[2] + part * (b.position_m[2] - a.position_m[2]),
+        ),
+    )
+
+
+def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
+    x, y, z = (p + v * ahead_s for p, v in zip(s.position_m, s.velocity_mps, strict=True))
+    return Attitude(s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z))
+
+
+def _is_jump(a: Telemetry, b: Telemetry, limit_m: float) -> bool:
+    moved = math.dist(a.position_m, b.position_m)
+    fastest = max(math.hypot(*a.velocity_mps), math.hypot(*b.velocity_mps))
+    return moved > limit_m + 1.5 * fastest * (b.t_s - a.t_s)
+
+
+def _is_finite(s: Telemetry) -> bool:
+    values = (*s.position_m, *s.velocity_mps, s.roll_rad, s.pitch_rad, s.yaw_rad, s.acc_z_g)
+    return all(math.isfinite(v) for v in values)

@@ -1,0 +1,166 @@
+"""A whole flight in lockstep: the flight loop on simulated time, exact for a seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perchctl.flight.loop import FlightParts, FlightReport, Tick, Watcher, fly
+from perchctl.link.mock import MockLink
+from perchctl.log.watch import LogWatcher
+from perchctl.mission.state import Operator, Phase
+from perchctl.pipeline import PipelineSetup
+from perchctl.profile import Profile
+from perchctl.sim.camera import SimCamera
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.vehicle import LOCKED
+from perchctl.vision.types import CameraModel, Frame
+
+MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
+HARD_LANDING_MPS = 1.0
+"""Sinking faster than this into the floor is a fall, whatever the log calls it."""
+
+
+class LockstepClock:
+    """The vehicle's own time; waiting lets the vehicle live."""
+
+    def __init__(self, link: MockLink) -> None:
+        self._link = link
+
+    def now(self) -> float:
+        return self._link.now_s
+
+    def wait_until(self, t_s: float) -> None:
+        if t_s > self._link.now_s:
+            self._link.advance_to(t_s)
+
+
+class LockstepSource:
+    """The simulated camera's delivered frames; the newest wins, as for a live camera."""
+
+    live = True
+    finished = False
+
+    def __init__(self, camera: SimCamera, latency_s: float) -> None:
+        self._camera = camera
+        self._latency_s = latency_s
+        self._count = 0
+
+    def poll(self, now_s: float) -> Frame | None:
+        delivered = self._camera.take()
+        if not delivered:
+            return None
+        last = delivered[-1]
+        self._count += 1
+        arrival_s = last.t_arrival_s
+        return Frame(self._count - 1, arrival_s - self._latency_s, last.image, arrival_s)
+
+    def problem(self, now_s: float) -> str | None:
+        return None
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        return self._camera.renderer.camera.size_px
+
+    def describe(self) -> str:
+        return "sim:"
+
+    def close(self) -> None:
+        return None
+
+
+class Truth:
+    """Watches the true vehicle, which the flight cannot see."""
+
+    problem: str | None = None
+
+    def __init__(self, vehicle: SimulatedVehicle) -> None:
+        self._vehicle = vehicle
+        self._sink_mps = 0.0
+        self.fell = False
+
+    def event(self, t_s: float, text: str) -> None:
+        return None
+
+    def tick(self, tick: Tick) -> None:
+        state = self._vehicle.world.state()
+        on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
+        if state.floor_contact and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
+            self.fell = True
+        self._sink_mps = -float(state.velocity_mps[2])
+
+    def for_log(self) -> tuple[tuple[float, float, float], float]:
+        x, y, z = (float(v) for v in self._vehicle.world.state().position_m)
+        return (x, y, z), self._vehicle.world.gear_miss_m()
+
+
+@dataclass(frozen=True)
+class LockstepFlight:
+    """A finished flight and what only the simulator knows of it."""
+
+    report: FlightReport
+    seed: int
+    miss_m: float
+    hanging: bool
+    fell: bool
+    locked: bool
+    simulated_s: float
+
+
+def fly_lockstep(
+    profile: Profile,
+    camera: CameraModel,
+    setup: PipelineSetup,
+    scenario: Scenario,
+    log: LogWatcher | None = None,
+    operator_at: dict[Phase, Operator] | None = None,
+) -> LockstepFlight:
+    """Fly `scenario` to its end. `operator_at` gives the person's word as soon as a
+    phase is reached (for tests)."""
+    vehicle = SimulatedVehicle(scenario, camera, profile.target)
+    link = MockLink(vehicle, profile.link.telemetry_period_s)
+    assert vehicle.camera is not None
+    source = LockstepSource(vehicle.camera, profile.camera.latency_s)
+    truth = Truth(vehicle)
+    watchers: tuple[Watcher, ...] = (truth,)
+    if log is not None:
+        log.truth = truth.for_log
+        watchers = (truth, log)
+    word = _Word(operator_at or {})
+    parts = FlightParts(
+        link, source, LockstepClock(link), profile, setup, (*watchers, word), word.read
+    )
+    link.connect()
+    report = fly(parts)
+    link.close()
+    link.advance_to(link.now_s + 1.0)
+    hanging = bool(vehicle.world.state().magnet_engaged)
+    fell = truth.fell or (report.phase is Phase.PERCHED and not hanging)
+    return LockstepFlight(
+        report=report,
+        seed=scenario.seed,
+        miss_m=vehicle.world.gear_miss_m(),
+        hanging=hanging,
+        fell=fell,
+        locked=bool(vehicle.firmware.supervisor_info & LOCKED),
+        simulated_s=link.now_s,
+    )
+
+
+class _Word:
+    """Says the operator's word once the given phase has been seen."""
+
+    problem: str | None = None
+
+    def __init__(self, at: dict[Phase, Operator]) -> None:
+        self._at = at
+        self._said = Operator.NONE
+
+    def read(self) -> Operator:
+        return self._said
+
+    def tick(self, tick: Tick) -> None:
+        self._said = max(self._said, self._at.get(tick.state.phase, Operator.NONE))
+
+    def event(self, t_s: float, text: str) -> None:
+        return None

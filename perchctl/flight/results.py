@@ -1,0 +1,133 @@
+"""How flights ended: one flight's result and the figures of a campaign of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+FlightEnd = Literal["perched", "landed", "aborted"]
+ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
+
+
+@dataclass(frozen=True)
+class FlightResult:
+    """One simulated flight.
+
+    Attributes:
+        outcome: the terminal phase, in small letters.
+        miss_m: horizontal distance of the gear from the target's centre in the
+            simulation's truth; None when it did not perch.
+        time_s: duration of the flight in the loop's time.
+        attempts: perching attempts, the successful one included.
+        locked: the supervisor had locked the vehicle at the end.
+        fell: it hit the floor other than by landing.
+        realtime_factor: loop time over wall time.
+    """
+
+    seed: int
+    outcome: FlightEnd
+    reason: str
+    miss_m: float | None
+    time_s: float
+    attempts: int
+    locked: bool
+    fell: bool
+    realtime_factor: float
+
+
+def campaign_summary(
+    results: Sequence[FlightResult], wall_s: float | None = None, worst: int = 5
+) -> dict[str, Any]:
+    """A campaign's figures, ready for JSON.
+
+    `miss_m` is taken over the perched flights (None without any; p95 by linear
+    interpolation). `realtime_factor` is flight time over `wall_s`, or over the
+    sum of the flights' own wall times without it. `worst_seeds` names at most
+    `worst` flights: those that did not perch first, then the largest misses.
+    """
+    misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
+    flown_s = sum(r.time_s for r in results)
+    if wall_s is None:
+        wall_s = sum(r.time_s / r.realtime_factor for r in results if r.realtime_factor > 0)
+    return {
+        "flights": len(results),
+        **{end: sum(r.outcome == end for r in results) for end in ENDS},
+        "locked": sum(r.locked for r in results),
+        "fell": sum(r.fell for r in results),
+        "miss_m": {
+            "median": _rounded(np.median(misses)) if misses else None,
+            "p95": _rounded(np.percentile(misses, 95)) if misses else None,
+            "max": _rounded(max(misses)) if misses else None,
+        },
+        "realtime_factor": _rounded(flown_s / wall_s) if wall_s > 0 else None,
+        "worst_seeds": [r.seed for r in worst_first(results)[:worst]],
+    }
+
+
+def worst_first(results: Sequence[FlightResult]) -> list[FlightResult]:
+    """Not perched first (aborted before landed), then the largest misses, then by seed."""
+    return sorted(results, key=lambda r: (-ENDS.index(r.outcome), -(r.miss_m or 0.0), r.seed))
+
+
+def _rounded(value: Any) -> float:
+    return round(float(value), 6)
+
+
+def campaign_table(
+    results: Sequence[FlightResult], wall_s: float | None = None, worst: int = 5
+) -> str:
+    """The campaign's figures and its worst flights as plain text."""
+    figures = campaign_summary(results, wall_s, worst)
+    lines = [f"{name:<18}{text}" for name, text in campaign_rows(figures, results)]
+    if results:
+        lines += ["", "worst flights"]
+        lines += aligned(
+            [("seed", "outcome", "miss [mm]", "time [s]", "attempts", "reason")]
+            + [_cells(r) for r in worst_first(results)[:worst]]
+        )
+    return "\n".join(lines)
+
+
+def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Rows of cells as lines of columns; the first row is the head."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def _cells(r: FlightResult) -> tuple[str, ...]:
+    flags = [word for word, on in (("locked", r.locked), ("fell", r.fell)) if on]
+    outcome = ", ".join([r.outcome, *flags])
+    miss = "-" if r.miss_m is None else f"{r.miss_m * 1e3:.1f}"
+    return str(r.seed), outcome, miss, f"{r.time_s:.1f}", str(r.attempts), r.reason
+
+
+def campaign_rows(
+    figures: Mapping[str, Any], results: Sequence[FlightResult]
+) -> list[tuple[str, str]]:
+    """Name and text of each figure of `campaign_summary`."""
+    flights = figures["flights"]
+    rows = [("flights", str(flights))]
+    for end in ENDS:
+        share = f" ({100.0 * figures[end] / flights:.1f} %)" if flights else ""
+        rows.append((end, f"{figures[end]}{share}"))
+    rows += [("locked", str(figures["locked"])), ("fell", str(figures["fell"]))]
+    miss = figures["miss_m"]
+    if miss["max"] is not None:
+        text = ", ".join(f"{k} {miss[k] * 1e3:.1f}" for k in ("median", "p95", "max"))
+        rows.append(("miss [mm]", text))
+    if results:
+        times = [r.time_s for r in results]
+        attempts = [r.attempts for r in results]
+        rows.append(("flight time [s]", f"median {np.median(times):.1f}, max {max(times):.1f}"))
+        rows.append(("attempts", f"mean {np.mean(attempts):.2f}, max {max(attempts)}"))
+    if figures["realtime_factor"] is not None:
+        rows.append(("real-time factor", f"{figures['realtime_factor']:.1f}"))
+    if figures["worst_seeds"]:
+        rows.append(("worst seeds", ", ".join(map(str, figures["worst_seeds"]))))
+    return rows

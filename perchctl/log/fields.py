@@ -1,0 +1,238 @@
+"""What one loop tick leaves in the flight log: every key, its unit and its meaning.
+
+Keys are flat and carry their unit; SI and radians, frames as in
+`perchctl.geometry`. A missing value is None (absent in the file, None again
+once read). `FIELDS` is copied into each log's header, so that a log explains
+itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from perchctl.vehicle import (
+    Command,
+    EmergencyStop,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+    TakeOff,
+    Telemetry,
+)
+from perchctl.vision.types import MARKERS, MarkerPose, PipelineOutput, TargetPose
+
+_POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
+
+FIELDS: dict[str, str] = {
+    "t_s": "time on the loop's clock",
+    # the planner
+    "phase": "phase of the mission",
+    "stage": "markers seen in the newest frame: none, large, both or small",
+    "reason": "why the phase was entered",
+    "hold": "why the vehicle is held in place, empty when it is not",
+    "attempts": "failed perching attempts so far",
+    # the vehicle's own estimate, world axes
+    "x_m": "body in the world of the state estimate",
+    "y_m": "body in the world of the state estimate",
+    "z_m": "body in the world of the state estimate, up",
+    "vx_mps": "velocity, world axes",
+    "vy_mps": "velocity, world axes",
+    "vz_mps": "velocity, world axes",
+    "roll_rad": "right-handed about body x",
+    "pitch_rad": "right-handed about body y: positive is nose down",
+    "yaw_rad": "right-handed about world z",
+    "acc_z_g": "specific force along body z, +1 at rest",
+    "thrust": "commanded by the vehicle's controller, 0..65535",
+    "battery_v": "under the load of the moment",
+    "battery_state": "pm.state; 3 is low power",
+    "supervisor": "supervisor bits",
+    "var_m2": "largest of the estimator's position variances",
+    "tel_age_s": "age of the telemetry sample",
+    # the camera; None in a tick without a new frame
+    "frame": "number of the frame that this tick processed",
+    "frame_t_s": "its time of exposure on the loop's clock",
+    "large_px": "corners of the large marker, x y of TL TR BR BL",
+    "small_px": "corners of the small marker, x y of TL TR BR BL",
+    **{
+        key: text
+        for short, name in _POSE_SOURCES.items()
+        for key, text in (
+            (f"{short}x_m", f"{name}: unfiltered pose of the target, relative to the gear, level"),
+            (f"{short}y_m", f"{name}: as {short}x_m"),
+            (f"{short}z_m", f"{name}: as {short}x_m"),
+            (f"{short}yaw_rad", f"{name}: unfiltered heading of the target in the level frame"),
+            (f"{short}_rms_px", f"{name}: RMS reprojection error"),
+        )
+    },
+    "cam_age_s": "since the last good frame",
+    # the merged, filtered target: the paper's error vector
+    "ex_m": "target relative to the gear, level frame",
+    "ey_m": "target relative to the gear, level frame",
+    "ez_m": "target relative to the gear, level frame",
+    "eyaw_rad": "heading of the target in the level frame",
+    "evx_mps": "the filter's velocity of the target, level axes",
+    "evy_mps": "the filter's velocity of the target, level axes",
+    "evz_mps": "the filter's velocity of the target, level axes",
+    "esx_m": "standard deviation of ex_m",
+    "esy_m": "standard deviation of ey_m",
+    "esz_m": "standard deviation of ez_m",
+    "esyaw_rad": "standard deviation of eyaw_rad",
+    "measured": "true when the frame held the target, false while the filter coasts",
+    "unseen": "frames since the target was last detected",
+    "tx_m": "target in the world of the state estimate",
+    "ty_m": "target in the world of the state estimate",
+    "tz_m": "target in the world of the state estimate",
+    "tyaw_rad": "heading of the target in the world of the state estimate",
+    # what was sent
+    "cmd": "idle, takeoff, position, thrust, stop, land or emergency",
+    "cmd_x_m": "position setpoint, world of the state estimate",
+    "cmd_y_m": "position setpoint, world of the state estimate",
+    "cmd_z_m": "position setpoint, or the height of a take-off or landing",
+    "cmd_yaw_rad": "setpoint's heading",
+    "cmd_thrust": "raw thrust 0..65535",
+    "cmd_duration_s": "duration of a take-off or landing",
+    "late_s": "how late this tick began",
+    # simulation only
+    "true_x_m": "true position of the body, simulation only",
+    "true_y_m": "true position of the body, simulation only",
+    "true_z_m": "true position of the body, simulation only",
+    "true_miss_m": "true horizontal distance of the gear from the target's centre, simulation only",
+}
+
+
+def tick_record(
+    *,
+    t_s: float,
+    telemetry: Telemetry | None,
+    output: PipelineOutput | None,
+    target: TargetPose | None,
+    phase: str,
+    reason: str,
+    command: Command | None,
+    stage: str | None = None,
+    hold: str = "",
+    attempts: int = 0,
+    loop_late_s: float = 0.0,
+    camera_age_s: float | None = None,
+    telemetry_age_s: float | None = None,
+    true_position_m: tuple[float, float, float] | None = None,
+    true_miss_m: float | None = None,
+) -> dict[str, Any]:
+    """One tick as a flat record with all keys of `FIELDS`, in their order.
+
+    `output` is what this tick's new frame gave, None without a new frame.
+    `stage` defaults to the output's, else to the target's.
+    """
+    if stage is None:
+        seen = output or target
+        stage = seen.stage.value if seen is not None else None
+    if telemetry is not None and telemetry_age_s is None:
+        telemetry_age_s = t_s - telemetry.t_s
+    values: dict[str, Any] = {
+        "t_s": t_s,
+        "phase": phase,
+        "stage": stage,
+        "reason": reason,
+        "hold": hold or None,
+        "attempts": attempts,
+        "tel_age_s": telemetry_age_s,
+        "cam_age_s": camera_age_s,
+        "late_s": loop_late_s,
+        "true_miss_m": true_miss_m,
+        **_xyz("true_", true_position_m),
+        **_telemetry_values(telemetry),
+        **_output_values(output),
+        **_target_values(target),
+        **_command_values(command),
+    }
+    return {key: values.get(key) for key in FIELDS}
+
+
+def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:
+    if vector is None:
+        return {}
+    return {f"{prefix}{axis}_{unit}": v for axis, v in zip("xyz", vector, strict=True)}
+
+
+def _telemetry_values(tel: Telemetry | None) -> dict[str, Any]:
+    if tel is None:
+        return {}
+    return {
+        **_xyz("", tel.position_m),
+        **_xyz("v", tel.velocity_mps, "mps"),
+        "roll_rad": tel.roll_rad,
+        "pitch_rad": tel.pitch_rad,
+        "yaw_rad": tel.yaw_rad,
+        "acc_z_g": tel.acc_z_g,
+        "thrust": tel.thrust,
+        "battery_v": tel.battery_v,
+        "battery_state": tel.battery_state,
+        "supervisor": tel.supervisor,
+        "var_m2": tel.position_variance_m2,
+    }
+
+
+def _output_values(output: PipelineOutput | None) -> dict[str, Any]:
+    if output is None:
+        return {}
+    values: dict[str, Any] = {
+        "frame": output.detections.frame_index,
+        "frame_t_s": output.detections.t_s,
+    }
+    for marker in MARKERS:
+        detection = output.detections.get(marker)
+        if detection is not None:
+            corners = detection.corners_px.reshape(-1)
+            values[f"{marker}_px"] = [round(float(c), 3) for c in corners]
+    for short, name in _POSE_SOURCES.items():
+        pose = output.poses.get(name)
+        if pose is not None:
+            values |= _pose_values(short, pose)
+    return values
+
+
+def _pose_values(short: str, pose: MarkerPose) -> dict[str, Any]:
+    return {
+        **_xyz(short, pose.e_m),
+        f"{short}yaw_rad": pose.e_yaw_rad,
+        f"{short}_rms_px": pose.reprojection_px,
+    }
+
+
+def _target_values(target: TargetPose | None) -> dict[str, Any]:
+    if target is None:
+        return {}
+    return {
+        **_xyz("e", target.e_m),
+        "eyaw_rad": target.e_yaw_rad,
+        **_xyz("ev", target.velocity_mps, "mps"),
+        **_xyz("es", target.sigma_m),
+        "esyaw_rad": target.sigma_yaw_rad,
+        "measured": target.measured,
+        "unseen": target.unseen,
+        **_xyz("t", target.world_m),
+        "tyaw_rad": target.world_yaw_rad,
+    }
+
+
+def _command_values(command: Command | None) -> Mapping[str, Any]:
+    match command:
+        case None:
+            return {}
+        case Idle():
+            return {"cmd": "idle"}
+        case TakeOff(height_m, duration_s):
+            return {"cmd": "takeoff", "cmd_z_m": height_m, "cmd_duration_s": duration_s}
+        case PositionSetpoint(x_m, y_m, z_m, yaw_rad):
+            return {"cmd": "position", **_xyz("cmd_", (x_m, y_m, z_m)), "cmd_yaw_rad": yaw_rad}
+        case RawThrust(thrust):
+            return {"cmd": "thrust", "cmd_thrust": thrust}
+        case StopMotors():
+            return {"cmd": "stop"}
+        case Land(height_m, duration_s):
+            return {"cmd": "land", "cmd_z_m": height_m, "cmd_duration_s": duration_s}
+        case EmergencyStop():
+            return {"cmd": "emergency"}

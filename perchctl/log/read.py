@@ -1,0 +1,166 @@
+"""Reading a flight log back, whatever became of its last line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.geometry import Array
+from perchctl.log.fields import FIELDS
+from perchctl.log.jsonl import decode
+from perchctl.log.write import FORMAT, SCHEMA_VERSION
+
+KINDS = ("tick", "event", "summary")
+
+
+@dataclass(frozen=True)
+class PhaseSpan:
+    """One stay in a phase; times on the loop's clock."""
+
+    phase: str
+    start_s: float
+    end_s: float
+    reason: str = ""
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True, eq=False)
+class FlightLog:
+    """One flight as it was written.
+
+    Attributes:
+        records: the ticks, each with all keys of `FIELDS` (None where missing).
+        truncated: the flight did not get to write its summary, or the tail is cut.
+        ignored_bytes: length of the unreadable tail.
+    """
+
+    path: Path
+    header: dict[str, Any]
+    records: list[dict[str, Any]]
+    events: list[dict[str, Any]]
+    summary: dict[str, Any] | None
+    truncated: bool
+    ignored_bytes: int = 0
+
+    def column(self, key: str) -> Array:
+        """A field over the ticks, shape (n,); NaN where it is missing.
+
+        Raises InvalidValue for a value that is no number.
+        """
+        try:
+            values = [np.nan if r.get(key) is None else float(r[key]) for r in self.records]
+        except (TypeError, ValueError):
+            raise InvalidValue(f"{self.path}: {key} is not a number in every record") from None
+        return np.array(values, dtype=np.float64)
+
+    @property
+    def start_s(self) -> float:
+        """Loop time of the first tick (0 without ticks)."""
+        return float(self.records[0]["t_s"]) if self.records else 0.0
+
+    @cached_property
+    def phases(self) -> tuple[PhaseSpan, ...]:
+        """The phases flown through, in order; each lasts until the next begins."""
+        spans: list[PhaseSpan] = []
+        for record in self.records:
+            t_s, phase = float(record["t_s"]), str(record.get("phase") or "")
+            if spans and spans[-1].phase == phase:
+                last = spans[-1]
+                spans[-1] = PhaseSpan(phase, last.start_s, t_s, last.reason)
+                continue
+            if spans:
+                last = spans[-1]
+                spans[-1] = PhaseSpan(last.phase, last.start_s, t_s, last.reason)
+            spans.append(PhaseSpan(phase, t_s, t_s, str(record.get("reason") or "")))
+        return tuple(spans)
+
+
+def read_log(path: Path) -> FlightLog:
+    """Read a flight log; an unreadable tail is ignored and counted.
+
+    Raises NotFound when there is no such file, and InvalidValue, with the line,
+    when it is not a flight log or is damaged elsewhere than at its end.
+    """
+    lines = _lines(path)
+    header = _header(path, lines)
+    good: list[dict[str, Any]] = []
+    bad: tuple[int, str] | None = None  # first unreadable line
+    ignored = 0
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            record = _checked(decode(line))
+        except ValueError as error:
+            bad = bad or (number, str(error))
+            ignored += len(line)
+            continue
+        if bad is not None:
+            raise InvalidValue(
+                f"{path}: line {bad[0]}: not a record of a flight log ({bad[1]}), and records "
+                f"follow it: the file is damaged, take the original"
+            )
+        good.append(record)
+    summary = next((r for r in good if r["kind"] == "summary"), None)
+    blank = dict.fromkeys(FIELDS)
+    return FlightLog(
+        path=path,
+        header=header,
+        records=[blank | _without_kind(r) for r in good if r["kind"] == "tick"],
+        events=[_without_kind(r) for r in good if r["kind"] == "event"],
+        summary=None if summary is None else _without_kind(summary),
+        truncated=summary is None or ignored > 0,
+        ignored_bytes=ignored,
+    )
+
+
+def _lines(path: Path) -> list[bytes]:
+    try:
+        return path.read_bytes().splitlines(keepends=True)
+    except FileNotFoundError:
+        raise NotFound(f"flight log {path} does not exist") from None
+    except IsADirectoryError:
+        raise NotFound(f"flight log {path} is a folder; name one of its .jsonl files") from None
+    except OSError as error:
+        raise NotFound(f"flight log {path} cannot be read: {error.strerror}") from None
+
+
+def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
+    if not lines:
+        raise InvalidValue(f"{path}: line 1: the file is empty, a flight log begins with a header")
+    try:
+        header = decode(lines[0])
+    except ValueError:
+        header = {}
+    if header.get("kind") != "header" or header.get("format") != FORMAT:
+        raise InvalidValue(
+            f"{path}: line 1: not a flight log of perchctl (its header is missing); logs are "
+            f"the .jsonl files in the profile's log.directory"
+        )
+    version = header.get("version")
+    if version != SCHEMA_VERSION:
+        raise InvalidValue(
+            f"{path}: line 1: schema version {version!r}, this perchctl reads {SCHEMA_VERSION}; "
+            f"the log was written by perchctl {header.get('perchctl', 'of unknown version')}"
+        )
+    return header
+
+
+def _checked(record: dict[str, Any]) -> dict[str, Any]:
+    kind = record.get("kind")
+    if kind not in KINDS:
+        raise ValueError(f"kind {kind!r}, allowed are {', '.join(KINDS)}")
+    t_s = record.get("t_s")
+    if kind != "summary" and (isinstance(t_s, bool) or not isinstance(t_s, (int, float))):
+        raise ValueError(f"t_s must be a number of seconds, found {t_s!r}")
+    return record
+
+
+def _without_kind(record: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in record.items() if k != "kind"}

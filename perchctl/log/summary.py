@@ -1,0 +1,126 @@
+"""A flight in a few lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perchctl.log.read import FlightLog, PhaseSpan
+from perchctl.vehicle import NO_BATTERY_READING_V
+
+
+@dataclass(frozen=True)
+class FlightSummary:
+    """What is worth saying after one flight.
+
+    Attributes:
+        outcome: ``perched``, ``landed``, ``aborted``, or ``unknown`` for a log
+            that ends without its summary.
+        cause: what decided it, such as ``target not found``.
+        miss_m: None where no truth is known.
+    """
+
+    outcome: str
+    reason: str
+    cause: str = ""
+    duration_s: float = 0.0
+    attempts: int = 0
+    miss_m: float | None = None
+    battery_min_v: float | None = None
+    locked: bool = False
+    fell: bool = False
+    phases: tuple[PhaseSpan, ...] = ()
+
+    def as_record(self) -> dict[str, Any]:
+        """For `FlightLogWriter.close`; the phases are in the ticks already."""
+        return {
+            "outcome": self.outcome,
+            "cause": self.cause or None,
+            "reason": self.reason,
+            "duration_s": self.duration_s,
+            "attempts": self.attempts,
+            "miss_m": self.miss_m,
+            "battery_min_v": self.battery_min_v,
+            "locked": self.locked,
+            "fell": self.fell,
+        }
+
+
+def summary_of(log: FlightLog) -> FlightSummary:
+    """From the log's summary record; from its ticks where that is missing."""
+    phases = log.phases
+    battery_v = log.column("battery_v")
+    known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
+    said: Mapping[str, Any] = log.summary or {
+        "outcome": "unknown",
+        "reason": f"the log ends in {phases[-1].phase}" if phases else "the log holds no flight",
+    }
+    last = log.records[-1] if log.records else {}
+    battery_min_v = float(np.min(known_v)) if known_v.size else None
+    return FlightSummary(
+        outcome=str(said.get("outcome", "unknown")),
+        reason=str(said.get("reason", "")),
+        cause=str(said.get("cause") or ""),
+        duration_s=float(said.get("duration_s") or sum(p.duration_s for p in phases)),
+        attempts=int(said.get("attempts", last.get("attempts")) or 0),
+        miss_m=said.get("miss_m"),
+        battery_min_v=said.get("battery_min_v") or battery_min_v,
+        locked=bool(said.get("locked", False)),
+        fell=bool(said.get("fell", False)),
+        phases=phases,
+    )
+
+
+def summary_text(
+    flight: FlightSummary | FlightLog, log_path: Path | None = None, plot_path: Path | None = None
+) -> str:
+    """A few lines, no colour, no line break at the end."""
+    faults = []
+    if isinstance(flight, FlightLog):
+        faults = _log_faults(flight)
+        flight = summary_of(flight)
+    lines = [f"{flight.outcome.upper()}: {flight.reason}".rstrip(": ")]
+    if flight.cause and flight.cause != flight.outcome:
+        lines[0] += f" [{flight.cause}]"
+    if flight.miss_m is not None:
+        lines.append(f"miss:      {flight.miss_m * 1e3:.1f} mm")
+    lines.append(f"flight:    {flight.duration_s:.1f} s, {_attempts(flight.attempts)}")
+    if flight.phases:
+        lines.append(f"phases:    {phases_text(flight.phases)}")
+    if flight.battery_min_v is not None:
+        lines.append(f"battery:   {flight.battery_min_v:.2f} V at its lowest")
+    if flight.locked:
+        lines.append("vehicle:   locked by its supervisor: inspect and restart it")
+    if flight.fell:
+        lines.append("vehicle:   fell")
+    lines += faults
+    if log_path is not None:
+        lines.append(f"log:       {log_path}")
+    if plot_path is not None:
+        lines.append(f"plot:      {plot_path}")
+    return "\n".join(lines)
+
+
+def _log_faults(log: FlightLog) -> list[str]:
+    """What the log has lost, if anything."""
+    faults = []
+    lost = (log.summary or {}).get("lost_records", 0)
+    if lost:
+        faults.append(f"log lost:  {lost} records ({(log.summary or {}).get('problem')})")
+    if log.ignored_bytes:
+        faults.append(f"log lost:  its tail, {log.ignored_bytes} unreadable bytes")
+    return faults
+
+
+def phases_text(phases: Sequence[PhaseSpan]) -> str:
+    """``APPROACH 3.1 s > SEARCH 0.4 s > ...``; terminals, which take no time, by name."""
+    parts = [f"{p.phase} {p.duration_s:.1f} s" if p.duration_s > 0 else p.phase for p in phases]
+    return " > ".join(parts)
+
+
+def _attempts(count: int) -> str:
+    return f"{count} attempt" if count == 1 else f"{count} attempts"

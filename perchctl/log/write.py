@@ -1,0 +1,222 @@
+"""The flight log: append-only JSON lines, readable after any crash.
+
+Line 1 is the header; then one `tick` record a turn of the loop, `event` records
+between them, and one `summary` at the end. A flight is never troubled by its
+log: a write that fails is remembered in `FlightLogWriter.problem`.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import perchctl
+from perchctl.errors import InvalidValue
+from perchctl.log.fields import FIELDS
+from perchctl.log.jsonl import encode
+from perchctl.profile import Profile
+
+FORMAT = "perchctl-flight-log"
+SCHEMA_VERSION = 1
+FSYNC_PERIOD_S = 1.0
+RETRY_PERIOD_S = 1.0
+CLOSE_TIMEOUT_S = 2.0
+
+
+def make_header(
+    profile: Profile,
+    *,
+    uri: str,
+    source: str,
+    seed: int | None = None,
+    lockstep: bool = False,
+    started: datetime | None = None,
+) -> dict[str, Any]:
+    """The first record. Without `started` it depends on nothing but its arguments."""
+    return {
+        "kind": "header",
+        "format": FORMAT,
+        "version": SCHEMA_VERSION,
+        "perchctl": perchctl.__version__,
+        "uri": uri,
+        "source": source,
+        "seed": seed,
+        "lockstep": lockstep,
+        "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
+        "profile": profile.model_dump(mode="json"),
+        "fields": FIELDS,
+    }
+
+
+def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
+    """``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl`` in the directory.
+
+    (A flight in lockstep is named ``flight_seed<seed>.jsonl`` by the campaign.)
+    """
+    safe = re.sub(r"[^A-Za-z0-9._-]+", "-", profile_name).strip("-.") or "profile"
+    return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"
+
+
+class FlightLogWriter:
+    """Writes one flight. Only `open` raises; afterwards look at `problem`.
+
+    Attributes:
+        path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.
+        problem: None, or one sentence about the first record that was lost.
+        lost_records: how many could not be written.
+    """
+
+    def __init__(self, path: Path, fd: int, fsync: bool) -> None:
+        self.path = path
+        self.problem: str | None = None
+        self.lost_records = 0
+        self._fd = fd
+        self._fsync = fsync
+        self._closed = False
+        self._good_bytes = 0
+        self._synced_s: float | None = None
+        self._failed_s: float | None = None
+        self._sync_thread: threading.Thread | None = None
+
+    @classmethod
+    def open(cls, path: Path, header: Mapping[str, Any], fsync: bool = False) -> FlightLogWriter:
+        """Create the file and its folder and write the header.
+
+        `fsync` (for flights in real time) brings the records to the disk about
+        once a second of the loop's time, on a thread beside the loop.
+        Raises InvalidValue when the file cannot be created: that is before the
+        flight, where refusing costs nothing.
+        """
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            free, fd = _create(path)
+        except OSError as error:
+            raise InvalidValue(_cannot_start(path, error)) from None
+        writer = cls(free, fd, fsync)
+        try:
+            writer._append(encode(header))
+        except OSError as error:
+            os.close(fd)
+            free.unlink(missing_ok=True)
+            raise InvalidValue(_cannot_start(path, error)) from None
+        return writer
+
+    def write(self, record: Mapping[str, Any]) -> None:
+        """Append one tick record (`perchctl.log.fields.tick_record`). Never raises."""
+        self._put({"kind": "tick", **record}, _time_of(record))
+
+    def event(self, t_s: float, text: str, level: str = "info") -> None:
+        """Append a phase change or a warning (`level` ``info`` or ``warning``). Never raises."""
+        self._put({"kind": "event", "t_s": t_s, "level": level, "text": text}, t_s)
+
+    def close(self, summary: Mapping[str, Any] | None = None) -> None:
+        """Append the summary, if there is one, and close. Never raises; twice is once."""
+        if self._closed:
+            return
+        if summary is not None:
+            lost = {"lost_records": self.lost_records, "problem": self.problem}
+            self._failed_s = None  # one last try, whatever happened before
+            self._put({"kind": "summary", **summary, **lost}, None)
+        self._closed = True
+        if self._sync_thread is not None:
+            self._sync_thread.join(CLOSE_TIMEOUT_S)
+            if self._sync_thread.is_alive():
+                # The disk hangs: the records are with the kernel, more cannot be done.
+                self._remember("the disk does not answer")
+                return
+        if self._fsync:
+            self._sync_to_disk()
+        with suppress(OSError):
+            os.close(self._fd)
+
+    def _put(self, record: Mapping[str, Any], t_s: float | None) -> None:
+        if self._closed or self._is_waiting(t_s):
+            self.lost_records += 1
+            return
+        try:
+            self._append(encode(record))
+        except (OSError, TypeError, ValueError, RecursionError) as error:
+            self.lost_records += 1
+            self._failed_s = t_s
+            self._remember(_explain(error))
+            return
+        self._failed_s = None
+        if self._fsync and t_s is not None:
+            self._sync_sometimes(t_s)
+
+    def _is_waiting(self, t_s: float | None) -> bool:
+        """After a failure the disk is left alone for a while: a failing one is slow."""
+        if t_s is None or self._failed_s is None:
+            return False
+        return t_s - self._failed_s < RETRY_PERIOD_S
+
+    def _append(self, line: bytes) -> None:
+        """Write the whole line or, on failure, leave no piece of it behind."""
+        done = 0
+        try:
+            while done < len(line):
+                done += os.write(self._fd, line[done:])
+        except OSError:
+            if done:
+                with suppress(OSError):
+                    os.ftruncate(self._fd, self._good_bytes)
+            raise
+        self._good_bytes += done
+
+    def _sync_sometimes(self, t_s: float) -> None:
+        if self._synced_s is None:
+            self._synced_s = t_s
+        busy = self._sync_thread is not None and self._sync_thread.is_alive()
+        if busy or t_s - self._synced_s < FSYNC_PERIOD_S:
+            return
+        self._synced_s = t_s
+        # A slow disk may take longer than the loop can wait.
+        self._sync_thread = threading.Thread(target=self._sync_to_disk, daemon=True)
+        self._sync_thread.start()
+
+    def _sync_to_disk(self) -> None:
+        try:
+            os.fsync(self._fd)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a pipe, a special file
+                self._remember(_explain(error))
+
+    def _remember(self, problem: str) -> None:
+        if self.problem is None:
+            self.problem = problem
+
+
+def _create(path: Path) -> tuple[Path, int]:
+    """A file that did not exist before, by `path`'s name or the next free one."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
+    for number in count(1):
+        free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        with suppress(FileExistsError):
+            return free, os.open(free, flags, 0o644)
+    raise AssertionError("unreachable")
+
+
+def _time_of(record: Mapping[str, Any]) -> float | None:
+    t_s = record.get("t_s")
+    return float(t_s) if isinstance(t_s, (int, float)) else None
+
+
+def _explain(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return f"the flight log cannot be written: {error.strerror or error}"
+    return f"a record cannot be written into the flight log: {error}"
+
+
+def _cannot_start(path: Path, error: OSError) -> str:
+    return (
+        f"{path}: the flight log cannot be created ({error.strerror or error}); free the place "
+        f"or name another folder in the profile (log.directory)"
+    )

@@ -1,0 +1,166 @@
+"""The named conditions that the mission's table debounces, and why a vehicle is held.
+
+A condition is true or false in one tick; `PlannerState.since` holds since when it has been
+true without a break, and `Context.held(name)` tells for how long.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from perchctl.mission.context import Context
+from perchctl.mission.state import Phase
+
+
+def _aligned(c: Context) -> bool:
+    align = c.profile.planner.align
+    return (
+        c.fresh
+        and c.error_xy_m <= align.xy_m
+        and abs(c.error_yaw_rad) <= math.radians(align.yaw_deg)
+    )
+
+
+def _settled(c: Context) -> bool:
+    """Under the target at the stand-off, slow, and seen by the small marker (fault 33)."""
+    ascend = c.profile.planner.ascend
+    return (
+        c.fresh
+        and c.small_is_fresh
+        and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+        and c.error_xy_m <= ascend.settle_xy_m
+        and abs(c.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
+        and c.speed_mps <= ascend.settle_speed_mps
+    )
+
+
+def _near_standoff(c: Context) -> bool:
+    ascend = c.profile.planner.ascend
+    return c.tracked and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+
+
+def _contact(c: Context) -> bool:
+    """Position, acceleration and thrust together (fault 40).
+
+    The gear is where the target is and has stopped; the accelerometer reads the
+    one g of a body at rest; yet the thrust is above what hovering takes, so the
+    ceiling must be carrying the difference.
+    """
+    perch, tel = c.profile.planner.perch, c.obs.telemetry
+    return (
+        abs(c.error_z_m) <= perch.contact_z_m
+        and abs(tel.velocity_mps[2]) <= perch.contact_speed_mps
+        and abs(tel.acc_z_g - 1.0) <= perch.contact_acc_g
+        and c.state.hover_thrust > 0
+        and tel.thrust >= perch.contact_thrust_ratio * c.state.hover_thrust
+    )
+
+
+def _magnet_holds(c: Context) -> bool:
+    """The vehicle stays up on a thrust that could not carry it."""
+    complete = c.profile.planner.complete
+    return c.obs.telemetry.thrust <= complete.hold_ratio * c.state.hover_thrust and not _slipping(c)
+
+
+def _slipping(c: Context) -> bool:
+    """Falling away from the proven contact, by position or by acceleration."""
+    complete, tel = c.profile.planner.complete, c.obs.telemetry
+    if c.state.contact_z_m is None:
+        return False
+    below = c.state.contact_z_m - tel.position_m[2] > complete.slip_m
+    sinking = tel.velocity_mps[2] < -0.15
+    return (below and sinking) or (sinking and tel.acc_z_g < complete.slip_acc_g)
+
+
+def _hanging(c: Context) -> bool:
+    """Held up by the magnet, wherever the mission is: still, at the target's height, on
+    a thrust that could not carry the vehicle."""
+    tel, complete = c.obs.telemetry, c.profile.planner.complete
+    return (
+        c.state.hover_thrust > 0
+        and tel.thrust <= complete.hold_ratio * c.state.hover_thrust
+        and c.height_m > 0.3
+        and c.state.anchor is not None
+        and abs(c.error_z_m) <= 0.15
+        and abs(tel.velocity_mps[2]) < 0.05
+        and abs(tel.acc_z_g - 1.0) <= c.profile.planner.perch.contact_acc_g
+    )
+
+
+def _steady(c: Context) -> bool:
+    return c.speed_mps <= c.profile.planner.recover.steady_mps
+
+
+def _at_takeoff_height(c: Context) -> bool:
+    return (
+        c.height_m >= 0.8 * c.profile.planner.takeoff_height_m
+        and c.speed_mps <= 0.25
+        and c.state.setpoint is not None
+    )
+
+
+def _estimated(c: Context) -> bool:
+    return c.fresh and c.state.anchor_spread_m <= c.profile.planner.estimate.spread_m
+
+
+def _tilted(c: Context) -> bool:
+    return c.tilt_rad > math.radians(c.profile.safety.max_tilt_deg)
+
+
+def _down(c: Context) -> bool:
+    """Motors off by the telemetry, and the supervisor agrees that nothing flies."""
+    return c.obs.telemetry.thrust < 1 and not c.flying
+
+
+def _resting(c: Context) -> bool:
+    """On the floor, or hung up: not moving although a lower height is asked for."""
+    tel = c.obs.telemetry
+    return abs(tel.velocity_mps[2]) < 0.05 and abs(tel.acc_z_g - 1.0) < 0.1
+
+
+CONDITIONS: dict[str, Callable[[Context], bool]] = {
+    "aligned": _aligned,
+    "settled": _settled,
+    "near_standoff": _near_standoff,
+    "contact": _contact,
+    "magnet_holds": _magnet_holds,
+    "slipping": _slipping,
+    "hanging": _hanging,
+    "untracked": lambda c: not c.tracked,
+    "steady": _steady,
+    "at_takeoff_height": _at_takeoff_height,
+    "estimated": _estimated,
+    "tilted": _tilted,
+    "down": _down,
+    "resting": _resting,
+    "battery_low": lambda c: c.battery_is_low,
+    "high_level_idle": lambda c: not c.high_level_active,
+}
+
+
+def conditions_since(view: Context) -> dict[str, float]:
+    """`PlannerState.since` of this tick. A condition seen while the vehicle is held
+    in place for a fault, or in stale telemetry, does not count."""
+    old = view.state.since
+    return {name: old.get(name, view.obs.t_s) for name, holds in CONDITIONS.items() if holds(view)}
+
+
+def hold_reason(c: Context) -> str:
+    """Why the vehicle must stay where it is in this tick, or the empty string."""
+    safety = c.profile.safety
+    if c.state.phase not in _HOLDABLE:
+        return ""
+    if c.telemetry_age_s > safety.telemetry_hold_s:
+        return f"telemetry is {c.telemetry_age_s:.1f} s old"
+    if c.state.jump_s is not None:
+        return "the state estimate jumped"
+    if c.obs.loop_late_s > safety.loop_late_hold_s:
+        return f"the control loop is {c.obs.loop_late_s:.1f} s late"
+    if c.state.phase in _CAMERA_PHASES and c.obs.camera_age_s > safety.camera_hold_s:
+        return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
+    return ""
+
+
+_CAMERA_PHASES = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND})
+_HOLDABLE = _CAMERA_PHASES | {Phase.RECOVER}

@@ -1,0 +1,155 @@
+"""What one tick means to the mission: state, observation and profile, and what follows from
+them: the vehicle's height and tilt, the target's error, the ages of what is known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from perchctl.geometry import Array, rot_z, rotation_from_rpy, wrap_rad
+from perchctl.mission.state import Observation, PlannerState
+from perchctl.profile import Profile
+from perchctl.vehicle import FLYING, HL_ACTIVE, HL_FINISHED, LOW_POWER, NO_BATTERY_READING_V
+
+HANGING_S = 1.0
+"""For how long a thrust below the weight must be enough before it proves the magnet."""
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    state: PlannerState
+    obs: Observation
+    profile: Profile
+
+    @property
+    def in_phase_s(self) -> float:
+        return self.obs.t_s - self.state.entered_s
+
+    def held(self, condition: str) -> float:
+        """Seconds for which the condition has been true; -1 when it is not."""
+        since = self.state.since.get(condition)
+        return -1.0 if since is None else self.obs.t_s - since
+
+    # --- the vehicle -----------------------------------------------------
+
+    @cached_property
+    def position_m(self) -> Array:
+        return np.array(self.obs.telemetry.position_m)
+
+    @cached_property
+    def speed_mps(self) -> float:
+        return math.sqrt(sum(v * v for v in self.obs.telemetry.velocity_mps))
+
+    @cached_property
+    def gear_world_m(self) -> Array:
+        tel = self.obs.telemetry
+        R = rotation_from_rpy(tel.roll_rad, tel.pitch_rad, tel.yaw_rad)
+        return self.position_m + R @ np.array(self.profile.vehicle.gear_body_m)
+
+    @property
+    def height_m(self) -> float:
+        """Above the ground the flight started from, in the estimate's world."""
+        ground = self.state.ground_m
+        return self.obs.telemetry.position_m[2] - (ground[2] if ground else 0.0)
+
+    @property
+    def telemetry_age_s(self) -> float:
+        return self.obs.t_s - self.obs.telemetry.t_s
+
+    @property
+    def flying(self) -> bool:
+        return self.obs.telemetry.has(FLYING)
+
+    @property
+    def high_level_active(self) -> bool:
+        return self.obs.telemetry.has(HL_ACTIVE)
+
+    @property
+    def high_level_finished(self) -> bool:
+        return self.obs.telemetry.has(HL_FINISHED)
+
+    @property
+    def tilt_rad(self) -> float:
+        tel = self.obs.telemetry
+        return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
+
+    @property
+    def battery_is_low(self) -> bool:
+        tel = self.obs.telemetry
+        known = tel.battery_v >= NO_BATTERY_READING_V
+        return tel.battery_state == LOW_POWER or (
+            known and tel.battery_v < self.profile.safety.min_load_v
+        )
+
+    # --- the target ------------------------------------------------------
+
+    @cached_property
+    def target_world_m(self) -> Array | None:
+        anchor = self.state.anchor
+        return None if anchor is None else anchor.at(self.obs.t_s)
+
+    @cached_property
+    def error_m(self) -> Array | None:
+        """(e_x, e_y, e_z) now: target relative to the gear, level frame, (3,)."""
+        if self.target_world_m is None:
+            return None
+        R_world_level = rot_z(self.obs.telemetry.yaw_rad)
+        return R_world_level.T @ (self.target_world_m - self.gear_world_m)
+
+    @cached_property
+    def error_xy_m(self) -> float:
+        e = self.error_m
+        return math.inf if e is None else math.hypot(e[0], e[1])
+
+    @cached_property
+    def error_z_m(self) -> float:
+        e = self.error_m
+        return math.inf if e is None else float(e[2])
+
+    @cached_property
+    def error_yaw_rad(self) -> float:
+        anchor = self.state.anchor
+        if anchor is None:
+            return math.inf
+        return wrap_rad(anchor.yaw_rad - self.obs.telemetry.yaw_rad)
+
+    @property
+    def target_age_s(self) -> float:
+        """Since the exposure of the last frame in which the target was measured."""
+        anchor = self.state.anchor
+        return math.inf if anchor is None else self.obs.t_s - anchor.t_s
+
+    @property
+    def tracked(self) -> bool:
+        """Seen, or coasting within the filter's n_max frames."""
+        return self.obs.target is not None
+
+    @property
+    def fresh(self) -> bool:
+        return self.tracked and self.target_age_s <= self._fresh_limit_s
+
+    @property
+    def small_is_fresh(self) -> bool:
+        return self.obs.t_s - self.state.small_seen_s <= self._fresh_limit_s
+
+    @property
+    def _fresh_limit_s(self) -> float:
+        # A frame is as old as the camera's latency when it arrives.
+        return self.profile.planner.ascend.fresh_s + self.profile.camera.latency_s
+
+    @property
+    def contact_goal_z_m(self) -> float:
+        """Height of the body at which the gear touches the target."""
+        target = self.target_world_m
+        if target is None:
+            return math.inf
+        return float(target[2]) - self.profile.vehicle.gear_body_m[2]
+
+    @property
+    def cone_m(self) -> float:
+        ascend = self.profile.planner.ascend
+        return ascend.cone_base_m + ascend.cone_slope * max(0.0, self.error_z_m)

@@ -1,0 +1,302 @@
+"""The mission as one ordered table: first match wins, safety rows on top.
+
+The README's diagram and `perchctl fly --help` are drawn from `TABLE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from perchctl.mission.context import HANGING_S, Context
+from perchctl.mission.state import FLYING_PHASES, Operator, Outcome, Phase, Severity
+from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
+
+Guard = Callable[[Context], bool]
+P, S, O = Phase, Severity, Outcome  # noqa: E741 - column names of the table below
+
+AIR = FLYING_PHASES | {P.LANDING}
+BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
+BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """From any of `phases`, when `when` holds, to `to`; `reason` is told to the user."""
+
+    name: str
+    phases: frozenset[Phase]
+    when: Guard
+    to: Phase
+    reason: str | Callable[[Context], str]
+    severity: Severity = Severity.CONTINUE
+    outcome: Outcome | None = None
+    counts_attempt: bool = False
+
+    def explain(self, view: Context) -> str:
+        return self.reason if isinstance(self.reason, str) else self.reason(view)
+
+
+def _only(*phases: Phase) -> frozenset[Phase]:
+    return frozenset(phases)
+
+
+def _left_jump_hold(c: Context) -> bool:
+    jump = c.state.jump_s
+    return jump is not None and c.obs.t_s - jump >= c.profile.safety.jump_hold_s
+
+
+def _fence_broken(c: Context) -> bool:
+    if c.state.ground_m is None:
+        return False
+    x, y, _ = c.obs.telemetry.position_m
+    dx, dy = x - c.state.ground_m[0], y - c.state.ground_m[1]
+    return (dx * dx + dy * dy) ** 0.5 > c.profile.safety.fence_radius_m
+
+
+def _searched_out(c: Context) -> bool:
+    return c.state.searches >= c.profile.planner.search.attempts
+
+
+def _attempts_used(c: Context) -> bool:
+    return c.state.attempts >= c.profile.planner.attempts
+
+
+def _is_high(c: Context) -> bool:
+    return c.height_m > 0.3 and abs(c.error_z_m) < 0.15
+
+
+def _settling_too_long(c: Context) -> bool:
+    ascend = c.profile.planner.ascend
+    return c.held("near_standoff") > ascend.settle_timeout_s
+
+
+TABLE: tuple[Row, ...] = (
+    # --- safety, gravest first -------------------------------------------
+    Row(
+        "operator-stop", AIR, lambda c: c.obs.operator >= Operator.STOP, P.ABORTED,
+        "second Ctrl-C: emergency stop", S.STOP, O.EMERGENCY,
+    ),
+    Row(
+        "locked", AIR, lambda c: c.obs.telemetry.has(LOCKED), P.ABORTED,
+        "the supervisor has locked the vehicle: inspect and restart it", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "tumbled", AIR, lambda c: c.obs.telemetry.has(TUMBLED), P.ABORTED,
+        "the vehicle has tumbled: inspect and restart it", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "crashed", AIR, lambda c: c.obs.telemetry.has(CRASHED), P.ABORTED,
+        "the supervisor reports a crash: inspect and restart the vehicle", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "tilted", AIR,
+        lambda c: c.held("tilted") >= c.profile.safety.tilt_debounce_s
+        and not c.state.motors_stopped,
+        P.ABORTED, "tilted beyond the limit: motors cut", S.STOP, O.SAFETY,
+    ),
+    Row(
+        "operator-land", FLYING_PHASES, lambda c: c.obs.operator >= Operator.LAND, P.LANDING,
+        "the operator asked to land", S.LAND, O.OPERATOR,
+    ),
+    Row(
+        "link-lost", FLYING_PHASES, lambda c: c.obs.link_problem is not None, P.LANDING,
+        lambda c: f"link lost: {c.obs.link_problem}", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "telemetry-stale", FLYING_PHASES,
+        lambda c: c.telemetry_age_s > c.profile.safety.telemetry_land_s, P.LANDING,
+        lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "estimator-jump", FLYING_PHASES, _left_jump_hold, P.LANDING,
+        "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "battery-low", BEFORE_CONTACT,
+        lambda c: c.held("battery_low") >= c.profile.safety.battery_debounce_s, P.LANDING,
+        lambda c: f"battery at {c.obs.telemetry.battery_v:.2f} V under load", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "battery-unknown", BEFORE_CONTACT,
+        lambda c: c.obs.battery_age_s > c.profile.safety.battery_stale_s, P.LANDING,
+        "the battery's reading stands still", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "height-limit", BEFORE_CONTACT,
+        lambda c: c.height_m > c.profile.safety.max_height_m, P.LANDING,
+        lambda c: f"height {c.height_m:.2f} m is above the limit", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "fence", BEFORE_CONTACT, _fence_broken, P.LANDING,
+        "outside the fence", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "camera-gone", BY_CAMERA,
+        lambda c: c.obs.camera_age_s > c.profile.safety.camera_land_s, P.LANDING,
+        lambda c: c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s",
+        S.LAND, O.SAFETY,
+    ),
+    Row(
+        "loop-late", FLYING_PHASES,
+        lambda c: c.obs.loop_late_s > c.profile.safety.loop_late_land_s, P.LANDING,
+        lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "markers-disagree", BY_CAMERA,
+        lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames, P.LANDING,
+        "large and small marker contradict each other: check the printed sizes in the "
+        "profile and the camera's calibration",
+        S.LAND, O.SAFETY,
+    ),
+    Row(
+        "log-lost", BEFORE_CONTACT,
+        lambda c: c.profile.safety.land_on_log_error and c.obs.log_problem is not None,
+        P.LANDING, lambda c: f"flight log: {c.obs.log_problem}", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "time-over", BEFORE_CONTACT,
+        lambda c: c.obs.t_s - c.state.started_s > c.profile.planner.perching_time_s, P.LANDING,
+        "the perching time is over", S.LAND, O.ATTEMPTS_USED_UP,
+    ),
+    # --- the magnet may catch early ---------------------------------------------
+    Row(
+        "caught", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
+        lambda c: c.held("hanging") >= HANGING_S, P.COMPLETE,
+        "hanging on the magnet already",
+    ),
+    # --- phase 1: approach ---------------------------------------------------
+    Row(
+        "approached", _only(P.APPROACH), lambda c: c.held("at_takeoff_height") >= 0.3, P.SEARCH,
+        "hovering in the perching area",
+    ),
+    Row(
+        "approach-timeout", _only(P.APPROACH),
+        lambda c: c.in_phase_s > c.profile.planner.approach_timeout_s, P.LANDING,
+        lambda c: f"take-off reached only {c.height_m:.2f} m", S.LAND, O.SAFETY,
+    ),
+    # --- phase 2: search -----------------------------------------------------
+    Row(
+        "found", _only(P.SEARCH),
+        lambda c: c.state.confirmed >= c.profile.planner.search.confirm_frames, P.ESTIMATE,
+        "target seen",
+    ),
+    Row(
+        "searched-out", _only(P.SEARCH), _searched_out, P.LANDING,
+        lambda c: "target not found in the allowed attempts"
+        + (f" ({c.obs.camera_problem})" if c.obs.camera_problem else ""),
+        S.LAND, O.TARGET_NOT_FOUND,
+    ),
+    # --- phase 3: estimate ---------------------------------------------------
+    Row(
+        "estimate-lost", _only(P.ESTIMATE),
+        lambda c: c.held("untracked") > 1.0
+        or c.in_phase_s > c.profile.planner.estimate.timeout_s,
+        P.SEARCH, "the target's pose does not settle", S.HOLD,
+    ),
+    Row(
+        "estimated", _only(P.ESTIMATE),
+        lambda c: c.held("estimated") >= c.profile.planner.estimate.dwell_s, P.ALIGN,
+        "pose is steady",
+    ),
+    # --- phase 4: align ------------------------------------------------------
+    Row(
+        "align-lost", _only(P.ALIGN), lambda c: not c.tracked, P.SEARCH,
+        "target lost in alignment", S.HOLD,
+    ),
+    Row(
+        "align-timeout", _only(P.ALIGN),
+        lambda c: c.in_phase_s > c.profile.planner.align.timeout_s, P.RECOVER,
+        "alignment took too long", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "aligned", _only(P.ALIGN),
+        lambda c: c.held("aligned") >= c.profile.planner.align.dwell_s, P.ASCEND,
+        "aligned in position and heading",
+    ),
+    # --- phase 5: ascend -----------------------------------------------------
+    Row(
+        "ascend-lost", _only(P.ASCEND), lambda c: not c.tracked, P.RECOVER,
+        "target lost in ascent", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "outside-cone", _only(P.ASCEND),
+        lambda c: c.error_xy_m > c.cone_m, P.ALIGN,
+        "drifted out of the cone", S.HOLD,
+    ),
+    Row(
+        "ascend-timeout", _only(P.ASCEND),
+        lambda c: c.in_phase_s > c.profile.planner.ascend.timeout_s or _settling_too_long(c),
+        P.RECOVER, "does not settle under the target", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "settled", _only(P.ASCEND),
+        lambda c: c.held("settled") >= c.profile.planner.ascend.settle_dwell_s, P.PERCH,
+        "settled at the stand-off",
+    ),
+    # --- phase 6: perch ------------------------------------------------------
+    Row(
+        "contact", _only(P.PERCH),
+        lambda c: c.held("contact") >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
+        "contact proven by position, acceleration and thrust",
+    ),
+    Row(
+        "no-contact", _only(P.PERCH),
+        lambda c: c.in_phase_s > c.profile.planner.perch.timeout_s, P.RECOVER,
+        "no proof of contact", S.BACK_OFF, counts_attempt=True,
+    ),
+    # --- phase 7: completion -------------------------------------------------
+    Row(
+        "slipped", _only(P.COMPLETE), lambda c: c.held("slipping") >= 0.03, P.RECOVER,
+        lambda c: "slipped while hanging" if c.state.motors_stopped else "the magnet does not hold",
+        S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "not-released", _only(P.COMPLETE),
+        lambda c: not c.state.motors_stopped
+        and c.in_phase_s > c.profile.planner.complete.release_timeout_s,
+        P.RECOVER, "the thrust could not be released", S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "perched", _only(P.COMPLETE),
+        lambda c: c.state.motors_stopped
+        and c.held("down") >= 0.1
+        and c.in_phase_s >= c.profile.planner.complete.watch_s,
+        P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
+    ),
+    # --- the failed attempt --------------------------------------------------
+    Row(
+        "attempts-used", _only(P.RECOVER),
+        lambda c: _attempts_used(c) and c.in_phase_s > 0.5, P.LANDING,
+        "all perching attempts are used up", S.LAND, O.ATTEMPTS_USED_UP,
+    ),
+    Row(
+        "recovered", _only(P.RECOVER),
+        lambda c: c.held("steady") >= c.profile.planner.recover.dwell_s
+        and c.in_phase_s >= c.profile.planner.recover.dwell_s,
+        P.ESTIMATE, "steady again, trying once more",
+    ),
+    Row(
+        "recover-timeout", _only(P.RECOVER),
+        lambda c: c.in_phase_s > c.profile.planner.recover.timeout_s, P.LANDING,
+        "the vehicle does not become steady", S.LAND, O.SAFETY,
+    ),
+    # --- landing ---------------------------------------------------------------
+    Row(
+        "landed", _only(P.LANDING), lambda c: c.held("down") >= 0.1, P.LANDED,
+        lambda c: "motors off, hanging on the magnet" if _is_high(c) else "motors off",
+    ),
+    Row(
+        "landing-timeout", _only(P.LANDING),
+        lambda c: c.in_phase_s > c.profile.planner.landing.timeout_s, P.ABORTED,
+        "the landing was not confirmed in time", S.LAND, O.SAFETY,
+    ),
+)  # fmt: skip
+
+
+def first_match(view: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
+    """The first row that applies to the view's phase, or None to stay."""
+    for row in table:
+        if view.state.phase in row.phases and row.when(view):
+            return row
+    return None

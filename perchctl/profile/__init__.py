@@ -1,0 +1,73 @@
+"""Profiles: one YAML file says everything a flight depends on.
+
+schema: the models, each key with its bounds. load: reading, `extends`, the files a profile
+names. places: where shipped and the user's files are. dictionaries: ArUco's ids.
+"""
+
+from perchctl.profile.load import (
+    find_calibration,
+    find_profile,
+    find_weights,
+    load_profile,
+    read_weights,
+)
+from perchctl.profile.schema import (
+    AlignConfig,
+    AscendConfig,
+    CameraConfig,
+    CompleteConfig,
+    DetectorConfig,
+    EstimateConfig,
+    FittedWeights,
+    KalmanConfig,
+    LandingConfig,
+    LinkConfig,
+    LogConfig,
+    MarkerConfig,
+    MergeConfig,
+    Mounting,
+    PerchConfig,
+    PlannerConfig,
+    PoseConfig,
+    Profile,
+    RecoverConfig,
+    SafetyConfig,
+    SearchConfig,
+    SimulationConfig,
+    TargetConfig,
+    VehicleConfig,
+    WeightsConfig,
+)
+
+__all__ = [
+    "AlignConfig",
+    "AscendConfig",
+    "CameraConfig",
+    "CompleteConfig",
+    "DetectorConfig",
+    "EstimateConfig",
+    "FittedWeights",
+    "KalmanConfig",
+    "LandingConfig",
+    "LinkConfig",
+    "LogConfig",
+    "MarkerConfig",
+    "MergeConfig",
+    "Mounting",
+    "PerchConfig",
+    "PlannerConfig",
+    "PoseConfig",
+    "Profile",
+    "RecoverConfig",
+    "SafetyConfig",
+    "SearchConfig",
+    "SimulationConfig",
+    "TargetConfig",
+    "VehicleConfig",
+    "WeightsConfig",
+    "find_calibration",
+    "find_profile",
+    "find_weights",
+    "load_profile",
+    "read_weights",
+]

@@ -1,0 +1,168 @@
+"""From a profile's name or path to a checked, frozen `Profile`.
+
+`load_profile(name_or_path)` reads the file, follows `extends`, and checks the whole.
+Every fault is one `InvalidValue` sentence of the form ``file: key: what is wrong``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.profile.places import data_file, data_folder, listing, user_config_folder
+from perchctl.profile.schema import FittedWeights, Profile
+
+
+def find_profile(name: str) -> Path:
+    """The file of a profile given by path or by name; NotFound names the choices."""
+    if "/" in name or name.endswith((".yaml", ".yml")):
+        path = Path(name).expanduser()
+        if path.is_file():
+            return path
+        what = "is a folder" if path.is_dir() else "does not exist"
+        raise NotFound(f"profile file {name} {what}; shipped profiles are {_choices()}")
+    found = data_file("profiles", name)
+    if found is None:
+        raise NotFound(f"profile {name!r} not found; give a path, or one of {_choices()}")
+    return found
+
+
+def load_profile(name: str, *, with_weights: bool = True) -> Profile:
+    """Read, resolve `extends` and check a profile; the weights of its `merge.weights_file`
+    take the place of `merge.weights` unless told otherwise. Errors: NotFound, InvalidValue."""
+    path = find_profile(name)
+    values = _resolved(path, seen=())
+    values.setdefault("name", path.stem)
+    try:
+        profile = Profile.model_validate(values)
+    except ValidationError as error:
+        raise InvalidValue(_one_sentence(path, error)) from None
+    if profile.merge.weights_file is None or not with_weights:
+        return profile
+    fitted = read_weights(find_weights(profile.merge.weights_file, path))
+    merge = profile.merge.model_copy(update={"weights": fitted.weights})
+    return profile.model_copy(update={"merge": merge})
+
+
+def find_weights(name: str, profile_path: Path) -> Path:
+    """A weights file by its whole path, beside the profile, or in the user's folder."""
+    given = Path(name).expanduser()
+    for candidate in (given, profile_path.parent / name):
+        if candidate.is_absolute() and candidate.is_file():
+            return candidate
+    beside = profile_path.resolve().parent / name
+    found = beside if beside.is_file() else data_file("weights", name)
+    if found is None:
+        raise NotFound(
+            f"{profile_path}: merge.weights_file: {name} is neither beside the profile nor in "
+            f"{user_config_folder() / 'weights'}; perchctl fit-weights makes one, or remove the key"
+        )
+    return found
+
+
+def read_weights(path: Path) -> FittedWeights:
+    """Read and check a weights file. Errors: NotFound, InvalidValue."""
+    values = _read_yaml(path)
+    try:
+        return FittedWeights.model_validate(values)
+    except ValidationError as error:
+        raise InvalidValue(_one_sentence(path, error)) from None
+
+
+def find_calibration(name: str, profile_path: Path | None = None) -> Path:
+    """A calibration file by path, beside the profile, or by name from `calib/`."""
+    candidates = [Path(name).expanduser()]
+    if profile_path is not None:
+        candidates.append(profile_path.parent / name)
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    found = data_file("calib", name)
+    if found is None:
+        raise NotFound(
+            f"calibration file {name} not found; give a path, or one of "
+            f"{', '.join(listing('calib')) or 'none (' + str(data_folder('calib')) + ' is empty)'}"
+        )
+    return found
+
+
+def _choices() -> str:
+    return ", ".join(listing("profiles"))
+
+
+def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
+    if path in seen:
+        raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
+    values = _read_yaml(path)
+    _place_weights(values, path)
+    base_name = values.pop("extends", None)
+    if base_name is None:
+        return values
+    if not isinstance(base_name, str):
+        raise InvalidValue(f"{path}: extends: must be the name or path of a profile")
+    beside = path.parent / base_name
+    base = beside if beside.is_file() else find_profile(base_name)
+    return _merged(_resolved(base, (*seen, path)), values)
+
+
+def _place_weights(values: dict[str, Any], path: Path) -> None:
+    """A weights file beside the profile that names it, whichever extends that one."""
+    merge = values.get("merge")
+    name = merge.get("weights_file") if isinstance(merge, dict) else None
+    if isinstance(name, str) and (beside := path.resolve().parent / name).is_file():
+        values["merge"] = {**merge, "weights_file": str(beside)}  # type: ignore[dict-item]
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise InvalidValue(f"{path}: line {line}: not YAML: {error.problem}") from None
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InvalidValue(
+            f"{path}: not a text file in YAML ({error.__class__.__name__})"
+        ) from None
+    except OSError as error:
+        raise NotFound(f"{path}: cannot be read: {error.strerror}") from None
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise InvalidValue(f"{path}: must hold keys and values, found {type(values).__name__}")
+    return values
+
+
+def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    result = dict(base)
+    for key, value in over.items():
+        old = result.get(key)
+        both = isinstance(old, dict) and isinstance(value, dict)
+        result[key] = _merged(old, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def _one_sentence(path: Path, error: ValidationError) -> str:
+    faults = error.errors(include_url=False)
+    first = faults[0]
+    key = ".".join(str(part) for part in first["loc"]) or "profile"
+    if first["type"] == "extra_forbidden":
+        text = f"this key is unknown; allowed here are {', '.join(_keys_at(first['loc'][:-1]))}"
+    elif first["type"] == "value_error":
+        text = str(first["ctx"]["error"])
+    else:
+        text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {first['input']!r}"
+        if key.endswith("_m") and first["type"] == "less_than_equal":
+            text += " (metres: were millimetres or centimetres meant?)"
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return f"{path}: {key}: {text}{more}"
+
+
+def _keys_at(loc: tuple[int | str, ...]) -> list[str]:
+    model: Any = Profile
+    for part in loc:
+        model = model.model_fields[part].annotation
+    return list(model.model_fields)

@@ -1,0 +1,38 @@
+"""Where perchctl finds its shipped files and puts the user's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import platformdirs
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def data_folder(kind: str) -> Path:
+    """Shipped `profiles` or `calib`: inside an installed wheel, or in the checkout."""
+    shipped = _PACKAGE / "_data" / kind
+    return shipped if shipped.is_dir() else _PACKAGE.parent / kind
+
+
+def data_file(kind: str, name: str) -> Path | None:
+    """A shipped or user file by name (with or without .yaml), or None."""
+    for folder in (user_config_folder() / kind, data_folder(kind)):
+        for candidate in (folder / name, folder / f"{name}.yaml"):
+            if candidate.is_file():
+                return candidate
+    return None
+
+
+def listing(kind: str) -> list[str]:
+    """Names of the files of that kind that can be named without a path."""
+    folders = (data_folder(kind), user_config_folder() / kind)
+    return sorted({p.stem for f in folders if f.is_dir() for p in f.glob("*.yaml")})
+
+
+def user_config_folder() -> Path:
+    return Path(platformdirs.user_config_dir("perchctl", appauthor=False))
+
+
+def user_cache_folder() -> Path:
+    return Path(platformdirs.user_cache_dir("perchctl", appauthor=False))

@@ -1,0 +1,72 @@
+"""The child process: be the vehicle that the parent describes, or one started by hand.
+
+``python -m perchctl.sim.process --port 19850`` runs one in the foreground.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Sequence
+
+import cv2
+
+from perchctl.calibration.files import load_calibration
+from perchctl.errors import PerchError
+from perchctl.profile.places import data_file
+from perchctl.sim.process.control import HostSetup, connect
+from perchctl.sim.process.handle import START_TIMEOUT_S
+from perchctl.sim.process.host import VehicleHost
+from perchctl.sim.process.runner import Runner
+from perchctl.sim.scenario import Scenario
+
+
+def serve_parent() -> None:
+    """The child: be the vehicle that the parent describes, until it says stop or is gone."""
+    cv2.setNumThreads(1)  # the picture must not take the physics' core
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    port, token = sys.stdin.readline().split()
+    channel = connect(int(port), token)
+    setup = channel.receive(START_TIMEOUT_S)
+    realtime = setup.pace == "realtime"
+    try:
+        host = VehicleHost(setup, live=realtime)
+    except (PerchError, OSError, ValueError) as error:
+        channel.send(f"{type(error).__name__}: {error}")
+        return
+    with contextlib.closing(host):
+        channel.send((host.uri, host.stream.url if host.stream is not None else ""))
+        Runner(host, channel, realtime=realtime, linger_s=setup.linger_s).run()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """A simulated vehicle in the foreground, in real time, until Ctrl-C."""
+    parser = argparse.ArgumentParser(
+        prog="python -m perchctl.sim.process",
+        description="A simulated Crazyflie on udp://, its camera on http://, until Ctrl-C.",
+    )
+    parser.add_argument("--port", type=int, default=19850, help="UDP port of the vehicle")
+    parser.add_argument("--http-port", type=int, default=8080, help="port of the camera's stream")
+    parser.add_argument("--seed", type=int, default=0, help="seed of noise and drops")
+    options = parser.parse_args(arguments)
+
+    calibration = data_file("calib", "example_640x480")
+    setup = HostSetup(
+        scenario=Scenario(seed=options.seed),
+        camera=load_calibration(calibration) if calibration is not None else None,
+        port=options.port,
+        http_port=options.http_port,
+    )
+    try:
+        host = VehicleHost(setup, live=True)
+    except PerchError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    with contextlib.closing(host):
+        stream = host.stream.url if host.stream is not None else "none"
+        print(f"vehicle {host.uri}\ncamera  {stream}\nCtrl-C ends it", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            Runner(host, None, realtime=True, linger_s=0.0).run()
+    return 0

@@ -1,0 +1,254 @@
+"""The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
+
+`SimProcess` is the handle in the process that flies. The child does not share its
+terminal's Ctrl-C and outlives a killed parent by a few seconds (`runner`), as a
+real vehicle would.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import IO, TYPE_CHECKING, Any, Literal
+
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
+from perchctl.sim.scenario import Scenario
+
+if TYPE_CHECKING:
+    from perchctl.profile import TargetConfig
+    from perchctl.sim.crtp.server import LinkOptions
+    from perchctl.sim.process.control import Channel
+    from perchctl.vision.types import CameraModel
+
+Pace = Literal["realtime", "stepped"]
+START_TIMEOUT_S = 30.0
+ANSWER_TIMEOUT_S = 15.0
+SLOWEST_PACE = 20.0
+"""Wall-clock seconds allowed for one simulated second of `advance`."""
+_STOP_TIMEOUT_S = 5.0
+# -P and the path at the end: an installed package is found as usual, a checkout too,
+# and nothing in the working directory can shadow a module.
+_CHILD = (
+    "import sys; sys.path.append(sys.argv[1]); "
+    "from perchctl.sim.process.child import serve_parent; serve_parent()"
+)
+
+
+class SimProcess:
+    """Handle of a running simulated vehicle; a context manager.
+
+    `uri` is for cflib, `stream_url` for a network camera ("" without a camera). All
+    methods may be called from any thread; they raise `ConnectionFailed` when the child
+    is gone and `TimedOut` when it does not answer.
+    """
+
+    def __init__(self, child: subprocess.Popen[bytes], channel: Channel, stderr: IO[bytes]) -> None:
+        self._child = child
+        self._channel = channel
+        self._stderr = stderr
+        self._lock = threading.Lock()
+        self._stopped = False
+        self.uri = ""
+        self.stream_url = ""
+
+    @classmethod
+    def start(
+        cls,
+        scenario: Scenario | None = None,
+        pace: Pace = "realtime",
+        *,
+        camera: CameraModel | None = None,
+        target: TargetConfig | None = None,
+        link: LinkOptions | None = None,
+        port: int = 0,
+        http_port: int = 0,
+        truth_file: Path | None = None,
+        linger_s: float | None = None,
+        timeout_s: float = START_TIMEOUT_S,
+    ) -> SimProcess:
+        """Start the vehicle and wait, for at most `timeout_s`, until it answers.
+
+        Ports 0 are chosen by the operating system. `truth_file` receives JSON lines of
+        `truth()`, 50 a simulated second. `linger_s` is how long the vehicle lives on
+        after this process has gone (None: `control.LINGER_S`). Raises
+        `ConnectionFailed` when the child ends or does not come up, `InvalidValue` for an
+        unknown pace.
+        """
+        from perchctl.sim.crtp.server import LinkOptions
+        from perchctl.sim.process import control
+
+        if pace not in ("realtime", "stepped"):
+            raise InvalidValue(f"pace {pace!r} is unknown, choose 'realtime' or 'stepped'")
+        setup = control.HostSetup(
+            scenario=scenario or Scenario(),
+            pace=pace,
+            camera=camera,
+            target=target,
+            link=link or LinkOptions(),
+            port=port,
+            http_port=http_port,
+            truth_file=str(truth_file) if truth_file is not None else None,
+            linger_s=linger_s if linger_s is not None else control.LINGER_S,
+        )
+        token = secrets.token_hex(control.TOKEN_BYTES)
+        stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
+        with control.listen() as listener:
+            child = _spawn(stderr)
+            assert child.stdin is not None
+            with contextlib.suppress(OSError), child.stdin:
+                child.stdin.write(f"{listener.getsockname()[1]} {token}\n".encode())
+            channel = control.accept(listener, token, timeout_s, lambda: child.poll() is None)
+        if channel is None:
+            raise _gave_up(child, stderr, f"did not come up within {timeout_s:.0f} s")
+        process = cls(child, channel, stderr)
+        try:
+            channel.send(setup)
+            answer = channel.receive(timeout_s)
+        except (EOFError, OSError):
+            channel.close()
+            raise _gave_up(child, stderr, "gave no answer") from None
+        if isinstance(answer, str):
+            process.stop()
+            raise ConnectionFailed(f"the simulated vehicle could not start: {answer}")
+        process.uri, process.stream_url = answer
+        return process
+
+    @property
+    def pid(self) -> int:
+        return self._child.pid
+
+    def is_running(self) -> bool:
+        return self._child.poll() is None
+
+    def advance(self, dt_s: float) -> float:
+        """Let `dt_s` pass (stepped pace only); the simulated time since the start."""
+        if dt_s < 0.0:
+            raise InvalidValue(f"time cannot go back ({dt_s} s)")
+        allowed_s = ANSWER_TIMEOUT_S + SLOWEST_PACE * dt_s
+        return float(self._ask("advance", allowed_s, dt_s=dt_s))
+
+    def truth(self) -> dict[str, Any]:
+        """The true state: `VehicleHost.truth`, SI and radians, world frame."""
+        state: dict[str, Any] = self._ask("truth")
+        return state
+
+    def set_pose(
+        self,
+        position_m: tuple[float, float, float],
+        rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        *,
+        velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        hold: bool = False,
+    ) -> None:
+        """Put the vehicle somewhere; `hold` pins it there until `let_go`."""
+        self._ask(
+            "set_pose", position_m=position_m, rpy_rad=rpy_rad, velocity_mps=velocity_mps, hold=hold
+        )
+
+    def let_go(self) -> None:
+        self._ask("let_go")
+
+    def set_battery(self, rest_v: float) -> None:
+        """Change the battery's resting voltage."""
+        self._ask("set_battery", rest_v=rest_v)
+
+    def push(self, force_n: tuple[float, float, float]) -> None:
+        """A constant outside force, world axes, until changed."""
+        self._ask("push", force_n=force_n)
+
+    def silence(self, duration_s: float) -> None:
+        """The vehicle hears and says nothing for `duration_s` of simulated time."""
+        self._ask("silence", duration_s=duration_s)
+
+    def reboot(self) -> None:
+        """Restart the firmware, as the power button does; log blocks are lost."""
+        self._ask("reboot")
+
+    def replace_vehicle(self, scenario: Scenario) -> None:
+        """A new vehicle under the same link; a client's log blocks go on."""
+        self._ask("replace_vehicle", scenario=scenario)
+
+    def stop(self) -> None:
+        """End the vehicle's process. May be called twice."""
+        if self._stopped:
+            return
+        self._stopped = True
+        with contextlib.suppress(PerchError):
+            self._ask("stop", _STOP_TIMEOUT_S)
+        self._channel.close()
+        _end(self._child)
+        self._stderr.close()
+
+    def __enter__(self) -> SimProcess:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def _ask(self, name: str, timeout_s: float = ANSWER_TIMEOUT_S, **arguments: Any) -> Any:
+        with self._lock:
+            try:
+                self._channel.send((name, arguments))
+                good, result = self._channel.receive(timeout_s)
+            except TimeoutError:
+                raise TimedOut(
+                    f"the simulated vehicle did not answer {name!r} within {timeout_s:.0f} s"
+                ) from None
+            except (EOFError, OSError):
+                raise ConnectionFailed(
+                    f"the simulated vehicle has ended{_last_line(self._stderr)}"
+                ) from None
+        if not good:
+            raise InvalidValue(f"the simulated vehicle refused {name!r}: {result}")
+        return result
+
+
+def _spawn(stderr: IO[bytes]) -> subprocess.Popen[bytes]:
+    root = str(Path(__file__).resolve().parents[3])
+    command = [sys.executable, "-P", "-c", _CHILD, root]
+    if sys.platform == "win32":
+        flags = subprocess.CREATE_NEW_PROCESS_GROUP
+        return subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=stderr, stderr=stderr, creationflags=flags
+        )
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=stderr, stderr=stderr, start_new_session=True
+    )
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    try:
+        child.wait(_STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()
+
+
+def _gave_up(child: subprocess.Popen[bytes], stderr: IO[bytes], why: str) -> ConnectionFailed:
+    code = child.poll()
+    child.kill()
+    child.wait()
+    what = f"ended with code {code}" if code is not None else why
+    error = ConnectionFailed(f"the simulated vehicle {what}{_last_line(stderr)}")
+    stderr.close()
+    return error
+
+
+def _last_line(stderr: IO[bytes]) -> str:
+    """The child's last words, for a message."""
+    if stderr.closed:
+        return ""
+    stderr.seek(0)
+    lines = stderr.read().decode(errors="replace").strip().splitlines()
+    return f": {lines[-1]}" if lines else ""

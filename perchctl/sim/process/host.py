@@ -1,0 +1,180 @@
+"""The simulated vehicle behind its link and its video: what runs in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import deque
+from pathlib import Path
+from typing import Any, TextIO
+
+from perchctl.geometry import rpy_from_rotation
+from perchctl.sim.crtp.server import CrtpServer
+from perchctl.sim.crtp.udp import UdpEndpoint
+from perchctl.sim.process.control import HostSetup
+from perchctl.sim.process.mjpeg import MjpegServer
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim.world import TrueState
+
+TRUTH_EVERY = 10  # control periods between two lines of the truth file
+_PAST_S = 1.0  # how far the picture may lag behind the physics
+_WAKE_EVERY = 5  # control periods between two looks of the renderer at the physics
+
+
+class VehicleHost:
+    """One vehicle, its CRTP endpoint and its video stream.
+
+    `live` moves the rendering into a thread of its own, so that a picture never holds
+    up the physics; otherwise pictures are rendered within the steps, exactly in order.
+    """
+
+    def __init__(self, setup: HostSetup, *, live: bool) -> None:
+        self._setup = setup
+        self._live = live
+        self._steps = 0
+        self.vehicle = SimulatedVehicle(setup.scenario, setup.camera, setup.target)
+        self.server = CrtpServer(self.vehicle.firmware, setup.link)
+        self.endpoint = UdpEndpoint(setup.port, setup.link)
+        self.stream: MjpegServer | None = None
+        self._truth: TextIO | None = None
+        try:
+            if setup.camera is not None:
+                self.stream = MjpegServer(setup.http_port)
+            if setup.truth_file is not None:
+                self._truth = Path(setup.truth_file).open("w", encoding="utf-8")  # noqa: SIM115
+        except BaseException:
+            self.close()
+            raise
+        self._feed = self._new_feed()
+
+    @property
+    def uri(self) -> str:
+        return f"udp://127.0.0.1:{self.endpoint.port}"
+
+    @property
+    def elapsed_s(self) -> float:
+        """Simulated time since the start; unlike the firmware's, no reboot resets it."""
+        return self._steps * CONTROL_PERIOD_S
+
+    def serve(self) -> None:
+        """Answer what has arrived, without time passing; log data waits for the next step."""
+        self.endpoint.serve(self.server, self.elapsed_s)
+
+    def step(self) -> None:
+        """Packets that have arrived, one control period, then what is due to be sent."""
+        self.endpoint.serve(self.server, self.elapsed_s)
+        if self._feed is not None:
+            self.vehicle.firmware.step()
+            self._feed.add(self.vehicle.world.state())
+        else:
+            self.vehicle.step()
+            self._publish_arrived()
+        self._steps += 1
+        self.endpoint.send_due(self.server, self.elapsed_s)
+        if self._truth is not None and self._steps % TRUTH_EVERY == 0:
+            self._truth.write(json.dumps(self.truth()) + "\n")
+            self._truth.flush()
+
+    def advance(self, dt_s: float) -> None:
+        for _ in range(round(dt_s / CONTROL_PERIOD_S)):
+            self.step()
+
+    def truth(self) -> dict[str, Any]:
+        """What no Crazyflie could tell: the true state, SI and radians, plus what it says."""
+        world, firmware = self.vehicle.world, self.vehicle.firmware
+        state = world.state()
+        return {
+            "t_s": self.elapsed_s,
+            "position_m": tuple(state.position_m.tolist()),
+            "velocity_mps": tuple(state.velocity_mps.tolist()),
+            "rpy_rad": rpy_from_rotation(state.R_world_body),
+            "specific_force_mps2": tuple(state.specific_force_mps2.tolist()),
+            "battery_v": world.battery_v,
+            "motors": tuple(int(firmware.log_value(f"motor.m{i}")) for i in (1, 2, 3, 4)),
+            "supervisor_info": firmware.supervisor_info,
+            "floor_contact": state.floor_contact,
+            "ceiling_force_n": state.ceiling_force_n,
+            "magnet_engaged": state.magnet_engaged,
+            "gear_miss_m": world.gear_miss_m(),
+        }
+
+    def replace_vehicle(self, scenario: Scenario) -> None:
+        """A new vehicle under the same link: connection and log blocks stay."""
+        self._close_feed()
+        self.vehicle = SimulatedVehicle(scenario, self._setup.camera, self._setup.target)
+        self.server.replace_firmware(self.vehicle.firmware, keep_blocks=True)
+        self._feed = self._new_feed()
+
+    def close(self) -> None:
+        self._close_feed()
+        self.endpoint.close()
+        if self.stream is not None:
+            self.stream.close()
+        if self._truth is not None:
+            self._truth.close()
+
+    def _publish_arrived(self) -> None:
+        if self.vehicle.camera is None or self.stream is None:
+            return
+        arrived = self.vehicle.camera.take()
+        if arrived:
+            self.stream.publish(arrived[-1].image)
+
+    def _new_feed(self) -> _PictureFeed | None:
+        if not self._live or self.vehicle.camera is None or self.stream is None:
+            return None
+        return _PictureFeed(self.vehicle, self.stream)
+
+    def _close_feed(self) -> None:
+        feed: _PictureFeed | None = getattr(self, "_feed", None)
+        if feed is not None:
+            feed.close()
+
+
+class _PictureFeed:
+    """Renders in its own thread from the states that the physics leaves behind."""
+
+    def __init__(self, vehicle: SimulatedVehicle, stream: MjpegServer) -> None:
+        assert vehicle.camera is not None
+        self._camera = vehicle.camera
+        self._stream = stream
+        self._past: deque[TrueState] = deque(maxlen=round(_PAST_S / CONTROL_PERIOD_S))
+        self._changed = threading.Condition()
+        self._closed = False
+        self._waiting = 0
+        self._thread = threading.Thread(target=self._run, name="picture-feed", daemon=True)
+        self._thread.start()
+
+    def add(self, state: TrueState) -> None:
+        with self._changed:
+            self._past.append(state)
+            self._waiting += 1
+            if self._waiting >= _WAKE_EVERY:
+                self._changed.notify()
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (t_s := self._next_time()) is not None:
+            self._camera.advance(t_s, self._state_at)
+            arrived = self._camera.take()
+            if arrived:
+                self._stream.publish(arrived[-1].image)
+
+    def _next_time(self) -> float | None:
+        """Waits for the physics to go on; None when closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._waiting >= _WAKE_EVERY)
+            self._waiting = 0
+            return None if self._closed else self._past[-1].t_s
+
+    def _state_at(self, t_s: float) -> TrueState:
+        """The true state nearest to `t_s` of those still known."""
+        with self._changed:
+            back = round((self._past[-1].t_s - t_s) / CONTROL_PERIOD_S)
+            return self._past[max(-len(self._past), -1 - max(0, back))]

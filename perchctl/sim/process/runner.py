@@ -1,0 +1,141 @@
+"""How time passes in the simulated vehicle's process, and when it ends.
+
+- real time: paced by the wall clock; catches up after a hiccup, never runs ahead;
+- stepped: only the parent's `advance` moves time; between two of them the link is
+  answered, so that cflib connects without simulated time passing.
+
+When the parent is gone, however it went, the vehicle flies on in real time for
+`HostSetup.linger_s` and then ends: what the firmware does after its tool has died can be seen.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from collections.abc import Callable
+from typing import Any
+
+from perchctl.sim.process.control import Channel
+from perchctl.sim.process.host import VehicleHost
+from perchctl.sim.scenario import CONTROL_PERIOD_S
+
+MAX_LAG_S = 1.0
+"""A longer hiccup (a suspended computer) is cut off instead of being caught up with."""
+_IDLE_S = 0.25
+_BATCH = 50  # steps between two looks at the control connection while catching up
+
+
+class Runner:
+    """Runs one host until it is told to stop or its parent has been gone for a while."""
+
+    def __init__(
+        self,
+        host: VehicleHost,
+        channel: Channel | None,
+        *,
+        realtime: bool,
+        linger_s: float,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._host = host
+        self._channel = channel
+        self._realtime = realtime
+        self._linger_s = linger_s
+        self._clock = clock
+        self._parent = os.getppid()
+        self._end_s: float | None = None
+        self._stopped = False
+        self._origin_s = clock() - host.elapsed_s
+        self._calls: dict[str, Callable[..., Any]] = {
+            "advance": self._advance,
+            "truth": host.truth,
+            "set_pose": self._set_pose,
+            "let_go": lambda: host.vehicle.world.let_go(),
+            "silence": lambda duration_s: host.endpoint.silence(host.elapsed_s, duration_s),
+            "reboot": host.server.reboot,
+            "replace_vehicle": host.replace_vehicle,
+            "set_battery": self._set_battery,
+            "push": self._push,
+            "stop": self._stop,
+        }
+
+    def run(self) -> None:
+        while not self._stopped and not self._is_over():
+            self._wait(self.catch_up() if self._realtime else _IDLE_S)
+
+    def _restart_clock(self) -> None:
+        self._origin_s = self._clock() - self._host.elapsed_s
+
+    def catch_up(self) -> float:
+        """Step up to now, some steps at most at once; how long to wait for the next step."""
+        now_s = self._clock() - self._origin_s
+        if now_s - self._host.elapsed_s > MAX_LAG_S:
+            self._origin_s += now_s - self._host.elapsed_s - MAX_LAG_S
+            now_s = self._clock() - self._origin_s
+        for _ in range(_BATCH):
+            if self._host.elapsed_s + CONTROL_PERIOD_S > now_s:
+                break
+            self._host.step()
+        next_s = self._origin_s + self._host.elapsed_s + CONTROL_PERIOD_S
+        return max(0.0, next_s - self._clock())
+
+    def _wait(self, timeout_s: float) -> None:
+        sockets = [self._host.endpoint.socket]
+        if self._channel is not None:
+            sockets.append(self._channel.socket)
+        ready, _, _ = select.select(sockets, [], [], timeout_s)
+        if self._host.endpoint.socket in ready:
+            self._host.serve()
+        if self._channel is not None and self._channel.socket in ready:
+            self._obey(self._channel)
+
+    def _obey(self, channel: Channel) -> None:
+        """One request of the parent: (name, arguments) -> (True, result) or (False, text)."""
+        try:
+            name, arguments = channel.receive()
+        except EOFError:
+            self._lose_parent()
+            return
+        answer: tuple[bool, Any]
+        try:
+            answer = True, self._calls[name](**arguments)
+        except Exception as error:
+            answer = False, f"{type(error).__name__}: {error}"
+        try:
+            channel.send(answer)
+        except OSError:
+            self._lose_parent()
+
+    def _is_over(self) -> bool:
+        if self._channel is not None and os.getppid() != self._parent:
+            self._lose_parent()
+        return self._end_s is not None and self._clock() >= self._end_s
+
+    def _lose_parent(self) -> None:
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+        self._end_s = self._clock() + self._linger_s
+        self._realtime = True
+        self._restart_clock()
+
+    # --- the parent's requests ------------------------------------------------------
+
+    def _advance(self, dt_s: float) -> float:
+        if self._realtime:
+            raise RuntimeError("only a stepped vehicle can be advanced")
+        self._host.advance(dt_s)
+        return self._host.elapsed_s
+
+    def _set_pose(self, **where: Any) -> None:
+        self._host.vehicle.world.set_pose(**where)
+
+    def _set_battery(self, rest_v: float) -> None:
+        self._host.vehicle.world.battery_rest_v = rest_v
+
+    def _push(self, force_n: tuple[float, float, float]) -> None:
+        self._host.vehicle.world.external_force_n = force_n
+
+    def _stop(self) -> None:
+        self._stopped = True

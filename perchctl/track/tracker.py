@@ -1,0 +1,208 @@
+"""Tracking frame by frame: the pipeline's memory, what deserves a sentence, what is counted."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from perchctl.camera.health import HealthState, Verdict, assess
+from perchctl.display.page.live import State
+from perchctl.display.page.sketch import Sketch
+from perchctl.pipeline import PipelineSetup, make_setup, step
+from perchctl.profile import Profile, TargetConfig
+from perchctl.target.print_check import (
+    MIN_FRAMES,
+    PrintVerdict,
+    SizeRatio,
+    combined,
+    size_ratio,
+    verdict,
+)
+from perchctl.track.result import Tracked, record_of, text_rows, tracked_of
+from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
+
+MOST_NOTES = 20
+FOLD_RATIOS = 500  # frames whose size ratios are kept one by one
+# A live picture that stands still or is noise is no measurement; the others are searched.
+_NO_PICTURE = ("frozen", "snow")
+_DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
+_MIRRORED = (
+    "the picture is mirrored: switch that off in the camera, or set camera.mirrored in the profile"
+)
+
+
+def camera_setup(profile: Profile, camera: CameraModel, stills: bool = False) -> PipelineSetup:
+    """The profile's pipeline with the camera in the place of vehicle and gear, so that
+    its target is in the camera frame. Stills are each searched as thoroughly as can be."""
+    detector = profile.detector
+    if stills:
+        detector = detector.model_copy(update={"blurred_every": 1})
+    return make_setup(
+        detector,
+        profile.pose,
+        profile.kalman,
+        profile.merge,
+        profile.target,
+        np.eye(4),
+        (0.0, 0.0, 0.0),
+        camera,
+    )
+
+
+@dataclass(eq=False)
+class Tracker:
+    """Frame in, result out; remembers what the pipeline must (nothing with `stills`).
+
+    `notes` are the sentences that the newest frame deserves.
+    """
+
+    setup: PipelineSetup
+    live: bool
+    stills: bool = False
+    recorded_stills: bool = False  # pictures of a folder may be alike
+    disagreement_frames: int = 15
+    notes: tuple[str, ...] = ()
+    output: PipelineOutput | None = None
+    _state: PipelineState = field(default_factory=PipelineState)
+    _health: HealthState = field(default_factory=HealthState)
+    _last: Tracked | None = None
+
+    def track(self, frame: Frame, name: str | int) -> Tracked | None:
+        """The frame's result; None for a live source's repetition of the last picture."""
+        judged = self._assess(frame)
+        if self.live and judged.kind == "repeated":
+            return None
+        self.output = None
+        self.notes = () if judged.kind in ("ok", "repeated") else (judged.text,)
+        if self.live and judged.kind in _NO_PICTURE:
+            return Tracked(name, frame.t_s)
+        before = PipelineState() if self.stills else self._state
+        self._state, output = step(before, frame, None, self.setup)
+        last = None if self._last is None else self._last.target
+        self.output = output
+        self._last = tracked_of(name, frame.t_s, output, not self.stills, last)
+        if output.detections.mirrored:
+            self.notes += (_MIRRORED,)
+        if output.disagreeing_frames >= (1 if self.stills else self.disagreement_frames):
+            self.notes += (_DISAGREE,)
+        return self._last
+
+    def _assess(self, frame: Frame) -> Verdict:
+        alike_is_frozen = self.live or not (self.stills or self.recorded_stills)
+        self._health, judged = assess(self._health, frame, alike_is_frozen)
+        return judged
+
+
+@dataclass(eq=False)
+class Tally:
+    """What the summary says."""
+
+    frames: int = 0
+    large: int = 0
+    small: int = 0
+    started_s: float = 0.0
+    notes: Counter[str] = field(default_factory=Counter)
+
+    def add(self, tracked: Tracked, notes: tuple[str, ...]) -> None:
+        self.frames += 1
+        self.large += tracked.large is not None
+        self.small += tracked.small is not None
+        self.notes.update(notes)
+
+    def text(self, now_s: float) -> str:
+        took_s = max(now_s - self.started_s, 1e-6)
+        share = 100.0 / max(self.frames, 1)
+        plural = "frame" if self.frames == 1 else "frames"
+        said = "".join(f"; {note.partition(':')[0]} in {n}" for note, n in self.notes.items())
+        return (
+            f"{self.frames} {plural} in {took_s:.1f} s ({self.frames / took_s:.0f} a second): "
+            f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{said}"
+        )
+
+
+@dataclass(eq=False)
+class PrintCheck:
+    """The ratio of the two markers' apparent sizes over the frames that show both."""
+
+    camera: CameraModel
+    target: TargetConfig
+    _ratios: list[SizeRatio] = field(default_factory=list)
+
+    def add(self, output: PipelineOutput | None) -> None:
+        if output is None:
+            return
+        large, small = output.detections.large, output.detections.small
+        if large is None or small is None or not (large.refined and small.refined):
+            return
+        ratio = size_ratio(
+            large.corners_px,
+            small.corners_px,
+            (large.sigma_px, small.sigma_px),
+            self.camera,
+            self.target,
+        )
+        if ratio is not None:
+            self._ratios.append(ratio)
+        if len(self._ratios) >= FOLD_RATIOS:
+            mean = combined(self._ratios)
+            self._ratios = [] if mean is None else [mean]
+
+    @property
+    def judged(self) -> bool:
+        """Whether enough frames showed both markers."""
+        return sum(ratio.frames for ratio in self._ratios) >= MIN_FRAMES
+
+    def verdict(self) -> PrintVerdict:
+        return verdict(combined(self._ratios), self.target)
+
+
+class Notes:
+    """Sentences on stderr: one when a condition begins, and not without end."""
+
+    def __init__(self) -> None:
+        self._before: frozenset[str] = frozenset()
+        self._left = MOST_NOTES
+        self._silent = False
+
+    def changes(self, frame: str | int, notes: tuple[str, ...]) -> None:
+        for note in notes:
+            if note in self._before:
+                continue
+            where = frame if isinstance(frame, str) else f"frame {frame}"
+            self._left -= 1
+            if self._left >= 0:
+                self.line(f"{where}: {note}")
+            if self._left == 0:
+                self.line("more of this kind is only counted from here on")
+        self._before = frozenset(notes)
+        self._silent = False
+
+    def silence(self, silent: bool, source: str) -> None:
+        if silent and not self._silent:
+            self.line(f"{source} delivers no frame; waiting for it (Ctrl-C ends)")
+        self._silent = self._silent or silent
+
+    def line(self, text: str) -> None:
+        print(f"perchctl: {text}", file=sys.stderr)
+
+
+def sketch_of(frame: Frame, tracked: Tracked, axis_m: float) -> Sketch:
+    target = tracked.target
+    found = ((name, tracked.get(name)) for name in MARKERS)
+    return Sketch(
+        frame.image,
+        tuple((name, seen.corners_px) for name, seen in found if seen is not None),
+        None if target is None else (target.rvec_rad, target.tvec_m, axis_m),
+    )
+
+
+def track_state(tracked: Tracked, notes: tuple[str, ...]) -> State:
+    """The frame for the page."""
+    return {
+        "rows": [list(row) for row in text_rows(tracked)],
+        "note": "; ".join(notes),
+        "track": record_of(tracked),
+    }

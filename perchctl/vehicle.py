@@ -1,0 +1,89 @@
+"""What the planner sees and what it says: telemetry in, commands out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# Supervisor bits (firmware facts, "Supervisor").
+CAN_ARM, ARMED, AUTO_ARM, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << i for i in range(8))
+HL_ACTIVE, HL_FINISHED, HL_DISABLED, DECK_FAULT = (1 << i for i in range(8, 12))
+
+LOW_POWER = 3  # pm.state
+NO_BATTERY_READING_V = 1.0
+"""Below this nothing is measured: the battery is unknown, not empty (fault 7)."""
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """The vehicle's newest state, SI and right-handed (see `perchctl.geometry`).
+
+    `t_s` is on the loop's clock; `thrust` is the commanded 0..65535;
+    `acc_z_g` is the specific force along body z (+1 at rest on the ground).
+    """
+
+    t_s: float
+    position_m: tuple[float, float, float]
+    velocity_mps: tuple[float, float, float]
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    acc_z_g: float
+    thrust: float
+    battery_v: float
+    supervisor: int
+    battery_state: int = 0  # pm.state; 3 = low power
+    position_variance_m2: float | None = None  # largest of the estimator's three
+
+    def has(self, bit: int) -> bool:
+        return bool(self.supervisor & bit)
+
+
+@dataclass(frozen=True)
+class Idle:
+    """Send nothing (on the ground, or while a high-level command runs)."""
+
+
+@dataclass(frozen=True)
+class TakeOff:
+    """High-level take-off to an absolute height; the vehicle flies it alone."""
+
+    height_m: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class PositionSetpoint:
+    """Absolute position of the body in the world of the state estimate."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_rad: float
+
+
+@dataclass(frozen=True)
+class RawThrust:
+    """Level attitude and a raw thrust 0..65535: stabilised position control off."""
+
+    thrust: int
+
+
+@dataclass(frozen=True)
+class StopMotors:
+    """Stop setpoint followed by the notify that keeps the supervisor from locking."""
+
+
+@dataclass(frozen=True)
+class Land:
+    """High-level landing: handed over once, then the vehicle flies it alone."""
+
+    height_m: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class EmergencyStop:
+    """Cut the motors now and lock: the user's second Ctrl-C, or a useless attitude."""
+
+
+Command = Idle | TakeOff | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop

@@ -1,0 +1,135 @@
+"""A marker's drawing on a grid: how white each node is, sharp and blurred."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+
+_REACH_CELLS = 0.6  # of white around the border
+_EDGE = 12  # nodes more all around, for the blur
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A marker's cells with its border, 1 = white, (n, n); for the target's large marker
+    what lies in its centre, at `ratio` of its size, and `sheet`, half the side of the
+    white paper in the marker's own coordinates (None: white without end)."""
+
+    cells: Array
+    centre: Array | None = None
+    ratio: float = 0.0
+    sheet: float | None = None
+
+    @property
+    def reach(self) -> float:
+        """Half side of the part that is compared."""
+        return 1.0 + _REACH_CELLS * 2.0 / len(self.cells)
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """A drawing at the nodes (n * n,) with its changes (n * n, 9) with the eight terms of
+    a homography's increment and with the blur's square."""
+
+    value: Array
+    jacobian: Array
+
+
+def drawing_of(bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None,
+               ratio: float = 0.0) -> Drawing:  # fmt: skip
+    """From inner bits, 1 = white; with a centre, the target's large marker: its sheet has
+    a cell of white around it."""
+    cells = np.pad(bits.astype(np.float64), 1)
+    if centre is None:
+        return Drawing(cells)
+    return Drawing(cells, np.pad(centre.astype(np.float64), 1), ratio, 1.0 + 2.0 / len(cells))
+
+
+def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array:
+    """Share of each cell in each node, (nodes, cells)."""
+    edges = size * np.linspace(-1.0, 1.0, n_cells + 1)
+    low, high = axis[:, None] - half_node, axis[:, None] + half_node
+    overlap = np.minimum(high, edges[1:]) - np.maximum(low, edges[:-1])
+    return np.asarray(np.maximum(overlap, 0.0) / (2.0 * half_node))
+
+
+def _wide(axis: Array, half_node: float) -> Array:
+    more = 2.0 * half_node * np.arange(1, _EDGE + 1)
+    return np.concatenate([axis[0] - more[::-1], axis, axis[-1] + more])
+
+
+def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
+    """Whiteness of each node and of `_EDGE` nodes more all around, exact in area, as if the
+    paper had no end."""
+    wide = _wide(axis, half_node)
+    C = _coverage(wide, half_node, len(drawing.cells), 1.0)
+    black = C @ (1.0 - drawing.cells) @ C.T
+    if drawing.centre is not None:
+        C = _coverage(wide, half_node, len(drawing.centre), drawing.ratio)
+        black += C @ (1.0 - drawing.centre) @ C.T
+    return (1.0 - black).astype(np.float32)
+
+
+def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32] | None:
+    """Share of each node that is not on the paper, likewise; None without an end."""
+    if drawing.sheet is None:
+        return None
+    on = _coverage(_wide(axis, half_node), half_node, 1, drawing.sheet)
+    return (1.0 - on @ on.T).astype(np.float32)
+
+
+def blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> Rendering:
+    """The drawing blurred by sigma nodes, and its changes, per unit of the drawing."""
+    soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    step = float(axis[1] - axis[0])
+    e, n = _EDGE, len(axis)
+    middle = slice(e, e + n)
+    left, right = soft[middle, e - 1 : e + n - 1], soft[middle, e + 1 : e + n + 1]
+    up, down = soft[e - 1 : e + n - 1, middle], soft[e + 1 : e + n + 1, middle]
+    value = soft[middle, middle]
+    du, dv = np.float32(0.5 / step) * (right - left), np.float32(0.5 / step) * (down - up)
+    laplace = left + right + up + down - 4.0 * value
+    u, v = np.meshgrid(axis, axis)
+    along = u * du + v * dv
+    parts = [-u * du, -v * du, -du, -u * dv, -v * dv, -dv, u * along, v * along, 0.5 * laplace]
+    flat = np.asarray(np.stack(parts, axis=-1), dtype=np.float64).reshape(n * n, 9)
+    return Rendering(value.ravel().astype(np.float64), flat)
+
+
+def gram(A: Array, B: Array) -> Array:
+    """A^T B of tall matrices (n * n, a) and (n * n, b), block by block: large products
+    wake threads, which cost more than they save, and far more on a busy machine."""
+    n = math.isqrt(len(A))
+    blocks = np.matmul(A.reshape(n, n, -1).transpose(0, 2, 1), B.reshape(n, n, -1))
+    return np.asarray(blocks.sum(axis=0))
+
+
+def mixed(columns: Array, coefficients: Array) -> Array:
+    """The columns (r, k) times coefficients (k,), likewise."""
+    return np.asarray(np.einsum("rk,k->r", columns, coefficients))
+
+
+def pattern_seen(
+    drawing: Drawing, axis: Array, sigma: float, error: Array, light: Array, coefficients: Array
+) -> tuple[float, float]:
+    """Correlation and height of the inner pattern, beyond what a plain square explains."""
+    plain = Drawing(np.zeros_like(drawing.cells))
+    half = float(axis[1] - axis[0]) / 2
+    square = blurred(drawn(plain, axis, half), sigma, axis).value
+    # The sheet's end, where there is one, is the last column of the light.
+    known: Array = np.column_stack([light[:, :3], square, light[:, 7:]])
+    left: Array = np.stack([light[:, 3], mixed(light, coefficients) + error], axis=1)
+    A = gram(known, known) + 1e-9 * np.eye(known.shape[1])
+    mix = np.asarray(np.linalg.solve(A, gram(known, left)), dtype=np.float64)
+    bits, seen = (left[:, k] - mixed(known, mix[:, k]) for k in (0, 1))
+    energy, product = float((bits * bits).sum()), float((bits * seen).sum())
+    both = math.sqrt(energy * float((seen * seen).sum()))
+    if both < 1e-9:
+        return 0.0, 0.0
+    return product / both, product / max(energy, 1e-9) / float(coefficients[3])

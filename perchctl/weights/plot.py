@@ -1,0 +1,150 @@
+"""One picture of a fit of the merge weights: does LMS settle, what is gained, how sure."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from perchctl.errors import InvalidValue
+from perchctl.log.plot import BLACK, BLUE, DPI, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+from perchctl.weights.evidence import LABELS
+from perchctl.weights.report import Result
+from perchctl.weights.types import AXES, PAPER_WEIGHTS
+
+SIZE_IN = (14.0, 10.5)
+NAMES = ("x", "y", "z", r"$\psi$")
+_UNITS = ("mm", "mm", "mm", "deg")
+_SCALES = (1e3, 1e3, 1e3, 180.0 / math.pi)
+_SHOWN = {
+    "large": (SKY, "o"),
+    "small": (ORANGE, "^"),
+    "paper": (PURPLE, "D"),
+    "chosen": (BLACK, "s"),
+    "joint": (GREEN, "x"),
+}
+_BARS = {
+    "lms": (BLUE, "LMS"),
+    "nlms": (SKY, "norm. LMS"),
+    "closed_form": (BLACK, "closed\nform"),
+    "inverse_variance": (VERMILLION, "inverse\nvariance"),
+}
+MOST_POINTS = 2000
+MOST_POSITIONS = 200
+
+
+def plot_weights(result: Result, png_path: Path) -> None:
+    """Learning curves, errors by position, weights with intervals; a column an axis.
+
+    Raises InvalidValue for a file that cannot be written.
+    """
+    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(3, 4)
+    for k in range(len(AXES)):
+        _learning(axes[0, k], result, k)
+        _by_position(axes[1, k], result, k)
+        _weights(axes[2, k], result, k)
+        for ax in axes[:, k]:
+            ax.grid(True, color="#D8D8D8", linewidth=0.6)
+            ax.set_axisbelow(True)
+    axes[0, 0].set_ylabel("weight of the large marker")
+    axes[2, 0].set_ylabel("weight, 95 % over positions")
+    axes[0, 0].legend(fontsize=8, loc="best")
+    handles = [
+        Line2D([], [], linestyle="none", marker=marker, color=colour, label=_label(result, name))
+        for name, (colour, marker) in _SHOWN.items()
+        if _method(result, name) in result.evidence.methods
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
+    errors = result.errors
+    name = Path(errors.name).name.replace("$", r"\$")
+    figure.suptitle(
+        f"{name}   |   {len(errors)} rows of {len(errors.positions)} positions   |   "
+        + (
+            "recommended: " + ", ".join(
+                f"{axis} {w:.3f}" for axis, w in zip(AXES, result.recommended, strict=True)
+            )
+            if any(result.proven)
+            else "no weights are recommended"
+        ),
+        fontsize=12,
+    )  # fmt: skip
+    try:
+        figure.savefig(png_path, format="png")
+    except OSError as error:
+        raise InvalidValue(f"{png_path}: cannot be written: {error.strerror}") from None
+
+
+def _method(result: Result, name: str) -> str:
+    return result.chosen if name == "chosen" else name
+
+
+def _label(result: Result, name: str) -> str:
+    said = LABELS[_method(result, name)]
+    return f"{said}, position left out of the fit" if name == "chosen" else said
+
+
+def _learning(ax: Axes, result: Result, k: int) -> None:
+    for name, colour in (("lms", BLUE), ("nlms", ORANGE)):
+        run = result.runs[name]
+        # Even in the logarithm, as the axis is.
+        last = len(run.rows) - 1
+        shown = np.unique(
+            np.rint(np.geomspace(1, last + 1, min(last + 1, MOST_POINTS))).astype(int) - 1
+        )
+        ax.plot(
+            np.maximum(run.rows[shown], 1.0), run.curve[shown, k], color=colour, linewidth=1.2,
+            label=LABELS[name],
+        )  # fmt: skip
+    closed = float(result.fits["closed_form"].raw[k])
+    ax.axhline(closed, color=BLACK, linestyle="--", linewidth=1.0, label="closed form")
+    ax.axhline(PAPER_WEIGHTS[k], color=PURPLE, linestyle=":", linewidth=1.2, label="the paper's")
+    ax.set_xscale("log")
+    ax.set_xlabel("rows run through")
+    ax.set_title(f"{NAMES[k]}: learning curve", fontsize=10)
+
+
+def _by_position(ax: Axes, result: Result, k: int) -> None:
+    positions = result.errors.positions
+    shown = np.unique(
+        np.linspace(0, len(positions) - 1, min(len(positions), MOST_POSITIONS)).astype(int)
+    )
+    for name, (colour, marker) in _SHOWN.items():
+        method = result.evidence.methods.get(_method(result, name))
+        if method is None:
+            continue
+        rms = _SCALES[k] * method.by_position[shown, k]
+        ax.plot(
+            shown + 1, np.where(rms > 0.0, rms, np.nan), linestyle="none", marker=marker,
+            color=colour, markersize=5, fillstyle="none" if name == "chosen" else "full",
+        )  # fmt: skip
+    ax.set_yscale("log")
+    ax.set_xlabel("position")
+    ax.set_ylabel(f"RMS error [{_UNITS[k]}]")
+    ax.set_title(f"{NAMES[k]}: error by position", fontsize=10)
+
+
+def _weights(ax: Axes, result: Result, k: int) -> None:
+    for i, (name, (colour, _)) in enumerate(_BARS.items()):
+        fit = result.fits[name]
+        low, high = float(fit.low[k]), float(fit.high[k])
+        if math.isfinite(low) and math.isfinite(high):
+            ax.plot([i, i], [low, high], color=colour, linewidth=2.0)
+        ax.plot([i], [fit.raw[k]], marker="o", color=colour, markersize=6)
+        ax.annotate(f"{fit.weights[k]:.3f}", (i, fit.raw[k]), xytext=(7, 0), fontsize=8,
+                    textcoords="offset points", va="center")  # fmt: skip
+    ax.axhline(PAPER_WEIGHTS[k], color=PURPLE, linestyle=":", linewidth=1.2)
+    for edge in (0.0, 1.0):
+        ax.axhline(edge, color=GREY, linewidth=0.8)
+    ax.set_xticks(range(len(_BARS)), [label for _, label in _BARS.values()], fontsize=8)
+    ax.set_xlim(-0.5, len(_BARS) - 0.2)
+    ax.set_title(
+        f"{NAMES[k]}: " + ("proven to help" if result.proven[k] else "not proven to help"),
+        fontsize=10,
+    )

@@ -1,0 +1,249 @@
+"""The live display, and that nothing it does reaches the loop."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from rich.text import Text
+
+from perchctl.display.panel import Reporter, make_reporter, panel
+from perchctl.display.status import FlightStatus, status_rows
+from perchctl.display.watch import DisplayWatcher, status_of
+from perchctl.log.read import read_log
+from perchctl.log.watch import LogWatcher
+from perchctl.log.write import FlightLogWriter
+from perchctl.mission.planner import start
+from perchctl.mission.state import Observation
+from perchctl.mission.watch import Tick
+from perchctl.vehicle import PositionSetpoint
+from tests.helpers import log as synthetic
+
+STATUS = FlightStatus(
+    t_s=101.0,
+    phase="ALIGN",
+    in_phase_s=1.25,
+    e_m=(-0.123, 0.045, 1.234),
+    e_yaw_rad=math.radians(-166.2),
+    stage="both",
+    height_m=0.82,
+    battery_v=3.714,
+    link_age_s=0.012,
+    camera_age_s=0.05,
+    loop_late_s=0.001,
+    attempts=1,
+    reason="pose is steady",
+)
+ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-9]m")
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+class Recorder:
+    """A surface that remembers."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.shown: list[FlightStatus] = []
+        self.closed = 0
+
+    def line(self, text: str) -> None:
+        self.lines.append(text)
+
+    def show(self, status: FlightStatus) -> None:
+        self.shown.append(status)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def test_one_line_an_event_where_there_is_no_terminal() -> None:
+    stream = io.StringIO()
+    reporter = make_reporter(stream=stream)
+    reporter.event(100.0, "SEARCH: hovering in the perching area")
+    for i in range(50):
+        reporter.update(replace(STATUS, t_s=100.0 + 0.02 * i, phase="SEARCH"))
+    reporter.update(STATUS)  # a change that no event told
+    reporter.event(102.5, "holding: no picture for 0.6 s")
+    reporter.close()
+    assert stream.getvalue().splitlines() == [
+        "[   0.00 s] SEARCH: hovering in the perching area",
+        "[   1.00 s] ALIGN: pose is steady",
+        "[   2.50 s] holding: no picture for 0.6 s",
+    ]
+
+
+def test_no_more_than_ten_pictures_a_second() -> None:
+    surface = Recorder()
+    reporter = Reporter(surface)
+    for i in range(500):  # ten seconds of the loop
+        reporter.update(replace(STATUS, t_s=100.0 + 0.02 * i))
+    reporter.close()
+    assert 1 <= len(surface.shown) <= 101
+    assert surface.shown[-1].t_s > 109.8
+    assert surface.closed == 1
+
+
+def test_the_panel_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "80")
+    stream = Terminal()
+    reporter = make_reporter(stream=stream)
+    reporter.event(100.0, "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b")
+    reporter.update(replace(STATUS, phase="LANDING"))
+    reporter.close()
+    assert reporter.problem is None
+    text = ESCAPE.sub("", stream.getvalue())
+    assert "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b" in text
+    assert "x -12.3  y +4.5  z +123.4 cm   yaw -166.2 deg" in text
+    assert COLOUR.search(stream.getvalue())
+    line = next(line for line in stream.getvalue().splitlines() if "radio://" in line)
+    assert not COLOUR.search(line)
+
+
+def test_no_color(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm-256color")
+    stream = Terminal()
+    reporter = make_reporter(True, stream)
+    reporter.update(replace(STATUS, phase="ABORTED", hold="no picture"))
+    reporter.close()
+    assert "ABORTED" in stream.getvalue()
+    assert not COLOUR.search(stream.getvalue())
+
+
+def test_a_dumb_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "dumb")
+    stream = Terminal()
+    reporter = make_reporter(stream=stream)
+    reporter.update(STATUS)
+    reporter.close()
+    assert stream.getvalue() == "[   0.00 s] ALIGN: pose is steady\n"
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        STATUS,
+        replace(STATUS, e_m=None, e_yaw_rad=None, camera_age_s=math.inf, link_age_s=12.0),
+        replace(STATUS, reason="why " * 100, hold="[bold]held[/bold] " * 20),
+        replace(STATUS, e_m=(-99.9, 99.9, 99.9), e_yaw_rad=-math.pi, in_phase_s=999.9),
+    ],
+)
+def test_the_panel_fits_into_80_columns(status: FlightStatus) -> None:
+    console = Console(width=80, file=io.StringIO(), highlight=False, markup=False)
+    with console.capture() as capture:
+        console.print(panel(status))
+    lines = capture.get().splitlines()
+    assert len(lines) == 8
+    assert max(Text(line).cell_len for line in lines) <= 80
+    for name, _ in status_rows(status):
+        assert sum(f" {name} " in line for line in lines) == 1, name
+
+
+def test_a_display_that_fails_falls_silent_once() -> None:
+    class Failing(Recorder):
+        def line(self, text: str) -> None:
+            super().line(text)
+            raise BrokenPipeError("gone")
+
+    surface = Failing()
+    reporter = Reporter(surface)
+    reporter.event(0.0, "SEARCH: x")
+    reporter.close()
+    assert reporter.problem == "the display fell silent: BrokenPipeError: gone"
+    reporter.event(1.0, "ALIGN: y")
+    reporter.update(STATUS)
+    reporter.close()
+    assert len(surface.lines) == 1
+
+
+def test_a_terminal_that_stands_still_does_not_stop_the_loop() -> None:
+    """Ctrl-S: writing blocks; update and event return all the same."""
+    gate = threading.Event()
+
+    class Stuck(Recorder):
+        def line(self, text: str) -> None:
+            gate.wait(30.0)
+            super().line(text)
+
+    surface = Stuck()
+    reporter = Reporter(surface)
+    for i in range(5000):
+        reporter.event(0.02 * i, f"event {i}")
+        reporter.update(replace(STATUS, t_s=0.02 * i))
+    assert surface.lines == []
+    gate.set()
+    reporter.close()
+    assert surface.lines[-1] == "[  99.98 s] event 4999"
+    assert len(surface.lines) <= 1001
+
+
+def tick(**changes: Any) -> Tick:
+    telemetry = synthetic.telemetry(99.99, 0.3)
+    state = start(Observation(t_s=98.0, telemetry=synthetic.telemetry(98.0, 0.1)))
+    values: dict[str, Any] = {
+        "t_s": 100.0,
+        "telemetry": telemetry,
+        "output": None,
+        "target": synthetic.target(1.0, 1.0),
+        "state": state,
+        "command": PositionSetpoint(1.0, 2.0, 0.5, 0.0),
+        "loop_late_s": 0.002,
+        "camera_age_s": math.inf,
+        "telemetry_age_s": 0.01,
+    }
+    return Tick(**(values | changes))
+
+
+def test_what_the_loop_knows_reaches_log_and_display(tmp_path: Path) -> None:
+    log = LogWatcher(FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header()))
+    surface = Recorder()
+    display = DisplayWatcher(Reporter(surface))
+    for watcher in (log, display):
+        watcher.event(100.0, "APPROACH: start")
+        watcher.tick(tick())
+        watcher.event(100.1, "holding: no picture")
+    assert (log.problem, display.problem) == (None, None)
+    log.close()
+    display.reporter.close()
+    back = read_log(log.path)
+    assert back.truncated
+    assert [e["level"] for e in back.events] == ["info", "warning"]
+    record = back.records[0]
+    assert (record["phase"], record["cmd"], record["cmd_z_m"]) == ("APPROACH", "position", 0.5)
+    assert (record["tel_age_s"], record["cam_age_s"]) == (0.01, None)
+    status = surface.shown[0]
+    assert status.height_m == pytest.approx(0.2)
+    assert status.in_phase_s == pytest.approx(2.0)
+    assert status.stage == "both"
+    assert surface.lines[0] == "[   0.00 s] APPROACH: start"
+
+
+def test_a_status_without_a_target() -> None:
+    status = status_of(tick(target=None))
+    assert (status.e_m, status.e_yaw_rad, status.stage) == (None, None, "none")
+    assert dict(status_rows(status))["ages"].startswith("link 10 ms   camera none")
+
+
+def test_the_truth_of_a_simulation_is_logged(tmp_path: Path) -> None:
+    from perchctl.profile import Profile
+
+    log = LogWatcher.lockstep(tmp_path / "flight_seed3.jsonl", Profile(name="sim"), 3)
+    log.truth = lambda: ((1.0, 2.0, 3.0), 0.25)
+    log.tick(tick())
+    log.close()
+    record = read_log(log.path).records[0]
+    assert [record[f"true_{k}_m"] for k in ("x", "y", "z", "miss")] == [1.0, 2.0, 3.0, 0.25]

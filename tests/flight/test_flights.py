@@ -1,0 +1,232 @@
+"""Whole flights in lockstep: the mission against the simulated vehicle, exact for a seed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.commands.fly import EXIT_CODE_OF
+from perchctl.flight.campaign import fly_seed, run_campaign
+from perchctl.flight.results import FlightResult, campaign_summary
+from perchctl.log.read import FlightLog, read_log
+from perchctl.mission.state import SEVEN, Operator, Outcome, Phase
+from perchctl.profile import load_profile
+from perchctl.sim.draw import draw_scenario
+from tests.helpers.flights import SEED, SHORT, Flown, fly_short
+
+SEVEN_NAMES = [phase.value for phase in SEVEN]
+MISS_LIMIT_M = 0.020
+ON_THE_FLOOR_M = 0.05
+SLIPPERY_N = 0.1  # a quarter of the weight
+
+
+def is_perched(flown: Flown) -> bool:
+    flight, report = flown.flight, flown.report
+    return (
+        report.phase is Phase.PERCHED
+        and report.outcome is Outcome.PERCHED
+        and flight.hanging
+        and flight.miss_m < MISS_LIMIT_M
+        and not (flight.locked or report.locked or flight.fell)
+    )
+
+
+def is_landed(flown: Flown, outcome: Outcome) -> bool:
+    flight, report = flown.flight, flown.report
+    return (
+        report.phase is Phase.LANDED
+        and report.outcome is outcome
+        and flown.z_m < ON_THE_FLOOR_M
+        and not (flight.hanging or flight.locked or report.locked or flight.fell)
+    )
+
+
+# --- A flight under good conditions ---------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlightResult, Path]:
+    """The result of one flight of the short profile, and its log."""
+    path = tmp_path_factory.mktemp("quiet") / "flight.jsonl"
+    return fly_seed(load_profile(SHORT), SEED, path), path
+
+
+@pytest.fixture(scope="module")
+def quiet_log(quiet: tuple[FlightResult, Path]) -> FlightLog:
+    return read_log(quiet[1])
+
+
+def test_a_quiet_flight_perches(quiet: tuple[FlightResult, Path]) -> None:
+    result, _ = quiet
+    assert result.outcome == "perched"
+    assert result.miss_m is not None
+    assert result.miss_m < 0.005
+    assert result.attempts == 1
+    assert not result.locked
+    assert not result.fell
+
+
+def test_it_passes_the_seven_phases_in_order(quiet_log: FlightLog) -> None:
+    assert [span.phase for span in quiet_log.phases] == [*SEVEN_NAMES, "PERCHED"]
+    assert all(span.reason for span in quiet_log.phases)
+
+
+def test_its_log_is_whole(quiet_log: FlightLog) -> None:
+    assert not quiet_log.truncated
+    assert quiet_log.summary is not None
+    assert quiet_log.summary["outcome"] == "perched"
+    assert quiet_log.header["seed"] == SEED
+    assert quiet_log.header["lockstep"]
+    steps = np.diff(quiet_log.column("t_s"))
+    assert steps == pytest.approx(0.02, abs=1e-5)  # one record a loop
+
+
+def test_it_sends_one_kind_of_setpoint_once_it_flies(quiet_log: FlightLog) -> None:
+    """Firmware facts, "Setpoint modes": a change of mode costs 0.3 m at 42 g."""
+    kinds = [r["cmd"] for r in quiet_log.records if r["cmd"] != "idle"]
+    once = [kind for i, kind in enumerate(kinds) if i == 0 or kinds[i - 1] != kind]
+    assert len(once) == 3, once  # take-off, position setpoints, motors stopped
+
+
+def test_the_target_is_seen_in_both_sizes(quiet_log: FlightLog) -> None:
+    stages = {r["stage"] for r in quiet_log.records}
+    assert {"large", "both"} <= stages or {"both", "small"} <= stages
+
+
+def test_the_same_seed_gives_the_same_bytes(
+    quiet: tuple[FlightResult, Path], tmp_path: Path
+) -> None:
+    fly_seed(load_profile(SHORT), SEED, tmp_path / "again.jsonl")
+    assert (tmp_path / "again.jsonl").read_bytes() == quiet[1].read_bytes()
+
+
+def test_another_seed_is_another_flight(quiet: tuple[FlightResult, Path]) -> None:
+    seen: list[FlightResult] = []
+    (other,) = run_campaign(load_profile(SHORT), [SEED + 1], on_result=seen.append)
+    assert seen == [other]
+    assert other.outcome == "perched"
+    assert other.miss_m != quiet[0].miss_m
+    assert campaign_summary([other, quiet[0]])["perched"] == 2
+
+
+# --- The scenario of the shipped profile -------------------------------------------------
+
+
+def test_the_full_scenario_perches() -> None:
+    """Drift, draught, lost frames, mounting error, noise: all of them in one flight."""
+    profile = load_profile("sim")
+    scenario = draw_scenario(profile, 0)
+    assert scenario.camera_burst is not None
+    assert scenario.camera_drop_rate == 0.1
+    assert scenario.draught_mps != (0.0, 0.0, 0.0)
+    assert scenario.drift_mps != (0.0, 0.0, 0.0)
+    result = fly_seed(profile, 0)
+    assert result.outcome == "perched", result
+    assert result.miss_m is not None
+    assert result.miss_m < MISS_LIMIT_M
+    assert not result.locked
+    assert not result.fell
+
+
+# --- Contacts ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["position", "raw"])
+def test_a_first_contact_that_does_not_hold_is_tried_again(mode: str) -> None:
+    flown = fly_short({"planner.perch.mode": mode}, first_contact_force_n=SLIPPERY_N)
+    assert is_perched(flown), flown
+    assert flown.report.attempts == 2
+    way = flown.way
+    assert way[:8] == [*SEVEN_NAMES, "RECOVER"]
+    assert way[8:] == ["ESTIMATE", "ALIGN", "ASCEND", "PERCH", "COMPLETE", "PERCHED"]
+
+
+def test_a_magnet_that_never_holds_lands_after_the_attempts() -> None:
+    flown = fly_short({"planner.attempts": 2}, magnet_force_n=SLIPPERY_N)
+    assert is_landed(flown, Outcome.ATTEMPTS_USED_UP), flown
+    assert flown.way.count("PERCH") == 2
+    assert EXIT_CODE_OF[flown.report.outcome] == 51
+
+
+def test_the_papers_method_perches_with_raw_thrust() -> None:
+    """profiles/paper.yaml: EPnP's place, weights, level filter and raw thrust."""
+    conditions = load_profile(SHORT).simulation.model_dump(mode="json")
+    flown = fly_short({"simulation": conditions, "planner.complete.watch_s": 1.0}, base="paper")
+    assert is_perched(flown), flown
+    assert flown.way == [*SEVEN_NAMES, "PERCHED"]
+
+
+# --- Faults ------------------------------------------------------------------------------
+
+
+def test_a_bare_ceiling_is_searched_and_then_left() -> None:
+    flown = fly_short(no_target=True)
+    assert is_landed(flown, Outcome.TARGET_NOT_FOUND), flown
+    assert flown.way == ["APPROACH", "SEARCH", "LANDING", "LANDED"]
+    assert "not found" in flown.report.reason
+    assert EXIT_CODE_OF[flown.report.outcome] == 50
+
+
+FAULT_S = 4.6  # in ALIGN of the short flight
+
+
+def test_a_camera_that_goes_away_in_flight_lands() -> None:
+    flown = fly_short(camera_gone_at_s=FAULT_S)
+    assert is_landed(flown, Outcome.SAFETY), flown
+    assert "no picture" in flown.report.reason
+    assert "ALIGN" in flown.way
+    assert "PERCH" not in flown.way
+    assert EXIT_CODE_OF[flown.report.outcome] == 52
+
+
+def test_a_camera_that_freezes_in_flight_lands() -> None:
+    """The same bytes again and again are no measurement, though they show the target."""
+    flown = fly_short(camera_freeze_at_s=FAULT_S)
+    assert is_landed(flown, Outcome.SAFETY), flown
+    assert "stands still" in flown.report.reason
+    assert "ALIGN" in flown.way
+    assert "PERCH" not in flown.way
+
+
+def test_a_nearly_empty_battery_lands() -> None:
+    flown = fly_short({"safety.min_rest_v": 3.0}, battery_rest_v=3.3)
+    assert is_landed(flown, Outcome.SAFETY), flown
+    assert "battery" in flown.report.reason
+    assert "PERCH" not in flown.way
+
+
+# --- The person's word ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", SEVEN, ids=lambda p: p.value)
+def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
+    """On the floor, or, where the magnet has it already, hanging with the motors off."""
+    flown = fly_short(operator_at={phase: Operator.LAND})
+    report = flown.report
+    way = flown.way
+    assert way[-3:] == [phase.value, "LANDING", "LANDED"]
+    assert report.outcome is Outcome.OPERATOR
+    assert EXIT_CODE_OF[report.outcome] == 130
+    assert "the operator asked to land" in report.reason
+    assert not flown.flight.locked
+    assert not flown.flight.fell
+    assert flown.z_m < ON_THE_FLOOR_M or flown.flight.hanging
+    if phase not in (Phase.PERCH, Phase.COMPLETE):
+        assert not flown.flight.hanging
+
+
+@pytest.mark.parametrize(
+    "phase", [Phase.APPROACH, Phase.ASCEND, Phase.COMPLETE], ids=lambda p: p.value
+)
+def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
+    flown = fly_short(operator_at={phase: Operator.LAND, Phase.LANDING: Operator.STOP})
+    report = flown.report
+    assert flown.way[-3:] == [phase.value, "LANDING", "ABORTED"]
+    assert report.phase is Phase.ABORTED
+    assert report.outcome is Outcome.EMERGENCY
+    assert EXIT_CODE_OF[report.outcome] == 53
+    assert flown.flight.locked  # firmware facts, "When setpoints stop": the emergency stop locks

@@ -1,0 +1,183 @@
+"""Figures of a campaign and the words after a flight."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.commands.progress import progress_bar
+from perchctl.flight.results import (
+    ENDS,
+    FlightResult,
+    campaign_summary,
+    campaign_table,
+    worst_first,
+)
+from perchctl.log.read import PhaseSpan, read_log
+from perchctl.log.summary import FlightSummary, summary_of, summary_text
+from perchctl.log.write import FlightLogWriter
+from tests.helpers import log as synthetic
+
+PERCHED = FlightResult(1, "perched", "hanging still", 0.004, 20.0, 1, False, False, 5.0)
+LANDED = FlightResult(2, "landed", "target not found", None, 30.0, 0, False, False, 5.0)
+ABORTED = FlightResult(3, "aborted", "tilted", None, 10.0, 1, True, True, 2.5)
+
+results_lists = st.lists(
+    st.builds(
+        FlightResult,
+        seed=st.integers(0, 10_000),
+        outcome=st.sampled_from(ENDS),
+        reason=st.just("why"),
+        miss_m=st.none() | st.floats(0.0, 0.1),
+        time_s=st.floats(0.0, 120.0),
+        attempts=st.integers(0, 5),
+        locked=st.booleans(),
+        fell=st.booleans(),
+        realtime_factor=st.floats(0.1, 50.0),
+    ),
+    max_size=30,
+)
+
+
+def test_a_campaign_of_three() -> None:
+    figures = campaign_summary([PERCHED, LANDED, ABORTED], wall_s=12.0)
+    assert figures == {
+        "flights": 3,
+        "perched": 1,
+        "landed": 1,
+        "aborted": 1,
+        "locked": 1,
+        "fell": 1,
+        "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
+        "realtime_factor": 5.0,
+        "worst_seeds": [3, 2, 1],
+    }
+    without_wall = campaign_summary([PERCHED, LANDED, ABORTED])
+    assert without_wall["realtime_factor"] == pytest.approx(60.0 / (4.0 + 6.0 + 4.0))
+
+
+def test_no_flights() -> None:
+    figures = campaign_summary([])
+    assert figures["miss_m"] == {"median": None, "p95": None, "max": None}
+    assert (figures["flights"], figures["realtime_factor"], figures["worst_seeds"]) == (0, None, [])
+    assert "flights" in campaign_table([])
+
+
+@given(results_lists)
+def test_figures_of_any_campaign(results: list[FlightResult]) -> None:
+    figures = campaign_summary(results)
+    assert sum(figures[end] for end in ENDS) == figures["flights"] == len(results)
+    misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
+    miss = figures["miss_m"]
+    if misses:
+        assert miss["max"] == pytest.approx(max(misses), abs=1e-6)
+        assert miss["median"] <= miss["p95"] + 1e-6 <= miss["max"] + 2e-6
+    else:
+        assert miss["max"] is None
+    assert json.loads(json.dumps(figures)) == figures
+    order = worst_first(results)
+    ends = [ENDS.index(r.outcome) for r in order]
+    assert ends == sorted(ends, reverse=True)
+    assert figures["worst_seeds"] == [r.seed for r in order[:5]]
+    text = campaign_table(results)
+    assert all(len(line) == len(line.rstrip()) for line in text.splitlines())
+
+
+def test_worst_are_the_largest_misses_when_all_perched() -> None:
+    misses = [0.003, 0.009, 0.001, 0.007]
+    results = [replace(PERCHED, seed=i, miss_m=m) for i, m in enumerate(misses)]
+    assert campaign_summary(results, worst=3)["worst_seeds"] == [1, 3, 0]
+
+
+def test_table_says_what_happened() -> None:
+    lines = campaign_table([PERCHED, LANDED, ABORTED], wall_s=12.0).splitlines()
+    said = {line.split("  ")[0]: line for line in lines if line}
+    assert said["perched"].endswith("1 (33.3 %)")
+    assert said["miss [mm]"].endswith("median 4.0, p95 4.0, max 4.0")
+    assert said["flight time [s]"].endswith("median 20.0, max 30.0")
+    assert said["attempts"].endswith("mean 0.67, max 1")
+    assert said["worst seeds"].endswith("3, 2, 1")
+    assert "aborted, locked, fell" in said["3"]
+
+
+def test_words_after_a_flight(tmp_path: Path) -> None:
+    flight = FlightSummary(
+        outcome="landed",
+        reason="target not found in the allowed attempts",
+        cause="target not found",
+        duration_s=21.44,
+        attempts=1,
+        miss_m=None,
+        battery_min_v=3.521,
+        locked=True,
+        fell=True,
+        phases=(PhaseSpan("APPROACH", 0.0, 3.0), PhaseSpan("LANDED", 3.0, 3.0)),
+    )
+    text = summary_text(flight, tmp_path / "f.jsonl", tmp_path / "f.png")
+    assert text.splitlines() == [
+        "LANDED: target not found in the allowed attempts [target not found]",
+        "flight:    21.4 s, 1 attempt",
+        "phases:    APPROACH 3.0 s > LANDED",
+        "battery:   3.52 V at its lowest",
+        "vehicle:   locked by its supervisor: inspect and restart it",
+        "vehicle:   fell",
+        f"log:       {tmp_path / 'f.jsonl'}",
+        f"plot:      {tmp_path / 'f.png'}",
+    ]
+
+
+def test_words_from_a_log(tmp_path: Path) -> None:
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
+    records = list(synthetic.ticks())
+    for record in records:
+        writer.write(record)
+    cut = read_log(writer.path)
+    writer.close(synthetic.SUMMARY)
+    text = summary_text(read_log(writer.path))
+    assert text.startswith("PERCHED: hanging still with the motors off\nmiss:      3.1 mm\n")
+    assert "SEARCH 0.5 s > ESTIMATE 0.5 s" in text
+    unfinished = summary_of(cut)
+    assert (unfinished.outcome, unfinished.reason) == ("unknown", "the log ends in PERCHED")
+    assert unfinished.duration_s == pytest.approx(18.6, abs=0.05)
+    assert unfinished.battery_min_v == pytest.approx(min(r["battery_v"] for r in records))
+    with writer.path.open("ab") as stream:
+        stream.write(b'{"kind":"ti')
+    assert "log lost:  its tail, 11 unreadable bytes" in summary_text(read_log(writer.path))
+
+
+def test_a_battery_that_is_not_measured_has_no_minimum(tmp_path: Path) -> None:
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
+    writer.write({"t_s": 0.0, "phase": "APPROACH", "battery_v": 0.0})
+    writer.close()
+    assert summary_of(read_log(writer.path)).battery_min_v is None
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "100")
+    plain, terminal = io.StringIO(), Terminal()
+    for stream in (plain, terminal):
+        with progress_bar(2, stream) as advance:
+            advance(PERCHED)
+            advance(LANDED)
+    assert plain.getvalue() == ""
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    assert re.search(r"flights .* 2/2 .* 1 perched, 1 landed", text)
+
+
+def test_rounding_keeps_a_micrometre() -> None:
+    figures = campaign_summary([replace(PERCHED, miss_m=float(np.float64(0.0012345678)))])
+    assert figures["miss_m"]["max"] == 0.001235

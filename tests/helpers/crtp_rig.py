@@ -1,0 +1,215 @@
+"""A simulated vehicle flown through cflib's own `udp://` driver, in steps.
+
+cflib's threads are waited for with bounded events; simulated time moves only by
+`advance`, so the flights are the same every time.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import cflib.crtp
+from cflib.crazyflie import Crazyflie
+from cflib.crazyflie.log import LogConfig
+from cflib.crtp.crtpstack import CRTPPacket
+
+from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.scenario import Scenario
+
+WAIT_S = 10.0
+LOG_PERIOD_S = 0.010
+CHUNK_S = 0.4  # so few packets fit into cflib's receive buffer
+BLOCKS = (
+    {f"stateEstimate.{n}": "float" for n in ("x", "y", "z", "vx", "vy", "vz")}
+    | {"supervisor.info": "uint16_t"},
+    {f"stateEstimate.{n}": "float" for n in ("roll", "pitch", "yaw")}
+    | {"acc.z": "float", "stabilizer.thrust": "float", "pm.vbat": "float", "pm.state": "int8_t"},
+)
+READY, HL_RUNNING, HL_DONE, LOW_LEVEL, LOCKED = 0x020E, 0x011E, 0x031E, 0x021E, 0x0244
+FLYING_BIT, TUMBLED_BIT, LOCKED_BIT, CRASHED_BIT, HL_BIT = 1 << 4, 1 << 5, 1 << 6, 1 << 7, 1 << 8
+CAN_FLY_BIT, ARMED_BIT = 1 << 3, 1 << 1
+
+
+class Client:
+    """One cflib connection; `connect` is bounded, unlike cflib's own."""
+
+    def __init__(self, uri: str, cache: str | None) -> None:
+        if not cflib.crtp.CLASSES:
+            cflib.crtp.init_drivers()
+        self.uri = uri
+        self.cf = Crazyflie(rw_cache=cache)
+        self.console = ""
+        self.sent: list[tuple[int, int, bytes]] = []
+        self._connected = threading.Event()
+        self._complete = threading.Event()
+        self.cf.connected.add_callback(lambda _: self._connected.set())
+        self.cf.fully_connected.add_callback(lambda _: self._complete.set())
+        self.cf.packet_sent.add_callback(
+            lambda pk: self.sent.append((pk.port, pk.channel, bytes(pk.data)))
+        )
+        self.cf.console.receivedChar.add_callback(self._hear)
+
+    def connect(self, wait_s: float = WAIT_S) -> bool:
+        self.cf.open_link(self.uri)
+        return self._connected.wait(wait_s) and self._complete.wait(wait_s)
+
+    def close(self) -> None:
+        self.cf.close_link()
+
+    def ask(
+        self, port: int, channel: int, data: bytes, wait_s: float = WAIT_S, begins: bytes = b""
+    ) -> bytes | None:
+        """Send one packet and wait for the next answer on its port and channel."""
+        arrived = threading.Event()
+        answers: list[bytes] = []
+
+        def take(packet: Any) -> None:
+            if bytes(packet.data[: len(begins)]) == begins and not arrived.is_set():
+                answers.append(bytes(packet.data))
+                arrived.set()
+
+        self.cf.add_header_callback(take, port, channel)
+        try:
+            self.send(port, channel, data)
+            return answers[0] if arrived.wait(wait_s) else None
+        finally:
+            self.cf.remove_header_callback(take, port, channel)
+
+    def send(self, port: int, channel: int, data: bytes) -> None:
+        packet = CRTPPacket()
+        packet.set_header(port, channel)
+        packet.data = data
+        self.cf.send_packet(packet)
+
+    def echo(self, number: int, wait_s: float = WAIT_S) -> bool:
+        """Whether the vehicle answers; by then it has served all that was sent before.
+
+        The first byte sets it apart from cflib's own pings.
+        """
+        ping = struct.pack("<Bd", 1, number)
+        return self.ask(15, 0, ping, wait_s, begins=ping) == ping
+
+    def supervisor_info(self) -> int:
+        """Asked of the supervisor port; cflib's getters may answer from a cache."""
+        answer = self.ask(9, 0, b"\x0c")
+        assert answer is not None
+        assert answer[0] == 0x8C
+        return int.from_bytes(answer[1:3], "little")
+
+    def _hear(self, text: str) -> None:
+        self.console += text
+
+
+class Pilot(Client):
+    """A client that logs everything it needs and moves the simulated time."""
+
+    def __init__(self, sim: SimProcess, cache: str | None) -> None:
+        super().__init__(sim.uri, cache)
+        self.sim = sim
+        self.t_s = 0.0
+        self.samples: list[tuple[float, dict[str, float]]] = []
+        self._stamps = [-1.0] * len(BLOCKS)
+        self._news = threading.Condition()
+
+    def start_log(self) -> None:
+        for index, variables in enumerate(BLOCKS):
+            block = LogConfig(name=f"rig{index}", period_in_ms=1000 * LOG_PERIOD_S)
+            for name, ctype in variables.items():
+                block.add_variable(name, ctype)
+            self.cf.log.add_config(block)
+            started = threading.Event()
+            block.started_cb.add_callback(lambda _block, _on, event=started: event.set())
+            block.data_received_cb.add_callback(
+                lambda stamp, data, _block, index=index: self._take(index, stamp, data)
+            )
+            block.start()
+            assert started.wait(WAIT_S)
+
+    def fresh(self, *, settle_s: float = 1.0, **scenario: Any) -> Pilot:
+        """A new vehicle on the floor, its raw thrust unlocked as the facts advise."""
+        self.sim.replace_vehicle(Scenario(**scenario))
+        self.t_s = 0.0
+        self.samples = []
+        self._stamps = [-1.0] * len(BLOCKS)
+        self.advance(settle_s)
+        return self
+
+    def unlock(self) -> None:
+        self.cf.commander.send_setpoint(0, 0, 0, 0)
+        self.cf.commander.send_notify_setpoint_stop()
+
+    def take_off(self, height_m: float, duration_s: float = 2.0, settle_s: float = 4.0) -> None:
+        self.unlock()
+        self.cf.high_level_commander.takeoff(height_m, duration_s)
+        self.advance(duration_s + settle_s)
+
+    def fly_to(self, height_m: float, hold_s: float = 2.0) -> None:
+        """Take off and hold a position setpoint: one mode from then on."""
+        self.take_off(height_m)
+        self.stream(hold_s, lambda: self.hold(height_m))
+
+    def hold(self, height_m: float) -> None:
+        self.cf.commander.send_position_setpoint(0, 0, height_m, 0)
+
+    def perch(self) -> None:
+        """Hang on the magnet: take off, rise, press, as the floor to beat does."""
+        self.fly_to(1.6, 0.5)
+        self.stream(4.0, lambda: self.hold(2.5))
+        assert self.sim.truth()["magnet_engaged"]
+
+    def advance(self, dt_s: float) -> None:
+        """Let time pass, and wait until the log data up to then have arrived."""
+        left_s = dt_s
+        while left_s > 1e-9:
+            part_s = min(CHUNK_S, left_s)
+            self.sim.advance(part_s)
+            self.t_s = round(self.t_s + part_s, 6)
+            left_s -= part_s
+            self._sync()
+
+    def stream(self, dt_s: float, send: Callable[[], None], period_s: float = 0.02) -> None:
+        """Send a command periodically while time passes."""
+        for _ in range(round(dt_s / period_s)):
+            send()
+            self.advance(period_s)
+
+    def until(self, done: Callable[[dict[str, Any]], bool], limit_s: float) -> float:
+        """Step by 2 ms until the truth fulfils `done`; how long that took."""
+        for step in range(round(limit_s / 0.002) + 1):
+            if done(self.sim.truth()):
+                self._sync()
+                return step * 0.002
+            self.sim.advance(0.002)
+            self.t_s = round(self.t_s + 0.002, 6)
+        raise AssertionError(f"not within {limit_s} s: {self.sim.truth()}")
+
+    def log(self, name: str, since_s: float = -1.0) -> list[tuple[float, float]]:
+        """(time, value) of a logged variable."""
+        return [(t, data[name]) for t, data in self.samples if name in data and t >= since_s]
+
+    def now(self, name: str) -> float:
+        return self.log(name)[-1][1]
+
+    @property
+    def info(self) -> int:
+        return int(self.now("supervisor.info"))
+
+    def motors_off(self) -> bool:
+        return bool(max(self.sim.truth()["motors"]) == 0)
+
+    def _take(self, index: int, stamp_ms: int, data: dict[str, float]) -> None:
+        with self._news:
+            self.samples.append((stamp_ms / 1000.0, data))
+            self._stamps[index] = stamp_ms / 1000.0
+            self._news.notify_all()
+
+    def _sync(self) -> None:
+        due_s = int(self.t_s / LOG_PERIOD_S + 1e-6) * LOG_PERIOD_S - 1e-6
+        if due_s < LOG_PERIOD_S / 2:
+            return
+        with self._news:
+            arrived = self._news.wait_for(lambda: min(self._stamps) >= due_s, WAIT_S)
+        assert arrived, f"no log data up to {due_s} s, only {self._stamps}"

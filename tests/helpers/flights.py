@@ -1,0 +1,95 @@
+"""Whole flights for tests: the short profile, its scenario, and one call to fly it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+
+from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
+from perchctl.flight.session import camera_model, pipeline_setup
+from perchctl.log.watch import LogWatcher, Truth
+from perchctl.mission.state import Operator, Phase
+from perchctl.mission.watch import FlightReport
+from perchctl.profile import Profile, load_profile
+from perchctl.sim.draw import draw_scenario
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from perchctl.mission.watch import Tick
+
+ROOT = Path(__file__).resolve().parents[2]
+SHORT = str(Path(__file__).with_name("short.yaml"))
+SEED = 3
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A flight's end, and the true height of its last tick."""
+
+    flight: LockstepFlight
+    z_m: float
+
+    @property
+    def report(self) -> FlightReport:
+        return self.flight.report
+
+    @property
+    def way(self) -> list[str]:
+        """The phases, in order."""
+        return [phase for _, phase, _ in self.report.history]
+
+
+class _Heights(LogWatcher):
+    """Takes the log's place, and keeps the true height only."""
+
+    def __init__(self) -> None:
+        self.truth: Callable[[], Truth] | None = None
+        self.z_m = 0.0
+
+    def tick(self, tick: Tick) -> None:
+        assert self.truth is not None
+        self.z_m = self.truth()[0][2]
+
+    def event(self, t_s: float, text: str) -> None:
+        return None
+
+    @property
+    def problem(self) -> str | None:
+        return None
+
+
+def short_profile(changes: Mapping[str, Any] | None = None, base: str = SHORT) -> Profile:
+    """A profile with some keys changed, each named by its dotted path."""
+    values = load_profile(base).model_dump(mode="json")
+    for dotted, value in (changes or {}).items():
+        *sections, key = dotted.split(".")
+        section = values
+        for name in sections:
+            section = section[name]
+        assert key in section, dotted
+        section[key] = value
+    return Profile.model_validate(values)
+
+
+def fly_short(
+    changes: Mapping[str, Any] | None = None,
+    operator_at: dict[Phase, Operator] | None = None,
+    *,
+    base: str = SHORT,
+    seed: int = SEED,
+    **scenario: Any,
+) -> Flown:
+    """One lockstep flight; `changes` are the profile's, `scenario` its scenario's."""
+    cv2.setNumThreads(1)
+    profile = short_profile(changes, base)
+    camera = camera_model(profile, None)
+    setup = pipeline_setup(profile, camera)
+    drawn = replace(draw_scenario(profile, seed), **scenario)
+    heights = _Heights()
+    flight = fly_lockstep(profile, camera, setup, drawn, heights, operator_at)
+    return Flown(flight, heights.z_m)

@@ -1,0 +1,170 @@
+"""A made-up but plausible flight for the tests of log, plot and display."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from perchctl.log.fields import tick_record
+from perchctl.log.write import make_header
+from perchctl.profile import Profile
+from perchctl.vehicle import (
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    StopMotors,
+    TakeOff,
+    Telemetry,
+)
+from perchctl.vision.types import (
+    Detection,
+    Detections,
+    MarkerPose,
+    PipelineOutput,
+    Stage,
+    TargetPose,
+)
+
+PERIOD_S = 0.02
+PLAN: tuple[tuple[str, float, str], ...] = (
+    ("APPROACH", 3.0, "start"),
+    ("SEARCH", 0.5, "hovering in the perching area"),
+    ("ESTIMATE", 0.5, "target seen"),
+    ("ALIGN", 4.0, "pose is steady"),
+    ("ASCEND", 6.0, "aligned in position and heading"),
+    ("PERCH", 1.2, "settled at the stand-off"),
+    ("COMPLETE", 3.4, "contact proven by position, acceleration and thrust"),
+    ("PERCHED", 0.0, "hanging still with the motors off"),
+)
+GONE_S = (5.0, 5.5)
+"""No detection between these times: the filter coasts."""
+
+
+def header(**changes: Any) -> dict[str, Any]:
+    args: dict[str, Any] = {"uri": "sim://", "source": "sim:", "seed": 7, "lockstep": True}
+    return make_header(Profile(name="sim"), **(args | changes))
+
+
+def telemetry(t_s: float = 0.0, z_m: float = 0.0) -> Telemetry:
+    return Telemetry(
+        t_s=t_s,
+        position_m=(0.3, -0.2, z_m),
+        velocity_mps=(0.01, 0.02, 0.03),
+        roll_rad=0.01,
+        pitch_rad=-0.02,
+        yaw_rad=0.5,
+        acc_z_g=1.0,
+        thrust=42000.0,
+        battery_v=3.9 - 0.01 * t_s,
+        supervisor=0x1A,
+    )
+
+
+def target(t_s: float, z_m: float, measured: bool = True, stage: Stage = Stage.BOTH) -> TargetPose:
+    decay = math.exp(-t_s / 4.0)
+    e_m = np.array([0.3 * decay, -0.2 * decay, max(0.0, 1.9 - z_m)])
+    return TargetPose(
+        t_s=t_s,
+        stage=stage,
+        e_m=e_m,
+        e_yaw_rad=2.0 * decay,
+        velocity_mps=np.zeros(3),
+        measured=measured,
+        unseen=0 if measured else 4,
+        sigma_m=np.full(3, 0.004),
+        sigma_yaw_rad=0.02,
+        world_m=np.array([0.6, -0.4, 2.2]),
+        world_yaw_rad=2.5,
+    )
+
+
+def output(index: int, truth: TargetPose, rng: np.random.Generator) -> PipelineOutput:
+    """Noisy poses of the large marker far away, of the small one near by."""
+    poses: dict[str, MarkerPose] = {}
+    detections = Detections(frame_index=index, t_s=truth.t_s)
+    if truth.e_m[2] > 0.12:
+        poses["large"] = _pose("large", truth, 0.01, rng)
+        detections = replace(detections, large=_detection("large"))
+    if truth.e_m[2] < 0.5:
+        poses["small"] = _pose("small", truth, 0.004, rng)
+        detections = replace(detections, small=_detection("small"))
+    return PipelineOutput(detections=detections, poses=poses, target=truth, stage=truth.stage)
+
+
+def _detection(marker: Any) -> Detection:
+    corners = np.array([[100.1234, 90.0], [200.0, 90.0], [200.0, 190.0], [100.0, 190.0]])
+    return Detection(marker=marker, corners_px=corners, sigma_px=0.1, refined=True)
+
+
+def _pose(source: Any, truth: TargetPose, sigma: float, rng: np.random.Generator) -> MarkerPose:
+    return MarkerPose(
+        source=source,
+        t_s=truth.t_s,
+        rvec_rad=np.zeros(3),
+        tvec_m=np.zeros(3),
+        e_m=truth.e_m + rng.normal(0.0, sigma, 3),
+        e_yaw_rad=truth.e_yaw_rad + float(rng.normal(0.0, 3.0 * sigma)),
+        sigma_m=np.full(3, sigma),
+        sigma_yaw_rad=sigma,
+        reprojection_px=0.4,
+    )
+
+
+def ticks(seed: int = 7) -> Iterator[dict[str, Any]]:
+    """The records of the flight in `PLAN`, 50 a second, a frame in every other."""
+    rng = np.random.default_rng(seed)
+    t_s, n = 1.1, 0
+    for phase, duration_s, reason in PLAN:
+        for _ in range(max(1, round(duration_s / PERIOD_S))):
+            flown_s = n * PERIOD_S
+            z_m = min(1.87, 0.25 * flown_s)
+            seen = flown_s > 3.2
+            gone = GONE_S[0] < flown_s < GONE_S[1]
+            stage = Stage.LARGE if z_m < 1.5 else Stage.BOTH
+            pose = target(flown_s, z_m, not gone, stage) if seen else None
+            frame = None
+            if pose is not None and not gone and n % 2 == 0:
+                frame = output(n // 2, pose, rng)
+            yield tick_record(
+                t_s=t_s,
+                telemetry=telemetry(t_s - 0.012, z_m),
+                output=frame,
+                target=pose,
+                phase=phase,
+                reason=reason,
+                command=_command(phase, z_m),
+                camera_age_s=0.03,
+            )
+            n += 1
+            t_s += PERIOD_S
+
+
+def _command(phase: str, z_m: float) -> Command:
+    match phase:
+        case "APPROACH":
+            return TakeOff(0.5, 2.5)
+        case "COMPLETE":
+            return StopMotors()
+        case "PERCHED":
+            return Idle()
+        case "LANDING":
+            return Land(-0.05, 2.0)
+    return PositionSetpoint(0.6, -0.4, z_m + 0.05, 0.5)
+
+
+SUMMARY = {
+    "outcome": "perched",
+    "cause": "perched",
+    "reason": "hanging still with the motors off",
+    "duration_s": 18.6,
+    "attempts": 1,
+    "miss_m": 0.0031,
+    "battery_min_v": 3.7,
+    "locked": False,
+    "fell": False,
+}

@@ -1,0 +1,92 @@
+"""Building blocks for planner tests: telemetry, targets and a flight told by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from perchctl.mission import planner
+from perchctl.mission.state import Anchor, Observation, Phase, PlannerState
+from perchctl.profile import Profile
+from perchctl.vehicle import (
+    ARMED,
+    AUTO_ARM,
+    CAN_FLY,
+    FLYING,
+    PositionSetpoint,
+    Telemetry,
+)
+from perchctl.vision.types import Stage, TargetPose
+
+READY = AUTO_ARM | CAN_FLY | ARMED
+AIRBORNE = READY | FLYING
+HOVER_THRUST = 56000.0
+CEILING_M = 2.2
+PROFILE = Profile()
+
+
+def telemetry(t_s: float, z_m: float = 1.0, **changes: object) -> Telemetry:
+    sample = Telemetry(
+        t_s=t_s,
+        position_m=(0.0, 0.0, z_m),
+        velocity_mps=(0.0, 0.0, 0.0),
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=0.0,
+        acc_z_g=1.0,
+        thrust=HOVER_THRUST,
+        battery_v=3.9 + 0.001 * (round(t_s * 100) % 7),
+        supervisor=AIRBORNE,
+    )
+    return replace(sample, **changes)  # type: ignore[arg-type]
+
+
+def target_at(
+    t_s: float, world_m: tuple[float, float, float] = (0.0, 0.0, CEILING_M), **changes: object
+) -> TargetPose:
+    pose = TargetPose(
+        t_s=t_s,
+        stage=Stage.BOTH,
+        e_m=np.array(world_m) - (0.0, 0.0, 1.03),
+        e_yaw_rad=0.0,
+        velocity_mps=np.zeros(3),
+        measured=True,
+        unseen=0,
+        sigma_m=np.full(3, 1e-3),
+        sigma_yaw_rad=1e-3,
+        world_m=np.array(world_m),
+        world_yaw_rad=0.0,
+        world_velocity_mps=np.zeros(3),
+    )
+    return replace(pose, **changes)  # type: ignore[arg-type]
+
+
+def observation(t_s: float, z_m: float = 1.0, **changes: object) -> Observation:
+    tel = changes.pop("telemetry", None) or telemetry(t_s, z_m)
+    obs = Observation(
+        t_s=t_s,
+        telemetry=tel,
+        target=target_at(t_s),
+        new_frame=True,  # type: ignore[arg-type]
+    )
+    return replace(obs, **changes)  # type: ignore[arg-type]
+
+
+def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
+    """A planner that has just come into `phase` in an undisturbed flight."""
+    state = planner.start(observation(0.0, 0.0))
+    target = np.array([0.0, 0.0, CEILING_M])
+    return replace(
+        state,
+        phase=phase,
+        entered_s=t_s,
+        t_s=t_s,
+        search_step_s=t_s,
+        setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
+        entry_m=(0.0, 0.0, z_m),
+        anchor=Anchor(t_s, target, 0.0, np.zeros(3)),
+        small_seen_s=t_s,
+        hover_thrust=HOVER_THRUST,
+        contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
+    )

@@ -1,0 +1,108 @@
+"""Pictures of the target with exact truth: every pixel's ray meets the target's plane,
+and the pattern there is known in closed form, edges softened symmetrically."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import R_MARKER_TARGET, Array, rotation_from_rpy
+from perchctl.profile.dictionaries import predefined
+from perchctl.vision.camera_model import undistort
+from perchctl.vision.types import CameraModel
+
+LARGE_M, SMALL_M, SHEET_M = 0.150, 0.025, 0.200
+CAMERA = CameraModel(
+    (640, 480),
+    np.array([[400.0, 0.0, 322.0], [0.0, 402.0, 236.0], [0.0, 0.0, 1.0]]),
+    np.array([-0.2, 0.05, 0.0005, -0.001, -0.005]),
+)
+
+
+def pose_of(
+    x_m: float,
+    y_m: float,
+    z_m: float,
+    yaw_rad: float = 0.0,
+    roll_rad: float = 0.0,
+    pitch_rad: float = 0.0,
+) -> tuple[Array, Array]:
+    """rvec, tvec of the marker frame for a target at (x, y, z) in the camera, turned by
+    yaw about the view, for a camera tilted by roll and pitch out of level."""
+    R_level_cam = rotation_from_rpy(roll_rad, pitch_rad, 0.0)
+    R_level_marker = rotation_from_rpy(0.0, 0.0, yaw_rad) @ R_MARKER_TARGET
+    rvec = cv2.Rodrigues(R_level_cam.T @ R_level_marker)[0]
+    return np.asarray(rvec, dtype=np.float64).ravel(), np.array([x_m, y_m, z_m])
+
+
+def render(
+    rvec: Array,
+    tvec: Array,
+    camera: CameraModel = CAMERA,
+    *,
+    markers: tuple[str, ...] = ("large", "small"),
+    blur_px: float = 0.7,
+    noise: float = 0.0,
+    white: float = 205.0,
+    black: float = 30.0,
+    background: float = 120.0,
+    seed: int = 0,
+) -> NDArray[np.uint8]:
+    """Grey picture (h, w), uint8."""
+    rays = _rays(camera)
+    h, w = rays.shape[:2]
+    R = cv2.Rodrigues(rvec)[0]
+    n = R[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (n @ tvec) / (rays @ n)
+    points = (rays * depth[..., None] - tvec) @ R  # in marker axes
+    x, y = points[..., 0], points[..., 1]
+    near = (depth > 0) & (np.abs(x) < 0.6 * SHEET_M) & (np.abs(y) < 0.6 * SHEET_M)
+    picture = np.full((h, w), background)
+    x, y = x[near], y[near]
+    soft = blur_px * depth[near] / camera.K[0, 0]
+    sheet = _box(x, -SHEET_M / 2, SHEET_M / 2, soft) * _box(y, -SHEET_M / 2, SHEET_M / 2, soft)
+    dark = np.zeros_like(x)
+    if "large" in markers:
+        dark += _pattern("DICT_4X4_1000", 997, LARGE_M, x, y, soft)
+    if "small" in markers:
+        dark += _pattern("DICT_ARUCO_ORIGINAL", 5, SMALL_M, x, y, soft)
+    picture[near] = background + sheet * (white - background) - dark * (white - black)
+    if noise > 0.0:
+        picture += np.random.default_rng(seed).normal(0.0, noise, picture.shape)
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+
+def bits_of(name: str, index: int) -> NDArray[np.uint8]:
+    """The inner bits of a marker, 1 = white, (n, n)."""
+    dictionary = predefined(name)
+    rows = np.ascontiguousarray(dictionary.bytesList[index : index + 1])
+    return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, dictionary.markerSize))
+
+
+def _pattern(name: str, index: int, side_m: float, x: Array, y: Array, soft: Array) -> Array:
+    black = np.pad(1.0 - bits_of(name, index), 1, constant_values=1.0)
+    edges = np.linspace(-side_m / 2, side_m / 2, len(black) + 1)
+    columns = np.diff(_step(edges[:, None] - x, soft), axis=0)
+    bands = np.diff(_step(edges[:, None] + y, soft), axis=0)  # rows run against y
+    return np.einsum("rn,rc,cn->n", bands, black, columns)
+
+
+def _step(distance: Array, soft: Array) -> Array:
+    return 0.5 * (1.0 + np.tanh(0.8 * np.sqrt(2.0) * distance / soft))
+
+
+def _box(v: Array, low: float, high: float, soft: Array) -> Array:
+    return _step(v - low, soft) - _step(v - high, soft)
+
+
+@cache
+def _rays(camera: CameraModel) -> Array:
+    w, h = camera.size_px
+    grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).reshape(-1, 2)
+    rays = np.ones((h * w, 3))
+    rays[:, :2] = undistort(grid.astype(np.float64), camera)
+    return rays.reshape(h, w, 3)

@@ -1,0 +1,98 @@
+"""The picture of a flight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.errors import InvalidValue
+from perchctl.geometry import Array
+from perchctl.log.plot import plot_flight, title_of
+from perchctl.log.read import FlightLog, read_log
+from perchctl.log.summary import summary_of
+from perchctl.log.write import FlightLogWriter
+from tests.helpers import log as synthetic
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:
+    path = tmp_path_factory.mktemp("log") / "f.jsonl"
+    writer = FlightLogWriter.open(path, synthetic.header())
+    for record in synthetic.ticks():
+        writer.write(record)
+    writer.close(synthetic.SUMMARY)
+    return read_log(writer.path)
+
+
+def picture(log: FlightLog, path: Path) -> Array:
+    plot_flight(log, path)
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image.astype(np.float64)
+
+
+def share_of(image: Array, hex_colour: str) -> float:
+    """Share of the pixels that have that colour (BGR image)."""
+    rgb = [int(hex_colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return float((np.abs(image - np.array(rgb[::-1])).max(axis=2) < 12).mean())
+
+
+def test_the_picture_holds_the_flight(log: FlightLog, tmp_path: Path) -> None:
+    image = picture(log, tmp_path / "f.png")
+    assert image.shape[0] > 1200
+    for colour in ("#56B4E9", "#E69F00", "#0072B2", "#CC79A7", "#009E73", "#D55E00"):
+        assert share_of(image, colour) > 2e-4, colour
+
+
+def test_raw_points_come_from_the_detections(log: FlightLog, tmp_path: Path) -> None:
+    """Without the small marker's poses its colour is left in the legend only."""
+    blind = [r | dict.fromkeys(("sx_m", "sy_m", "sz_m", "syaw_rad")) for r in log.records]
+    without = FlightLog(log.path, log.header, blind, log.events, log.summary, False)
+    full = share_of(picture(log, tmp_path / "a.png"), "#E69F00")
+    assert share_of(picture(without, tmp_path / "b.png"), "#E69F00") < full / 5
+
+
+@pytest.mark.parametrize("count", [1, 2, 60])
+def test_a_short_flight_without_a_target(log: FlightLog, count: int, tmp_path: Path) -> None:
+    """One tick, no pose, no summary: still a picture, and no warning."""
+    short = FlightLog(log.path, log.header, log.records[:count], [], None, True)
+    assert picture(short, tmp_path / "f.png").std() > 1.0
+
+
+def test_many_attempts_and_names_that_matplotlib_would_typeset(tmp_path: Path) -> None:
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
+    for i, record in enumerate(synthetic.ticks()):
+        phase = ("ALIGN", "ASCEND", "PERCH", "RECOVER")[i // 10 % 4]
+        writer.write(record | {"phase": phase, "reason": "50 $ and _more_ {"})
+    writer.close({"outcome": "landed", "reason": "a $ in {a} reason $ with \\frac"})
+    log = read_log(writer.path)
+    assert len(log.phases) > 50
+    assert picture(log, tmp_path / "f.png").std() > 1.0
+
+
+def test_title(log: FlightLog) -> None:
+    assert title_of(log, summary_of(log)).split() == [
+        "profile",
+        "sim,",
+        "seed",
+        "7",
+        "|",
+        "perched",
+        "|",
+        "miss",
+        "3.1",
+        "mm",
+    ]
+    cut = FlightLog(log.path, {}, log.records, [], None, True)
+    assert "unknown (the log ends in PERCHED)" in title_of(cut, summary_of(cut))
+
+
+def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:
+    empty = FlightLog(log.path, log.header, [], [], None, True)
+    with pytest.raises(InvalidValue, match="no ticks"):
+        plot_flight(empty, tmp_path / "f.png")
+    with pytest.raises(InvalidValue, match="cannot be written"):
+        plot_flight(log, tmp_path / "no" / "folder.png")
