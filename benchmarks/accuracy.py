@@ -28,7 +28,7 @@ from common import (
 )
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.pipeline import PipelineSetup, step
+from perchctl.pipeline import Pipeline, step
 from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
 from perchctl.vision.types import CameraModel, Frame, MarkerPose, PipelineOutput, PipelineState
 
@@ -50,7 +50,7 @@ def best_pose(output: PipelineOutput) -> MarkerPose | None:
     return next((poses[n] for n in ("joint", "large", "small") if n in poses), None)
 
 
-def look(setup: PipelineSetup, image: Picture) -> PipelineOutput:
+def look(setup: Pipeline, image: Picture) -> PipelineOutput:
     return step(PipelineState(), Frame(0, 0.0, image), None, setup)[1]
 
 

@@ -27,12 +27,13 @@ from perchctl.geometry import (  # noqa: E402
     rot_z,
     rotation_from_rpy,
 )
-from perchctl.pipeline import PipelineSetup, make_setup  # noqa: E402
+from perchctl.pipeline import Pipeline, camera_profile, make_pipeline  # noqa: E402
 from perchctl.profile import (  # noqa: E402
     DetectorConfig,
     KalmanConfig,
     MergeConfig,
     PoseConfig,
+    Profile,
     TargetConfig,
 )
 from perchctl.profile.dictionaries import predefined  # noqa: E402
@@ -68,18 +69,16 @@ def setup_with(
     pose: PoseConfig | None = None,
     kalman: KalmanConfig | None = None,
     merge: MergeConfig | None = None,
-) -> PipelineSetup:
+) -> Pipeline:
     """The pipeline with camera, body and gear in one point."""
-    return make_setup(
-        detector or DetectorConfig(),
-        pose or PoseConfig(),
-        kalman or KalmanConfig(),
-        merge or MergeConfig(),
-        TARGET,
-        np.eye(4),
-        (0.0, 0.0, 0.0),
-        camera,
+    profile = Profile(
+        target=TARGET,
+        detector=detector or DetectorConfig(),
+        pose=pose or PoseConfig(),
+        kalman=kalman or KalmanConfig(),
+        merge=merge or MergeConfig(),
     )
+    return make_pipeline(camera_profile(profile), camera)
 
 
 def renderer(seed: int = 0, camera: CameraModel = CAMERA, **scenario: Any) -> Renderer:

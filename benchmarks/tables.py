@@ -20,7 +20,7 @@ from common import (
 )
 
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.pipeline import PipelineSetup, step
+from perchctl.pipeline import Pipeline, step
 from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
 from perchctl.sim.renderer import Renderer
 from perchctl.vision.types import Frame, PipelineState
@@ -58,9 +58,7 @@ def markers_in_view(T: Array) -> list[str]:
     return [n for n in ("large", "small") if in_view(true_corners(T, n))]
 
 
-def measure(
-    setup: PipelineSetup, scene: Renderer, T: Array, e_m: Array, yaw: float, n: int
-) -> Peaks:
+def measure(setup: Pipeline, scene: Renderer, T: Array, e_m: Array, yaw: float, n: int) -> Peaks:
     """`e_m`, `yaw` are what should come out, in the camera's own axes."""
     state = PipelineState()
     errors, single = [], []

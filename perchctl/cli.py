@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import sys
 from collections.abc import Iterator
@@ -130,8 +129,8 @@ def fly(
             return
         if not (yes or options.simulated):
             _ask_before_arming(options.uri)
-        options = dataclasses.replace(options, view=view or view_port > 0, view_port=view_port)
-        code = work.run(options, as_json=as_json)
+        page_port = view_port if view or view_port > 0 else None
+        code = work.run(options, as_json=as_json, page_port=page_port)
         raise typer.Exit(code)
 
 

@@ -7,19 +7,12 @@ replaying all call it. It keeps no memory of its own: what it must remember is i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.profile import (
-    DetectorConfig,
-    KalmanConfig,
-    MergeConfig,
-    PoseConfig,
-    TargetConfig,
-)
+from perchctl.profile import KalmanConfig, MergeConfig, Mounting, Profile
 from perchctl.vision.filter import (
     MAX_GAP_S,
     POSITION,
@@ -63,12 +56,12 @@ from perchctl.vision.types import (
     TargetPose,
 )
 
-__all__ = ["PipelineOutput", "PipelineSetup", "PipelineState", "make_setup", "step"]
+__all__ = ["Pipeline", "PipelineOutput", "PipelineState", "make_pipeline", "step"]
 
 
 @dataclass(frozen=True, eq=False)
-class PipelineSetup:
-    """What does not change from frame to frame, made once by `make_setup`."""
+class Pipeline:
+    """What does not change from frame to frame, made once by `make_pipeline`."""
 
     detector: DetectorSetup
     pose: PoseSetup
@@ -91,31 +84,35 @@ class _Merged:
     stage: Stage
 
 
-def make_setup(
-    detector: DetectorConfig,
-    pose: PoseConfig,
-    kalman: KalmanConfig,
-    merge: MergeConfig,
-    target: TargetConfig,
-    T_body_cam: Array,
-    gear_body_m: Sequence[float] | Array,
-    camera: CameraModel,
-) -> PipelineSetup:
-    """Build the setup from a profile's sections, the mounting (4, 4), the gear (3,) and
-    the calibration. One setup serves one thread: it owns an OpenCV detector."""
-    return PipelineSetup(
-        detector=make_detector(detector, target),
-        pose=make_pose_setup(pose, target, T_body_cam, gear_body_m, camera),
-        level_filter=make_filter(kalman, in_world=False),
-        world_filter=make_filter(kalman, in_world=True),
-        kalman=kalman,
-        merge=merge,
+def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
+    """The profile's pipeline for a calibrated camera. One serves one thread: it owns an
+    OpenCV detector."""
+    mount, gear_body_m = profile.camera.mount, profile.vehicle.gear_body_m
+    return Pipeline(
+        detector=make_detector(profile.detector, profile.target),
+        pose=make_pose_setup(profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera),
+        level_filter=make_filter(profile.kalman, in_world=False),
+        world_filter=make_filter(profile.kalman, in_world=True),
+        kalman=profile.kalman,
+        merge=profile.merge,
         camera=camera,
     )
 
 
+def camera_profile(profile: Profile) -> Profile:
+    """The profile with the camera in the place of vehicle and gear: without a vehicle the
+    target's pose is asked for in the camera frame."""
+    bare = Mounting(position_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0))
+    return profile.model_copy(
+        update={
+            "camera": profile.camera.model_copy(update={"mount": bare}),
+            "vehicle": profile.vehicle.model_copy(update={"gear_body_m": (0.0, 0.0, 0.0)}),
+        }
+    )
+
+
 def step(
-    state: PipelineState, frame: Frame, attitude: Attitude | None, setup: PipelineSetup
+    state: PipelineState, frame: Frame, attitude: Attitude | None, setup: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
     """One frame. `attitude` is the vehicle's at the frame's time, None without one.
 
@@ -175,7 +172,7 @@ def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
 def _poses(
     detections: Detections,
     attitude: Attitude | None,
-    setup: PipelineSetup,
+    setup: Pipeline,
     normal: Array | None,
     near: MarkerPose | None,
 ) -> Poses:
@@ -199,7 +196,7 @@ def _chosen(
     poses: Poses,
     contradiction: bool,
     attitude: Attitude | None,
-    setup: PipelineSetup,
+    setup: Pipeline,
 ) -> dict[str, MarkerPose]:
     """Which pose feeds which track in this frame."""
     if poses.consistent and setup.merge.stages == "seen":
@@ -220,7 +217,7 @@ def _chosen(
     return {"joint": poses["joint"]} if "joint" in poses else {"joint": use}
 
 
-def _gear_above_camera(attitude: Attitude | None, setup: PipelineSetup) -> float:
+def _gear_above_camera(attitude: Attitude | None, setup: Pipeline) -> float:
     offset = setup.pose.gear_body_m - setup.pose.T_body_cam[:3, 3]
     return float((level_rotation(attitude) @ offset)[2])
 
@@ -230,7 +227,7 @@ def _step_tracks(
     chosen: dict[str, MarkerPose],
     t_s: float,
     world: Attitude | None,
-    setup: PipelineSetup,
+    setup: Pipeline,
 ) -> dict[str, MarkerTrack]:
     """All tracks one frame on; `world` is the attitude where they live in the world."""
     constants = setup.level_filter if world is None else setup.world_filter
@@ -245,7 +242,7 @@ def _step_tracks(
     return stepped
 
 
-def _measurement(pose: MarkerPose, world: Attitude | None, setup: PipelineSetup) -> Array:
+def _measurement(pose: MarkerPose, world: Attitude | None, setup: Pipeline) -> Array:
     """(yaw, x, y, z) in the tracks' frame."""
     if world is None:
         return np.array([pose.e_yaw_rad, *pose.e_m])
@@ -254,7 +251,7 @@ def _measurement(pose: MarkerPose, world: Attitude | None, setup: PipelineSetup)
 
 
 def _noise(
-    pose: MarkerPose, world: Attitude | None, constants: FilterSetup, setup: PipelineSetup
+    pose: MarkerPose, world: Attitude | None, constants: FilterSetup, setup: Pipeline
 ) -> Array | None:
     """Covariance (4, 4) of `_measurement`, None for the fixed one."""
     if pose.cov is None or constants.attitude_sigma_rad is None:
@@ -269,7 +266,7 @@ def _noise(
 
 
 def _to_world(
-    e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: PipelineSetup
+    e_m: Array, e_yaw_rad: float, attitude: Attitude, setup: Pipeline
 ) -> tuple[Array, float]:
     gear_level = level_rotation(attitude) @ setup.pose.gear_body_m
     position = np.asarray(attitude.position_m) + rot_z(attitude.yaw_rad) @ (e_m + gear_level)
@@ -277,7 +274,7 @@ def _to_world(
 
 
 def _to_level(
-    position_m: Array, yaw_rad: float, attitude: Attitude, setup: PipelineSetup
+    position_m: Array, yaw_rad: float, attitude: Attitude, setup: Pipeline
 ) -> tuple[Array, float]:
     """Inverse of `_to_world`."""
     gear_level = level_rotation(attitude) @ setup.pose.gear_body_m
@@ -290,7 +287,7 @@ def _merge_tracks(
     chosen: dict[str, MarkerPose],
     attitude: Attitude | None,
     in_world: bool,
-    setup: PipelineSetup,
+    setup: Pipeline,
 ) -> _Merged | None:
     """The tracks that this frame fed, or else those unseen for the shortest time."""
     if not tracks:
@@ -334,7 +331,7 @@ def _target(
     measured: bool,
     attitude: Attitude | None,
     in_world: bool,
-    setup: PipelineSetup,
+    setup: Pipeline,
 ) -> TargetPose:
     position, yaw = merged.vector[:3], float(merged.vector[3])
     velocity, cov = merged.velocity_mps, merged.cov_m2

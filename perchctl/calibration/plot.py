@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from perchctl.calibration.lens import PARAMETERS, pixel_derivatives, rays_of
@@ -16,10 +14,20 @@ from perchctl.calibration.predict import draws, ray_errors_px
 from perchctl.calibration.types import Calibration
 from perchctl.calibration.verdict import Level, level, limit_mm, sentence
 from perchctl.geometry import Array
+from perchctl.plot import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    GRID,
+    ORANGE,
+    SKY,
+    VERMILLION,
+    new_figure,
+    save_png,
+)
 from perchctl.vision.camera_model import distort, undistort
 
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILLION, GREY = "#0072B2", "#D55E00", "#8C8C8C"
 BANNER: dict[Level, str] = {"fly": GREEN, "care": "#B36B00", "stop": "#B00020"}
 SIZE_IN = (13.0, 11.5)
 DPI = 100
@@ -30,8 +38,7 @@ LIMIT_LOW = 0.5  # mm: the axis reaches down to it
 
 def draw_calibration(calibration: Calibration) -> bytes:
     """The report as a PNG."""
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*SIZE_IN, dpi=DPI)
     grid = figure.add_gridspec(4, 2, height_ratios=(0.22, 1.25, 1.0, 1.0))
     _banner(figure.add_subplot(grid[0, :]), calibration)
     _coverage(figure.add_subplot(grid[1, 0]), calibration)
@@ -41,7 +48,7 @@ def draw_calibration(calibration: Calibration) -> bytes:
     _distortion(figure.add_subplot(grid[3, 0]), calibration)
     _numbers(figure.add_subplot(grid[3, 1]), calibration)
     content = io.BytesIO()
-    figure.savefig(content, format="png")
+    save_png(figure, content)
     return content.getvalue()
 
 
@@ -143,7 +150,7 @@ def _views(ax: Axes, calibration: Calibration) -> None:
     ax.set_ylabel("RMS [px]")
     more = " (orange: without some corners)" if trimmed else ""
     ax.set_title(f"RMS of each view{more}", fontsize=10)
-    ax.grid(True, axis="y", color="#D8D8D8", linewidth=0.6)
+    ax.grid(True, axis="y", color=GRID, linewidth=0.6)
     ax.set_axisbelow(True)
 
 
@@ -170,7 +177,7 @@ def _target(ax: Axes, calibration: Calibration) -> None:
     ax.set_xlabel("distance to the target [cm]")
     ax.set_ylabel("error, 95 % [mm]")
     ax.set_title("Error at the target's centre", fontsize=10)
-    ax.grid(True, color="#D8D8D8", linewidth=0.6)
+    ax.grid(True, color=GRID, linewidth=0.6)
     ax.legend(fontsize=8, loc="upper left")
 
 
@@ -198,7 +205,7 @@ def _distortion(ax: Axes, calibration: Calibration) -> None:
     ax.set_xlabel("distance from the image centre [px]")
     ax.set_ylabel("moved by the lens [px]")
     ax.set_title(f"Distortion ({camera.model}) with its 95 % band", fontsize=10)
-    ax.grid(True, color="#D8D8D8", linewidth=0.6)
+    ax.grid(True, color=GRID, linewidth=0.6)
 
 
 def _radial(calibration: Calibration, far_px: Array) -> tuple[Array, Array, Array]:

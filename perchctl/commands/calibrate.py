@@ -28,7 +28,8 @@ from perchctl.camera.files import VideoSource, image_files, read_grey
 from perchctl.camera.open import open_source
 from perchctl.camera.source import check_size
 from perchctl.commands.coverage import coverage_bars, search_bar
-from perchctl.commands.track import Stopper, source_spec
+from perchctl.commands.interrupt import Stopper
+from perchctl.commands.track import source_spec
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import InvalidValue, UsageError

@@ -18,9 +18,9 @@ from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.profile import Profile, find_calibration, find_profile, load_profile
+from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.vision.types import CameraModel
-from perchctl.weights.collect import Eye, SessionFile, collecting_setup, fault_of, rows_of
+from perchctl.weights.collect import Eye, SessionFile, collecting_pipeline, fault_of, rows_of
 from perchctl.weights.dialogue import Experiment
 from perchctl.weights.truth import EstimateTruth, MocapTruth, Truth, TypedTruth, four_numbers
 
@@ -61,8 +61,7 @@ def collect(options: CollectOptions) -> None:
         if not 0.0 <= getattr(options, name) <= 50.0:
             raise InvalidValue(f"--{name} {getattr(options, name):g} must be between 0 and 50")
     profile = load_profile(options.profile, with_weights=False)
-    path = find_profile(options.profile)
-    camera = load_calibration(find_calibration(profile.camera.calibration, path))
+    camera = load_calibration(find_calibration(profile.camera.calibration))
     if options.truth == "sim":
         _collect_simulated(options, profile, camera)
     else:
@@ -89,7 +88,7 @@ def _collect_simulated(options: CollectOptions, profile: Profile, camera: Camera
 
     session = _session(options)
     stand = Stand(profile, camera, options.positions, options.seed, options.noise, options.blur)
-    setup = collecting_setup(profile, camera)
+    setup = collecting_pipeline(profile, camera)
     left = max(0, options.positions - len(session.done))
     with count_bar("frames", left * options.frames) as advance:
         for position in range(session.next_position, session.next_position + left):
@@ -131,7 +130,7 @@ def _collect_with_person(options: CollectOptions, profile: Profile, camera: Came
         experiment = Experiment(
             _session(options),
             source,
-            collecting_setup(profile, camera),
+            collecting_pipeline(profile, camera),
             truth,
             ask=_ask,
             say=_say,

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
+from perchctl.calibration.files import load_calibration
+from perchctl.commands.interrupt import signals_to
+from perchctl.display.page.flight import FlightPage, flight_page
 from perchctl.display.panel import make_reporter
 from perchctl.display.watch import DisplayWatcher
 from perchctl.errors import (
@@ -17,11 +21,13 @@ from perchctl.errors import (
     SafetyAbort,
     TargetNotFound,
 )
-from perchctl.flight.session import FlyOptions, check_options, fly_session
+from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight.session import FlyOptions, SessionResult, check_options, fly_session
 from perchctl.log.read import read_log
 from perchctl.log.summary import summary_text
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
+from perchctl.mission.watch import Watcher
 from perchctl.profile import (
     Profile,
     find_calibration,
@@ -61,7 +67,7 @@ def resolve(
 
 def plan(options: FlyOptions) -> dict[str, Any]:
     """What would be flown, fully resolved; nothing is connected."""
-    calibration = find_calibration(options.profile.camera.calibration, options.profile_path)
+    calibration = find_calibration(options.profile.camera.calibration)
     return {
         "uri": options.uri,
         "source": options.source,
@@ -127,9 +133,12 @@ def weights_text(options: FlyOptions) -> str:
     return f"weights {numbers} (from {path}{': ' + said if said else ''})"
 
 
-def run(options: FlyOptions, *, as_json: bool = False) -> int:
+def run(options: FlyOptions, *, as_json: bool = False, page_port: int | None = None) -> int:
     """Fly, log, plot, say how it ended; returns the exit code. Errors before the flight
-    and unforeseen ones are raised, after the vehicle has been landed."""
+    and unforeseen ones are raised, after the vehicle has been landed.
+
+    `page_port`: where to serve the live page (0: any free port); None: no page.
+    """
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir, options.profile, options.uri, options.source, simulated_seed
@@ -141,7 +150,7 @@ def run(options: FlyOptions, *, as_json: bool = False) -> int:
         log.event(time.monotonic(), merges.removeprefix("; "))
     print(f"perchctl: connecting to {options.uri}{merges}", file=sys.stderr)
     try:
-        result = fly_session(options, (log, DisplayWatcher(reporter)))
+        result = _fly(options, (log, DisplayWatcher(reporter)), page_port)
     except BaseException as error:
         log.abandon(str(error) or type(error).__name__)
         raise
@@ -156,6 +165,35 @@ def run(options: FlyOptions, *, as_json: bool = False) -> int:
     if as_json:
         print(json.dumps(summary.as_record() | {"exit_code": code, "log": str(log.path)}))
     return code
+
+
+def _fly(
+    options: FlyOptions, watchers: tuple[Watcher, ...], page_port: int | None
+) -> SessionResult:
+    """The session, with Ctrl-C on its switch and the live page, if asked for, around it."""
+    switch = OperatorSwitch()
+    with signals_to(switch.press), live_page(options, page_port, switch) as page:
+        if page is None:
+            return fly_session(options, watchers, switch)
+        return fly_session(options, (*watchers, page), switch, page.watched)
+
+
+def live_page(
+    options: FlyOptions, port: int | None, switch: OperatorSwitch
+) -> contextlib.AbstractContextManager[FlightPage | None]:
+    """The page of `--view`, with STOP wired to the switch; None without it.
+
+    Errors: InvalidValue for a port in use."""
+    if port is None:
+        return contextlib.nullcontext()
+    return flight_page(
+        load_calibration(find_calibration(options.profile.camera.calibration)),
+        f"perchctl fly {options.uri}",
+        options.profile.target.large.side_m,
+        port,
+        switch.land,
+        lambda text: print(f"perchctl: {text}", file=sys.stderr),
+    )
 
 
 def _plot(path: Path, profile: Profile) -> Path | None:

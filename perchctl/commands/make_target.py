@@ -15,7 +15,6 @@ from perchctl.profile import (
     Profile,
     TargetConfig,
     find_calibration,
-    find_profile,
     load_profile,
 )
 from perchctl.profile.dictionaries import check_marker_id
@@ -189,7 +188,7 @@ def _design(request: TargetRequest, camera_name: str) -> tuple[str, dict[str, An
     if request.ceiling_m is not None:
         _within("--ceiling", request.ceiling_m, 0.3, 50.0, "m")
     profile = load_profile(request.profile or DEFAULT_PROFILE)
-    path = find_calibration(camera_name, find_profile(request.profile or DEFAULT_PROFILE))
+    path = find_calibration(camera_name)
     camera = load_calibration(path)
     plot = request.plot or Path(DEFAULT_PLOT)
     check_writable(plot)

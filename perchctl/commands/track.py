@@ -5,15 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import TextIO
 
 import cv2
@@ -23,12 +20,13 @@ from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource, check_size
+from perchctl.commands.interrupt import Stopper
 from perchctl.commands.progress import count_bar
 from perchctl.display.page.flight import AXES_OF_SIDE
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import Interrupted, NotFound, UsageError
-from perchctl.profile import Profile, find_calibration, find_profile, load_profile
+from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.track.files import CsvFile, OverlayFile, check_output
 from perchctl.track.result import Tracked, record_of, text_line, text_rows
 from perchctl.track.tracker import (
@@ -36,7 +34,7 @@ from perchctl.track.tracker import (
     PrintCheck,
     Tally,
     Tracker,
-    camera_setup,
+    camera_pipeline,
     sketch_of,
     track_state,
 )
@@ -84,7 +82,7 @@ def resolve(
             if path.exists() and spec.partition(":")[2] and _same(path, spec):
                 raise UsageError(f"{path} is the source itself; write the result to another file")
     if calibration is None:
-        file = find_calibration(profile.camera.calibration, find_profile(profile_name))
+        file = find_calibration(profile.camera.calibration)
     else:
         file = find_calibration(str(calibration))
     return TrackOptions(spec, profile, file, stills, as_json, csv, overlay, view, view_port)
@@ -115,31 +113,6 @@ def _same(path: Path, spec: str) -> bool:
     return named.exists() and named.samefile(path)
 
 
-class Stopper:
-    """Ctrl-C (and SIGTERM) as a wish to end after this frame; a second one ends at once."""
-
-    def __init__(self) -> None:
-        self.asked = threading.Event()
-
-    def press(self, _signal: int = 0, _frame: FrameType | None = None) -> None:
-        if self.asked.is_set():
-            raise KeyboardInterrupt
-        self.asked.set()
-
-    @contextlib.contextmanager
-    def installed(self) -> Iterator[Stopper]:
-        if threading.current_thread() is not threading.main_thread():
-            yield self
-            return
-        names = (signal.SIGINT, signal.SIGTERM)
-        old = {name: signal.signal(name, self.press) for name in names}
-        try:
-            yield self
-        finally:
-            for name, handler in old.items():
-                signal.signal(name, handler)
-
-
 def run(
     options: TrackOptions,
     out: TextIO | None = None,
@@ -153,7 +126,7 @@ def run(
     """
     out = sys.stdout if out is None else out
     camera = load_calibration(options.calibration)
-    setup = camera_setup(options.profile, camera, options.stills)
+    setup = camera_pipeline(options.profile, camera, options.stills)
     start_s = clock()
     tally = Tally()
 

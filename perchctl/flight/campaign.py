@@ -9,14 +9,10 @@ from pathlib import Path
 
 import cv2
 
-from perchctl.calibration.files import load_calibration
 from perchctl.flight.lockstep import fly_lockstep
 from perchctl.flight.results import FlightEnd, FlightResult
-from perchctl.flight.session import pipeline_setup
-from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Phase
-from perchctl.profile import Profile, find_calibration
-from perchctl.sim.draw import draw_scenario
+from perchctl.profile import Profile
 
 OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.PERCHED: "perched",
@@ -29,21 +25,14 @@ def fly_seed(profile: Profile, seed: int, log_path: Path | None = None) -> Fligh
     """Fly one seed of the profile's scenario; a function of its own so that any
     executor can carry it to another process or machine."""
     cv2.setNumThreads(1)  # a job is one core, so that the rates are rates a core
-    camera = load_calibration(find_calibration(profile.camera.calibration))
-    setup = pipeline_setup(profile, camera)
-    log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed)
     began_s = time.perf_counter()
-    flight = fly_lockstep(profile, camera, setup, draw_scenario(profile, seed), log)
+    flight = fly_lockstep(profile, seed, log_path)
     wall_s = time.perf_counter() - began_s
-    perched = flight.report.phase is Phase.PERCHED and flight.hanging
-    miss_m = flight.miss_m if perched else None
-    if log is not None:
-        log.close(flight.report, miss_m, flight.fell)
     return FlightResult(
         seed=seed,
         outcome=OUTCOMES[flight.report.phase] if not flight.fell else "aborted",
         reason=flight.report.reason,
-        miss_m=miss_m,
+        miss_m=flight.perched_miss_m,
         time_s=flight.report.duration_s,
         attempts=flight.report.attempts,
         locked=flight.locked,

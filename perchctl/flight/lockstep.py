@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from perchctl.flight.loop import FlightParts, FlightReport, Tick, Watcher, fly
+from perchctl.calibration.files import load_calibration
+from perchctl.flight.loop import FlightParts, fly
 from perchctl.link.mock import MockLink
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Operator, Phase
-from perchctl.pipeline import PipelineSetup
-from perchctl.profile import Profile
+from perchctl.mission.watch import FlightReport, Tick, Watcher
+from perchctl.pipeline import make_pipeline
+from perchctl.profile import Profile, find_calibration
 from perchctl.sim.camera import SimCamera
+from perchctl.sim.draw import draw_scenario
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vehicle import LOCKED
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision.types import Frame
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 HARD_LANDING_MPS = 1.0
@@ -106,17 +110,36 @@ class LockstepFlight:
     locked: bool
     simulated_s: float
 
+    @property
+    def perched_miss_m(self) -> float | None:
+        """The gear's distance from the target's centre, where it hangs there."""
+        return self.miss_m if self.report.phase is Phase.PERCHED and self.hanging else None
+
 
 def fly_lockstep(
     profile: Profile,
-    camera: CameraModel,
-    setup: PipelineSetup,
-    scenario: Scenario,
-    log: LogWatcher | None = None,
+    seed: int = 0,
+    log: LogWatcher | Path | None = None,
+    *,
+    scenario: Scenario | None = None,
     operator_at: dict[Phase, Operator] | None = None,
 ) -> LockstepFlight:
-    """Fly `scenario` to its end. `operator_at` gives the person's word as soon as a
-    phase is reached (for tests)."""
+    """Fly one seed of the profile's scenario to its end, faster than real time.
+
+    Args:
+        log: a file to log to, or a watcher that is left open.
+        scenario: flown instead of the seed's own.
+        operator_at: the person's word, given as soon as a phase is reached.
+
+    Errors: NotFound, InvalidValue (calibration, log file).
+    """
+    scenario = draw_scenario(profile, seed) if scenario is None else scenario
+    if isinstance(log, Path):
+        watcher = LogWatcher.lockstep(log, profile, scenario.seed)
+        flight = fly_lockstep(profile, log=watcher, scenario=scenario, operator_at=operator_at)
+        watcher.close(flight.report, flight.perched_miss_m, flight.fell)
+        return flight
+    camera = load_calibration(find_calibration(profile.camera.calibration))
     vehicle = SimulatedVehicle(scenario, camera, profile.target)
     link = MockLink(vehicle, profile.link.telemetry_period_s)
     assert vehicle.camera is not None
@@ -127,8 +150,9 @@ def fly_lockstep(
         log.truth = truth.for_log
         watchers = (truth, log)
     word = _Word(operator_at or {})
+    pipeline = make_pipeline(profile, camera)
     parts = FlightParts(
-        link, source, LockstepClock(link), profile, setup, (*watchers, word), word.read
+        link, source, LockstepClock(link), profile, pipeline, (*watchers, word), word.read
     )
     link.connect()
     report = fly(parts)

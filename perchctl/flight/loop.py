@@ -20,7 +20,7 @@ from perchctl.link.protocol import Link
 from perchctl.mission import planner
 from perchctl.mission.state import Observation, Operator, Outcome, Phase, PlannerState
 from perchctl.mission.watch import FlightReport, Tick, Watcher
-from perchctl.pipeline import PipelineSetup
+from perchctl.pipeline import Pipeline
 from perchctl.pipeline import step as pipeline_step
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -53,7 +53,7 @@ class FlightParts:
     source: FrameSource
     clock: Clock
     profile: Profile
-    pipeline: PipelineSetup
+    pipeline: Pipeline
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
 

@@ -1,41 +1,38 @@
-"""One flight from options to report: opens the edges, flies, closes them again.
-
-The command line calls `fly_session`; nothing here knows typer.
-"""
+"""One flight in real time, from options to report: opens the edges, flies, closes them."""
 
 from __future__ import annotations
 
 import contextlib
-import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING
 
 from perchctl.calibration.files import load_calibration
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import ALLOWED, open_source
 from perchctl.camera.source import FrameSource
-from perchctl.display.page.flight import FlightView, flight_view
-from perchctl.errors import ConnectionFailed, Interrupted, InvalidValue, TimedOut, UsageError
-from perchctl.flight.loop import FlightParts, FlightReport, Watcher, fly
+from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError
+from perchctl.flight.loop import FlightParts, fly
+from perchctl.flight.operator import OperatorSwitch
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.uri import check_uri
-from perchctl.mission.state import Operator
-from perchctl.pipeline import PipelineSetup, make_setup
+from perchctl.mission.watch import FlightReport, Watcher
+from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile, find_calibration
 from perchctl.vision.types import CameraModel
+
+if TYPE_CHECKING:
+    from perchctl.sim.process.handle import SimProcess
 
 SOURCE_SCHEMES = ("camera", "video", "images", "http", "https", "sim")
 
 
 @dataclass(frozen=True)
 class FlyOptions:
-    """What the command line asked for, on top of the profile."""
+    """What is flown, and where: the command line on top of the profile."""
 
     profile: Profile
     profile_path: Path
@@ -43,8 +40,6 @@ class FlyOptions:
     source: str
     seed: int = 0
     log_dir: Path = Path("perchctl-logs")
-    view: bool = False
-    view_port: int = 0
 
     @property
     def simulated(self) -> bool:
@@ -71,65 +66,6 @@ class WallClock:
             time.sleep(left_s)
 
 
-@dataclass
-class OperatorSwitch:
-    """Ctrl-C as the planner understands it: once lands, twice stops.
-
-    `land` is the word of the live page's STOP button: it lands as one Ctrl-C does, however
-    often it is pressed, and never adds up to a stop of the motors.
-
-    Until the flight loop listens there is nothing to land, and the first Ctrl-C
-    leaves by `Interrupted`.
-    """
-
-    listening: bool = False
-    presses: int = 0
-    landing_asked: bool = False
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def read(self) -> Operator:
-        return Operator(min(max(self.presses, int(self.landing_asked)), 2))
-
-    def land(self) -> None:
-        self.landing_asked = True
-
-    def press(self, _signal: int = 0, _frame: FrameType | None = None) -> None:
-        if not self.listening:
-            raise Interrupted("Ctrl-C before take-off: nothing was started")
-        self.presses += 1
-
-    @contextlib.contextmanager
-    def installed(self) -> Iterator[OperatorSwitch]:
-        """Takes SIGINT and SIGTERM for the duration (main thread only)."""
-        if threading.current_thread() is not threading.main_thread():
-            yield self
-            return
-        names = (signal.SIGINT, signal.SIGTERM)
-        old = {name: signal.signal(name, self.press) for name in names}
-        try:
-            yield self
-        finally:
-            for name, handler in old.items():
-                signal.signal(name, handler)
-
-
-def camera_model(profile: Profile, profile_path: Path | None) -> CameraModel:
-    return load_calibration(find_calibration(profile.camera.calibration, profile_path))
-
-
-def pipeline_setup(profile: Profile, camera: CameraModel) -> PipelineSetup:
-    return make_setup(
-        profile.detector,
-        profile.pose,
-        profile.kalman,
-        profile.merge,
-        profile.target,
-        profile.camera.mount.T_body_cam,
-        profile.vehicle.gear_body_m,
-        camera,
-    )
-
-
 def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
@@ -144,46 +80,48 @@ def check_options(options: FlyOptions) -> None:
         raise InvalidValue(f"seed {options.seed} is negative; seeds are 0, 1, 2, ...")
 
 
-def fly_session(options: FlyOptions, watchers: tuple[Watcher, ...] = ()) -> SessionResult:
-    """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`."""
+def fly_session(
+    options: FlyOptions,
+    watchers: tuple[Watcher, ...] = (),
+    switch: OperatorSwitch | None = None,
+    watch_source: Callable[[FrameSource], FrameSource] = lambda source: source,
+) -> SessionResult:
+    """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
+
+    `switch` carries the person's word. `watch_source` may put a source around the camera's,
+    to look at its frames on their way.
+    """
     check_options(options)
-    camera = camera_model(options.profile, options.profile_path)
-    setup = pipeline_setup(options.profile, camera)
-    clock = WallClock()
-    switch = OperatorSwitch()
-    with switch.installed(), contextlib.ExitStack() as stack:
-        view = stack.enter_context(live_page(options, camera, switch))
+    profile, clock, switch = options.profile, WallClock(), switch or OperatorSwitch()
+    camera = load_calibration(find_calibration(profile.camera.calibration))
+    pipeline = make_pipeline(profile, camera)
+    with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
         if options.simulated:
             simulated = stack.enter_context(_simulated_vehicle(options, camera))
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
-        source: FrameSource = open_source(
-            spec,
-            options.profile.camera.latency_s,
-            camera.size_px,
-            clock.now,
-            options.profile.camera.start_timeout_s,
+        config = profile.camera
+        source = open_source(
+            spec, config.latency_s, camera.size_px, clock.now, config.start_timeout_s
         )
         stack.callback(source.close)
-        if options.profile.camera.mirrored:
+        if config.mirrored:
             source = UnmirroredSource(source)
-        if view is not None:
-            source, watchers = view.watched(source), (*watchers, view)
-        link = CflibLink(uri, options.profile.link, clock.now)
+        source = watch_source(source)
+        link = CflibLink(uri, profile.link, clock.now)
         try:
             link.connect()
             switch.listening = True
-            parts = FlightParts(link, source, clock, options.profile, setup, watchers, switch.read)
+            parts = FlightParts(link, source, clock, profile, pipeline, watchers, switch.read)
             report = fly(parts)
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
-        miss_m = _true_miss_m(simulated)
-    return SessionResult(report, miss_m=miss_m)
+        return SessionResult(report, miss_m=_true_miss_m(simulated))
 
 
-def _true_miss_m(simulated: Any | None) -> float | None:
+def _true_miss_m(simulated: SimProcess | None) -> float | None:
     """What the simulator knows; a simulator that is gone does not spoil the report."""
     if simulated is None:
         return None
@@ -192,25 +130,7 @@ def _true_miss_m(simulated: Any | None) -> float | None:
     return None
 
 
-def live_page(
-    options: FlyOptions, camera: CameraModel, switch: OperatorSwitch
-) -> contextlib.AbstractContextManager[FlightView | None]:
-    """The page of `--view`, with STOP wired to the switch; None without it.
-
-    Errors: InvalidValue for a port in use."""
-    if not options.view:
-        return contextlib.nullcontext()
-    return flight_view(
-        camera,
-        f"perchctl fly {options.uri}",
-        options.profile.target.large.side_m,
-        options.view_port,
-        switch.land,
-        lambda text: print(f"perchctl: {text}", file=sys.stderr),
-    )
-
-
-def _simulated_vehicle(options: FlyOptions, camera: CameraModel) -> Any:
+def _simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
     try:
         from perchctl.sim.draw import draw_scenario
         from perchctl.sim.process.handle import SimProcess

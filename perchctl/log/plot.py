@@ -8,22 +8,28 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.log.read import FlightLog
 from perchctl.log.summary import FlightSummary, summary_of
-
-# Okabe and Ito's palette: told apart with any colour vision.
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-BLUE, VERMILLION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
+from perchctl.plot import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    GRID,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    new_figure,
+    save_png,
+)
 
 SHADES = ("#EEF3F8", "#FFFFFF")
 SIZE_IN = (11.0, 13.5)
-DPI = 110
 NAME_GAP = 0.02
 """Share of the flight between the names of two phases, so that they do not overlap."""
 
@@ -39,8 +45,7 @@ def plot_flight(log: FlightLog, png_path: Path) -> None:
     """
     if not log.records:
         raise InvalidValue(f"{log.path}: the log holds no ticks, there is nothing to plot")
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*SIZE_IN)
     axes = figure.subplots(7, 1, sharex=True, height_ratios=(1.7, 1, 1, 1, 1, 1.1, 1.1))
     t_s = log.column("t_s") - log.start_s
     _plot_errors(axes[0], log, t_s)
@@ -51,7 +56,7 @@ def plot_flight(log: FlightLog, png_path: Path) -> None:
     _plot_power(axes[6], log, t_s)
     for ax in axes:
         _shade_phases(ax, log)
-        ax.grid(True, color="#D8D8D8", linewidth=0.6)
+        ax.grid(True, color=GRID, linewidth=0.6)
         ax.set_axisbelow(True)
         ax.margins(x=0.0)
     _name_phases(axes[0], log)
@@ -60,10 +65,7 @@ def plot_flight(log: FlightLog, png_path: Path) -> None:
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     figure.suptitle(title_of(log, summary_of(log)), fontsize=12)
-    try:
-        figure.savefig(png_path, format="png")
-    except OSError as error:
-        raise InvalidValue(f"{png_path}: cannot be written: {error.strerror}") from None
+    save_png(figure, png_path)
 
 
 def title_of(log: FlightLog, summary: FlightSummary) -> str:

@@ -73,14 +73,12 @@ def read_weights(path: Path) -> FittedWeights:
         raise InvalidValue(_one_sentence(path, error)) from None
 
 
-def find_calibration(name: str, profile_path: Path | None = None) -> Path:
-    """A calibration file by path, beside the profile, or by name from `calib/`."""
-    candidates = [Path(name).expanduser()]
-    if profile_path is not None:
-        candidates.append(profile_path.parent / name)
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
+def find_calibration(name: str) -> Path:
+    """A calibration file by path, or by name from `calib/`. (`load_profile` has found one
+    that stands beside its profile already.)"""
+    given = Path(name).expanduser()
+    if given.is_file():
+        return given
     found = data_file("calib", name)
     if found is None:
         raise NotFound(
@@ -98,7 +96,8 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
     values = _read_yaml(path)
-    _place_weights(values, path)
+    for section, key in (("merge", "weights_file"), ("camera", "calibration")):
+        _place_beside(values, path, section, key)
     base_name = values.pop("extends", None)
     if base_name is None:
         return values
@@ -109,12 +108,12 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     return _merged(_resolved(base, (*seen, path)), values)
 
 
-def _place_weights(values: dict[str, Any], path: Path) -> None:
-    """A weights file beside the profile that names it, whichever extends that one."""
-    merge = values.get("merge")
-    name = merge.get("weights_file") if isinstance(merge, dict) else None
+def _place_beside(values: dict[str, Any], path: Path, section: str, key: str) -> None:
+    """A file named by a profile is beside that profile, whichever other extends it."""
+    part = values.get(section)
+    name = part.get(key) if isinstance(part, dict) else None
     if isinstance(name, str) and (beside := path.resolve().parent / name).is_file():
-        values["merge"] = {**merge, "weights_file": str(beside)}  # type: ignore[dict-item]
+        values[section] = {**part, key: str(beside)}  # type: ignore[dict-item]
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:

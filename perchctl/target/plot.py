@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from perchctl.log.plot import BLACK, BLUE, DPI, GREY, ORANGE
+from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, new_figure, save_png
 
 if TYPE_CHECKING:
     from perchctl.target.design import Design, ErrorCurve
@@ -25,8 +23,7 @@ PANELS = (("x, y [mm]", 1e3), ("z [mm]", 1e3), ("turn [deg]", 180.0 / math.pi))
 
 def plot_design(design: Design, curve: ErrorCurve, file: Path | BinaryIO) -> None:
     """Bars from the nearest to the farthest range, and the error bound below them."""
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*SIZE_IN)
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(0.8, 1, 1, 1))
     _plot_spans(axes[0], design)
     for i, (label, scale) in enumerate(PANELS):
@@ -38,7 +35,7 @@ def plot_design(design: Design, curve: ErrorCurve, file: Path | BinaryIO) -> Non
                     100.0 * curve.z_m, values, line, color=colour, linewidth=width, label=name
                 )
         ax.set_ylabel(label)
-        ax.grid(True, which="both", color="#D8D8D8", linewidth=0.5)
+        ax.grid(True, which="both", color=GRID, linewidth=0.5)
         _plain_ticks(ax.yaxis)
     if axes[1].get_legend_handles_labels()[0]:
         axes[1].legend(loc="upper left", ncols=3, fontsize=8)
@@ -52,7 +49,7 @@ def plot_design(design: Design, curve: ErrorCurve, file: Path | BinaryIO) -> Non
         f"bound for corners of 0.2 px",
         fontsize=11,
     )
-    figure.savefig(file, format="png", metadata={"Software": None})
+    save_png(figure, file)
 
 
 def _plain_ticks(axis: Axis) -> None:

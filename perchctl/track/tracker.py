@@ -6,12 +6,10 @@ import sys
 from collections import Counter
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from perchctl.camera.health import HealthState, Verdict, assess
 from perchctl.display.page.live import State
 from perchctl.display.page.sketch import Sketch
-from perchctl.pipeline import PipelineSetup, make_setup, step
+from perchctl.pipeline import Pipeline, camera_profile, make_pipeline, step
 from perchctl.profile import Profile, TargetConfig
 from perchctl.target.print_check import (
     MIN_FRAMES,
@@ -34,22 +32,14 @@ _MIRRORED = (
 )
 
 
-def camera_setup(profile: Profile, camera: CameraModel, stills: bool = False) -> PipelineSetup:
+def camera_pipeline(profile: Profile, camera: CameraModel, stills: bool = False) -> Pipeline:
     """The profile's pipeline with the camera in the place of vehicle and gear, so that
     its target is in the camera frame. Stills are each searched as thoroughly as can be."""
-    detector = profile.detector
+    bare = camera_profile(profile)
     if stills:
-        detector = detector.model_copy(update={"blurred_every": 1})
-    return make_setup(
-        detector,
-        profile.pose,
-        profile.kalman,
-        profile.merge,
-        profile.target,
-        np.eye(4),
-        (0.0, 0.0, 0.0),
-        camera,
-    )
+        detector = bare.detector.model_copy(update={"blurred_every": 1})
+        bare = bare.model_copy(update={"detector": detector})
+    return make_pipeline(bare, camera)
 
 
 @dataclass(eq=False)
@@ -59,7 +49,7 @@ class Tracker:
     `notes` are the sentences that the newest frame deserves.
     """
 
-    setup: PipelineSetup
+    setup: Pipeline
     live: bool
     stills: bool = False
     recorded_stills: bool = False  # pictures of a folder may be alike

@@ -16,7 +16,7 @@ import numpy as np
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.pipeline import PipelineSetup, make_setup, step
+from perchctl.pipeline import Pipeline, make_pipeline, step
 from perchctl.profile import Profile
 from perchctl.vision.pose import estimate_pose
 from perchctl.vision.types import MARKERS, Attitude, CameraModel, Frame, MarkerPose, PipelineState
@@ -42,24 +42,16 @@ class Sight:
     center_px: Array | None
 
 
-def collecting_setup(profile: Profile, camera: CameraModel) -> PipelineSetup:
+def collecting_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
     """The profile's pipeline, as it is when it merges by weights."""
-    return make_setup(
-        profile.detector,
-        profile.pose,
-        profile.kalman,
-        profile.merge.model_copy(update={"method": "weights"}),
-        profile.target,
-        profile.camera.mount.T_body_cam,
-        profile.vehicle.gear_body_m,
-        camera,
-    )
+    merge = profile.merge.model_copy(update={"method": "weights"})
+    return make_pipeline(profile.model_copy(update={"merge": merge}), camera)
 
 
 class Eye:
     """Frames of one place through the pipeline; a new place is a new eye."""
 
-    def __init__(self, setup: PipelineSetup, attitude: Attitude | None = None) -> None:
+    def __init__(self, setup: Pipeline, attitude: Attitude | None = None) -> None:
         self._setup, self._attitude = setup, attitude
         self._state = PipelineState()
 

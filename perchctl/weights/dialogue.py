@@ -11,7 +11,7 @@ import numpy as np
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.errors import Interrupted, InvalidValue, NotFound, TimedOut
 from perchctl.geometry import Array, wrap_rad
-from perchctl.pipeline import PipelineSetup
+from perchctl.pipeline import Pipeline
 from perchctl.vision.types import Frame
 from perchctl.weights.collect import Eye, SessionFile, Sight, fault_of, rows_of, typical
 from perchctl.weights.truth import Actual, Ask, Truth, moved
@@ -34,7 +34,7 @@ class Experiment:
         self,
         session: SessionFile,
         source: FrameSource,
-        setup: PipelineSetup,
+        setup: Pipeline,
         truth: Truth,
         ask: Ask,
         say: Callable[[str], None],

@@ -7,12 +7,21 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from perchctl.errors import InvalidValue
-from perchctl.log.plot import BLACK, BLUE, DPI, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+from perchctl.plot import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    GRID,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    new_figure,
+    save_png,
+)
 from perchctl.weights.evidence import LABELS
 from perchctl.weights.report import Result
 from perchctl.weights.types import AXES, PAPER_WEIGHTS
@@ -43,15 +52,14 @@ def plot_weights(result: Result, png_path: Path) -> None:
 
     Raises InvalidValue for a file that cannot be written.
     """
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(*SIZE_IN)
     axes = figure.subplots(3, 4)
     for k in range(len(AXES)):
         _learning(axes[0, k], result, k)
         _by_position(axes[1, k], result, k)
         _weights(axes[2, k], result, k)
         for ax in axes[:, k]:
-            ax.grid(True, color="#D8D8D8", linewidth=0.6)
+            ax.grid(True, color=GRID, linewidth=0.6)
             ax.set_axisbelow(True)
     axes[0, 0].set_ylabel("weight of the large marker")
     axes[2, 0].set_ylabel("weight, 95 % over positions")
@@ -75,10 +83,7 @@ def plot_weights(result: Result, png_path: Path) -> None:
         ),
         fontsize=12,
     )  # fmt: skip
-    try:
-        figure.savefig(png_path, format="png")
-    except OSError as error:
-        raise InvalidValue(f"{png_path}: cannot be written: {error.strerror}") from None
+    save_png(figure, png_path)
 
 
 def _method(result: Result, name: str) -> str:

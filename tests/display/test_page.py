@@ -16,13 +16,15 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.commands.fly import live_page
 from perchctl.commands.track import resolve, run
-from perchctl.display.page.flight import FlightView
+from perchctl.display.page.flight import FlightPage
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.server import MAX_STREAMS, TOKEN_HEADER, is_loopback
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import InvalidValue
-from perchctl.flight.session import FlyOptions, OperatorSwitch, live_page
+from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight.session import FlyOptions
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.mission.watch import Tick
 from perchctl.profile import load_profile
@@ -309,13 +311,12 @@ class OneFrame:
         self.frame = None
 
 
-def options(**values: Any) -> FlyOptions:
-    return FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:", **values)
+OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 
 
 def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
     switch = OperatorSwitch(listening=True)
-    with live_page(options(view=True), camera(), switch) as view:
+    with live_page(OPTIONS, 0, switch) as view:
         assert view is not None
         assert view.page.url in capsys.readouterr().err
         assert switch.read() is Operator.NONE
@@ -331,13 +332,13 @@ def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) ->
 
 
 def test_without_view_no_page_is_opened(capsys: pytest.CaptureFixture[str]) -> None:
-    with live_page(options(), camera(), OperatorSwitch()) as view:
+    with live_page(OPTIONS, None, OperatorSwitch()) as view:
         assert view is None
     assert capsys.readouterr().err == ""
 
 
 def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
-    view = FlightView(page, 0.15)
+    view = FlightPage(page, 0.15)
     frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
     source = view.watched(OneFrame(frame))
     assert json.loads(ask(page.url, "/state")[1])["phase"] == "WAITING"
@@ -359,7 +360,7 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
 
 
 def test_a_view_that_fails_is_no_reason_to_land(page: LivePage) -> None:
-    view = FlightView(page, 0.15)
+    view = FlightPage(page, 0.15)
     view.watched(OneFrame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
     view.tick(None)  # type: ignore[arg-type]
     view.event(0.0, "something")

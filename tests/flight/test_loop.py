@@ -13,10 +13,9 @@ import pytest
 from perchctl.errors import Interrupted, InvalidValue, NotFound, SafetyAbort, TimedOut
 from perchctl.flight import loop as flight
 from perchctl.flight.loop import FlightParts, FlightReport, Tick, fly, rescue
-from perchctl.flight.session import pipeline_setup
 from perchctl.link.mock import ScriptedLink
 from perchctl.mission.state import Operator, Outcome, Phase
-from perchctl.pipeline import PipelineSetup
+from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
@@ -41,7 +40,7 @@ CAMERA = CameraModel(
     SIZE_PX, np.array([[40.0, 0.0, 32.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]]), np.zeros(5)
 )
 PROFILE = Profile()
-SETUP = pipeline_setup(PROFILE, CAMERA)
+SETUP = make_pipeline(PROFILE, CAMERA)
 PERIOD_S = 1.0 / PROFILE.link.loop_hz
 CLIMB_MPS = 0.5
 SINK_MPS = 0.4
@@ -205,7 +204,7 @@ class Rig:
     watcher: Watcher = field(default_factory=Watcher)
     clock: Clock | None = None
     profile: Profile = PROFILE
-    setup: PipelineSetup = SETUP
+    setup: Pipeline = SETUP
     operator: Callable[[], Operator] = lambda: Operator.NONE
 
     def parts(self) -> FlightParts:

@@ -24,10 +24,10 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.flight.session import camera_model
+from perchctl.calibration.files import load_calibration
 from perchctl.log.read import FlightLog, read_log
 from perchctl.mission.state import SEVEN
-from perchctl.profile import load_profile
+from perchctl.profile import find_calibration, load_profile
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.process.handle import SimProcess
 from perchctl.vehicle import FLYING, LOCKED
@@ -155,7 +155,7 @@ def vehicle(folder: Path) -> Iterator[Vehicle]:
     truth_file = folder / "truth.jsonl"
     with SimProcess.start(
         draw_scenario(profile, SEED),
-        camera=camera_model(profile, None),
+        camera=load_calibration(find_calibration(profile.camera.calibration)),
         target=profile.target,
         truth_file=truth_file,
     ) as sim:

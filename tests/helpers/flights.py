@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import cv2
 
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
-from perchctl.flight.session import camera_model, pipeline_setup
 from perchctl.log.watch import LogWatcher, Truth
 from perchctl.mission.state import Operator, Phase
 from perchctl.mission.watch import FlightReport
@@ -87,9 +86,7 @@ def fly_short(
     """One lockstep flight; `changes` are the profile's, `scenario` its scenario's."""
     cv2.setNumThreads(1)
     profile = short_profile(changes, base)
-    camera = camera_model(profile, None)
-    setup = pipeline_setup(profile, camera)
     drawn = replace(draw_scenario(profile, seed), **scenario)
     heights = _Heights()
-    flight = fly_lockstep(profile, camera, setup, drawn, heights, operator_at)
+    flight = fly_lockstep(profile, log=heights, scenario=drawn, operator_at=operator_at)
     return Flown(flight, heights.z_m)

@@ -23,7 +23,7 @@ from perchctl.errors import Interrupted, InvalidValue, NotFound, UsageError
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import TargetConfig, load_profile
 from perchctl.track.result import CSV_COLUMNS
-from perchctl.track.tracker import Notes, Tracker, camera_setup
+from perchctl.track.tracker import Notes, Tracker, camera_pipeline
 from perchctl.vision.camera_model import project
 from perchctl.vision.pose import square
 from perchctl.vision.types import Frame
@@ -350,7 +350,7 @@ def test_a_video_that_stands_still_is_named(
 
 
 def tracker(live: bool) -> Tracker:
-    return Tracker(camera_setup(load_profile("sim"), camera()), live=live)
+    return Tracker(camera_pipeline(load_profile("sim"), camera()), live=live)
 
 
 def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
@@ -381,7 +381,9 @@ def test_markers_that_contradict_are_named(tmp_path: Path) -> None:
     profile.write_text(
         "extends: sim\ntarget: {small: {dictionary: DICT_ARUCO_ORIGINAL, id: 5, side_m: 0.032}}\n"
     )
-    doubting = Tracker(camera_setup(load_profile(str(profile)), camera()), live=False, stills=True)
+    doubting = Tracker(
+        camera_pipeline(load_profile(str(profile)), camera()), live=False, stills=True
+    )
     image = picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))
     doubting.track(Frame(0, 0.0, image), 0)
     assert [note.partition(":")[0] for note in doubting.notes] == ["the two markers contradict"]

@@ -8,13 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.pipeline import PipelineSetup, make_setup
+from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import (
+    CameraConfig,
     DetectorConfig,
     KalmanConfig,
     MergeConfig,
+    Mounting,
     PoseConfig,
+    Profile,
     TargetConfig,
+    VehicleConfig,
 )
 from perchctl.vision.types import CameraModel
 from tests.helpers.target_picture import CAMERA
@@ -22,27 +26,33 @@ from tests.helpers.target_picture import CAMERA
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"
 
 
+BARE = Mounting(position_m=(0.0, 0.0, 0.0))
+
+
 @pytest.fixture(scope="session")
-def build() -> Callable[..., PipelineSetup]:
-    """`make_setup` with defaults: camera = body = gear, unless told otherwise."""
+def build() -> Callable[..., Pipeline]:
+    """`make_pipeline` with defaults: camera = body = gear, unless told otherwise."""
 
     def make(
         detector: DetectorConfig | None = None,
         pose: PoseConfig | None = None,
         kalman: KalmanConfig | None = None,
         merge: MergeConfig | None = None,
-        T_body_cam: Any = None,
+        mount: Mounting | None = None,
+        target: TargetConfig | None = None,
         gear_body_m: Any = (0.0, 0.0, 0.0),
         camera: CameraModel = CAMERA,
-    ) -> PipelineSetup:
-        return make_setup(
-            detector or DetectorConfig(),
-            pose or PoseConfig(),
-            kalman or KalmanConfig(),
-            merge or MergeConfig(),
-            TargetConfig(),
-            np.eye(4) if T_body_cam is None else T_body_cam,
-            gear_body_m,
+    ) -> Pipeline:
+        return make_pipeline(
+            Profile(
+                camera=CameraConfig(mount=mount or BARE),
+                vehicle=VehicleConfig(gear_body_m=gear_body_m),
+                target=target or TargetConfig(),
+                detector=detector or DetectorConfig(),
+                pose=pose or PoseConfig(),
+                kalman=kalman or KalmanConfig(),
+                merge=merge or MergeConfig(),
+            ),
             camera,
         )
 

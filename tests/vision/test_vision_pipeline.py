@@ -18,13 +18,13 @@ from perchctl.geometry import (
     rotation_from_rpy,
     wrap_rad,
 )
-from perchctl.pipeline import PipelineSetup, make_setup, step
+from perchctl.pipeline import Pipeline, step
 from perchctl.profile import (
     DetectorConfig,
     KalmanConfig,
     MarkerConfig,
     MergeConfig,
-    PoseConfig,
+    Mounting,
     TargetConfig,
 )
 from perchctl.vision.pose import estimate_pose
@@ -37,10 +37,10 @@ from perchctl.vision.types import (
     Sighting,
     Stage,
 )
-from tests.helpers.target_picture import CAMERA, pose_of, render
+from tests.helpers.target_picture import pose_of, render
 
-Build = Callable[..., PipelineSetup]
-MOUNT = make_T(rotation_from_rpy(0.03, -0.02, 0.4), (0.02, 0.0, 0.01))
+Build = Callable[..., Pipeline]
+MOUNT = Mounting(position_m=(0.02, 0.0, 0.01), rpy_deg=(1.7, -1.1, 23.0))
 GEAR = np.array([0.0, 0.0, 0.03])
 TARGET = np.array([0.4, -0.2, 2.0])
 TARGET_YAW = 2.5
@@ -50,7 +50,7 @@ EMPTY: NDArray[np.uint8] = np.full((480, 640), 120, np.uint8)
 def view(attitude: Attitude) -> NDArray[np.uint8]:
     """What the mounted camera sees of the target in the world."""
     R = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
-    T_world_cam = make_T(R, np.array(attitude.position_m)) @ MOUNT
+    T_world_cam = make_T(R, np.array(attitude.position_m)) @ MOUNT.T_body_cam
     T = invert_T(T_world_cam) @ make_T(rot_z(TARGET_YAW) @ R_MARKER_TARGET, TARGET)
     return render(np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=float).ravel(), T[:3, 3])
 
@@ -74,7 +74,7 @@ def fly(k: int) -> Attitude:
 
 
 def run(
-    setup: PipelineSetup,
+    setup: Pipeline,
     frames: int,
     lost: Callable[[int], bool] = lambda k: False,
     blind: bool = False,
@@ -95,7 +95,7 @@ def test_a_flight_past_the_target_is_measured(build: Build, method: str, frame: 
     setup = build(
         kalman=KalmanConfig(frame=frame),  # type: ignore[arg-type]
         merge=MergeConfig(method=method),  # type: ignore[arg-type]
-        T_body_cam=MOUNT,
+        mount=MOUNT,
         gear_body_m=GEAR,
     )
     outputs = run(setup, 12)
@@ -123,7 +123,7 @@ def test_a_flight_past_the_target_is_measured(build: Build, method: str, frame: 
 def test_while_unseen_the_target_coasts_in_the_world_and_is_then_given_up(
     build: Build, method: str
 ) -> None:
-    setup = build(merge=MergeConfig(method=method), T_body_cam=MOUNT, gear_body_m=GEAR)  # type: ignore[arg-type]
+    setup = build(merge=MergeConfig(method=method), mount=MOUNT, gear_body_m=GEAR)  # type: ignore[arg-type]
     n_max = setup.kalman.n_max
     outputs = run(setup, 4 + n_max + 3, lost=lambda k: k >= 4)
     for n in range(1, n_max + 1):
@@ -149,18 +149,19 @@ def test_nothing_seen_is_no_target(build: Build) -> None:
 
 
 def test_without_an_attitude_the_camera_counts_as_level(build: Build) -> None:
-    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    setup = build(mount=MOUNT, gear_body_m=GEAR)
     rvec, tvec = pose_of(0.03, 0.02, 0.5, 0.3)
     state, output = step(PipelineState(), Frame(0, 0.0, render(rvec, tvec)), None, setup)
     assert output.target is not None
-    expected = MOUNT[:3, :3] @ tvec + MOUNT[:3, 3] - GEAR
+    T = MOUNT.T_body_cam
+    expected = T[:3, :3] @ tvec + T[:3, 3] - GEAR
     assert np.abs(output.target.e_m - expected).max() < 0.001
     assert output.target.world_m is None
     assert not state.in_world
 
 
 def test_tracks_do_not_mix_frames_when_the_attitude_comes_and_goes(build: Build) -> None:
-    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    setup = build(mount=MOUNT, gear_body_m=GEAR)
     state = PipelineState()
     for k, known in enumerate([True, True, False, False, True]):
         attitude = fly(k)
@@ -252,18 +253,11 @@ def test_stages_by_range(build: Build, z_m: float, stage: Stage, method: str) ->
 
 
 @pytest.mark.parametrize("method", ["joint", "weights"])
-def test_markers_that_contradict_are_counted_and_the_better_is_used(method: str) -> None:
+def test_markers_that_contradict_are_counted_and_the_better_is_used(
+    build: Build, method: str
+) -> None:
     wrong = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.030))
-    setup = make_setup(
-        DetectorConfig(),
-        PoseConfig(),
-        KalmanConfig(),
-        MergeConfig(method=method),  # type: ignore[arg-type]
-        wrong,
-        np.eye(4),
-        (0.0, 0.0, 0.0),
-        CAMERA,
-    )
+    setup = build(merge=MergeConfig(method=method), target=wrong)  # type: ignore[arg-type]
     state = PipelineState()
     for k in range(3):
         image = render(*pose_of(0.0, 0.0, 0.24))
@@ -303,7 +297,7 @@ def test_velocity_is_in_level_axes(build: Build) -> None:
 
 def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
     """They are computed when asked for, and only then."""
-    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    setup = build(mount=MOUNT, gear_body_m=GEAR)
     attitude = fly(0)
     _, output = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
     joint = output.poses["joint"]
@@ -319,7 +313,7 @@ def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
 
 
 def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
-    setup = build(T_body_cam=MOUNT, gear_body_m=GEAR)
+    setup = build(mount=MOUNT, gear_body_m=GEAR)
     then, now = fly(0), fly(6)  # far, and turned, within one gap
     _, output = step(PipelineState(), Frame(0, then.t_s, view(then)), then, setup)
     sight = Sighting(output.poses["joint"], then)

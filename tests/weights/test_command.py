@@ -14,14 +14,14 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
+from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
 from perchctl.commands import collect_weights
 from perchctl.errors import InvalidValue
-from perchctl.flight.session import camera_model
 from perchctl.geometry import rot_z
-from perchctl.profile import load_profile
+from perchctl.profile import find_calibration, load_profile
 from perchctl.weights import truth
-from perchctl.weights.collect import Eye, SessionFile, collecting_setup, fault_of
+from perchctl.weights.collect import Eye, SessionFile, collecting_pipeline, fault_of
 from perchctl.weights.table import HEADER, NEEDED, read_csv
 from tests.helpers.weights_data import BEST, independent, known, write
 
@@ -275,10 +275,10 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     from perchctl.weights.simulated import Stand
 
     profile = load_profile("sim")
-    camera = camera_model(profile, None)
+    camera = load_calibration(find_calibration(profile.camera.calibration))
     stand = Stand(profile, camera, 2, 0, 4.0, 1.0)
     place = stand.place(1)
-    eye = Eye(collecting_setup(profile, camera))
+    eye = Eye(collecting_pipeline(profile, camera))
     good = [eye.look(frame) for frame in stand.frames(1, place, 6)]
     assert fault_of(good) is None
     moved = place.T_world_cam.copy()
@@ -296,7 +296,7 @@ def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
     from perchctl.weights.simulated import Stand
 
     profile = load_profile("sim")
-    camera = camera_model(profile, None)
+    camera = load_calibration(find_calibration(profile.camera.calibration))
     stand = Stand(profile, camera, 2, 0, 4.0, 1.0)
     pictures, typed = tmp_path / "pictures", []
     pictures.mkdir()

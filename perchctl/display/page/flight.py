@@ -6,23 +6,20 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING
 
 from perchctl.camera.source import FrameSource, SourceAround
 from perchctl.display.page.live import LivePage, State
 from perchctl.display.page.sketch import Sketch
 from perchctl.display.status import status_rows
 from perchctl.display.watch import status_of
+from perchctl.mission.watch import Tick
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput
-
-if TYPE_CHECKING:
-    from perchctl.mission.watch import Tick
 
 AXES_OF_SIDE = 0.5
 """Length of the drawn axes, in sides of the large marker."""
 
 
-class FlightView:
+class FlightPage:
     """Looks on as a watcher, and sees the pictures through `watched`.
 
     A page that fails is no reason to land: `problem` is None, ever; `page.problem` tells.
@@ -108,19 +105,19 @@ def _seen_note(output: PipelineOutput | None) -> str:
 
 
 @contextlib.contextmanager
-def flight_view(
+def flight_page(
     camera: CameraModel,
     title: str,
     large_side_m: float,
     port: int,
     land: Callable[[], None],
     say: Callable[[str], None],
-) -> Iterator[FlightView]:
+) -> Iterator[FlightPage]:
     """A page for one flight; `land` is what STOP does. Errors: InvalidValue (the port)."""
     page = LivePage(camera, title, port, on_stop=land)
     say(f"live page with a STOP button: {page.url}")
     try:
-        yield FlightView(page, large_side_m)
+        yield FlightPage(page, large_side_m)
     finally:
         page.close()
         if page.problem is not None:

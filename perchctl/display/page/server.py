@@ -13,11 +13,8 @@ import sys
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 from urllib.parse import urlsplit
-
-if TYPE_CHECKING:
-    from perchctl.display.page.live import LivePage
 
 HOSTS = ("127.0.0.1", "localhost", "::1")
 TOKEN_HEADER = "X-Perchctl-Token"
@@ -39,12 +36,31 @@ def is_loopback(host: str | None) -> bool:
         return False
 
 
+class Content(Protocol):
+    """What the server asks of the page that it serves; `perchctl.display.page.live` is it."""
+
+    opened: threading.Event
+    closed: bool
+
+    def state(self) -> dict[str, Any]: ...
+
+    def jpeg_after(self, number: int) -> tuple[int, bytes] | None: ...
+
+    def pause(self, seconds: float) -> bool: ...
+
+    def may_stop(self, token: str) -> bool: ...
+
+    def stop(self) -> None: ...
+
+    def remember(self, error: BaseException) -> None: ...
+
+
 class PageServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, page: LivePage, port: int) -> None:
+    def __init__(self, page: Content, port: int) -> None:
         self.page = page
         self.html = _HTML.read_text(encoding="utf-8")
         self.streams = threading.BoundedSemaphore(MAX_STREAMS)

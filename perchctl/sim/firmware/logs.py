@@ -3,25 +3,86 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from perchctl.sim.firmware.controller import Controller
+from perchctl.sim.firmware.estimator import Estimator
+from perchctl.sim.firmware.power import PowerMonitor
+from perchctl.sim.firmware.setpoint import Setpoint
+from perchctl.sim.firmware.supervisor import Supervisor
 
 if TYPE_CHECKING:
-    from perchctl.sim.firmware.vehicle import Firmware
+    from perchctl.sim.world import World
 
 Getter = Callable[[], float]
+AXES = "xyz"
+ANGLES = ("roll", "pitch", "yaw")
 
 
-def log_getters(firmware: Firmware) -> dict[str, Getter]:
+class Logged(Protocol):
+    """What of the firmware can be logged."""
+
+    world: World
+    estimator: Estimator
+    controller: Controller
+    supervisor: Supervisor
+    power: PowerMonitor
+    flown_setpoint: Setpoint
+
+    @property
+    def motors(self) -> Sequence[float]: ...
+
+    @property
+    def t_s(self) -> float: ...
+
+    @property
+    def supervisor_info(self) -> int: ...
+
+
+def log_getters(firmware: Logged) -> dict[str, Getter]:
     """Name -> getter, bound to one boot of the firmware."""
-    now = firmware.estimator.now
-    estimator = firmware.estimator
-    controller = firmware.controller
-    supervisor = firmware.supervisor
-    power = firmware.power
+    return {
+        **_system(firmware),
+        **_translation(firmware),
+        **_rotation(firmware),
+        **_motors(firmware),
+    }
 
-    def field(thing: object, name: str, scale: float = 1.0) -> Getter:
-        return lambda: scale * float(getattr(thing, name))
+
+def _field(thing: object, name: str, scale: float = 1.0) -> Getter:
+    return lambda: scale * float(getattr(thing, name))
+
+
+def _system(firmware: Logged) -> dict[str, Getter]:
+    """Power, supervisor, controller and ranges."""
+    power, supervisor = firmware.power, firmware.supervisor
+    controller, estimator = firmware.controller, firmware.estimator
+    return {
+        "pm.vbat": _field(power, "battery_v"),
+        "pm.vbatMV": _field(power, "battery_v", 1000.0),
+        "pm.state": _field(power, "state"),
+        "pm.batteryLevel": _field(power, "level_percent"),
+        "supervisor.info": lambda: float(firmware.supervisor_info),
+        "sys.canfly": _field(supervisor, "motors_allowed"),
+        "sys.isFlying": _field(supervisor, "is_flying"),
+        "sys.isTumbled": _field(supervisor, "tumbled"),
+        "stabilizer.thrust": _field(controller, "thrust"),
+        "controller.cmd_thrust": _field(controller, "thrust"),
+        "controller.actuatorThrust": _field(controller, "thrust"),
+        **{f"controller.{a}": _field(controller, f"desired_{a}_deg") for a in ANGLES},
+        "controller.accelz": lambda: estimator.acc_g[2],
+        "radio.rssi": lambda: 40.0,
+        "radio.isConnected": lambda: 1.0,
+        "kalman.inFlight": _field(supervisor, "is_flying"),
+        "range.zrange": lambda: 1000.0 * max(0.0, firmware.world.z_m),
+        "locSrv.tick": _field(estimator, "external_count"),
+    }
+
+
+def _translation(firmware: Logged) -> dict[str, Getter]:
+    """Position, velocity, acceleration, and the setpoint's."""
+    estimator, now = firmware.estimator, firmware.estimator.now
 
     def flown(name: str) -> Getter:
         return lambda: float(getattr(firmware.flown_setpoint, name))
@@ -29,71 +90,62 @@ def log_getters(firmware: Firmware) -> dict[str, Getter]:
     def acc(axis: int) -> Getter:
         return lambda: estimator.acc_g[axis]
 
-    def motor(i: int) -> Getter:
-        return lambda: float(int(firmware.motors[i]))
-
-    def quaternion(i: int) -> Getter:
-        return lambda: firmware.world.quaternion[i]
-
-    def output(i: int) -> Getter:
-        return lambda: controller.outputs[i]
-
     def variance() -> float:
         return estimator.variance(firmware.t_s)
 
-    getters: dict[str, Getter] = {
-        "pm.vbat": field(power, "battery_v"),
-        "pm.vbatMV": field(power, "battery_v", 1000.0),
-        "pm.state": field(power, "state"),
-        "pm.batteryLevel": field(power, "level_percent"),
-        "supervisor.info": lambda: float(firmware.supervisor_info),
-        "sys.canfly": field(supervisor, "motors_allowed"),
-        "sys.isFlying": field(supervisor, "is_flying"),
-        "sys.isTumbled": field(supervisor, "tumbled"),
-        "stabilizer.thrust": field(controller, "thrust"),
-        "controller.cmd_thrust": field(controller, "thrust"),
-        "controller.actuatorThrust": field(controller, "thrust"),
-        "controller.roll": field(controller, "desired_roll_deg"),
-        "controller.pitch": field(controller, "desired_pitch_deg"),
-        "controller.yaw": field(controller, "desired_yaw_deg"),
-        "controller.accelz": acc(2),
-        "radio.rssi": lambda: 40.0,
-        "radio.isConnected": lambda: 1.0,
-        "kalman.inFlight": field(supervisor, "is_flying"),
-        "range.zrange": lambda: 1000.0 * max(0.0, firmware.world.z_m),
-        "locSrv.tick": field(estimator, "external_count"),
-    }
-    for i, axis in enumerate("xyz"):
-        position = field(now, f"{axis}_m")
-        velocity = field(now, f"v{axis}_mps")
+    getters: dict[str, Getter] = {}
+    for i, axis in enumerate(AXES):
+        position = _field(now, f"{axis}_m")
+        velocity = _field(now, f"v{axis}_mps")
         getters |= {
             f"stateEstimate.{axis}": position,
             f"stateEstimate.v{axis}": velocity,
             f"kalman.state{axis.upper()}": position,
             f"kalman.stateP{axis.upper()}": velocity,
-            f"stateEstimateZ.{axis}": field(now, f"{axis}_m", 1000.0),
-            f"stateEstimateZ.v{axis}": field(now, f"v{axis}_mps", 1000.0),
+            f"stateEstimateZ.{axis}": _field(now, f"{axis}_m", 1000.0),
+            f"stateEstimateZ.v{axis}": _field(now, f"v{axis}_mps", 1000.0),
             f"kalman.var{axis.upper()}": variance,
             f"kalman.varP{axis.upper()}": variance,
             f"acc.{axis}": acc(i),
-            f"gyro.{axis}": field(now, f"gyro_{axis}_dps"),
+            f"gyro.{axis}": _field(now, f"gyro_{axis}_dps"),
             f"ctrltarget.{axis}": flown(f"{axis}_m"),
             f"ctrltarget.v{axis}": flown(f"v{axis}_mps"),
         }
-    for i, angle in enumerate(("roll", "pitch", "yaw")):
-        value = field(now, f"{angle}_deg")
+    return getters
+
+
+def _rotation(firmware: Logged) -> dict[str, Getter]:
+    """Attitude, rates, and the setpoint's."""
+    controller, now = firmware.controller, firmware.estimator.now
+
+    def flown(name: str) -> Getter:
+        return lambda: float(getattr(firmware.flown_setpoint, name))
+
+    def output(i: int) -> Getter:
+        return lambda: controller.outputs[i]
+
+    def quaternion(i: int) -> Getter:
+        return lambda: firmware.world.quaternion[i]
+
+    getters: dict[str, Getter] = {}
+    for i, (angle, axis, sign) in enumerate(zip(ANGLES, AXES, (1, -1, 1), strict=True)):
+        value = _field(now, f"{angle}_deg")
         getters |= {
             f"stateEstimate.{angle}": value,
             f"stabilizer.{angle}": value,
             f"ctrltarget.{angle}": flown(f"{angle}_deg"),
             f"controller.cmd_{angle}": output(i),
+            f"controller.r_{angle}": _field(now, f"gyro_{axis}_dps", math.radians(sign)),
         }
-    gyro = ("gyro_x_dps", "gyro_y_dps", "gyro_z_dps")
-    for angle, name, sign in zip(("roll", "pitch", "yaw"), gyro, (1, -1, 1), strict=True):
-        getters[f"controller.r_{angle}"] = field(now, name, math.radians(sign))
-    for i in range(4):
-        getters[f"motor.m{i + 1}"] = motor(i)
-        getters[f"motor.m{i + 1}req"] = motor(i)
-        getters[f"stateEstimate.q{'wxyz'[i]}"] = quaternion(i)
+    for i, part in enumerate("wxyz"):
+        getters[f"stateEstimate.q{part}"] = quaternion(i)
         getters[f"kalman.q{i}"] = quaternion(i)
     return getters
+
+
+def _motors(firmware: Logged) -> dict[str, Getter]:
+    def motor(i: int) -> Getter:
+        return lambda: float(int(firmware.motors[i]))
+
+    names = [f"motor.m{i + 1}{kind}" for i in range(4) for kind in ("", "req")]
+    return {name: motor(int(name[7]) - 1) for name in names}
