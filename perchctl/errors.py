@@ -65,6 +65,10 @@ class Interrupted(PerchError):
     meaning = "Ctrl-C, landed (in the air) or left (on the ground)"
 
 
+class ProfileNote(UserWarning):
+    """A profile was read, but one of its keys has another name by now, or is not used."""
+
+
 ERROR_CLASSES: tuple[type[PerchError], ...] = (
     PerchError,
     UsageError,

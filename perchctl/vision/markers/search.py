@@ -38,7 +38,7 @@ class DetectorSetup:
 
     `loose` takes nearly any quadrilateral for a candidate; `mirror_index` is the mirror
     image's place in the small marker's dictionary (None where it could be confused with
-    the marker itself), `patterns` how each marker renderings, `ratio` the small marker's side
+    the marker itself), `patterns` how each marker looks, `ratio` the small marker's side
     over the large one's.
     """
 
@@ -55,7 +55,7 @@ class DetectorSetup:
 
 
 def make_detector(config: DetectorConfig, target: TargetConfig) -> DetectorSetup:
-    """Dictionaries of just the target's ids, and the detector that renderings for them."""
+    """Dictionaries of just the target's ids, and the detector that looks for them."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
     patterns = [small_bits]
     mirror_index = None
