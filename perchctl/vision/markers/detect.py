@@ -77,7 +77,7 @@ def detect(
     `previous` is what an earlier frame gave (the last one that saw something is best);
     it says where to look first and decides between look-alikes. `expected` are better
     predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
-    `thorough` renderings once more, all over a picture in which nothing was found and nothing
+    `thorough` looks once more, all over a picture in which nothing was found and nothing
     is expected, for a target hidden by blur.
     """
     image = frame.image

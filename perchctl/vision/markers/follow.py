@@ -48,7 +48,7 @@ _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """How one marker renderings.
+    """How one marker looks.
 
     rim: inside of its border. drawing: all of it. spots (n, 1, 2): points in its own
     coordinates (see `perchctl.vision.markers.align`) at which its cells are read; owner (n,):
@@ -241,7 +241,7 @@ def aligned(
     blur_px: float = 1.5,
     max_sigma: float = _MAX_SIGMA,
 ) -> RefinedCorners | None:
-    """The marker by its drawing, None unless the picture renderings like it beyond doubt.
+    """The marker by its drawing, None unless the picture looks like it beyond doubt.
 
     `reach` is how far the corners may be from `start_px`, and `max_sigma` how vague they
     may stay, in sides.
