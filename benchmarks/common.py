@@ -78,7 +78,8 @@ def setup_with(
         kalman=kalman or KalmanConfig(),
         merge=merge or MergeConfig(),
     )
-    return make_pipeline(camera_profile(profile), camera)
+    bare = camera_profile(profile).model_copy(update={"pose": profile.pose})
+    return make_pipeline(bare, camera)
 
 
 def renderer(seed: int = 0, camera: CameraModel = CAMERA, **scenario: Any) -> Renderer:

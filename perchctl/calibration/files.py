@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from perchctl.errors import InvalidValue, NotFound
+from perchctl.profile import find_calibration
 from perchctl.vision.types import CameraModel
 
 KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
@@ -18,8 +19,11 @@ KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "p
 MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,), "equidistant": (4,)}
 
 
-def load_calibration(path: Path) -> CameraModel:
-    """Read a camera model. Errors: NotFound (no file), InvalidValue (wrong content)."""
+def load_calibration(file: Path | str) -> CameraModel:
+    """Read a camera model from a file, or by the name of one in `calib/`.
+
+    Errors: NotFound (no file), InvalidValue (wrong content)."""
+    path = find_calibration(file) if isinstance(file, str) else file
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

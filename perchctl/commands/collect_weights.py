@@ -18,7 +18,7 @@ from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.profile import Profile, find_calibration, load_profile
+from perchctl.profile import Profile, load_profile
 from perchctl.vision.types import CameraModel
 from perchctl.weights.collect import Eye, SessionFile, collecting_pipeline, fault_of, rows_of
 from perchctl.weights.dialogue import Experiment
@@ -61,7 +61,7 @@ def collect(options: CollectOptions) -> None:
         if not 0.0 <= getattr(options, name) <= 50.0:
             raise InvalidValue(f"--{name} {getattr(options, name):g} must be between 0 and 50")
     profile = load_profile(options.profile, with_weights=False)
-    camera = load_calibration(find_calibration(profile.camera.calibration))
+    camera = load_calibration(profile.camera.calibration)
     if options.truth == "sim":
         _collect_simulated(options, profile, camera)
     else:

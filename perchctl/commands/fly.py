@@ -27,7 +27,7 @@ from perchctl.log.read import read_log
 from perchctl.log.summary import summary_text
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.watch import Watcher
+from perchctl.mission.watch import Event, EventKind, Watcher
 from perchctl.profile import (
     Profile,
     find_calibration,
@@ -96,7 +96,7 @@ def plan_text(options: FlyOptions) -> str:
     lines = [
         f"vehicle      {resolved['uri']}" + (f", seed {options.seed}" if options.simulated else ""),
         f"camera       {resolved['source']}, calibration {resolved['calibration_file']}",
-        f"profile      {resolved['profile_file']}",
+        f"profile      {resolved['profile_file']}: {options.profile.description}".rstrip(": "),
         f"target       {target.large.side_m * 1e3:g} mm {target.large.dictionary}/"
         f"{target.large.id} around {target.small.side_m * 1e3:g} mm "
         f"{target.small.dictionary}/{target.small.id}",
@@ -147,7 +147,7 @@ def run(options: FlyOptions, *, as_json: bool = False, page_port: int | None = N
     merges = ""
     if options.profile.merge.method == "weights":
         merges = f"; merges with {weights_text(options)}"
-        log.event(time.monotonic(), merges.removeprefix("; "))
+        log.event(Event(time.monotonic(), EventKind.NOTE, merges.removeprefix("; ")))
     print(f"perchctl: connecting to {options.uri}{merges}", file=sys.stderr)
     try:
         result = _fly(options, (log, DisplayWatcher(reporter)), page_port)
@@ -187,7 +187,7 @@ def live_page(
     if port is None:
         return contextlib.nullcontext()
     return flight_page(
-        load_calibration(find_calibration(options.profile.camera.calibration)),
+        load_calibration(options.profile.camera.calibration),
         f"perchctl fly {options.uri}",
         options.profile.target.large.side_m,
         port,

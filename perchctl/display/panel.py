@@ -19,7 +19,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from perchctl.display.status import FlightStatus, status_rows
+from perchctl.display.status import FlightStatus, event_text, status_rows
+from perchctl.mission.watch import Event, EventKind
 
 PERIOD_S = 0.1
 CLOSE_TIMEOUT_S = 1.0
@@ -101,8 +102,8 @@ class Reporter:
         """Show this moment, unless the last one shown is less than 0.1 s old."""
         if self.problem is not None:
             return
-        if status.phase != self._phase:  # a change that no event has told
-            self._say(status.t_s, f"{status.phase}: {status.reason}")
+        if status.phase != self._phase:  # a change without an event
+            self._line(status.t_s, f"{status.phase}: {status.reason}")
             self._phase = status.phase
         elif status.t_s < self._next_s:
             return
@@ -110,14 +111,13 @@ class Reporter:
         self._status = status
         self._wake.set()
 
-    def event(self, t_s: float, text: str) -> None:
-        """One line, at once. ``PHASE: reason`` also tells the change to that phase."""
+    def event(self, event: Event) -> None:
+        """One line, at once."""
         if self.problem is not None:
             return
-        head = text.partition(":")[0]
-        if head.isupper() and head.isalpha():
-            self._phase = head
-        self._say(t_s, text)
+        if event.kind is EventKind.PHASE and event.phase is not None:
+            self._phase = event.phase.value
+        self._line(event.t_s, event_text(event))
         self._wake.set()
 
     def close(self) -> None:
@@ -126,7 +126,7 @@ class Reporter:
         self._wake.set()
         self._thread.join(CLOSE_TIMEOUT_S)
 
-    def _say(self, t_s: float, text: str) -> None:
+    def _line(self, t_s: float, text: str) -> None:
         if self._start_s is None:
             self._start_s = t_s
         self._lines.append(f"[{t_s - self._start_s:7.2f} s] {text}")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from perchctl.mission.watch import Event, EventKind
+
 
 @dataclass(frozen=True)
 class FlightStatus:
@@ -13,7 +15,8 @@ class FlightStatus:
     Attributes:
         t_s: the loop's clock.
         in_phase_s: time since the phase was entered.
-        e_m, e_yaw_rad: target relative to the gear; None while it is not tracked.
+        e_m, e_yaw_rad: target relative to the gear; None while none was seen.
+        tracked: the target is seen, or was a moment ago; else `e_m` is remembered.
         stage: markers seen: none, large, both, small.
         height_m: above the place of take-off.
         link_age_s, camera_age_s: since the newest telemetry and the last good frame.
@@ -27,6 +30,7 @@ class FlightStatus:
     in_phase_s: float
     e_m: tuple[float, float, float] | None
     e_yaw_rad: float | None
+    tracked: bool
     stage: str
     height_m: float
     battery_v: float
@@ -41,11 +45,12 @@ class FlightStatus:
 def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
     """Name and text of each line of the display, at most 80 columns together."""
     if status.e_m is None:
-        error = "not tracked"
+        error = "no target seen yet"
     else:
         x, y, z = (f"{100.0 * v:+.1f}" for v in status.e_m)
         yaw = "-" if status.e_yaw_rad is None else f"{math.degrees(status.e_yaw_rad):+.1f}"
         error = f"x {x}  y {y}  z {z} cm   yaw {yaw} deg"
+        error += "" if status.tracked else "   (not seen)"
     ages = (
         f"link {_age(status.link_age_s)}   camera {_age(status.camera_age_s)}"
         f"   loop late {_age(status.loop_late_s)}"
@@ -58,6 +63,17 @@ def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
         ("ages", ages),
         ("held" if status.hold else "reason", status.hold or status.reason),
     ]
+
+
+def event_text(event: Event) -> str:
+    """An event as one line."""
+    match event.kind:
+        case EventKind.PHASE:
+            return f"{event.phase.value if event.phase else '?'}: {event.reason}"
+        case EventKind.HOLD:
+            return f"holding: {event.reason}"
+        case EventKind.NOTE:
+            return event.reason
 
 
 def _age(seconds: float) -> str:

@@ -6,7 +6,7 @@ import math
 
 from perchctl.display.panel import Reporter
 from perchctl.display.status import FlightStatus
-from perchctl.mission.watch import Tick
+from perchctl.mission.watch import Event, Tick
 
 
 class DisplayWatcher:
@@ -18,8 +18,8 @@ class DisplayWatcher:
     def tick(self, tick: Tick) -> None:
         self.reporter.update(status_of(tick))
 
-    def event(self, t_s: float, text: str) -> None:
-        self.reporter.event(t_s, text)
+    def event(self, event: Event) -> None:
+        self.reporter.event(event)
 
     @property
     def problem(self) -> str | None:
@@ -41,6 +41,7 @@ def status_of(tick: Tick) -> FlightStatus:
         in_phase_s=tick.t_s - state.entered_s,
         e_m=e_m,
         e_yaw_rad=yaw_rad,
+        tracked=target is not None and target.tracked,
         stage="none" if target is None else target.stage.value,
         height_m=tel.position_m[2] - ground_z_m,
         battery_v=tel.battery_v,

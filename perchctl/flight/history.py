@@ -79,6 +79,11 @@ def attitude_at(history: History, t_s: float) -> Attitude | None:
     )
 
 
+def attitude_of(sample: Telemetry) -> Attitude:
+    """Attitude and position of a sample."""
+    return _attitude(sample, 0.0)
+
+
 def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
     x, y, z = (p + v * ahead_s for p, v in zip(s.position_m, s.velocity_mps, strict=True))
     return Attitude(s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z))

@@ -10,9 +10,9 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.link.mock import MockLink
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Operator, Phase
-from perchctl.mission.watch import FlightReport, Tick, Watcher
+from perchctl.mission.watch import Event, FlightReport, Tick, Watcher
 from perchctl.pipeline import make_pipeline
-from perchctl.profile import Profile, find_calibration
+from perchctl.profile import Profile
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.scenario import Scenario
@@ -83,7 +83,7 @@ class Truth:
         self._sink_mps = 0.0
         self.fell = False
 
-    def event(self, t_s: float, text: str) -> None:
+    def event(self, event: Event) -> None:
         return None
 
     def tick(self, tick: Tick) -> None:
@@ -119,7 +119,7 @@ class LockstepFlight:
 def fly_lockstep(
     profile: Profile,
     seed: int = 0,
-    log: LogWatcher | Path | None = None,
+    log: LogWatcher | Path | str | None = None,
     *,
     scenario: Scenario | None = None,
     operator_at: dict[Phase, Operator] | None = None,
@@ -134,12 +134,12 @@ def fly_lockstep(
     Errors: NotFound, InvalidValue (calibration, log file).
     """
     scenario = draw_scenario(profile, seed) if scenario is None else scenario
-    if isinstance(log, Path):
-        watcher = LogWatcher.lockstep(log, profile, scenario.seed)
+    if isinstance(log, (Path, str)):
+        watcher = LogWatcher.lockstep(Path(log), profile, scenario.seed)
         flight = fly_lockstep(profile, log=watcher, scenario=scenario, operator_at=operator_at)
         watcher.close(flight.report, flight.perched_miss_m, flight.fell)
         return flight
-    camera = load_calibration(find_calibration(profile.camera.calibration))
+    camera = load_calibration(profile.camera.calibration)
     vehicle = SimulatedVehicle(scenario, camera, profile.target)
     link = MockLink(vehicle, profile.link.telemetry_period_s)
     assert vehicle.camera is not None
@@ -186,5 +186,5 @@ class _Word:
     def tick(self, tick: Tick) -> None:
         self._said = max(self._said, self._at.get(tick.state.phase, Operator.NONE))
 
-    def event(self, t_s: float, text: str) -> None:
+    def event(self, event: Event) -> None:
         return None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -28,11 +26,6 @@ _FORBIDDEN = (
 )
 
 
-@dataclass(frozen=True)
-class Readiness:
-    started_s: float
-
-
 def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
     """Raises SafetyAbort for what waiting will not mend."""
     if telemetry is None:
@@ -55,15 +48,13 @@ def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
 
 
 def still_waiting_for(
-    readiness: Readiness,
     telemetry: Telemetry | None,
     has_frame: bool,
     camera_problem: str | None,
-    now_s: float,
+    waited_s: float,
     profile: Profile,
 ) -> str:
     """What is missing yet, or empty when ready. Raises TimedOut past the bound."""
-    waited_s = now_s - readiness.started_s
     safety = profile.safety
     if telemetry is None:
         return _bounded("telemetry", waited_s, safety.estimator_wait_s)

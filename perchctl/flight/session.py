@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +14,14 @@ from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import ALLOWED, open_source
 from perchctl.camera.source import FrameSource
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError
+from perchctl.flight.clock import WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.uri import check_uri
 from perchctl.mission.watch import FlightReport, Watcher
 from perchctl.pipeline import make_pipeline
-from perchctl.profile import Profile, find_calibration
+from perchctl.profile import Profile
 from perchctl.vision.types import CameraModel
 
 if TYPE_CHECKING:
@@ -54,18 +54,6 @@ class SessionResult:
     miss_m: float | None = None
 
 
-class WallClock:
-    """The one clock of a real-time flight."""
-
-    def now(self) -> float:
-        return time.monotonic()
-
-    def wait_until(self, t_s: float) -> None:
-        left_s = t_s - time.monotonic()
-        if left_s > 0:
-            time.sleep(left_s)
-
-
 def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
@@ -93,7 +81,7 @@ def fly_session(
     """
     check_options(options)
     profile, clock, switch = options.profile, WallClock(), switch or OperatorSwitch()
-    camera = load_calibration(find_calibration(profile.camera.calibration))
+    camera = load_calibration(profile.camera.calibration)
     pipeline = make_pipeline(profile, camera)
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None

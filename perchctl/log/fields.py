@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from perchctl.mission.watch import Event
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -22,7 +23,7 @@ from perchctl.vehicle import (
     TakeOff,
     Telemetry,
 )
-from perchctl.vision.types import MARKERS, MarkerPose, PipelineOutput, TargetPose
+from perchctl.vision.types import MARKERS, MarkerPose, PipelineOutput, TargetEstimate
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 
@@ -68,7 +69,7 @@ FIELDS: dict[str, str] = {
         )
     },
     "cam_age_s": "since the last good frame",
-    # the merged, filtered target: the paper's error vector
+    # the target's estimate at t_s, which the planner steers by: the paper's error vector
     "ex_m": "target relative to the gear, level frame",
     "ey_m": "target relative to the gear, level frame",
     "ez_m": "target relative to the gear, level frame",
@@ -80,7 +81,9 @@ FIELDS: dict[str, str] = {
     "esy_m": "standard deviation of ey_m",
     "esz_m": "standard deviation of ez_m",
     "esyaw_rad": "standard deviation of eyaw_rad",
-    "measured": "true when the frame held the target, false while the filter coasts",
+    "measured": "true when the newest frame held the target, false while the filter coasts",
+    "tracked": "true while the filter lives, false for a place that is only remembered",
+    "target_age_s": "since the exposure of the last frame in which the target was measured",
     "unseen": "frames since the target was last detected",
     "tx_m": "target in the world of the state estimate",
     "ty_m": "target in the world of the state estimate",
@@ -103,12 +106,34 @@ FIELDS: dict[str, str] = {
 }
 
 
+EVENT_FIELDS: dict[str, str] = {
+    "t_s": "time on the loop's clock",
+    "event": "phase (one was entered), hold (the vehicle is held in place) or note",
+    "phase": "the phase entered, or the one that was flown",
+    "row": "row of the mission's table that was taken",
+    "severity": "continue, hold, back off, land or stop",
+    "reason": "why",
+}
+
+
+def event_record(event: Event) -> dict[str, Any]:
+    """One event as a flat record with the keys of `EVENT_FIELDS`."""
+    return {
+        "t_s": event.t_s,
+        "event": event.kind.value,
+        "phase": event.phase.value if event.phase else None,
+        "row": event.row or None,
+        "severity": event.severity.name.lower().replace("_", " "),
+        "reason": event.reason,
+    }
+
+
 def tick_record(
     *,
     t_s: float,
     telemetry: Telemetry | None,
     output: PipelineOutput | None,
-    target: TargetPose | None,
+    target: TargetEstimate | None,
     phase: str,
     reason: str,
     command: Command | None,
@@ -202,7 +227,7 @@ def _pose_values(short: str, pose: MarkerPose) -> dict[str, Any]:
     }
 
 
-def _target_values(target: TargetPose | None) -> dict[str, Any]:
+def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
     if target is None:
         return {}
     return {
@@ -212,6 +237,8 @@ def _target_values(target: TargetPose | None) -> dict[str, Any]:
         **_xyz("es", target.sigma_m),
         "esyaw_rad": target.sigma_yaw_rad,
         "measured": target.measured,
+        "tracked": target.tracked,
+        "target_age_s": target.t_s - target.measured_s,
         "unseen": target.unseen,
         **_xyz("t", target.world_m),
         "tyaw_rad": target.world_yaw_rad,

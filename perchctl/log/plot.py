@@ -37,7 +37,7 @@ AXES = (("x", "m", 100.0, "x [cm]"), ("y", "m", 100.0, "y [cm]"), ("z", "m", 100
 YAW = ("yaw", "rad", 180.0 / math.pi, "yaw [deg]")
 
 
-def plot_flight(log: FlightLog, png_path: Path) -> None:
+def plot_flight(log: FlightLog, png_path: Path | str) -> None:
     """Draw the flight into a PNG: errors, detections against the filtered track (as
     the paper's figure 6), height, thrust and battery, over the named phases.
 
@@ -51,7 +51,7 @@ def plot_flight(log: FlightLog, png_path: Path) -> None:
     _plot_errors(axes[0], log, t_s)
     for ax, (name, unit, scale, label) in zip(axes[1:5], (*AXES, YAW), strict=True):
         _plot_raw_and_filtered(ax, log, t_s, f"{name}_{unit}", scale, label)
-    axes[1].legend(handles=_track_legend(), loc="best", ncols=4, fontsize=8)
+    axes[1].legend(handles=_track_legend(), loc="best", ncols=5, fontsize=8)
     _plot_height(axes[5], log, t_s)
     _plot_power(axes[6], log, t_s)
     for ax in axes:
@@ -65,7 +65,7 @@ def plot_flight(log: FlightLog, png_path: Path) -> None:
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     figure.suptitle(title_of(log, summary_of(log)), fontsize=12)
-    save_png(figure, png_path)
+    save_png(figure, Path(png_path))
 
 
 def title_of(log: FlightLog, summary: FlightSummary) -> str:
@@ -85,10 +85,10 @@ def _plot_errors(ax: Axes, log: FlightLog, t_s: Array) -> None:
     """The merged error e = (e_x, e_y, e_z, e_psi) on two scales."""
     lines: list[Line2D] = []
     for (name, unit, scale, _), colour in zip(AXES, (BLUE, VERMILLION, BLACK), strict=True):
-        e = scale * log.column(f"e{name}_{unit}")
+        e = scale * _while_tracked(log, log.column(f"e{name}_{unit}"))
         lines += ax.plot(t_s, e, color=colour, linewidth=1.4, label=f"$e_{name}$ [cm]")
     yaw_ax = ax.twinx()
-    yaw = YAW[2] * _unbroken(log.column("eyaw_rad"))
+    yaw = YAW[2] * _unbroken(_while_tracked(log, log.column("eyaw_rad")))
     lines += yaw_ax.plot(
         t_s, yaw, color=PURPLE, linewidth=1.4, linestyle="--", label=r"$e_\psi$ [deg], right"
     )
@@ -102,10 +102,10 @@ def _plot_errors(ax: Axes, log: FlightLog, t_s: Array) -> None:
 def _plot_raw_and_filtered(
     ax: Axes, log: FlightLog, t_s: Array, key: str, scale: float, label: str
 ) -> None:
-    for source, colour, marker in (("l", SKY, "o"), ("s", ORANGE, "^")):
+    for source, colour, marker in (("j", GREEN, "s"), ("l", SKY, "o"), ("s", ORANGE, "^")):
         raw = scale * log.column(f"{source}{key}")
         ax.plot(t_s, raw, linestyle="none", marker=marker, markersize=3, color=colour)
-    filtered = log.column(f"e{key}")
+    filtered = _while_tracked(log, log.column(f"e{key}"))
     if key.startswith("yaw"):
         filtered = _unbroken(filtered)
     ax.plot(t_s, scale * filtered, color=BLACK, linewidth=1.1)
@@ -114,14 +114,24 @@ def _plot_raw_and_filtered(
     ax.set_ylabel(label)
 
 
+def _while_tracked(log: FlightLog, values: Array) -> Array:
+    """NaN where the target is only remembered."""
+    remembered = [record.get("tracked") is False for record in log.records]
+    return np.where(remembered, np.nan, values)
+
+
 def _track_legend() -> list[Line2D]:
+    raw = (("s", GREEN, "both, raw"), ("o", SKY, "large, raw"), ("^", ORANGE, "small, raw"))
+    filtered = ((BLACK, 1.4, "filtered"), (VERMILLION, 2.4, "filtered, unseen"))
     return [
-        Line2D([], [], linestyle="none", marker="o", markersize=4, color=SKY, label="large, raw"),
-        Line2D(
-            [], [], linestyle="none", marker="^", markersize=4, color=ORANGE, label="small, raw"
+        *(
+            Line2D([], [], linestyle="none", marker=marker, markersize=4, color=colour, label=text)
+            for marker, colour, text in raw
         ),
-        Line2D([], [], color=BLACK, linewidth=1.4, label="filtered"),
-        Line2D([], [], color=VERMILLION, linewidth=2.4, label="filtered, unseen"),
+        *(
+            Line2D([], [], color=colour, linewidth=width, label=text)
+            for colour, width, text in filtered
+        ),
     ]
 
 

@@ -16,6 +16,8 @@ from perchctl.log.jsonl import decode
 from perchctl.log.write import FORMAT, SCHEMA_VERSION
 
 KINDS = ("tick", "event", "summary")
+READABLE_VERSIONS = (1, SCHEMA_VERSION)
+"""1 knew no `tracked` and no events of several fields; its missing values read None."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +85,13 @@ class FlightLog:
         return tuple(spans)
 
 
-def read_log(path: Path) -> FlightLog:
+def read_log(path: Path | str) -> FlightLog:
     """Read a flight log; an unreadable tail is ignored and counted.
 
     Raises NotFound when there is no such file, and InvalidValue, with the line,
     when it is not a flight log or is damaged elsewhere than at its end.
     """
+    path = Path(path)
     lines = _lines(path)
     header = _header(path, lines)
     good: list[dict[str, Any]] = []
@@ -144,9 +147,10 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
             f"the .jsonl files in the profile's log.directory"
         )
     version = header.get("version")
-    if version != SCHEMA_VERSION:
+    if version not in READABLE_VERSIONS:
+        readable = " and ".join(map(str, READABLE_VERSIONS))
         raise InvalidValue(
-            f"{path}: line 1: schema version {version!r}, this perchctl reads {SCHEMA_VERSION}; "
+            f"{path}: line 1: schema version {version!r}, this perchctl reads {readable}; "
             f"the log was written by perchctl {header.get('perchctl', 'of unknown version')}"
         )
     return header

@@ -11,7 +11,7 @@ from perchctl.log.fields import tick_record
 from perchctl.log.read import PhaseSpan
 from perchctl.log.summary import FlightSummary
 from perchctl.log.write import FlightLogWriter, log_path, make_header
-from perchctl.mission.watch import FlightReport, Tick
+from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.profile import Profile
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -59,11 +59,10 @@ class LogWatcher:
         if battery_v >= NO_BATTERY_READING_V:
             self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
         position_m, miss_m = (None, None) if self.truth is None else self.truth()
-        self.writer.write(record_of(tick, position_m, miss_m))
+        self.writer.write(flight_record(tick, position_m, miss_m))
 
-    def event(self, t_s: float, text: str) -> None:
-        level = "warning" if text.startswith("holding") else "info"
-        self.writer.event(t_s, text, level)
+    def event(self, event: Event) -> None:
+        self.writer.event(event)
 
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
@@ -103,14 +102,14 @@ def spans_of(report: FlightReport) -> tuple[PhaseSpan, ...]:
     starts = report.history
     if not starts:
         return ()
-    ends = [t_s for t_s, _, _ in starts[1:]] + [starts[-1][0]]
+    ends = [event.t_s for event in starts[1:]] + [starts[-1].t_s]
     return tuple(
-        PhaseSpan(phase, t_s, end_s, reason)
-        for (t_s, phase, reason), end_s in zip(starts, ends, strict=True)
+        PhaseSpan(event.phase.value if event.phase else "", event.t_s, end_s, event.reason)
+        for event, end_s in zip(starts, ends, strict=True)
     )
 
 
-def record_of(
+def flight_record(
     tick: Tick,
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,

@@ -20,12 +20,13 @@ from typing import Any
 
 import perchctl
 from perchctl.errors import InvalidValue
-from perchctl.log.fields import FIELDS
+from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
 from perchctl.log.jsonl import encode
+from perchctl.mission.watch import Event
 from perchctl.profile import Profile
 
 FORMAT = "perchctl-flight-log"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 2.0
@@ -53,6 +54,7 @@ def make_header(
         "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
         "profile": profile.model_dump(mode="json"),
         "fields": FIELDS,
+        "event_fields": EVENT_FIELDS,
     }
 
 
@@ -113,9 +115,9 @@ class FlightLogWriter:
         """Append one tick record (`perchctl.log.fields.tick_record`). Never raises."""
         self._put({"kind": "tick", **record}, _time_of(record))
 
-    def event(self, t_s: float, text: str, level: str = "info") -> None:
-        """Append a phase change or a warning (`level` ``info`` or ``warning``). Never raises."""
-        self._put({"kind": "event", "t_s": t_s, "level": level, "text": text}, t_s)
+    def event(self, event: Event) -> None:
+        """Append an event (`perchctl.log.fields.event_record`). Never raises."""
+        self._put({"kind": "event", **event_record(event)}, event.t_s)
 
     def close(self, summary: Mapping[str, Any] | None = None) -> None:
         """Append the summary, if there is one, and close. Never raises; twice is once."""

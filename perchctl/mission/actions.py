@@ -22,7 +22,7 @@ from perchctl.mission.guidance import (
     under_target_xy,
     walk,
 )
-from perchctl.mission.state import Operator, Outcome, Phase, PlannerState
+from perchctl.mission.state import Condition, MotorStop, Phase, PlannerState
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -82,8 +82,8 @@ def _under_target(c: Context, z_m: float, *, up_mps: float = 0.0, down_mps: floa
 
 
 def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
-    assert c.state.anchor is not None
-    yaw = c.state.anchor.yaw_rad
+    yaw = c.target_yaw_rad
+    assert yaw is not None
     x, y = under_target_xy(c, yaw)
     return PositionSetpoint(x, y, z_m, yaw)
 
@@ -117,7 +117,7 @@ def _search(c: Context) -> Acted:
         state = replace(state, searches=state.searches + 1, search_step_s=c.obs.t_s)
         c = Context(state, c.obs, c.profile)
     x, y, z = state.entry_m
-    if state.anchor is not None:
+    if c.target_m is not None:
         x, y = under_target_xy(c, state.entry_yaw_rad)
         height = min(z, c.contact_goal_z_m - c.profile.planner.ascend.near_m)
     else:
@@ -166,7 +166,7 @@ def _complete(c: Context) -> Acted:
     complete, state = c.profile.planner.complete, c.state
     if state.motors_stopped:
         return _stop_motors(c)
-    if c.held("magnet_holds") >= complete.hold_dwell_s:
+    if c.held(Condition.MAGNET_HOLDS) >= complete.hold_dwell_s:
         return _stop_motors(c)
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
@@ -201,7 +201,7 @@ def _recover(c: Context) -> Acted:
     setpoint = state.setpoint or hold_here(c)
     if setpoint.z_m > z:
         setpoint = replace(setpoint, z_m=z)
-    if state.anchor is not None and c.target_age_s < 3.0:
+    if c.target_m is not None and c.target_age_s < 3.0:
         x, y = under_target_xy(c, setpoint.yaw_rad)
         goal = PositionSetpoint(x, y, z, setpoint.yaw_rad)
     else:
@@ -214,7 +214,7 @@ def _landing(c: Context) -> Acted:
     """One high-level landing; given again only while it shows no effect. When the motors
     are off already (on the ground, or hanging), nothing is started again."""
     landing, state = c.profile.planner.landing, c.state
-    if state.motors_stopped or c.held("hanging") >= HANGING_S:
+    if state.motors_stopped or c.held(Condition.HANGING) >= HANGING_S:
         return _stop_motors(c)
     if c.obs.telemetry.thrust < 1 and (state.orders or not c.flying):
         return state, Idle()  # on the floor: another order would spin the motors up again
@@ -222,7 +222,7 @@ def _landing(c: Context) -> Acted:
     floor = ground_z - landing.undershoot_m
     waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
     near_floor = c.obs.telemetry.position_m[2] < ground_z + 0.15
-    if state.orders and near_floor and c.held("resting") > 1.0 and waited > 2.0:
+    if state.orders and near_floor and c.held(Condition.RESTING) > 1.0 and waited > 2.0:
         return _stop_motors(c)
     ignored = not c.high_level_active and waited > REPEAT_ORDER_S
     if state.orders == 0 or (ignored and state.orders < MAX_ORDERS):
@@ -237,16 +237,17 @@ def _terminal(c: Context) -> Acted:
 
 
 def _aborted(c: Context) -> Acted:
-    """Motors off, once: cut and locked on the user's word or with a useless attitude,
-    plainly stopped where the supervisor has ended the flight already."""
+    """The motors, once, as the row that aborted wants it."""
     if c.state.orders:
         return c.state, Idle()
     state = replace(c.state, orders=1, ordered_s=c.obs.t_s)
-    if c.state.outcome is Outcome.EMERGENCY or c.obs.operator is Operator.STOP:
-        return state, EmergencyStop()
-    if c.state.row == "tilted":
-        return state, EmergencyStop()
-    return (state, Idle()) if c.state.row == "landing-timeout" else (state, StopMotors())
+    match state.motor_stop:
+        case MotorStop.EMERGENCY:
+            return state, EmergencyStop()
+        case MotorStop.PLAIN:
+            return state, StopMotors()
+        case MotorStop.NONE:
+            return state, Idle()
 
 
 ACTIONS: dict[Phase, Callable[[Context], Acted]] = {

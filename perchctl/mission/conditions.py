@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 
 from perchctl.mission.context import Context
-from perchctl.mission.state import Phase
+from perchctl.mission.state import Condition, Phase
 
 
 def _aligned(c: Context) -> bool:
@@ -81,7 +81,7 @@ def _hanging(c: Context) -> bool:
         c.state.hover_thrust > 0
         and tel.thrust <= complete.hold_ratio * c.state.hover_thrust
         and c.height_m > 0.3
-        and c.state.anchor is not None
+        and c.obs.target is not None
         and abs(c.error_z_m) <= 0.15
         and abs(tel.velocity_mps[2]) < 0.05
         and abs(tel.acc_z_g - 1.0) <= c.profile.planner.perch.contact_acc_g
@@ -101,7 +101,7 @@ def _at_takeoff_height(c: Context) -> bool:
 
 
 def _estimated(c: Context) -> bool:
-    return c.fresh and c.state.anchor_spread_m <= c.profile.planner.estimate.spread_m
+    return c.fresh and c.state.target_spread_m <= c.profile.planner.estimate.spread_m
 
 
 def _tilted(c: Context) -> bool:
@@ -119,31 +119,32 @@ def _resting(c: Context) -> bool:
     return abs(tel.velocity_mps[2]) < 0.05 and abs(tel.acc_z_g - 1.0) < 0.1
 
 
-CONDITIONS: dict[str, Callable[[Context], bool]] = {
-    "aligned": _aligned,
-    "settled": _settled,
-    "near_standoff": _near_standoff,
-    "contact": _contact,
-    "magnet_holds": _magnet_holds,
-    "slipping": _slipping,
-    "hanging": _hanging,
-    "untracked": lambda c: not c.tracked,
-    "steady": _steady,
-    "at_takeoff_height": _at_takeoff_height,
-    "estimated": _estimated,
-    "tilted": _tilted,
-    "down": _down,
-    "resting": _resting,
-    "battery_low": lambda c: c.battery_is_low,
-    "high_level_idle": lambda c: not c.high_level_active,
+CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
+    Condition.AT_TAKEOFF_HEIGHT: _at_takeoff_height,
+    Condition.ESTIMATED: _estimated,
+    Condition.ALIGNED: _aligned,
+    Condition.UNTRACKED: lambda c: not c.tracked,
+    Condition.NEAR_STANDOFF: _near_standoff,
+    Condition.SETTLED: _settled,
+    Condition.CONTACT: _contact,
+    Condition.MAGNET_HOLDS: _magnet_holds,
+    Condition.SLIPPING: _slipping,
+    Condition.HANGING: _hanging,
+    Condition.STEADY: _steady,
+    Condition.TILTED: _tilted,
+    Condition.DOWN: _down,
+    Condition.RESTING: _resting,
+    Condition.BATTERY_LOW: lambda c: c.battery_is_low,
 }
+KEPT_OVER_A_CHANGE = (Condition.BATTERY_LOW, Condition.TILTED)
+"""The vehicle's own, whatever the phase, and however it is held."""
 
 
-def conditions_since(view: Context) -> dict[str, float]:
+def conditions_since(c: Context) -> dict[Condition, float]:
     """`PlannerState.since` of this tick. A condition seen while the vehicle is held
     in place for a fault, or in stale telemetry, does not count."""
-    old = view.state.since
-    return {name: old.get(name, view.obs.t_s) for name, holds in CONDITIONS.items() if holds(view)}
+    old = c.state.since
+    return {name: old.get(name, c.obs.t_s) for name, holds in CONDITIONS.items() if holds(c)}
 
 
 def hold_reason(c: Context) -> str:

@@ -8,12 +8,10 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
-
-from perchctl.geometry import Array, rot_z, rotation_from_rpy, wrap_rad
-from perchctl.mission.state import Observation, PlannerState
+from perchctl.geometry import Array
+from perchctl.mission.state import Condition, Observation, PlannerState
 from perchctl.profile import Profile
-from perchctl.vehicle import FLYING, HL_ACTIVE, HL_FINISHED, LOW_POWER, NO_BATTERY_READING_V
+from perchctl.vehicle import FLYING, HL_ACTIVE, LOW_POWER, NO_BATTERY_READING_V
 
 HANGING_S = 1.0
 """For how long a thrust below the weight must be enough before it proves the magnet."""
@@ -29,7 +27,7 @@ class Context:
     def in_phase_s(self) -> float:
         return self.obs.t_s - self.state.entered_s
 
-    def held(self, condition: str) -> float:
+    def held(self, condition: Condition) -> float:
         """Seconds for which the condition has been true; -1 when it is not."""
         since = self.state.since.get(condition)
         return -1.0 if since is None else self.obs.t_s - since
@@ -37,18 +35,8 @@ class Context:
     # --- the vehicle -----------------------------------------------------
 
     @cached_property
-    def position_m(self) -> Array:
-        return np.array(self.obs.telemetry.position_m)
-
-    @cached_property
     def speed_mps(self) -> float:
         return math.sqrt(sum(v * v for v in self.obs.telemetry.velocity_mps))
-
-    @cached_property
-    def gear_world_m(self) -> Array:
-        tel = self.obs.telemetry
-        R = rotation_from_rpy(tel.roll_rad, tel.pitch_rad, tel.yaw_rad)
-        return self.position_m + R @ np.array(self.profile.vehicle.gear_body_m)
 
     @property
     def height_m(self) -> float:
@@ -69,10 +57,6 @@ class Context:
         return self.obs.telemetry.has(HL_ACTIVE)
 
     @property
-    def high_level_finished(self) -> bool:
-        return self.obs.telemetry.has(HL_FINISHED)
-
-    @property
     def tilt_rad(self) -> float:
         tel = self.obs.telemetry
         return math.acos(max(-1.0, min(1.0, math.cos(tel.roll_rad) * math.cos(tel.pitch_rad))))
@@ -87,46 +71,40 @@ class Context:
 
     # --- the target ------------------------------------------------------
 
-    @cached_property
-    def target_world_m(self) -> Array | None:
-        anchor = self.state.anchor
-        return None if anchor is None else anchor.at(self.obs.t_s)
+    @property
+    def target_m(self) -> Array | None:
+        """The target in the world of the state estimate, (3,); None while none was seen."""
+        return None if self.obs.target is None else self.obs.target.world_m
 
-    @cached_property
-    def error_m(self) -> Array | None:
-        """(e_x, e_y, e_z) now: target relative to the gear, level frame, (3,)."""
-        if self.target_world_m is None:
-            return None
-        R_world_level = rot_z(self.obs.telemetry.yaw_rad)
-        return R_world_level.T @ (self.target_world_m - self.gear_world_m)
+    @property
+    def target_yaw_rad(self) -> float | None:
+        return None if self.obs.target is None else self.obs.target.world_yaw_rad
 
-    @cached_property
+    @property
     def error_xy_m(self) -> float:
-        e = self.error_m
-        return math.inf if e is None else math.hypot(e[0], e[1])
+        target = self.obs.target
+        return math.inf if target is None else math.hypot(target.e_m[0], target.e_m[1])
 
-    @cached_property
+    @property
     def error_z_m(self) -> float:
-        e = self.error_m
-        return math.inf if e is None else float(e[2])
+        target = self.obs.target
+        return math.inf if target is None else float(target.e_m[2])
 
-    @cached_property
+    @property
     def error_yaw_rad(self) -> float:
-        anchor = self.state.anchor
-        if anchor is None:
-            return math.inf
-        return wrap_rad(anchor.yaw_rad - self.obs.telemetry.yaw_rad)
+        target = self.obs.target
+        return math.inf if target is None else target.e_yaw_rad
 
     @property
     def target_age_s(self) -> float:
         """Since the exposure of the last frame in which the target was measured."""
-        anchor = self.state.anchor
-        return math.inf if anchor is None else self.obs.t_s - anchor.t_s
+        target = self.obs.target
+        return math.inf if target is None else self.obs.t_s - target.measured_s
 
     @property
     def tracked(self) -> bool:
         """Seen, or coasting within the filter's n_max frames."""
-        return self.obs.target is not None
+        return self.obs.target is not None and self.obs.target.tracked
 
     @property
     def fresh(self) -> bool:
@@ -134,7 +112,10 @@ class Context:
 
     @property
     def small_is_fresh(self) -> bool:
-        return self.obs.t_s - self.state.small_seen_s <= self._fresh_limit_s
+        target = self.obs.target
+        if target is None:
+            return False
+        return self.obs.t_s - target.small_measured_s <= self._fresh_limit_s
 
     @property
     def _fresh_limit_s(self) -> float:
@@ -144,10 +125,9 @@ class Context:
     @property
     def contact_goal_z_m(self) -> float:
         """Height of the body at which the gear touches the target."""
-        target = self.target_world_m
-        if target is None:
+        if self.target_m is None:
             return math.inf
-        return float(target[2]) - self.profile.vehicle.gear_body_m[2]
+        return float(self.target_m[2]) - self.profile.vehicle.gear_body_m[2]
 
     @property
     def cone_m(self) -> float:

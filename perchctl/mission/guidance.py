@@ -28,7 +28,7 @@ def hold_here(c: Context) -> PositionSetpoint:
 
 def under_target_xy(c: Context, yaw_rad: float) -> tuple[float, float]:
     """Where the body has to be so that the gear is under the target at that heading."""
-    target = c.target_world_m
+    target = c.target_m
     assert target is not None
     gear = rot_z(yaw_rad) @ c.profile.vehicle.gear_body_m
     return float(target[0] - gear[0]), float(target[1] - gear[1])

@@ -11,23 +11,18 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.mission.actions import act
-from perchctl.mission.conditions import conditions_since, hold_reason
+from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason
 from perchctl.mission.context import Context
 from perchctl.mission.state import (
     TERMINALS,
-    Anchor,
+    Condition,
     Observation,
     Phase,
     PlannerState,
-    Severity,
 )
-from perchctl.mission.table import TABLE, Row, first_match
+from perchctl.mission.table import TABLE, Row, first_match, risen
 from perchctl.profile import Profile
 from perchctl.vehicle import Command
-from perchctl.vision.types import Stage
-
-MAX_DRIFT_MPS = 0.05
-"""The target stands still: what seems to move faster is the filter's noise."""
 
 
 def start(obs: Observation) -> PlannerState:
@@ -62,46 +57,35 @@ def is_over(state: PlannerState) -> bool:
 
 
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    state = _with_anchor(state, obs)
+    state = _with_target(state, obs)
     if obs.jumped and state.jump_s is None:
         state = replace(state, jump_s=obs.t_s)
-    view = Context(state, obs, profile)
-    state = replace(state, hold=hold_reason(view))
+    context = Context(state, obs, profile)
+    state = replace(state, hold=hold_reason(context))
+    since = conditions_since(context)
     if state.hold:
-        # A held vehicle proves nothing: the dwell times begin anew.
-        keep = ("tilted", "battery_low", "high_level_idle")
-        since = {k: s for k, s in conditions_since(view).items() if k in keep}
-    else:
-        since = conditions_since(view)
-    if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and view.speed_mps < 0.3:
+        since = _kept(since)  # a held vehicle proves nothing: the dwell times begin anew
+    if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and context.speed_mps < 0.3:
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
     return replace(state, since=since)
 
 
-def _with_anchor(state: PlannerState, obs: Observation) -> PlannerState:
+def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
+    """Whether frames in a row measure the target, and how far they agree on its place."""
     target = obs.target
     if not obs.new_frame:
         return state
     if target is None or not target.measured or target.world_m is None:
         return replace(state, confirmed=0)
-    velocity = target.world_velocity_mps
-    velocity = np.zeros(3) if velocity is None else velocity
-    speed = float(np.linalg.norm(velocity))
-    if speed > MAX_DRIFT_MPS:
-        velocity = velocity * (MAX_DRIFT_MPS / speed)
-    yaw = target.world_yaw_rad if target.world_yaw_rad is not None else 0.0
-    anchor = Anchor(target.t_s, target.world_m, yaw, velocity)
-    spread = 0.0
-    if state.anchor is not None:
-        moved = float(np.linalg.norm(anchor.world_m - state.anchor.at(target.t_s)))
-        spread = max(moved, 0.9 * state.anchor_spread_m)
-    small_seen = target.stage in (Stage.BOTH, Stage.SMALL)
+    spread_m = 0.0
+    if state.target_m is not None:
+        moved_m = float(np.linalg.norm(target.world_m - state.target_m))
+        spread_m = max(moved_m, 0.9 * state.target_spread_m)
     return replace(
         state,
-        anchor=anchor,
-        anchor_spread_m=spread,
+        target_m=target.world_m,
+        target_spread_m=spread_m,
         confirmed=state.confirmed + 1,
-        small_seen_s=target.t_s if small_seen else state.small_seen_s,
     )
 
 
@@ -116,18 +100,22 @@ def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     return state.hover_thrust + part * (thrust - state.hover_thrust)
 
 
-def _enter(state: PlannerState, row: Row, view: Context) -> PlannerState:
-    obs = view.obs
-    keep = ("battery_low", "tilted")
+def _kept(since: dict[Condition, float]) -> dict[Condition, float]:
+    return {name: since_s for name, since_s in since.items() if name in KEPT_OVER_A_CHANGE}
+
+
+def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
+    obs = context.obs
     new = replace(
         state,
         phase=row.to,
         entered_s=obs.t_s,
-        reason=row.explain(view),
+        reason=row.explain(context),
         row=row.name,
-        severity=Severity(max(row.severity, Severity.CONTINUE)),
+        severity=risen(state.severity, row.severity),
+        motor_stop=row.motor_stop,
         outcome=row.outcome or state.outcome,
-        since={k: s for k, s in state.since.items() if k in keep},
+        since=_kept(state.since),
         attempts=state.attempts + int(row.counts_attempt),
         entry_m=obs.telemetry.position_m,
         entry_yaw_rad=obs.telemetry.yaw_rad,

@@ -7,7 +7,7 @@ from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
 from perchctl.vehicle import PositionSetpoint, Telemetry
-from perchctl.vision.types import TargetPose
+from perchctl.vision.types import TargetEstimate
 
 
 class Phase(Enum):
@@ -41,7 +41,7 @@ TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 
 
 class Severity(IntEnum):
-    """How grave a row is; within a flight it only rises."""
+    """How grave a row is. From `LAND` on it only rises until the flight is over."""
 
     CONTINUE = 0
     HOLD = 1
@@ -61,6 +61,34 @@ class Outcome(Enum):
     OPERATOR = "operator"
 
 
+class Condition(Enum):
+    """What the table debounces; `perchctl.mission.conditions` says when each holds."""
+
+    AT_TAKEOFF_HEIGHT = "at take-off height"
+    ESTIMATED = "estimated"
+    ALIGNED = "aligned"
+    UNTRACKED = "untracked"
+    NEAR_STANDOFF = "near the stand-off"
+    SETTLED = "settled"
+    CONTACT = "contact"
+    MAGNET_HOLDS = "magnet holds"
+    SLIPPING = "slipping"
+    HANGING = "hanging"
+    STEADY = "steady"
+    TILTED = "tilted"
+    DOWN = "down"
+    RESTING = "resting"
+    BATTERY_LOW = "battery low"
+
+
+class MotorStop(Enum):
+    """How the motors are stopped when a row aborts the flight."""
+
+    NONE = "none"  # they are left alone
+    PLAIN = "plain"  # stopped, where the supervisor has ended the flight already
+    EMERGENCY = "emergency"  # cut and locked
+
+
 class Operator(IntEnum):
     """The person's word; it only rises (Ctrl-C once, twice)."""
 
@@ -75,7 +103,7 @@ class Observation:
 
     Attributes:
         telemetry: the newest sample; its age is `t_s - telemetry.t_s`.
-        target: the pipeline's newest merged pose, None when nothing is tracked.
+        target: the pipeline's estimate at `t_s`, None when no target was seen yet.
         new_frame: a good frame was processed in this tick.
         camera_age_s: since the last good frame arrived.
         camera_problem, link_problem: None, or one sentence.
@@ -87,7 +115,7 @@ class Observation:
 
     t_s: float
     telemetry: Telemetry
-    target: TargetPose | None = None
+    target: TargetEstimate | None = None
     new_frame: bool = False
     camera_age_s: float = 0.0
     camera_problem: str | None = None
@@ -98,21 +126,6 @@ class Observation:
     disagreeing_frames: int = 0
     operator: Operator = Operator.NONE
     log_problem: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Anchor:
-    """Where the target stands in the world of the state estimate, and how that
-    world drifts against it; `t_s` is the exposure it was last measured at."""
-
-    t_s: float
-    world_m: Array
-    yaw_rad: float
-    velocity_mps: Array
-
-    def at(self, t_s: float) -> Array:
-        """Predicted position at `t_s`, shape (3,)."""
-        return self.world_m + self.velocity_mps * (t_s - self.t_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,15 +140,15 @@ class PlannerState:
     reason: str = "start"
     row: str = ""
     severity: Severity = Severity.CONTINUE
+    motor_stop: MotorStop = MotorStop.NONE
     outcome: Outcome | None = None
-    since: dict[str, float] = field(default_factory=dict)
+    since: dict[Condition, float] = field(default_factory=dict)
     attempts: int = 0
     searches: int = 0
     search_step_s: float = 0.0
     confirmed: int = 0
-    anchor: Anchor | None = None
-    anchor_spread_m: float = 0.0
-    small_seen_s: float = -1e9
+    target_m: Array | None = None  # in the world, at the last frame that measured it
+    target_spread_m: float = 0.0  # by which successive frames' targets differ
     ground_m: tuple[float, float, float] | None = None
     entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entry_yaw_rad: float = 0.0

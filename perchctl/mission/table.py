@@ -5,15 +5,24 @@ The README's diagram and `perchctl fly --help` are drawn from `TABLE`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.mission.context import HANGING_S, Context
-from perchctl.mission.state import FLYING_PHASES, Operator, Outcome, Phase, Severity
+from perchctl.mission.state import (
+    FLYING_PHASES,
+    Condition,
+    MotorStop,
+    Operator,
+    Outcome,
+    Phase,
+    Severity,
+)
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
 Guard = Callable[[Context], bool]
-P, S, O = Phase, Severity, Outcome  # noqa: E741 - column names of the table below
+P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
 
 AIR = FLYING_PHASES | {P.LANDING}
 BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
@@ -22,7 +31,10 @@ BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """From any of `phases`, when `when` holds, to `to`; `reason` is told to the user."""
+    """From any of `phases`, when `when` holds, to `to`.
+
+    `reason` is shown to the user; `motor_stop` is what a row into ABORTED does to the motors.
+    """
 
     name: str
     phases: frozenset[Phase]
@@ -32,9 +44,10 @@ class Row:
     severity: Severity = Severity.CONTINUE
     outcome: Outcome | None = None
     counts_attempt: bool = False
+    motor_stop: MotorStop = MotorStop.NONE
 
-    def explain(self, view: Context) -> str:
-        return self.reason if isinstance(self.reason, str) else self.reason(view)
+    def explain(self, c: Context) -> str:
+        return self.reason if isinstance(self.reason, str) else self.reason(c)
 
 
 def _only(*phases: Phase) -> frozenset[Phase]:
@@ -51,7 +64,7 @@ def _fence_broken(c: Context) -> bool:
         return False
     x, y, _ = c.obs.telemetry.position_m
     dx, dy = x - c.state.ground_m[0], y - c.state.ground_m[1]
-    return (dx * dx + dy * dy) ** 0.5 > c.profile.safety.fence_radius_m
+    return math.hypot(dx, dy) > c.profile.safety.fence_radius_m
 
 
 def _searched_out(c: Context) -> bool:
@@ -68,7 +81,7 @@ def _is_high(c: Context) -> bool:
 
 def _settling_too_long(c: Context) -> bool:
     ascend = c.profile.planner.ascend
-    return c.held("near_standoff") > ascend.settle_timeout_s
+    return c.held(C.NEAR_STANDOFF) > ascend.settle_timeout_s
 
 
 TABLE: tuple[Row, ...] = (
@@ -76,24 +89,29 @@ TABLE: tuple[Row, ...] = (
     Row(
         "operator-stop", AIR, lambda c: c.obs.operator >= Operator.STOP, P.ABORTED,
         "second Ctrl-C: emergency stop", S.STOP, O.EMERGENCY,
+        motor_stop=MotorStop.EMERGENCY,
     ),
     Row(
         "locked", AIR, lambda c: c.obs.telemetry.has(LOCKED), P.ABORTED,
         "the supervisor has locked the vehicle: inspect and restart it", S.STOP, O.SAFETY,
+        motor_stop=MotorStop.PLAIN,
     ),
     Row(
         "tumbled", AIR, lambda c: c.obs.telemetry.has(TUMBLED), P.ABORTED,
         "the vehicle has tumbled: inspect and restart it", S.STOP, O.SAFETY,
+        motor_stop=MotorStop.PLAIN,
     ),
     Row(
         "crashed", AIR, lambda c: c.obs.telemetry.has(CRASHED), P.ABORTED,
         "the supervisor reports a crash: inspect and restart the vehicle", S.STOP, O.SAFETY,
+        motor_stop=MotorStop.PLAIN,
     ),
     Row(
         "tilted", AIR,
-        lambda c: c.held("tilted") >= c.profile.safety.tilt_debounce_s
+        lambda c: c.held(C.TILTED) >= c.profile.safety.tilt_debounce_s
         and not c.state.motors_stopped,
         P.ABORTED, "tilted beyond the limit: motors cut", S.STOP, O.SAFETY,
+        motor_stop=MotorStop.EMERGENCY,
     ),
     Row(
         "operator-land", FLYING_PHASES, lambda c: c.obs.operator >= Operator.LAND, P.LANDING,
@@ -114,7 +132,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "battery-low", BEFORE_CONTACT,
-        lambda c: c.held("battery_low") >= c.profile.safety.battery_debounce_s, P.LANDING,
+        lambda c: c.held(C.BATTERY_LOW) >= c.profile.safety.battery_debounce_s, P.LANDING,
         lambda c: f"battery at {c.obs.telemetry.battery_v:.2f} V under load", S.LAND, O.SAFETY,
     ),
     Row(
@@ -162,12 +180,12 @@ TABLE: tuple[Row, ...] = (
     # --- the magnet may catch early ---------------------------------------------
     Row(
         "caught", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
-        lambda c: c.held("hanging") >= HANGING_S, P.COMPLETE,
+        lambda c: c.held(C.HANGING) >= HANGING_S, P.COMPLETE,
         "hanging on the magnet already",
     ),
     # --- phase 1: approach ---------------------------------------------------
     Row(
-        "approached", _only(P.APPROACH), lambda c: c.held("at_takeoff_height") >= 0.3, P.SEARCH,
+        "approached", _only(P.APPROACH), lambda c: c.held(C.AT_TAKEOFF_HEIGHT) >= 0.3, P.SEARCH,
         "hovering in the perching area",
     ),
     Row(
@@ -190,13 +208,13 @@ TABLE: tuple[Row, ...] = (
     # --- phase 3: estimate ---------------------------------------------------
     Row(
         "estimate-lost", _only(P.ESTIMATE),
-        lambda c: c.held("untracked") > 1.0
+        lambda c: c.held(C.UNTRACKED) > 1.0
         or c.in_phase_s > c.profile.planner.estimate.timeout_s,
         P.SEARCH, "the target's pose does not settle", S.HOLD,
     ),
     Row(
         "estimated", _only(P.ESTIMATE),
-        lambda c: c.held("estimated") >= c.profile.planner.estimate.dwell_s, P.ALIGN,
+        lambda c: c.held(C.ESTIMATED) >= c.profile.planner.estimate.dwell_s, P.ALIGN,
         "pose is steady",
     ),
     # --- phase 4: align ------------------------------------------------------
@@ -211,7 +229,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "aligned", _only(P.ALIGN),
-        lambda c: c.held("aligned") >= c.profile.planner.align.dwell_s, P.ASCEND,
+        lambda c: c.held(C.ALIGNED) >= c.profile.planner.align.dwell_s, P.ASCEND,
         "aligned in position and heading",
     ),
     # --- phase 5: ascend -----------------------------------------------------
@@ -231,13 +249,13 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "settled", _only(P.ASCEND),
-        lambda c: c.held("settled") >= c.profile.planner.ascend.settle_dwell_s, P.PERCH,
+        lambda c: c.held(C.SETTLED) >= c.profile.planner.ascend.settle_dwell_s, P.PERCH,
         "settled at the stand-off",
     ),
     # --- phase 6: perch ------------------------------------------------------
     Row(
         "contact", _only(P.PERCH),
-        lambda c: c.held("contact") >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
+        lambda c: c.held(C.CONTACT) >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
         "contact proven by position, acceleration and thrust",
     ),
     Row(
@@ -247,7 +265,7 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- phase 7: completion -------------------------------------------------
     Row(
-        "slipped", _only(P.COMPLETE), lambda c: c.held("slipping") >= 0.03, P.RECOVER,
+        "slipped", _only(P.COMPLETE), lambda c: c.held(C.SLIPPING) >= 0.03, P.RECOVER,
         lambda c: "slipped while hanging" if c.state.motors_stopped else "the magnet does not hold",
         S.BACK_OFF, counts_attempt=True,
     ),
@@ -260,7 +278,7 @@ TABLE: tuple[Row, ...] = (
     Row(
         "perched", _only(P.COMPLETE),
         lambda c: c.state.motors_stopped
-        and c.held("down") >= 0.1
+        and c.held(C.DOWN) >= 0.1
         and c.in_phase_s >= c.profile.planner.complete.watch_s,
         P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
     ),
@@ -272,7 +290,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "recovered", _only(P.RECOVER),
-        lambda c: c.held("steady") >= c.profile.planner.recover.dwell_s
+        lambda c: c.held(C.STEADY) >= c.profile.planner.recover.dwell_s
         and c.in_phase_s >= c.profile.planner.recover.dwell_s,
         P.ESTIMATE, "steady again, trying once more",
     ),
@@ -283,7 +301,7 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- landing ---------------------------------------------------------------
     Row(
-        "landed", _only(P.LANDING), lambda c: c.held("down") >= 0.1, P.LANDED,
+        "landed", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1, P.LANDED,
         lambda c: "motors off, hanging on the magnet" if _is_high(c) else "motors off",
     ),
     Row(
@@ -294,9 +312,19 @@ TABLE: tuple[Row, ...] = (
 )  # fmt: skip
 
 
-def first_match(view: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
-    """The first row that applies to the view's phase, or None to stay."""
+def first_match(c: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
+    """The first row that applies to the phase, or None to stay.
+
+    Whatever the table says, a landing is never undone: a row that would lead from it to a
+    flying phase is passed over.
+    """
     for row in table:
-        if view.state.phase in row.phases and row.when(view):
+        undoes = c.state.severity >= Severity.LAND and row.to in FLYING_PHASES
+        if c.state.phase in row.phases and not undoes and row.when(c):
             return row
     return None
+
+
+def risen(before: Severity, row: Severity) -> Severity:
+    """The flight's severity after a row: from `LAND` on it only rises."""
+    return max(before, row) if before >= Severity.LAND else row

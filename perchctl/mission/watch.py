@@ -3,21 +3,51 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import Protocol
 
-from perchctl.mission.state import Outcome, Phase, PlannerState
+from perchctl.mission.state import Outcome, Phase, PlannerState, Severity
 from perchctl.vehicle import Command, Telemetry
-from perchctl.vision.types import PipelineOutput, TargetPose
+from perchctl.vision.types import PipelineOutput, TargetEstimate
+
+
+class EventKind(Enum):
+    PHASE = "phase"  # a phase was entered
+    HOLD = "hold"  # the vehicle is held in place
+    NOTE = "note"  # something worth a line
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened. It becomes words only where it is shown.
+
+    Attributes:
+        phase: the phase entered, or the one that was flown.
+        row: the row of the mission's table that was taken; empty at the start and for
+            what is no transition.
+        reason: why, in a sentence without its end.
+    """
+
+    t_s: float
+    kind: EventKind
+    reason: str
+    phase: Phase | None = None
+    row: str = ""
+    severity: Severity = Severity.CONTINUE
 
 
 @dataclass(frozen=True, eq=False)
 class Tick:
-    """All that one turn of the loop knew and did, for the log and the display."""
+    """All that one turn of the loop knew and did, for the log and the display.
+
+    `output` is what this tick's new frame gave, None without one; `target` the estimate
+    that the planner steered by.
+    """
 
     t_s: float
     telemetry: Telemetry
     output: PipelineOutput | None
-    target: TargetPose | None
+    target: TargetEstimate | None
     state: PlannerState
     command: Command
     loop_late_s: float
@@ -30,7 +60,7 @@ class Watcher(Protocol):
 
     def tick(self, tick: Tick) -> None: ...
 
-    def event(self, t_s: float, text: str) -> None: ...
+    def event(self, event: Event) -> None: ...
 
     @property
     def problem(self) -> str | None: ...
@@ -38,7 +68,7 @@ class Watcher(Protocol):
 
 @dataclass(frozen=True)
 class FlightReport:
-    """How the flight ended. `row` names the transition that decided it."""
+    """How the flight ended; `history` are its phases' events, the first at the start."""
 
     phase: Phase
     outcome: Outcome
@@ -46,4 +76,4 @@ class FlightReport:
     attempts: int
     duration_s: float
     locked: bool
-    history: tuple[tuple[float, str, str], ...] = ()
+    history: tuple[Event, ...] = ()

@@ -1,7 +1,8 @@
 """Profiles: one YAML file says everything a flight depends on.
 
-schema: the models, each key with its bounds. load: reading, `extends`, the files a profile
-names. places: where shipped and the user's files are. dictionaries: ArUco's ids.
+schema: the models, each key with its bounds (vision and mission hold the larger sections).
+load: reading, `extends`, the files a profile names. old_keys: what earlier versions called
+them. places: where shipped and the user's files are. dictionaries: ArUco's ids.
 """
 
 from perchctl.profile.load import (
@@ -11,29 +12,33 @@ from perchctl.profile.load import (
     load_profile,
     read_weights,
 )
-from perchctl.profile.schema import (
+from perchctl.profile.mission import (
     AlignConfig,
     AscendConfig,
-    CameraConfig,
     CompleteConfig,
-    DetectorConfig,
     EstimateConfig,
-    FittedWeights,
-    KalmanConfig,
     LandingConfig,
-    LinkConfig,
-    LogConfig,
-    MarkerConfig,
-    MergeConfig,
-    Mounting,
     PerchConfig,
     PlannerConfig,
-    PoseConfig,
-    Profile,
     RecoverConfig,
     SafetyConfig,
     SearchConfig,
+)
+from perchctl.profile.schema import (
+    LinkConfig,
+    LogConfig,
+    Profile,
     SimulationConfig,
+)
+from perchctl.profile.vision import (
+    CameraConfig,
+    DetectorConfig,
+    FittedWeights,
+    KalmanConfig,
+    MarkerConfig,
+    MergeConfig,
+    Mounting,
+    PoseConfig,
     TargetConfig,
     VehicleConfig,
     WeightsConfig,

@@ -6,15 +6,18 @@ Every fault is one `InvalidValue` sentence of the form ``file: key: what is wron
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import ValidationError
 
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, NotFound, ProfileNote
+from perchctl.profile.old_keys import with_present_keys
 from perchctl.profile.places import data_file, data_folder, listing, user_config_folder
-from perchctl.profile.schema import FittedWeights, Profile
+from perchctl.profile.schema import Profile
+from perchctl.profile.vision import FittedWeights
 
 
 def find_profile(name: str) -> Path:
@@ -33,7 +36,8 @@ def find_profile(name: str) -> Path:
 
 def load_profile(name: str, *, with_weights: bool = True) -> Profile:
     """Read, resolve `extends` and check a profile; the weights of its `merge.weights_file`
-    take the place of `merge.weights` unless told otherwise. Errors: NotFound, InvalidValue."""
+    take the place of `merge.weights` unless told otherwise. Old keys are read, with a
+    `ProfileNote` as warning. Errors: NotFound, InvalidValue."""
     path = find_profile(name)
     values = _resolved(path, seen=())
     values.setdefault("name", path.stem)
@@ -95,7 +99,7 @@ def _choices() -> str:
 def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
-    values = _read_yaml(path)
+    values = _with_present_keys(_read_yaml(path), path)
     for section, key in (("merge", "weights_file"), ("camera", "calibration")):
         _place_beside(values, path, section, key)
     base_name = values.pop("extends", None)
@@ -106,6 +110,16 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     beside = path.parent / base_name
     base = beside if beside.is_file() else find_profile(base_name)
     return _merged(_resolved(base, (*seen, path)), values)
+
+
+def _with_present_keys(values: dict[str, Any], path: Path) -> dict[str, Any]:
+    try:
+        values, notes = with_present_keys(values)
+    except ValueError as error:
+        raise InvalidValue(f"{path}: {error}") from None
+    for note in notes:
+        warnings.warn(f"{path}: {note}", ProfileNote, stacklevel=2)
+    return values
 
 
 def _place_beside(values: dict[str, Any], path: Path, section: str, key: str) -> None:

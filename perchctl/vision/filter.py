@@ -24,6 +24,8 @@ POSITION = [X, Y, Z]
 VELOCITY = [VX, VY, VZ]
 
 MAX_GAP_S = 1.0
+MAX_PREDICTION_S = 1.0
+"""Beyond it the target is taken to stay where it was predicted."""
 
 H: Array = np.zeros((4, 8))
 H[range(4), MEASURED] = 1.0  # equation 2
@@ -45,6 +47,7 @@ class FilterSetup:
     alpha: float
     n_max: int
     attitude_sigma_rad: float | None = None  # None: R for every measurement
+    drift_mps: float = math.inf  # most that the target moves while nothing is measured
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
@@ -63,6 +66,7 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
         attitude_sigma_rad=(
             math.radians(config.attitude_sigma_deg) if config.noise == "measured" else None
         ),
+        drift_mps=config.drift_mps if in_world else math.inf,
     )
 
 
@@ -144,11 +148,30 @@ def step_track(
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0)
 
 
+def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
+    """The track at a time after its frame, with no measurement in between."""
+    dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
+    if dt_s <= 0.0:
+        return track
+    x, P = _moved(track.x, track.P, dt_s, setup)
+    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=track.unseen)
+
+
 def _coast(track: MarkerTrack, dt_s: float, t_s: float, setup: FilterSetup) -> MarkerTrack | None:
     if track.unseen >= setup.n_max:
         return None
     x = track.x.copy()
     x[RATES] *= setup.alpha  # equation 3
-    x, P = predict(x, track.P, F=transition(dt_s), Q=setup.Q)
-    x[YAW] = wrap_rad(float(x[YAW]))
+    x, P = _moved(x, track.P, dt_s, setup)
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=track.unseen + 1)
+
+
+def _moved(x: Array, P: Array, dt_s: float, setup: FilterSetup) -> tuple[Array, Array]:
+    """State and covariance after `dt_s` without a measurement."""
+    speed_mps = float(np.linalg.norm(x[VELOCITY]))
+    if speed_mps > setup.drift_mps:
+        x = x.copy()
+        x[VELOCITY] *= setup.drift_mps / speed_mps
+    x, P = predict(x, P, F=transition(dt_s), Q=setup.Q)
+    x[YAW] = wrap_rad(float(x[YAW]))
+    return x, P

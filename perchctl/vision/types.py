@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
@@ -155,28 +154,38 @@ class MarkerTrack:
 
 
 @dataclass(frozen=True, eq=False)
-class TargetPose:
-    """The merged pose of the target at a frame's time, in the level frame,
-    relative to the gear: the paper's e = (e_x, e_y, e_z, e_psi).
+class TargetEstimate:
+    """Where the target is at `t_s`: the paper's e = (e_x, e_y, e_z, e_psi), its spread, and
+    what it rests on. The one error that steers, is logged and is shown.
 
     Attributes:
-        e_m: (3,) m; e_yaw_rad: in (-pi, pi].
+        t_s: the time it holds for; of the frame, or later by prediction.
+        measured_s, small_measured_s: exposure of the last frame in which the target, and
+            its small marker, were measured.
+        stage: what the newest frame was merged from; ``NONE`` while the filter coasts.
+        measured: the newest frame held a detection of the target.
+        tracked: the filter lives: the target was measured at most `kalman.n_max` frames
+            ago. False is the place where it was last.
+        unseen: frames since the last detection.
+        e_m: target relative to the gear in the level frame, (3,) m; sigma_m (3,).
+        e_yaw_rad: heading of the target in the level frame, in (-pi, pi].
         velocity_mps: filter's velocity of `e_m` (`kalman.frame: level`) or of the
             target in the world (`kalman.frame: world`), in level axes, (3,).
-        measured: True where this very frame held a detection of the target;
-            False while the filter coasts.
-        unseen: frames since the last detection.
-        world_m, world_yaw_rad: the target in the world of the vehicle's state
-            estimate; None without an attitude.
+        world_m, world_yaw_rad: the target in the world of the vehicle's state estimate;
+            None without an attitude. world_velocity_mps: how that world drifts against
+            the target, None where the filter does not work in it.
     """
 
     t_s: float
+    measured_s: float
+    small_measured_s: float
     stage: Stage
+    measured: bool
+    tracked: bool
+    unseen: int
     e_m: Array
     e_yaw_rad: float
     velocity_mps: Array
-    measured: bool
-    unseen: int
     sigma_m: Array
     sigma_yaw_rad: float
     world_m: Array | None = None
@@ -193,15 +202,32 @@ class Sighting:
 
 
 @dataclass(frozen=True, eq=False)
+class Measured:
+    """What one frame's corners gave.
+
+    Attributes:
+        poses: by ``joint``, ``large``, ``small``; the surest first.
+        fed: the track that each pose of this frame goes into.
+        contradicting: the two markers exclude each other.
+    """
+
+    poses: dict[str, MarkerPose] = field(default_factory=dict)
+    fed: dict[str, MarkerPose] = field(default_factory=dict)
+    contradicting: bool = False
+
+
+@dataclass(frozen=True, eq=False)
 class PipelineState:
     """All the memory of the pipeline; `PipelineState()` is a fresh start."""
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
-    last: Detections | None = None
-    disagreeing_frames: int = 0
     in_world: bool = False  # the tracks' frame: world of the state estimate, or level
-    normal_cam: Array | None = None  # the target's last normal, camera axes, (3,)
-    sight: Sighting | None = None  # the last
+    measured: Measured = Measured()  # of the newest frame
+    attitude: Attitude | None = None  # at the newest frame
+    target: TargetEstimate | None = None  # at the last frame with a track
+    last: Detections | None = None
+    sighting: Sighting | None = None  # the last
+    disagreeing_frames: int = 0
     empty_frames: int = 0  # in a row, without either marker
 
 
@@ -210,7 +236,7 @@ class PipelineOutput:
     """Everything one frame gave, for the planner and the log."""
 
     detections: Detections
-    poses: Mapping[str, MarkerPose]
-    target: TargetPose | None
+    poses: dict[str, MarkerPose]
+    target: TargetEstimate | None  # at the frame's time
     stage: Stage  # by this frame's detections
     disagreeing_frames: int = 0  # frames in a row in which the two markers contradict

@@ -39,6 +39,11 @@ def read_flight_log(path: Path) -> Measurements:
     both = np.isfinite(poses["large"]).all(axis=1) & np.isfinite(poses["small"]).all(axis=1)
     actual = _actual(log, scenario, t_s, frame_s + ahead_s)
     rows = np.flatnonzero(both & np.isfinite(actual).all(axis=1))
+    if not len(rows) and np.isfinite(poses["joint"]).any():
+        raise InvalidValue(
+            f"{path}: line 1: both markers were only solved jointly in this flight; fly it with "
+            f"pose.each_marker: true (or merge.method: weights) in the profile"
+        )
     if not len(rows):
         raise InvalidValue(
             f"{path}: lines 2 to {len(log.records) + 1}: no tick with the truth holds both markers"

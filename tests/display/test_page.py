@@ -31,6 +31,7 @@ from perchctl.profile import load_profile
 from perchctl.vehicle import Idle
 from perchctl.vision.types import Detection, Detections, Frame, MarkerPose, PipelineOutput, Stage
 from tests.helpers.log import telemetry
+from tests.helpers.mission import note
 from tests.helpers.recording import CALIBRATION, VIEWS, camera, picture, write_pictures
 
 CORNERS = np.array([[200.0, 150.0], [400.0, 150.0], [400.0, 350.0], [200.0, 350.0]])
@@ -363,7 +364,7 @@ def test_a_view_that_fails_is_no_reason_to_land(page: LivePage) -> None:
     view = FlightPage(page, 0.15)
     view.watched(OneFrame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
     view.tick(None)  # type: ignore[arg-type]
-    view.event(0.0, "something")
+    view.event(note(0.0, "something"))
     assert view.problem is None
     view.tick(tick(1.0, "no output"))  # type: ignore[arg-type]
     json.loads(ask(page.url, "/state")[1])

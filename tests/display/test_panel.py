@@ -21,10 +21,11 @@ from perchctl.log.read import read_log
 from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission.planner import start
-from perchctl.mission.state import Observation
+from perchctl.mission.state import Observation, Phase
 from perchctl.mission.watch import Tick
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
+from tests.helpers.mission import entered, held, note
 
 STATUS = FlightStatus(
     t_s=101.0,
@@ -32,6 +33,7 @@ STATUS = FlightStatus(
     in_phase_s=1.25,
     e_m=(-0.123, 0.045, 1.234),
     e_yaw_rad=math.radians(-166.2),
+    tracked=True,
     stage="both",
     height_m=0.82,
     battery_v=3.714,
@@ -71,11 +73,11 @@ class Recorder:
 def test_one_line_an_event_where_there_is_no_terminal() -> None:
     stream = io.StringIO()
     reporter = make_reporter(stream=stream)
-    reporter.event(100.0, "SEARCH: hovering in the perching area")
+    reporter.event(entered(100.0, Phase.SEARCH, "hovering in the perching area"))
     for i in range(50):
         reporter.update(replace(STATUS, t_s=100.0 + 0.02 * i, phase="SEARCH"))
     reporter.update(STATUS)  # a change that no event told
-    reporter.event(102.5, "holding: no picture for 0.6 s")
+    reporter.event(held(102.5, "no picture for 0.6 s"))
     reporter.close()
     assert stream.getvalue().splitlines() == [
         "[   0.00 s] SEARCH: hovering in the perching area",
@@ -101,7 +103,7 @@ def test_the_panel_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     stream = Terminal()
     reporter = make_reporter(stream=stream)
-    reporter.event(100.0, "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b")
+    reporter.event(note(100.0, "link: radio://0/80/2M/E7E7E7E7E7 [ok] https://a.b"))
     reporter.update(replace(STATUS, phase="LANDING"))
     reporter.close()
     assert reporter.problem is None
@@ -140,6 +142,7 @@ def test_a_dumb_terminal_gets_lines(monkeypatch: pytest.MonkeyPatch) -> None:
         replace(STATUS, e_m=None, e_yaw_rad=None, camera_age_s=math.inf, link_age_s=12.0),
         replace(STATUS, reason="why " * 100, hold="[bold]held[/bold] " * 20),
         replace(STATUS, e_m=(-99.9, 99.9, 99.9), e_yaw_rad=-math.pi, in_phase_s=999.9),
+        replace(STATUS, e_m=(-99.9, 99.9, 99.9), e_yaw_rad=-math.pi, tracked=False),
     ],
 )
 def test_the_panel_fits_into_80_columns(status: FlightStatus) -> None:
@@ -161,10 +164,10 @@ def test_a_display_that_fails_falls_silent_once() -> None:
 
     surface = Failing()
     reporter = Reporter(surface)
-    reporter.event(0.0, "SEARCH: x")
+    reporter.event(entered(0.0, Phase.SEARCH, "x"))
     reporter.close()
     assert reporter.problem == "the display fell silent: BrokenPipeError: gone"
-    reporter.event(1.0, "ALIGN: y")
+    reporter.event(entered(1.0, Phase.ALIGN, "y"))
     reporter.update(STATUS)
     reporter.close()
     assert len(surface.lines) == 1
@@ -182,7 +185,7 @@ def test_a_terminal_that_stands_still_does_not_stop_the_loop() -> None:
     surface = Stuck()
     reporter = Reporter(surface)
     for i in range(5000):
-        reporter.event(0.02 * i, f"event {i}")
+        reporter.event(note(0.02 * i, f"event {i}"))
         reporter.update(replace(STATUS, t_s=0.02 * i))
     assert surface.lines == []
     gate.set()
@@ -213,15 +216,16 @@ def test_what_the_loop_knows_reaches_log_and_display(tmp_path: Path) -> None:
     surface = Recorder()
     display = DisplayWatcher(Reporter(surface))
     for watcher in (log, display):
-        watcher.event(100.0, "APPROACH: start")
+        watcher.event(entered(100.0, Phase.APPROACH, "start"))
         watcher.tick(tick())
-        watcher.event(100.1, "holding: no picture")
+        watcher.event(held(100.1, "no picture"))
     assert (log.problem, display.problem) == (None, None)
     log.close()
     display.reporter.close()
     back = read_log(log.path)
     assert back.truncated
-    assert [e["level"] for e in back.events] == ["info", "warning"]
+    assert [e["event"] for e in back.events] == ["phase", "hold"]
+    assert [e["severity"] for e in back.events] == ["continue", "hold"]
     record = back.records[0]
     assert (record["phase"], record["cmd"], record["cmd_z_m"]) == ("APPROACH", "position", 0.5)
     assert (record["tel_age_s"], record["cam_age_s"]) == (0.01, None)

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from perchctl.errors import Interrupted, InvalidValue, NotFound, SafetyAbort, TimedOut
-from perchctl.flight import loop as flight
-from perchctl.flight.loop import FlightParts, FlightReport, Tick, fly, rescue
+from perchctl.flight import loop, senses
+from perchctl.flight.loop import FlightParts, fly
+from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.mission.state import Operator, Outcome, Phase
+from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -184,15 +186,15 @@ class Watcher:
 
     on_tick: Callable[[Tick], None] = lambda tick: None
     ticks: list[Tick] = field(default_factory=list)
-    events: list[str] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
     problem: str | None = None
 
     def tick(self, tick: Tick) -> None:
         self.ticks.append(tick)
         self.on_tick(tick)
 
-    def event(self, t_s: float, text: str) -> None:
-        self.events.append(text)
+    def event(self, event: Event) -> None:
+        self.events.append(event)
 
 
 @dataclass
@@ -220,6 +222,10 @@ class Rig:
 
     def fly(self) -> FlightReport:
         return fly(self.parts())
+
+    def rescue(self, known: Telemetry | None) -> None:
+        landing = self.profile.planner.landing
+        rescue(self.link, self.clock or Clock(self.link), landing, self.operator, known)
 
     def refused(self, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
@@ -266,12 +272,12 @@ AIRBORNE_TICKS = 60
 
 
 def test_a_failure_in_vision_lands_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flight, "pipeline_step", _later(flight.pipeline_step, AIRBORNE_TICKS))
+    monkeypatch.setattr(senses, "step", _later(senses.step, AIRBORNE_TICKS))
     landed_after_a_break(Rig())
 
 
 def test_a_failure_in_the_planner_lands_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flight.planner, "step", _later(flight.planner.step, AIRBORNE_TICKS))
+    monkeypatch.setattr(loop.planner, "step", _later(loop.planner.step, AIRBORNE_TICKS))
     landed_after_a_break(Rig())
 
 
@@ -327,7 +333,7 @@ def test_a_failure_while_hanging_with_the_motors_off_starts_nothing() -> None:
     hanging = Vehicle(lambda s: replace(s, supervisor=AIRBORNE, thrust=0.0))
     hanging.advance_to(1.0)
     rig = Rig(hanging)
-    rescue(rig.parts(), telemetry(1.0, 2.0, thrust=0.0))
+    rig.rescue(telemetry(1.0, 2.0, thrust=0.0))
     assert rig.link.sent == []
     assert rig.link.now_s < 2.0
 
@@ -335,20 +341,20 @@ def test_a_failure_while_hanging_with_the_motors_off_starts_nothing() -> None:
 def test_the_rescue_is_bounded() -> None:
     """A vehicle that never says it has landed is not waited for for ever."""
     rig = Rig(Vehicle(lambda s: replace(s, supervisor=AIRBORNE | HL_ACTIVE)))
-    rescue(rig.parts(), telemetry(0.0))
+    rig.rescue(telemetry(0.0))
     assert rig.link.now_s == pytest.approx(PROFILE.planner.landing.timeout_s, abs=0.2)
     assert len(rig.link.said(Land)) == 1
 
 
 def test_the_rescue_orders_again_what_shows_no_effect() -> None:
     rig = Rig(Vehicle(lambda s: replace(s, supervisor=AIRBORNE, thrust=HOVER_THRUST)))
-    rescue(rig.parts(), telemetry(0.0))
+    rig.rescue(telemetry(0.0))
     assert np.diff(rig.link.said(Land)).min() > 1.0
 
 
 def test_a_rescue_without_telemetry_still_orders_the_landing() -> None:
     rig = Rig(Vehicle(lambda s: None))
-    rescue(rig.parts(), telemetry(0.0))
+    rig.rescue(telemetry(0.0))
     assert rig.link.said(Land)
 
 
@@ -357,7 +363,7 @@ def test_ctrl_c_twice_stops_a_rescue_too() -> None:
         Vehicle(lambda s: replace(s, supervisor=AIRBORNE | HL_ACTIVE)),
         operator=lambda: Operator.STOP if rig.link.now_s > 0.5 else Operator.NONE,
     )
-    rescue(rig.parts(), telemetry(0.0))
+    rig.rescue(telemetry(0.0))
     assert rig.link.said(EmergencyStop)[0] == pytest.approx(0.6, abs=0.11)
     assert rig.link.now_s < 1.0
 
@@ -568,5 +574,5 @@ def test_every_turn_is_told_once_and_phases_are_announced() -> None:
     report = rig.fly()
     times = [t.t_s for t in rig.watcher.ticks]
     assert np.diff(times) == pytest.approx(PERIOD_S, abs=1e-6)
-    assert [e.split(":")[0] for e in rig.watcher.events] == [p for _, p, _ in report.history]
+    assert tuple(rig.watcher.events) == report.history
     assert report.duration_s == pytest.approx(times[-1] - times[0])

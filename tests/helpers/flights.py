@@ -12,7 +12,7 @@ import cv2
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.log.watch import LogWatcher, Truth
 from perchctl.mission.state import Operator, Phase
-from perchctl.mission.watch import FlightReport
+from perchctl.mission.watch import Event, FlightReport
 from perchctl.profile import Profile, load_profile
 from perchctl.sim.draw import draw_scenario
 
@@ -40,7 +40,7 @@ class Flown:
     @property
     def way(self) -> list[str]:
         """The phases, in order."""
-        return [phase for _, phase, _ in self.report.history]
+        return [event.phase.value for event in self.report.history if event.phase]
 
 
 class _Heights(LogWatcher):
@@ -54,7 +54,7 @@ class _Heights(LogWatcher):
         assert self.truth is not None
         self.z_m = self.truth()[0][2]
 
-    def event(self, t_s: float, text: str) -> None:
+    def event(self, event: Event) -> None:
         return None
 
     @property

@@ -27,7 +27,7 @@ from perchctl.vision.types import (
     MarkerPose,
     PipelineOutput,
     Stage,
-    TargetPose,
+    TargetEstimate,
 )
 
 PERIOD_S = 0.02
@@ -65,12 +65,17 @@ def telemetry(t_s: float = 0.0, z_m: float = 0.0) -> Telemetry:
     )
 
 
-def target(t_s: float, z_m: float, measured: bool = True, stage: Stage = Stage.BOTH) -> TargetPose:
+def target(
+    t_s: float, z_m: float, measured: bool = True, stage: Stage = Stage.BOTH
+) -> TargetEstimate:
     decay = math.exp(-t_s / 4.0)
     e_m = np.array([0.3 * decay, -0.2 * decay, max(0.0, 1.9 - z_m)])
-    return TargetPose(
+    return TargetEstimate(
         t_s=t_s,
+        measured_s=t_s if measured else t_s - 0.13,
+        small_measured_s=t_s,
         stage=stage,
+        tracked=True,
         e_m=e_m,
         e_yaw_rad=2.0 * decay,
         velocity_mps=np.zeros(3),
@@ -83,7 +88,7 @@ def target(t_s: float, z_m: float, measured: bool = True, stage: Stage = Stage.B
     )
 
 
-def output(index: int, truth: TargetPose, rng: np.random.Generator) -> PipelineOutput:
+def output(index: int, truth: TargetEstimate, rng: np.random.Generator) -> PipelineOutput:
     """Noisy poses of the large marker far away, of the small one near by."""
     poses: dict[str, MarkerPose] = {}
     detections = Detections(frame_index=index, t_s=truth.t_s)
@@ -101,7 +106,7 @@ def _detection(marker: Any) -> Detection:
     return Detection(marker=marker, corners_px=corners, sigma_px=0.1, refined=True)
 
 
-def _pose(source: Any, truth: TargetPose, sigma: float, rng: np.random.Generator) -> MarkerPose:
+def _pose(source: Any, truth: TargetEstimate, sigma: float, rng: np.random.Generator) -> MarkerPose:
     return MarkerPose(
         source=source,
         t_s=truth.t_s,

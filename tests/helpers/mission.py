@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.mission import planner
-from perchctl.mission.state import Anchor, Observation, Phase, PlannerState
+from perchctl.mission.state import Observation, Phase, PlannerState, Severity
+from perchctl.mission.watch import Event, EventKind
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -17,7 +18,7 @@ from perchctl.vehicle import (
     PositionSetpoint,
     Telemetry,
 )
-from perchctl.vision.types import Stage, TargetPose
+from perchctl.vision.types import Stage, TargetEstimate
 
 READY = AUTO_ARM | CAN_FLY | ARMED
 AIRBORNE = READY | FLYING
@@ -43,16 +44,24 @@ def telemetry(t_s: float, z_m: float = 1.0, **changes: object) -> Telemetry:
 
 
 def target_at(
-    t_s: float, world_m: tuple[float, float, float] = (0.0, 0.0, CEILING_M), **changes: object
-) -> TargetPose:
-    pose = TargetPose(
+    t_s: float,
+    world_m: tuple[float, float, float] = (0.0, 0.0, CEILING_M),
+    body_m: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    **changes: object,
+) -> TargetEstimate:
+    """The target as the pipeline estimates it from a level vehicle that looks along x."""
+    gear_m = np.array(body_m) + PROFILE.vehicle.gear_body_m
+    pose = TargetEstimate(
         t_s=t_s,
+        measured_s=t_s,
+        small_measured_s=t_s,
         stage=Stage.BOTH,
-        e_m=np.array(world_m) - (0.0, 0.0, 1.03),
+        measured=True,
+        tracked=True,
+        unseen=0,
+        e_m=np.array(world_m) - gear_m,
         e_yaw_rad=0.0,
         velocity_mps=np.zeros(3),
-        measured=True,
-        unseen=0,
         sigma_m=np.full(3, 1e-3),
         sigma_yaw_rad=1e-3,
         world_m=np.array(world_m),
@@ -67,16 +76,27 @@ def observation(t_s: float, z_m: float = 1.0, **changes: object) -> Observation:
     obs = Observation(
         t_s=t_s,
         telemetry=tel,
-        target=target_at(t_s),
+        target=target_at(t_s, body_m=tel.position_m),
         new_frame=True,  # type: ignore[arg-type]
     )
     return replace(obs, **changes)  # type: ignore[arg-type]
 
 
+def entered(t_s: float, phase: Phase, reason: str) -> Event:
+    return Event(t_s, EventKind.PHASE, reason, phase)
+
+
+def held(t_s: float, reason: str) -> Event:
+    return Event(t_s, EventKind.HOLD, reason, Phase.ALIGN, severity=Severity.HOLD)
+
+
+def note(t_s: float, text: str) -> Event:
+    return Event(t_s, EventKind.NOTE, text)
+
+
 def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
     """A planner that has just come into `phase` in an undisturbed flight."""
     state = planner.start(observation(0.0, 0.0))
-    target = np.array([0.0, 0.0, CEILING_M])
     return replace(
         state,
         phase=phase,
@@ -85,8 +105,7 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         search_step_s=t_s,
         setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
         entry_m=(0.0, 0.0, z_m),
-        anchor=Anchor(t_s, target, 0.0, np.zeros(3)),
-        small_seen_s=t_s,
+        target_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
         contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
     )

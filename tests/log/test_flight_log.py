@@ -30,6 +30,7 @@ from perchctl.vehicle import (
     TakeOff,
 )
 from tests.helpers import log as synthetic
+from tests.helpers.mission import held, note
 
 STARTED = datetime(2024, 3, 1, 14, 5, 9, tzinfo=UTC)
 
@@ -38,7 +39,7 @@ def small_log(path: Path, ticks: int = 5) -> Path:
     writer = FlightLogWriter.open(path, synthetic.header())
     for i in range(ticks):
         writer.write({"t_s": 0.02 * i, "phase": "SEARCH", "z_m": 0.1 * i})
-        writer.event(0.02 * i, f"event {i}")
+        writer.event(note(0.02 * i, f"event {i}"))
     writer.close(synthetic.SUMMARY)
     assert writer.problem is None
     return writer.path
@@ -52,7 +53,7 @@ def test_a_flight_comes_back(tmp_path: Path) -> None:
     written = list(synthetic.ticks())
     for record in written:
         writer.write(record)
-    writer.event(1.5, "holding: no picture", "warning")
+    writer.event(held(1.5, "no picture"))
     writer.close(synthetic.SUMMARY)
     log = read_log(writer.path)
     assert log.header["profile"]["name"] == "sim"
@@ -62,7 +63,9 @@ def test_a_flight_comes_back(tmp_path: Path) -> None:
     for back, record in zip(log.records, written, strict=True):
         assert list(back) == list(FIELDS)
         assert back == to_plain(record)
-    assert log.events == [{"t_s": 1.5, "level": "warning", "text": "holding: no picture"}]
+    assert log.events == [
+        {"t_s": 1.5, "event": "hold", "phase": "ALIGN", "severity": "hold", "reason": "no picture"}
+    ]
     assert log.summary is not None
     assert log.summary["miss_m"] == 0.0031
     assert (log.truncated, log.ignored_bytes) == (False, 0)
@@ -191,12 +194,13 @@ def test_a_file_that_cannot_grow_never_raises_and_stays_whole(tmp_path: Path) ->
         "from pathlib import Path\n"
         "from perchctl.log.write import FlightLogWriter\n"
         "from tests.helpers import log as synthetic\n"
+        "from tests.helpers.mission import note\n"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
         "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header())\n"
         "for i in range(300):\n"
         "    w.write({'t_s': 0.02 * i, 'reason': 'x' * 200})\n"
-        "w.event(6.1, 'still flying')\n"
+        "w.event(note(6.1, 'still flying'))\n"
         "w.close(synthetic.SUMMARY)\n"
         "print(w.lost_records, w.problem)\n"
     )
@@ -316,6 +320,7 @@ def test_a_killed_writer_leaves_a_readable_log(tmp_path: Path) -> None:
         "from pathlib import Path\n"
         "from perchctl.log.write import FlightLogWriter\n"
         "from tests.helpers import log as synthetic\n"
+        "from tests.helpers.mission import note\n"
         "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header(), fsync=True)\n"
         "for n, record in enumerate(synthetic.ticks()):\n"
         "    w.write(record)\n"
@@ -341,7 +346,7 @@ def test_not_a_flight_log(tmp_path: Path) -> None:
     refused(b'{"kind":"header"}\n', "line 1: not a flight log")
     refused(b"[1]\n", "line 1: not a flight log")
     refused(good[0][:-20], "line 1: not a flight log")
-    refused(good[0].replace(b'"version":1', b'"version":99'), "line 1: schema version 99")
+    refused(good[0].replace(b'"version":2', b'"version":99'), "line 1: schema version 99")
     refused(b"".join([*good[:3], b"garbage\n", *good[3:]]), "line 4: not a record")
     refused(b"".join([*good[:3], b'{"kind":"tick"}\n', *good[3:]]), "line 4: .*t_s must be")
     refused(b"".join([*good[:2], b'{"kind":"?","t_s":1}\n', *good[3:]]), "line 3: .*allowed are")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import ast
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
+import perchctl
 from perchctl.calibration.files import load_calibration
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, NotFound, ProfileNote
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.profile.places import listing
 
@@ -30,7 +35,7 @@ def test_paper_constants() -> None:
     assert (paper.kalman.alpha, paper.kalman.n_max) == (0.85, 8)
     weights = paper.merge.weights
     assert (weights.x, weights.y, weights.z, weights.yaw) == (0.275, 0.306, 0.728, 0.469)
-    assert (paper.merge.z1_m, paper.merge.z2_m, paper.merge.z3_m) == (1.15, 0.25, 0.12)
+    assert (paper.merge.z2_m, paper.merge.z3_m) == (0.25, 0.12)
     assert paper.merge.method == "weights"
     assert paper.planner.recover.descend_m == 0.10
     assert load_calibration(find_calibration(paper.camera.calibration)).size_px == (640, 480)
@@ -101,6 +106,97 @@ def test_extends_in_a_circle_is_refused(tmp_path: Path) -> None:
 def test_a_profile_round_trips_through_its_own_dump() -> None:
     profile = load_profile("sim")
     assert Profile.model_validate(profile.model_dump(mode="json")) == profile
+
+
+OLD = """
+extends: sim
+camera: {T_body_cam: {position_m: [0.01, 0.02, 0.03]}}
+planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}}
+merge: {z1_m: 1.2}
+"""
+
+
+def test_old_keys_are_read_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "old.yaml"
+    path.write_text(OLD)
+    with pytest.warns(ProfileNote) as notes:
+        profile = load_profile(str(path))
+    assert profile.camera.mount.position_m == (0.01, 0.02, 0.03)
+    assert profile.planner.integral_per_s == 0.3
+    said = sorted(str(note.message) for note in notes)
+    assert said == [
+        f"{path}: camera.T_body_cam was read as mount, its present name: rename it",
+        f"{path}: merge.z1_m is no longer used: remove it",
+        f"{path}: planner.recover.speed_mps is no longer used: remove it",
+        f"{path}: planner.trim_per_s was read as integral_per_s, its present name: rename it",
+    ]
+
+
+def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
+    both = "camera: {mount: {}, T_body_cam: {}}"
+    assert "camera.T_body_cam is the old name of mount" in _refusal(tmp_path, both)
+
+
+def test_a_profile_in_an_old_log_is_read() -> None:
+    values = load_profile("sim").model_dump(mode="json")
+    values["camera"]["T_body_cam"] = values["camera"].pop("mount")
+    values["merge"]["z1_m"] = 1.15
+    assert Profile.model_validate(values) == load_profile("sim")
+
+
+def test_a_calibration_is_found_beside_the_profile_that_names_it(tmp_path: Path) -> None:
+    text = find_calibration("example_640x480").read_text(encoding="utf-8")
+    (tmp_path / "base").mkdir()
+    (tmp_path / "base" / "lens.yaml").write_text(text, encoding="utf-8")
+    (tmp_path / "base" / "base.yaml").write_text("camera: {calibration: lens.yaml}\n")
+    (tmp_path / "mine.yaml").write_text("extends: base/base.yaml\n")
+    mine = load_profile(str(tmp_path / "mine.yaml"))
+    assert Path(mine.camera.calibration) == (tmp_path / "base" / "lens.yaml").resolve()
+
+
+# --- every key is read by something ------------------------------------------------------
+
+
+def keys_of(model: type[BaseModel], name: str = "profile") -> Iterator[tuple[str, str]]:
+    """(section's name, key) of every value."""
+    for key, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from keys_of(kind, key)
+        else:
+            yield name, key
+
+
+@cache
+def attributes_read() -> set[tuple[str, str]]:
+    """Every ``name.key`` and ``x.name.key`` in the package's code."""
+    found: set[tuple[str, str]] = set()
+    for path in Path(perchctl.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute):
+                owner = node.value
+                if isinstance(owner, ast.Attribute):
+                    found.add((owner.attr, node.attr))
+                elif isinstance(owner, ast.Name):
+                    found.add((owner.id, node.attr))
+    return found
+
+
+ALIASES = {
+    "camera": ("config",), "detector": ("config",), "pose": ("config",), "kalman": ("config",),
+    "merge": ("config",), "weights": ("weights",), "large": ("large", "config", "old"),
+    "small": ("small", "config", "old"), "mount": ("self",), "simulation": ("ranges", "sim"),
+    "link": ("_config",),
+}  # fmt: skip
+"""By what other names the code holds a section."""
+
+
+@pytest.mark.parametrize(("section", "key"), sorted(set(keys_of(Profile))))
+def test_each_key_is_read_by_something(section: str, key: str) -> None:
+    """A key that nothing reads is a promise that nothing keeps."""
+    read = attributes_read()
+    names = (section, *ALIASES.get(section, ()))
+    assert any((name, key) in read for name in names), f"nothing reads {section}.{key}"
 
 
 @pytest.mark.parametrize(

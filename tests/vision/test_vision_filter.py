@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from perchctl.geometry import wrap_rad
 from perchctl.profile import KalmanConfig
 from perchctl.vision.filter import (
+    MAX_PREDICTION_S,
     POSITION,
     RATES,
     VELOCITY,
@@ -23,6 +24,7 @@ from perchctl.vision.filter import (
     Y,
     Z,
     make_filter,
+    predicted,
     start_track,
     step_track,
     transition,
@@ -181,3 +183,41 @@ def test_the_old_track_is_not_written_to() -> None:
     step_track(start, None, 0.03, SETUP)
     assert np.array_equal(start.x, x)
     assert np.array_equal(start.P, P)
+
+
+WORLD = make_filter(CONFIG, in_world=True)
+
+
+@given(
+    velocity_mps=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    later_s=st.floats(-1.0, 30.0),
+    coasting=st.booleans(),
+)
+def test_what_is_not_measured_drifts_at_most(
+    velocity_mps: tuple[float, float, float], later_s: float, coasting: bool
+) -> None:
+    """A target stands still: ahead of its last frame it moves by the estimate's drift, and
+    for a second at most."""
+    x = np.zeros(8)
+    x[VELOCITY] = velocity_mps
+    track = MarkerTrack(t_s=10.0, x=x, P=np.eye(8) * 1e-4)
+    if coasting:
+        found = step_track(track, None, 10.0 + max(min(later_s, 0.9), 0.01), WORLD)
+    else:
+        found = predicted(track, 10.0 + later_s, WORLD)
+    assert found is not None
+    moved_m = float(np.linalg.norm(found.x[POSITION]))
+    assert moved_m <= WORLD.drift_mps * min(max(later_s, 0.01), MAX_PREDICTION_S) + 1e-12
+    assert (np.diag(found.P)[POSITION] >= 1e-4 - 1e-12).all()
+    if later_s <= 0.0 and not coasting:
+        assert found is track
+
+
+def test_a_measured_velocity_is_free() -> None:
+    """The limit is for prediction; the filter itself follows what it measures."""
+    track = None
+    for k in range(60):
+        z = np.array([0.0, 0.3 * k / 30.0, 0.0, 0.0])
+        track = step_track(track, z, k / 30.0, WORLD)
+    assert track is not None
+    assert track.x[VX] > 0.2

@@ -7,6 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.geometry import (
@@ -18,13 +20,14 @@ from perchctl.geometry import (
     rotation_from_rpy,
     wrap_rad,
 )
-from perchctl.pipeline import Pipeline, step
+from perchctl.pipeline import Pipeline, estimate, step
 from perchctl.profile import (
     DetectorConfig,
     KalmanConfig,
     MarkerConfig,
     MergeConfig,
     Mounting,
+    PoseConfig,
     TargetConfig,
 )
 from perchctl.vision.pose import estimate_pose
@@ -115,7 +118,7 @@ def test_a_flight_past_the_target_is_measured(build: Build, method: str, frame: 
         assert (output.target.world_velocity_mps is not None) == (frame == "world")
         for pose in output.poses.values():
             assert np.abs(pose.e_m - e).max() < 0.01
-        expected = {"large", "small"} | ({"joint"} if method == "joint" else set())
+        expected = {"joint"} if method == "joint" else {"large", "small"}
         assert set(output.poses) == expected
 
 
@@ -295,9 +298,15 @@ def test_velocity_is_in_level_axes(build: Build) -> None:
     assert np.abs(output.target.velocity_mps[[0, 2]]).max() < 0.01
 
 
-def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
-    """They are computed when asked for, and only then."""
+def test_a_joint_pose_that_fits_is_enough(build: Build) -> None:
     setup = build(mount=MOUNT, gear_body_m=GEAR)
+    attitude = fly(0)
+    _, output = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
+    assert list(output.poses) == ["joint"]
+
+
+def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
+    setup = build(mount=MOUNT, gear_body_m=GEAR, pose=PoseConfig(each_marker=True))
     attitude = fly(0)
     _, output = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
     joint = output.poses["joint"]
@@ -309,7 +318,71 @@ def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
         assert np.array_equal(output.poses[name].e_m, alone.e_m)
     assert list(output.poses) == ["joint", "large", "small"]
     assert output.poses["joint"] is joint
-    assert output.poses.get("none") is None
+
+
+@pytest.mark.parametrize("frame", ["world", "level"])
+def test_the_estimate_at_the_frame_is_the_frames(build: Build, frame: str) -> None:
+    setup = build(kalman=KalmanConfig(frame=frame), mount=MOUNT, gear_body_m=GEAR)  # type: ignore[arg-type]
+    state = PipelineState()
+    for k in range(4):
+        attitude = fly(k)
+        state, output = step(state, Frame(k, attitude.t_s, view(attitude)), attitude, setup)
+        assert output.target is not None
+        target = estimate(state, attitude.t_s, attitude, setup)
+        assert target is not None
+        assert np.allclose(target.e_m, output.target.e_m, atol=1e-12)
+        assert target.e_yaw_rad == pytest.approx(output.target.e_yaw_rad)
+        assert (target.measured, target.tracked, target.unseen) == (True, True, 0)
+
+
+@given(
+    angles=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-3.0, 3.0)),
+    position_m=st.tuples(*[st.floats(-1.0, 1.0)] * 3),
+    later_s=st.floats(0.0, 0.1),
+)
+@settings(max_examples=30, deadline=None)
+def test_the_estimate_follows_the_vehicle(
+    build: Build,
+    angles: tuple[float, float, float],
+    position_m: tuple[float, float, float],
+    later_s: float,
+) -> None:
+    """The target stays in the world, wherever the vehicle is at the moment of asking."""
+    setup, attitude = build(mount=MOUNT, gear_body_m=GEAR), fly(0)
+    state, _ = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
+    now = Attitude(attitude.t_s + later_s, *angles, position_m)
+    target = estimate(state, now.t_s, now, setup)
+    assert target is not None
+    assert target.world_m is not None
+    e_m, e_yaw_rad = true_e(now)
+    assert np.abs(target.e_m - e_m).max() < 0.003
+    assert abs(wrap_rad(target.e_yaw_rad - e_yaw_rad)) < 0.01
+    assert target.t_s == now.t_s
+    assert target.measured_s == attitude.t_s
+
+
+@pytest.mark.parametrize("frame", ["world", "level"])
+def test_a_lost_target_is_remembered_in_the_world(build: Build, frame: str) -> None:
+    setup = build(kalman=KalmanConfig(frame=frame), mount=MOUNT, gear_body_m=GEAR)  # type: ignore[arg-type]
+    state, last = PipelineState(), fly(3)
+    for k in range(4 + setup.kalman.n_max + 2):
+        attitude = fly(k)
+        image = view(attitude) if k < 4 else EMPTY
+        state, output = step(state, Frame(k, attitude.t_s, image), attitude, setup)
+    assert output.target is None
+    target = estimate(state, attitude.t_s + 5.0, attitude, setup)
+    assert target is not None
+    assert (target.tracked, target.measured) == (False, False)
+    assert target.measured_s == last.t_s
+    assert target.stage is Stage.NONE
+    limit_m = 0.01 if frame == "world" else 0.15  # level: the vehicle's own way while it coasts
+    assert np.abs(target.e_m - true_e(attitude)[0]).max() < limit_m
+
+
+def test_nothing_seen_is_no_estimate(build: Build) -> None:
+    setup = build()
+    state, _ = step(PipelineState(), Frame(0, 0.0, EMPTY), None, setup)
+    assert estimate(state, 0.1, fly(0), setup) is None
 
 
 def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:

@@ -12,7 +12,7 @@ from perchctl.display.page.live import LivePage, State
 from perchctl.display.page.sketch import Sketch
 from perchctl.display.status import status_rows
 from perchctl.display.watch import status_of
-from perchctl.mission.watch import Tick
+from perchctl.mission.watch import Event, Tick
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput
 
 AXES_OF_SIDE = 0.5
@@ -51,7 +51,7 @@ class FlightPage:
         except Exception as error:
             self.page.remember(error)
 
-    def event(self, t_s: float, text: str) -> None:
+    def event(self, event: Event) -> None:
         return None
 
     def _seen(self, frame: Frame) -> None:

@@ -1,0 +1,86 @@
+"""What a turn of the loop takes in: telemetry, at most one frame, and what follows from them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+from perchctl.camera.health import HealthState, assess
+from perchctl.camera.source import FrameSource, check_size
+from perchctl.flight.history import History, attitude_at, attitude_of, extended
+from perchctl.link.protocol import Link
+from perchctl.pipeline import Pipeline, estimate, step
+from perchctl.profile import Profile
+from perchctl.vision.types import Frame, PipelineOutput, PipelineState, TargetEstimate
+
+
+@dataclass(eq=False)
+class Senses:
+    """The loop's working memory of what it sees.
+
+    `output` is what this turn's frame gave, None where there was none to look at.
+    """
+
+    link: Link
+    source: FrameSource
+    pipeline: Pipeline
+    profile: Profile
+    history: History = field(default_factory=History)
+    state: PipelineState = field(default_factory=PipelineState)
+    output: PipelineOutput | None = None
+    blind: bool = False
+    last_good_frame_s: float = -math.inf
+    camera_problem: str | None = None
+    frames: int = 0
+    _health: HealthState = field(default_factory=HealthState)
+    _note: str | None = None
+
+    def take_in(self, now_s: float, *, look: bool = True) -> None:
+        """Telemetry and at most one frame. Without `look` the frame only counts as a sign
+        of the camera's life."""
+        self.history = extended(self.history, self.link.telemetry(), self.profile.safety)
+        self.output, self.blind = None, not look
+        frame = self.source.poll(now_s)
+        problem = self.source.problem(now_s)
+        if frame is None:
+            if problem is None and self.source.finished:
+                problem = f"{self.source.describe()} has ended"
+            if problem is not None:
+                self.camera_problem = problem
+            return
+        if self.frames == 0:
+            check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
+        rejection = problem or self._rejection(frame, now_s)
+        self.camera_problem = rejection or self._note
+        if rejection is not None:
+            return
+        self.last_good_frame_s = now_s
+        self.frames += 1
+        if look:
+            attitude = attitude_at(self.history, frame.t_s)
+            self.state, self.output = step(self.state, frame, attitude, self.pipeline)
+
+    def target(self, now_s: float) -> TargetEstimate | None:
+        """The estimate at the present. The filter coasts by frames: while none are looked
+        at, its target is a remembered place."""
+        newest = self.history.newest
+        attitude = None if newest is None else attitude_of(newest)
+        target = estimate(self.state, now_s, attitude, self.pipeline)
+        stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
+        if target is not None and (self.blind or stale):
+            return replace(target, tracked=False)
+        return target
+
+    def _rejection(self, frame: Frame, now_s: float) -> str | None:
+        """Why this frame is no measurement: frozen, no picture at all, or too old."""
+        live = self.source.live
+        self._health, verdict = assess(self._health, frame, live)
+        # A dark target may still be seen, and a bare ceiling looks like an empty screen:
+        # such pictures are searched all the same, but the user is told of them.
+        self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
+        if not verdict.usable and self._note is None:
+            return verdict.text
+        age_s = now_s - frame.t_s
+        if live and age_s > self.profile.safety.max_frame_age_s:
+            return f"the picture is {age_s:.1f} s late"
+        return None

@@ -1,0 +1,45 @@
+"""Keys that profiles and logs of earlier versions hold: read under their present names."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+RENAMED: dict[str, str] = {
+    "camera.T_body_cam": "mount",
+    "planner.trim_per_s": "integral_per_s",
+    "planner.trim_limit_m": "integral_limit_m",
+}
+"""Dotted path -> the key's present name, in the same section."""
+UNUSED: tuple[str, ...] = ("merge.z1_m", "planner.recover.speed_mps")
+"""Nothing depends on them any more: left out."""
+
+
+def with_present_keys(values: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The values under their present keys, and a note for each old one.
+
+    Raises ValueError where a key stands under both of its names.
+    """
+    notes: list[str] = []
+    result = copy.deepcopy(values)
+    for dotted, new in RENAMED.items():
+        section, old = _section_of(result, dotted)
+        if section is None or old not in section:
+            continue
+        if new in section:
+            raise ValueError(f"{dotted} is the old name of {new}, which is given too: keep one")
+        section[new] = section.pop(old)
+        notes.append(f"{dotted} was read as {new}, its present name: rename it")
+    for dotted in UNUSED:
+        section, old = _section_of(result, dotted)
+        if section is not None and section.pop(old, None) is not None:
+            notes.append(f"{dotted} is no longer used: remove it")
+    return result, notes
+
+
+def _section_of(values: dict[str, Any], dotted: str) -> tuple[dict[str, Any] | None, str]:
+    *names, key = dotted.split(".")
+    section: Any = values
+    for name in names:
+        section = section.get(name) if isinstance(section, dict) else None
+    return (section if isinstance(section, dict) else None), key

@@ -1,0 +1,223 @@
+"""The two ways from one frame's markers to the target.
+
+`weights` is the paper's (section II-A): a pose and a Kalman filter for each marker, then W.
+`joint` solves both markers' corners at once and filters that one pose. A strategy names its
+tracks, measures (which poses there are, and which track each feeds) and merges the tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from perchctl.geometry import Array
+from perchctl.profile import MergeConfig
+from perchctl.vision.filter import POSITION, VELOCITY, YAW
+from perchctl.vision.merge import (
+    better,
+    choose_stage,
+    disagree,
+    merge_pair,
+    merge_variance,
+)
+from perchctl.vision.pose import PoseSetup, estimate_pose, level_rotation
+from perchctl.vision.types import (
+    MARKERS,
+    Attitude,
+    Detection,
+    Detections,
+    MarkerPose,
+    MarkerTrack,
+    Measured,
+    Stage,
+)
+
+CONSISTENT_CHI2 = 4.0
+"""Per degree of freedom: below it, both markers' corners fit one pose so well that the two
+cannot contradict (that takes four standard deviations)."""
+_STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances."""
+
+    vector: Array
+    velocity_mps: Array
+    cov_m2: Array
+    var_yaw_rad2: float
+    unseen: int
+    stage: Stage
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known before a frame is solved.
+
+    `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,)
+    the target's normal at that last pose, in the camera's axes of then.
+    """
+
+    attitude: Attitude | None
+    near: MarkerPose | None
+    normal_cam: Array | None
+
+
+class MergeStrategy(Protocol):
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        """Names of its filters."""
+
+    def measure(self, detections: Detections, prior: Prior) -> Measured:
+        """Solve what this frame needs, once, and choose the track that each pose feeds."""
+
+    def merge(
+        self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
+    ) -> Merged | None:
+        """The target from the tracks; `fed` is what the newest frame fed them with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The paper's: each marker its pose and its filter, merged by W (equations 5, 8, 12)."""
+
+    config: MergeConfig
+    pose: PoseSetup
+    tracks: tuple[str, ...] = MARKERS
+
+    def measure(self, detections: Detections, prior: Prior) -> Measured:
+        singles = _singles(_seen(detections), detections.t_s, prior, self.pose, prior.near)
+        contradicting = _contradict(singles, self.config)
+        fed = _usable(singles, contradicting, prior, self.config, self.pose)
+        return Measured(singles, fed, contradicting)
+
+    def merge(
+        self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
+    ) -> Merged | None:
+        """The tracks that this frame fed, or else those unseen for the shortest time."""
+        if not tracks:
+            return None
+        least = min(track.unseen for track in tracks.values())
+        used = {name: track for name, track in tracks.items() if track.unseen == least}
+        used = {name: track for name, track in used.items() if name in fed} or used
+        if len(used) == 1:
+            name, track = next(iter(used.items()))
+            return _alone(track, fed.get(name))
+        large, small = used["large"], used["small"]
+        weights = self.config.weights
+        order = [*POSITION, YAW]
+        variance = merge_variance(np.diag(large.P)[order], np.diag(small.P)[order], weights)
+        w = np.array([weights.x, weights.y, weights.z])
+        return Merged(
+            vector=merge_pair(large.x[order], small.x[order], weights),
+            velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
+            cov_m2=np.diag(variance[:3]),
+            var_yaw_rad2=float(variance[3]),
+            unseen=least,
+            stage=Stage.BOTH if fed else Stage.NONE,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Both markers' corners in one solve, one filter; a marker alone feeds the same one."""
+
+    config: MergeConfig
+    pose: PoseSetup
+    tracks: tuple[str, ...] = ("joint",)
+
+    def measure(self, detections: Detections, prior: Prior) -> Measured:
+        seen, t_s = _seen(detections), detections.t_s
+        joint = None
+        if len(seen) == 2:
+            joint = estimate_pose(
+                seen, t_s, prior.attitude, self.pose, prior.normal_cam, prior.near
+            )
+        clear = joint is not None and joint.chi2 < CONSISTENT_CHI2
+        enough = joint is not None and clear and self.config.stages == "seen"
+        # The joint tilt is the surest: the single markers of its frame start from it.
+        singles = {}
+        if not enough or self.pose.config.each_marker:
+            singles = _singles(seen, t_s, prior, self.pose, joint or prior.near)
+        if joint is None:
+            contradicting = _contradict(singles, self.config)
+            fed = _usable(singles, contradicting, prior, self.config, self.pose)
+            if len(fed) == 2:
+                return Measured(singles, {"joint": better(fed["large"], fed["small"])})
+            return Measured(singles, _as_joint(fed), contradicting)
+        poses = {"joint": joint, **singles}
+        if enough:
+            return Measured(poses, {"joint": joint})
+        contradicting = not clear and _contradict(singles, self.config)
+        fed = _usable(singles, contradicting, prior, self.config, self.pose)
+        return Measured(poses, _as_joint(fed) if len(fed) == 1 else {"joint": joint}, contradicting)
+
+    def merge(
+        self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
+    ) -> Merged | None:
+        return _alone(tracks["joint"], fed.get("joint")) if tracks else None
+
+
+def make_strategy(config: MergeConfig, pose: PoseSetup) -> MergeStrategy:
+    """The profile's `merge.method`."""
+    return Joint(config, pose) if config.method == "joint" else Weights(config, pose)
+
+
+def _seen(detections: Detections) -> list[Detection]:
+    return [d for name in MARKERS if (d := detections.get(name)) is not None]
+
+
+def _singles(
+    seen: list[Detection],
+    t_s: float,
+    prior: Prior,
+    setup: PoseSetup,
+    start: MarkerPose | None,
+) -> dict[str, MarkerPose]:
+    found = (estimate_pose([d], t_s, prior.attitude, setup, prior.normal_cam, start) for d in seen)
+    return {pose.source: pose for pose in found if pose is not None}
+
+
+def _contradict(singles: Mapping[str, MarkerPose], config: MergeConfig) -> bool:
+    if len(singles) < 2:
+        return False
+    return disagree(singles["large"], singles["small"], config.disagreement_m)
+
+
+def _usable(
+    singles: Mapping[str, MarkerPose],
+    contradicting: bool,
+    prior: Prior,
+    config: MergeConfig,
+    setup: PoseSetup,
+) -> dict[str, MarkerPose]:
+    """The single markers' poses that count: of two that contradict the better, else what
+    the stage asks for."""
+    if len(singles) < 2:
+        return dict(singles)
+    use = better(singles["large"], singles["small"])
+    if contradicting:
+        return {use.source: use}
+    offset = setup.gear_body_m - setup.T_body_cam[:3, 3]
+    z_m = float(use.e_m[2] + (level_rotation(prior.attitude) @ offset)[2])
+    stage = choose_stage(True, True, z_m, config)
+    return dict(singles) if stage is Stage.BOTH else {stage.value: singles[stage.value]}
+
+
+def _as_joint(fed: Mapping[str, MarkerPose]) -> dict[str, MarkerPose]:
+    pose = next(iter(fed.values()), None)
+    return {} if pose is None else {"joint": pose}
+
+
+def _alone(track: MarkerTrack, pose: MarkerPose | None) -> Merged:
+    return Merged(
+        vector=np.array([*track.x[POSITION], track.x[YAW]]),
+        velocity_mps=track.x[VELOCITY],
+        cov_m2=track.P[np.ix_(POSITION, POSITION)],
+        var_yaw_rad2=float(track.P[YAW, YAW]),
+        unseen=track.unseen,
+        stage=Stage.NONE if pose is None else _STAGE_OF[pose.source],
+    )

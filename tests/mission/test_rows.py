@@ -1,0 +1,272 @@
+"""Each row of the mission's table decides something: its case ends otherwise without it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.mission import planner
+from perchctl.mission.state import (
+    FLYING_PHASES,
+    TERMINALS,
+    Observation,
+    Operator,
+    Outcome,
+    Phase,
+    PlannerState,
+    Severity,
+)
+from perchctl.mission.table import TABLE, Row, first_match, risen
+from perchctl.vehicle import (
+    CRASHED,
+    LOCKED,
+    TUMBLED,
+    Command,
+    EmergencyStop,
+    Idle,
+    StopMotors,
+)
+from tests.helpers.mission import (
+    AIRBORNE,
+    CEILING_M,
+    HOVER_THRUST,
+    PROFILE,
+    READY,
+    observation,
+    state_in,
+    target_at,
+    telemetry,
+)
+
+P, O = Phase, Outcome  # noqa: E741 - column names of the cases below
+START_S = 10.0
+PERIOD_S = 0.02
+CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
+STANDOFF_Z_M = CONTACT_Z_M - PROFILE.planner.ascend.standoff_m
+
+Look = Callable[[float], Observation]
+"""The observation at a time."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row's case: from `phase`, with what is observed for `lasts_s`, the mission enters
+    `to`, with that outcome and that last command."""
+
+    phase: Phase
+    to: Phase
+    look: Look
+    lasts_s: float = 0.1
+    outcome: Outcome | None = None
+    command: type[Command] | None = None  # type: ignore[valid-type]
+    state: dict[str, Any] = field(default_factory=dict)
+    z_m: float = 1.0
+    profile: Any = PROFILE
+
+    def holds(self, table: tuple[Row, ...] = TABLE) -> bool:
+        state = replace(state_in(self.phase, START_S, self.z_m), **self.state)
+        for i in range(1, max(2, round(self.lasts_s / PERIOD_S)) + 1):
+            obs = self.look(START_S + PERIOD_S * i)
+            state, command = planner.step(state, obs, self.profile, table)
+            if state.phase is self.to:
+                fits = self.command is None or isinstance(command, self.command)
+                return fits and state.outcome is self.outcome
+        return False
+
+
+def flown(z_m: float = 1.0, **tel: Any) -> Look:
+    """In the air at a height, the target in sight."""
+
+    def look(t_s: float) -> Observation:
+        return observation(t_s, telemetry=replace(telemetry(t_s, z_m), **tel))
+
+    return look
+
+
+def seen(z_m: float = 1.0, **obs: Any) -> Look:
+    return lambda t_s: observation(t_s, z_m, **obs)
+
+
+def unseen(z_m: float = 1.0) -> Look:
+    """The target is where it was, but no longer tracked."""
+
+    def look(t_s: float) -> Observation:
+        remembered = target_at(
+            t_s, body_m=(0.0, 0.0, z_m), measured=False, tracked=False, measured_s=START_S - 1.0
+        )
+        return observation(t_s, z_m, target=remembered)
+
+    return look
+
+
+def aside(x_m: float, z_m: float = 1.0) -> Look:
+    """The vehicle beside the target."""
+
+    def look(t_s: float) -> Observation:
+        body_m = (x_m, 0.0, z_m)
+        tel = telemetry(t_s, position_m=body_m)
+        return observation(t_s, telemetry=tel, target=target_at(t_s, body_m=body_m))
+
+    return look
+
+
+def old(look: Look, since_s: float) -> Look:
+    """Observations whose telemetry stays at a time."""
+
+    def aged(t_s: float) -> Observation:
+        obs = look(t_s)
+        return replace(obs, telemetry=replace(obs.telemetry, t_s=since_s))
+
+    return aged
+
+
+LAND_ON_LOG = PROFILE.model_copy(
+    update={"safety": PROFILE.safety.model_copy(update={"land_on_log_error": True})}
+)
+QUIET = HOVER_THRUST * 0.5
+PRESSED = HOVER_THRUST * 1.1
+OFF = {"thrust": 0.0, "supervisor": READY}
+
+# row of the table: its case
+CASES: dict[str, Case] = {
+    "operator-stop": Case(
+        P.ALIGN, P.ABORTED, seen(operator=Operator.STOP), 0.1, O.EMERGENCY, EmergencyStop
+    ),
+    "locked": Case(P.ALIGN, P.ABORTED, flown(supervisor=AIRBORNE | LOCKED), 0.1, O.SAFETY,
+                   StopMotors),
+    "tumbled": Case(P.ALIGN, P.ABORTED, flown(supervisor=AIRBORNE | TUMBLED), 0.1, O.SAFETY,
+                    StopMotors),
+    "crashed": Case(P.ALIGN, P.ABORTED, flown(supervisor=AIRBORNE | CRASHED), 0.1, O.SAFETY,
+                    StopMotors),
+    "tilted": Case(P.ALIGN, P.ABORTED, flown(roll_rad=1.5), 0.5, O.SAFETY, EmergencyStop),
+    "operator-land": Case(P.ALIGN, P.LANDING, seen(operator=Operator.LAND), 0.1, O.OPERATOR),
+    "link-lost": Case(P.ALIGN, P.LANDING, seen(link_problem="gone"), 0.1, O.SAFETY),
+    "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), START_S), 1.5, O.SAFETY),
+    "estimator-jump": Case(P.ALIGN, P.LANDING, seen(jumped=True), 0.8, O.SAFETY),
+    "battery-low": Case(P.ALIGN, P.LANDING, flown(battery_v=2.8), 1.8, O.SAFETY),
+    "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
+    "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
+    "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
+    "camera-gone": Case(
+        P.ALIGN, P.LANDING, seen(camera_age_s=4.0, new_frame=False), 0.1, O.SAFETY
+    ),
+    "loop-late": Case(P.ALIGN, P.LANDING, seen(loop_late_s=1.2), 0.1, O.SAFETY),
+    "markers-disagree": Case(P.ALIGN, P.LANDING, seen(disagreeing_frames=40), 0.1, O.SAFETY),
+    "log-lost": Case(
+        P.ALIGN, P.LANDING, seen(log_problem="disk full"), 0.1, O.SAFETY, profile=LAND_ON_LOG
+    ),
+    "time-over": Case(
+        P.ALIGN, P.LANDING, seen(), 0.1, O.ATTEMPTS_USED_UP, state={"started_s": -1000.0}
+    ),
+    "caught": Case(P.PERCH, P.COMPLETE, flown(2.1, thrust=QUIET), 1.2, z_m=2.1),
+    "approached": Case(P.APPROACH, P.SEARCH, seen(0.5), 0.4, z_m=0.5),
+    "approach-timeout": Case(
+        P.APPROACH, P.LANDING, seen(0.1), 0.1, O.SAFETY, state={"entered_s": -20.0}, z_m=0.1
+    ),
+    "found": Case(P.SEARCH, P.ESTIMATE, seen(), 0.2),
+    "searched-out": Case(
+        P.SEARCH, P.LANDING, unseen(), 0.1, O.TARGET_NOT_FOUND, state={"searches": 6}
+    ),
+    "estimate-lost": Case(P.ESTIMATE, P.SEARCH, unseen(), 1.2),
+    "estimated": Case(P.ESTIMATE, P.ALIGN, seen(), 0.6),
+    "align-lost": Case(P.ALIGN, P.SEARCH, unseen()),
+    "align-timeout": Case(P.ALIGN, P.RECOVER, aside(0.2), state={"entered_s": -20.0}),
+    "aligned": Case(P.ALIGN, P.ASCEND, seen(), 0.6),
+    "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen()),
+    "outside-cone": Case(P.ASCEND, P.ALIGN, aside(0.4)),
+    "ascend-timeout": Case(P.ASCEND, P.RECOVER, seen(), state={"entered_s": -50.0}),
+    "settled": Case(P.ASCEND, P.PERCH, seen(STANDOFF_Z_M), 0.5, z_m=STANDOFF_Z_M),
+    "contact": Case(
+        P.PERCH, P.COMPLETE, flown(CONTACT_Z_M, thrust=PRESSED), 0.5, z_m=CONTACT_Z_M
+    ),
+    "no-contact": Case(P.PERCH, P.RECOVER, seen(2.0), 3.2, z_m=2.0),
+    "slipped": Case(
+        P.COMPLETE, P.RECOVER,
+        flown(CONTACT_Z_M - 0.1, velocity_mps=(0.0, 0.0, -0.5), thrust=QUIET),
+        z_m=CONTACT_Z_M,
+    ),
+    "not-released": Case(
+        P.COMPLETE, P.RECOVER, flown(CONTACT_Z_M), state={"entered_s": 0.0}, z_m=CONTACT_Z_M
+    ),
+    "perched": Case(
+        P.COMPLETE, P.PERCHED, flown(CONTACT_Z_M, **OFF), 0.3, O.PERCHED,
+        state={"entered_s": 0.0, "motors_stopped": True}, z_m=CONTACT_Z_M,
+    ),
+    "attempts-used": Case(
+        P.RECOVER, P.LANDING, seen(), 0.7, O.ATTEMPTS_USED_UP,
+        state={"attempts": PROFILE.planner.attempts},
+    ),
+    "recovered": Case(P.RECOVER, P.ESTIMATE, seen(), 1.2),
+    "recover-timeout": Case(
+        P.RECOVER, P.LANDING, flown(velocity_mps=(0.5, 0.0, 0.0)), 0.1, O.SAFETY,
+        state={"entered_s": 0.0},
+    ),
+    "landed": Case(
+        P.LANDING, P.LANDED, flown(0.02, **OFF), 0.3, O.OPERATOR,
+        state={"outcome": O.OPERATOR, "orders": 1}, z_m=0.02,
+    ),
+    "landing-timeout": Case(
+        P.LANDING, P.ABORTED, seen(), 0.1, O.SAFETY, Idle,
+        state={"entered_s": -20.0, "orders": 1, "ordered_s": START_S},
+    ),
+}  # fmt: skip
+
+
+def test_every_row_has_its_case() -> None:
+    assert list(CASES) == [row.name for row in TABLE]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_row_decides(name: str) -> None:
+    assert CASES[name].holds()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_without_the_row_a_case_fails(name: str) -> None:
+    """A safety row that no test misses is no safety row."""
+    without = tuple(row for row in TABLE if row.name != name)
+    assert not CASES[name].holds(without)
+
+
+# --- severity ------------------------------------------------------------------------------
+
+ROGUE = Row("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")
+
+
+def test_no_row_undoes_a_landing() -> None:
+    """Whatever a table says: from a landing nothing leads back into the flight."""
+    landing = replace(state_in(P.LANDING), severity=Severity.LAND, orders=1)
+    context = planner.Context(landing, observation(START_S), PROFILE)
+    assert first_match(context, (ROGUE,)) is None
+    flying = planner.Context(state_in(P.ALIGN), observation(START_S), PROFILE)
+    assert first_match(flying, (ROGUE,)) is ROGUE
+
+
+@given(st.lists(st.sampled_from(Severity), max_size=20))
+def test_from_landing_on_the_severity_only_rises(rows: list[Severity]) -> None:
+    severity, grave = Severity.CONTINUE, False
+    for row in rows:
+        before, severity = severity, risen(severity, row)
+        assert not grave or severity >= before
+        grave = grave or severity >= Severity.LAND
+        assert grave == (severity >= Severity.LAND)
+
+
+def test_a_landing_goes_on_to_its_end() -> None:
+    state: PlannerState = state_in(P.ALIGN)
+    state, _ = planner.step(state, observation(START_S, operator=Operator.LAND), PROFILE)
+    assert state.severity is Severity.LAND
+    for i in range(1, 30):
+        tel = telemetry(START_S + 0.1 * i, 0.01, **OFF)
+        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        assert state.severity is Severity.LAND
+        if state.phase in TERMINALS:
+            break
+    assert state.phase is P.LANDED
+    assert math.isfinite(state.entered_s)
