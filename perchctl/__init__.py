@@ -1,3 +1,58 @@
-"""perchctl: hang a Crazyflie onto a ceiling by the sight of a printed target."""
+"""perchctl: hang a Crazyflie onto a ceiling by the sight of a printed target.
 
-__version__ = "0.1.0"
+The names below are the public ones, for notebooks and scripts; `docs/python.md` shows them
+at work. They are loaded when they are first used, so that the command line starts at once.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.2.0"
+
+if TYPE_CHECKING:
+    from perchctl.calibration.files import load_calibration
+    from perchctl.flight.lockstep import fly_lockstep
+    from perchctl.log.plot import plot_flight
+    from perchctl.log.read import read_log
+    from perchctl.pipeline import estimate, make_pipeline, step
+    from perchctl.profile import load_profile
+    from perchctl.vision.types import Attitude, Frame, PipelineState
+
+_HOMES = {
+    "Attitude": "perchctl.vision.types",
+    "Frame": "perchctl.vision.types",
+    "PipelineState": "perchctl.vision.types",
+    "estimate": "perchctl.pipeline",
+    "fly_lockstep": "perchctl.flight.lockstep",
+    "load_calibration": "perchctl.calibration.files",
+    "load_profile": "perchctl.profile",
+    "make_pipeline": "perchctl.pipeline",
+    "plot_flight": "perchctl.log.plot",
+    "read_log": "perchctl.log.read",
+    "step": "perchctl.pipeline",
+}
+
+__all__ = [
+    "Attitude",
+    "Frame",
+    "PipelineState",
+    "__version__",
+    "estimate",
+    "fly_lockstep",
+    "load_calibration",
+    "load_profile",
+    "make_pipeline",
+    "plot_flight",
+    "read_log",
+    "step",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'perchctl' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__
