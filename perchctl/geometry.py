@@ -1,6 +1,6 @@
 """Frames and rotations: the laws every other module cites.
 
-Conventions (the README's page "Frames and signs" says the same):
+Conventions (`docs/conventions.md` has them all):
 
 - ``T_a_b`` is a 4x4 homogeneous matrix that maps coordinates in b into a, so
   inner letters cancel: ``T_world_body @ T_body_cam @ T_cam_target``.

@@ -1,4 +1,4 @@
-"""What the planner sees and what it says: telemetry in, commands out."""
+"""What planner, link, simulator and log agree on: telemetry in, commands out."""
 
 from __future__ import annotations
 

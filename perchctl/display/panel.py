@@ -62,7 +62,7 @@ class PanelSurface:
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        # stdout is for data and is left alone; what others say on stderr goes above the panel.
+        # stdout is for data and is left alone; what others write on stderr goes above the panel.
         self._live = Live(
             console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True
         )
@@ -79,7 +79,7 @@ class PanelSurface:
 
 
 class Reporter:
-    """What the loop talks to. No method raises or waits, but `close` (bounded).
+    """The display, as the loop sees it. No method raises or waits, but `close` (bounded).
 
     Attributes:
         problem: None, or why the display fell silent.
@@ -158,7 +158,7 @@ class Reporter:
 
 
 def make_reporter(interactive: bool | None = None, stream: TextIO | None = None) -> Reporter:
-    """A panel when `interactive`, plain lines when not; None asks the stream.
+    """A panel when `interactive`, plain lines when not; None: as the stream is.
 
     `stream` defaults to stderr. NO_COLOR takes the colours away.
     """

@@ -16,7 +16,7 @@ KEEP_S = 2.0
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first, and what a look at it told."""
+    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it."""
 
     samples: tuple[Telemetry, ...] = ()
     jumped: bool = False
@@ -28,7 +28,7 @@ class History:
 
 
 def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> History:
-    """The history with new samples; `jumped` speaks of these samples only.
+    """The history with new samples; `jumped` is about these samples only.
 
     Samples with NaN or out of order are left out (fault 35).
     """

@@ -100,7 +100,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class LockstepFlight:
-    """A finished flight and what only the simulator knows of it."""
+    """A finished flight and what only the simulator can measure."""
 
     report: FlightReport
     seed: int
@@ -129,7 +129,7 @@ def fly_lockstep(
     Args:
         log: a file to log to, or a watcher that is left open.
         scenario: flown instead of the seed's own.
-        operator_at: the person's word, given as soon as a phase is reached.
+        operator_at: the operator's command, given as soon as a phase is reached.
 
     Errors: NotFound, InvalidValue (calibration, log file).
     """
@@ -149,10 +149,10 @@ def fly_lockstep(
     if log is not None:
         log.truth = truth.for_log
         watchers = (truth, log)
-    word = _Word(operator_at or {})
+    operator = _OperatorAt(operator_at or {})
     pipeline = make_pipeline(profile, camera)
     parts = FlightParts(
-        link, source, LockstepClock(link), profile, pipeline, (*watchers, word), word.read
+        link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read
     )
     link.connect()
     report = fly(parts)
@@ -171,20 +171,20 @@ def fly_lockstep(
     )
 
 
-class _Word:
-    """Says the operator's word once the given phase has been seen."""
+class _OperatorAt:
+    """Gives the operator's command once a phase has been reached."""
 
     problem: str | None = None
 
     def __init__(self, at: dict[Phase, Operator]) -> None:
         self._at = at
-        self._said = Operator.NONE
+        self._command = Operator.NONE
 
     def read(self) -> Operator:
-        return self._said
+        return self._command
 
     def tick(self, tick: Tick) -> None:
-        self._said = max(self._said, self._at.get(tick.state.phase, Operator.NONE))
+        self._command = max(self._command, self._at.get(tick.state.phase, Operator.NONE))
 
     def event(self, event: Event) -> None:
         return None

@@ -76,7 +76,7 @@ class Senses:
         live = self.source.live
         self._health, verdict = assess(self._health, frame, live)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen:
-        # such pictures are searched all the same, but the user is told of them.
+        # such pictures are searched all the same, but the user is shown why.
         self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
         if not verdict.usable and self._note is None:
             return verdict.text

@@ -48,7 +48,7 @@ class FlyOptions:
 
 @dataclass(frozen=True)
 class SessionResult:
-    """How the flight ended; `miss_m` where a simulator knows it."""
+    """How the flight ended; `miss_m` where a simulator measures it."""
 
     report: FlightReport
     miss_m: float | None = None
@@ -76,7 +76,7 @@ def fly_session(
 ) -> SessionResult:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
 
-    `switch` carries the person's word. `watch_source` may put a source around the camera's,
+    `switch` carries the operator's commands. `watch_source` may put a source around the camera's,
     to look at its frames on their way.
     """
     check_options(options)
@@ -110,7 +110,7 @@ def fly_session(
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:
-    """What the simulator knows; a simulator that is gone does not spoil the report."""
+    """Measured by the simulator; a simulator that is gone does not spoil the report."""
     if simulated is None:
         return None
     with contextlib.suppress(ConnectionFailed, TimedOut):

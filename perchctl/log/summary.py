@@ -55,22 +55,22 @@ def summary_of(log: FlightLog) -> FlightSummary:
     phases = log.phases
     battery_v = log.column("battery_v")
     known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
-    said: Mapping[str, Any] = log.summary or {
+    end: Mapping[str, Any] = log.summary or {
         "outcome": "unknown",
         "reason": f"the log ends in {phases[-1].phase}" if phases else "the log holds no flight",
     }
     last = log.records[-1] if log.records else {}
     battery_min_v = float(np.min(known_v)) if known_v.size else None
     return FlightSummary(
-        outcome=str(said.get("outcome", "unknown")),
-        reason=str(said.get("reason", "")),
-        cause=str(said.get("cause") or ""),
-        duration_s=float(said.get("duration_s") or sum(p.duration_s for p in phases)),
-        attempts=int(said.get("attempts", last.get("attempts")) or 0),
-        miss_m=said.get("miss_m"),
-        battery_min_v=said.get("battery_min_v") or battery_min_v,
-        locked=bool(said.get("locked", False)),
-        fell=bool(said.get("fell", False)),
+        outcome=str(end.get("outcome", "unknown")),
+        reason=str(end.get("reason", "")),
+        cause=str(end.get("cause") or ""),
+        duration_s=float(end.get("duration_s") or sum(p.duration_s for p in phases)),
+        attempts=int(end.get("attempts", last.get("attempts")) or 0),
+        miss_m=end.get("miss_m"),
+        battery_min_v=end.get("battery_min_v") or battery_min_v,
+        locked=bool(end.get("locked", False)),
+        fell=bool(end.get("fell", False)),
         phases=phases,
     )
 

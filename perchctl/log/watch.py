@@ -114,7 +114,7 @@ def flight_record(
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
-    """The tick as a record; the truth where a simulation knows it."""
+    """The tick as a record; with the truth of a simulation."""
     return tick_record(
         t_s=tick.t_s,
         telemetry=tick.telemetry,

@@ -90,7 +90,7 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
-    """Slow mean of the thrust in quiet flight: the yardstick of the contact proof."""
+    """Slow mean of the thrust in quiet flight: the reference of the contact proof."""
     thrust = obs.telemetry.thrust
     if thrust < 1000:
         return state.hover_thrust

@@ -90,7 +90,7 @@ class MotorStop(Enum):
 
 
 class Operator(IntEnum):
-    """The person's word; it only rises (Ctrl-C once, twice)."""
+    """The operator's command; it only rises (Ctrl-C once, twice)."""
 
     NONE = 0
     LAND = 1
@@ -99,7 +99,7 @@ class Operator(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Everything one tick knows. Times on the loop's clock; ages in seconds.
+    """All that is known in one tick. Times on the loop's clock; ages in seconds.
 
     Attributes:
         telemetry: the newest sample; its age is `t_s - telemetry.t_s`.
