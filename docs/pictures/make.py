@@ -1,0 +1,409 @@
+"""Every picture of the README and of these pages.
+
+    python docs/pictures/make.py
+
+flies one simulated flight (`--profile`, `--seed`; or takes a log with `--log`) and writes the
+pictures beside this file (`--into`, `--only`). The live page is photographed by a headless
+Chromium; where none is installed that picture is left as it is, and the command says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.text import Text
+
+ROOT = Path(__file__).resolve().parents[2]
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))
+
+from perchctl.calibration.files import load_calibration  # noqa: E402
+from perchctl.display.page.live import LivePage  # noqa: E402
+from perchctl.display.page.sketch import Sketch, draw  # noqa: E402
+from perchctl.display.panel import panel  # noqa: E402
+from perchctl.display.status import FlightStatus, status_rows  # noqa: E402
+from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
+from perchctl.log.plot import plot_flight  # noqa: E402
+from perchctl.log.read import FlightLog, read_log  # noqa: E402
+from perchctl.pipeline import make_pipeline, step  # noqa: E402
+from perchctl.plot import (  # noqa: E402
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    VERMILLION,
+    new_figure,
+    save_png,
+)
+from perchctl.profile import Profile, find_calibration, load_profile  # noqa: E402
+from perchctl.sim.draw import draw_scenario  # noqa: E402
+from perchctl.sim.renderer import Renderer  # noqa: E402
+from perchctl.vision.types import Frame, PipelineState  # noqa: E402
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+NEAR_WIDTH_M = 0.2
+"""Of the side view where the vehicle is at the ceiling."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A logged simulated flight, and what its seed says about the world it was flown in."""
+
+    log: FlightLog
+
+    @cached_property
+    def profile(self) -> Profile:
+        return Profile.model_validate(self.log.header["profile"])
+
+    @cached_property
+    def scenario(self) -> Any:
+        return draw_scenario(self.profile, int(self.log.header["seed"]))
+
+    @cached_property
+    def camera(self) -> Any:
+        return load_calibration(find_calibration(self.profile.camera.calibration))
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        return Renderer(self.scenario, self.camera, self.profile.target)
+
+    @cached_property
+    def pipeline(self) -> Any:
+        return make_pipeline(self.profile, self.camera)
+
+    def index_at(self, t_s: float) -> int:
+        """The tick at that time, s after the first."""
+        after = self.log.column("t_s") >= self.log.start_s + t_s - 1e-6
+        return int(np.argmax(after)) if after.any() else len(self.log.records) - 1
+
+    def entered_s(self, phase: str, last: bool = True) -> float | None:
+        """When a phase was entered, s after the first tick; None if it never was."""
+        spans = [span for span in self.log.phases if span.phase == phase]
+        return spans[-1 if last else 0].start_s - self.log.start_s if spans else None
+
+    def frame(self, index: int) -> Frame:
+        """What the camera sees at that tick: rendered anew, from the logged truth."""
+        r = self.log.records[index]
+        R = rotation_from_rpy(r["roll_rad"], r["pitch_rad"], r["yaw_rad"])
+        T_world_body = make_T(R, (r["true_x_m"], r["true_y_m"], r["true_z_m"]))
+        T_world_cam = T_world_body @ np.array(self.scenario.T_body_cam_true)
+        image = self.renderer.render([T_world_cam], frame_index=index)
+        return Frame(index, float(r["t_s"]), image)
+
+    def sketch(self, frame: Frame) -> Sketch:
+        """The frame with what the pipeline finds in it."""
+        _, output = step(PipelineState(), frame, None, self.pipeline)
+        found = {name: output.detections.get(name) for name in ("large", "small")}
+        poses = output.poses
+        pose = next((poses[name] for name in ("joint", "large", "small") if name in poses), None)
+        axis_m = 0.5 * self.profile.target.large.side_m
+        return Sketch(
+            frame.image,
+            tuple((name, seen.corners_px) for name, seen in found.items() if seen is not None),
+            None if pose is None else (pose.rvec_rad, pose.tvec_m, axis_m),
+        )
+
+    def status(self, index: int) -> FlightStatus:
+        """What the displays showed at that tick."""
+        r, first = self.log.records[index], self.log.records[0]
+        span = next(s for s in reversed(self.log.phases) if s.start_s <= r["t_s"])
+        return FlightStatus(
+            t_s=r["t_s"],
+            phase=r["phase"],
+            in_phase_s=r["t_s"] - span.start_s,
+            e_m=None if r["ex_m"] is None else (r["ex_m"], r["ey_m"], r["ez_m"]),
+            e_yaw_rad=r["eyaw_rad"],
+            stage=r["stage"] or "none",
+            height_m=r["z_m"] - first["z_m"],
+            battery_v=r["battery_v"],
+            link_age_s=r["tel_age_s"],
+            camera_age_s=r["cam_age_s"],
+            loop_late_s=r["late_s"],
+            attempts=r["attempts"],
+            reason=r["reason"],
+        )
+
+
+# --- the pictures ---------------------------------------------------------------------
+
+
+def target(_: Flight, file: Path) -> None:
+    """Front and back of the printed target, side by side."""
+    import pypdfium2  # type: ignore[import-untyped]
+
+    with tempfile.TemporaryDirectory() as folder:
+        pdf = Path(folder) / "target.pdf"
+        _perchctl("make-target", "-p", "sim", "-o", str(pdf))
+        sheets = []
+        for page in pypdfium2.PdfDocument(pdf.read_bytes()):
+            # Drawn fine and shrunk: thin lines stay visible in a small picture.
+            fine = page.render(scale=4 * 75 / 72.0, grayscale=True).to_numpy()
+            small = cv2.resize(
+                fine.reshape(fine.shape[:2]), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA
+            )
+            sheets.append(np.pad(small, 1, constant_values=150))
+    gap = np.full((sheets[0].shape[0], 16), 255, np.uint8)
+    _write(file, np.hstack([sheets[0], gap, sheets[1]]))
+
+
+def flight(flown: Flight, file: Path) -> None:
+    """The plot that each flight leaves beside its log."""
+    plot_flight(flown.log, file)
+
+
+def strip(flown: Flight, file: Path) -> None:
+    """Six moments: what the camera sees, and the vehicle from the side, to scale; for the
+    last three, nearer."""
+    moments = _moments(flown)
+    figure = new_figure(13.0, 6.6, dpi=100)
+    axes = figure.subplots(2, len(moments), height_ratios=(0.75, 2.1), squeeze=False)
+    for i, (title, index) in enumerate(moments):
+        picture, side = axes[0][i], axes[1][i]
+        seen = draw(flown.sketch(flown.frame(index)), flown.camera)
+        picture.imshow(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB))
+        picture.set_title(title, fontsize=10)
+        picture.set_axis_off()
+        near = flown.status(index).phase in ("PERCH", "COMPLETE", "PERCHED")
+        _side_view(side, flown, index, near)
+        side.set_ylabel("height [m]" if i == 0 else "", fontsize=9)
+    save_png(figure, file)
+
+
+def terminal(flown: Flight, file: Path) -> None:
+    """The panel in a terminal, with the lines above it."""
+    index = _shown(flown)
+    console = Console(record=True, width=82, file=io.StringIO(), force_terminal=True)
+    console.print(Text("$ perchctl fly"))
+    for span in flown.log.phases:
+        if span.start_s > flown.log.records[index]["t_s"]:
+            break
+        text = f"[{span.start_s - flown.log.start_s:7.2f} s] {span.phase}: {span.reason}"
+        console.print(Text(text), soft_wrap=True)
+    console.print(panel(flown.status(index)))
+    svg = console.export_svg(title="perchctl", unique_id="perchctl")
+    # Fonts from another server would be fetched by each reader.
+    svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
+    file.write_text(svg.replace("Fira Code, ", ""), encoding="utf-8")
+
+
+def calibration(_: Flight, file: Path) -> None:
+    """The report of a calibration from rendered pictures of a board."""
+    from tests.helpers.boards import CHARUCO, draw_camera, render_folder
+
+    with tempfile.TemporaryDirectory() as folder:
+        board = Path(folder) / "board"
+        camera = draw_camera(np.random.default_rng(4))
+        render_folder(board, camera, CHARUCO, 14, seed=4)
+        result = Path(folder) / "camera.yaml"
+        _perchctl("calibrate", f"images:{board}", "-o", str(result))
+        shutil.copyfile(result.with_suffix(".png"), file)
+
+
+def page(flown: Flight, file: Path) -> None:
+    """The live page of the flight, in a browser without a window."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        print(f"{file.name}: skipped, none of {', '.join(BROWSERS)} is installed")
+        return
+    index = _shown(flown)
+    status, picture = flown.status(index), flown.sketch(flown.frame(index))
+    live = LivePage(flown.camera, "perchctl fly sim://", on_stop=lambda: None)
+    closing = threading.Event()
+
+    def feed() -> None:
+        """As a flight does: 30 pictures a second, so that the page shows a rate."""
+        number = 0
+        while not closing.wait(1.0 / 30.0):
+            number += 1
+            live.show(number, picture)
+
+    live.tell(lambda: _page_state(status))
+    feeder = threading.Thread(target=feed, daemon=True)
+    feeder.start()
+    try:
+        _photograph(browser, live.url, file)
+    finally:
+        closing.set()
+        live.close()
+        feeder.join()
+
+
+PICTURES: dict[str, Callable[[Flight, Path], None]] = {
+    "target.png": target,
+    "flight.png": flight,
+    "strip.png": strip,
+    "panel.svg": terminal,
+    "calibration.png": calibration,
+    "page.png": page,
+}
+
+
+# --- what they share ------------------------------------------------------------------
+
+
+def _moments(flown: Flight) -> list[tuple[str, int]]:
+    """Titles and ticks of the strip; phases that were not flown are left out."""
+    end_s = flown.log.phases[-1].start_s - flown.log.start_s
+    perch_s, complete_s = flown.entered_s("PERCH"), flown.entered_s("COMPLETE")
+    times = (
+        ("SEARCH", flown.entered_s("SEARCH", last=False)),
+        ("ALIGN", _within(flown, "ALIGN", 0.4)),
+        ("ASCEND", _within(flown, "ASCEND", 0.35)),
+        ("PERCH: settled below", perch_s),
+        ("COMPLETE: in contact", complete_s),
+        ("PERCHED: motors off", end_s if complete_s is not None else None),
+    )
+    return [(f"{name}\n{t_s:.1f} s", flown.index_at(t_s)) for name, t_s in times if t_s is not None]
+
+
+def _within(flown: Flight, phase: str, share: float) -> float | None:
+    """The time at which a share of the phase's last stay is over; None if it was not flown."""
+    spans = [span for span in flown.log.phases if span.phase == phase]
+    if not spans:
+        return None
+    return spans[-1].start_s + share * spans[-1].duration_s - flown.log.start_s
+
+
+def _shown(flown: Flight) -> int:
+    """The tick of the displays' pictures: in the ascent, or else at the end."""
+    t_s = _within(flown, "ASCEND", 0.35)
+    return len(flown.log.records) - 1 if t_s is None else flown.index_at(t_s)
+
+
+def _side_view(ax: Axes, flown: Flight, index: int, near: bool) -> None:
+    """Ceiling, target and vehicle in the upright plane through start and target, in m;
+    `near` shows the last centimetres of it."""
+    way, ceiling_m = _along(flown), flown.scenario.ceiling_z_m
+    left, right = min(way.min(), 0.0) - 0.25, max(way.max(), 0.0) + 0.25
+    height_m, above_m = ceiling_m + 0.05, 0.08
+    if near:
+        share = NEAR_WIDTH_M / (right - left)
+        left, right = -NEAR_WIDTH_M / 2.0, NEAR_WIDTH_M / 2.0
+        height_m, above_m = share * (height_m + above_m) - share * above_m, share * above_m
+    ax.set_xlim(left, right)
+    ax.set_ylim(ceiling_m - height_m, ceiling_m + above_m)
+    ax.set_aspect("equal")
+    ax.tick_params(labelsize=8)
+    ax.add_patch(Rectangle((left, ceiling_m), right - left, above_m, color="#D5D5D5", zorder=0))
+    ax.axhline(0.0, color=GREY, linewidth=1.5)
+    upto = slice(0, index + 1)
+    ax.plot(way[upto], flown.log.column("true_z_m")[upto], color=ORANGE, linewidth=1.2)
+    half_m, thick_m = flown.profile.target.large.side_m / 2.0, 0.004 if near else 0.02
+    ax.add_patch(Rectangle((-half_m, ceiling_m), 2 * half_m, thick_m, color=BLACK))
+    ax.add_patch(Rectangle((-0.025, ceiling_m + thick_m), 0.05, thick_m, color=VERMILLION))
+    _vehicle(ax, flown, way[index], flown.log.records[index])
+
+
+def _along(flown: Flight) -> Array:
+    """Horizontal place of each tick on the way from the start to the target, m."""
+    target_xy = np.array(flown.scenario.target_xy_m)
+    xy = np.stack([flown.log.column("true_x_m"), flown.log.column("true_y_m")], axis=1)
+    to_target = target_xy - xy[0]
+    direction = to_target / max(float(np.linalg.norm(to_target)), 1e-6)
+    return np.asarray((xy - target_xy) @ direction)
+
+
+def _vehicle(ax: Axes, flown: Flight, s_m: float, record: dict[str, Any]) -> None:
+    """Board, battery, motors, propellers and gear of a Crazyflie, true to size."""
+    z, gear_m = record["true_z_m"], flown.profile.vehicle.gear_body_m[2]
+    spins = (record["thrust"] or 0) > 0
+    parts = [
+        (-0.046, -0.002, 0.092, 0.004, BLUE),
+        (-0.016, 0.002, 0.032, 0.007, GREY),
+        (-0.003, 0.002, 0.006, gear_m - 0.002, BLACK),
+    ]
+    for side in (-0.046, 0.046):
+        parts.append((side - 0.0035, -0.012, 0.007, 0.02, GREY))
+        parts.append((side - 0.0225, 0.008, 0.045, 0.002, GREEN if spins else BLACK))
+    for x, up, width, height, colour in parts:
+        ax.add_patch(Rectangle((s_m + x, z + up), width, height, color=colour, zorder=3))
+
+
+def _page_state(status: FlightStatus) -> dict[str, Any]:
+    return {
+        "phase": status.phase,
+        "battery": f"{status.battery_v:.2f} V",
+        "battery_v": status.battery_v,
+        "rows": [list(row) for row in status_rows(status)],
+        "note": "",
+    }
+
+
+def _photograph(browser: str, url: str, file: Path) -> None:
+    with tempfile.TemporaryDirectory() as profile:
+        subprocess.run(
+            [
+                browser,
+                "--headless=new",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--hide-scrollbars",
+                f"--user-data-dir={profile}",
+                "--window-size=1100,560",
+                "--timeout=4000",
+                f"--screenshot={file.resolve()}",
+                url,
+            ],
+            check=True,
+            capture_output=True,
+            timeout=60,
+        )
+
+
+def _perchctl(*words: str) -> None:
+    subprocess.run(
+        [sys.executable, "-m", "perchctl", *words], cwd=ROOT, check=True, capture_output=True
+    )
+
+
+def _write(file: Path, picture: NDArray[np.uint8]) -> None:
+    cv2.imwrite(str(file), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def fly(profile: str, seed: int, folder: Path) -> FlightLog:
+    _perchctl("simulate", "-p", profile, "--only", str(seed), "--log-dir", str(folder))
+    return read_log(folder / f"flight_seed{seed}.jsonl")
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--into", type=Path, default=Path(__file__).parent, help="folder")
+    parser.add_argument("--only", nargs="+", choices=sorted(PICTURES), default=list(PICTURES))
+    parser.add_argument("--profile", default="sim")
+    parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--log", type=Path, help="a lockstep flight's log, instead of flying")
+    given = parser.parse_args(words)
+    with tempfile.TemporaryDirectory() as folder:
+        profile = load_profile(given.profile).name if given.log is None else ""
+        log = read_log(given.log) if given.log else fly(given.profile, given.seed, Path(folder))
+        if profile:
+            print(f"profile {profile}, seed {given.seed}: {log.phases[-1].phase}")
+        flown = Flight(log)
+        for name in given.only:
+            file = given.into / name
+            PICTURES[name](flown, file)
+            if file.exists():
+                print(f"{file}: {file.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
