@@ -9,6 +9,7 @@ at any turn (z3: at the turn that needs the most room).
 
 from __future__ import annotations
 
+import argparse
 import math
 import sys
 from collections.abc import Callable
@@ -112,6 +113,7 @@ def measure(
 
 
 def main() -> int:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     target = TargetConfig()
     worst = 0.0
     print("f px  blur px  range  designed cm  measured cm  difference %")
