@@ -132,6 +132,7 @@ class Flight:
             in_phase_s=r["t_s"] - span.start_s,
             e_m=None if r["ex_m"] is None else (r["ex_m"], r["ey_m"], r["ez_m"]),
             e_yaw_rad=r["eyaw_rad"],
+            tracked=bool(r["tracked"]),
             stage=r["stage"] or "none",
             height_m=r["z_m"] - first["z_m"],
             battery_v=r["battery_v"],

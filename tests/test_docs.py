@@ -1,0 +1,395 @@
+"""The pages hold: their command lines and examples run, their links lead somewhere, their tables
+are the code's."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import shlex
+import shutil
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.calibration.files import load_calibration
+from perchctl.cli import app
+from perchctl.flight.lockstep import fly_lockstep
+from perchctl.log.jsonl import decode
+from perchctl.mission.table import TABLE
+from perchctl.profile import Profile, load_profile
+from tests.helpers.boards import CHARUCO, render_folder
+from tests.helpers.flights import ROOT, SEED, short_profile
+from tests.helpers.recording import make_recording
+from tests.helpers.weights_data import known
+from tests.helpers.weights_data import write as write_session
+
+DOCS = ROOT / "docs"
+PAGES = (ROOT / "README.md", *sorted(ROOT.glob("C*.md")), *sorted(DOCS.glob("*.md")))
+TEXT = {path: path.read_text(encoding="utf-8") for path in PAGES}
+README = TEXT[ROOT / "README.md"]
+FAULTS = TEXT[DOCS / "faults.md"]
+
+MOST_LINES = 200
+MOST_PICTURE_BYTES = 1_500_000
+
+CAMCHAIN = """cam0:
+  camera_model: pinhole
+  distortion_model: radtan
+  distortion_coeffs: [-0.2, 0.05, 0.001, -0.002]
+  intrinsics: [400.5, 401.5, 320.25, 240.75]
+  resolution: [640, 480]
+"""
+QUICK = """extends: sim
+planner: {perching_time_s: 0.3}
+"""
+"""A flight that lands again before it has left the floor; whole ones are flown in tests/flight."""
+TOOLS = ("pytest", "ruff ", "mypy")
+"""`.ci/run` runs these; a test does not run the tests."""
+SET_UP = ("python3 -m venv ", ". .venv/", "pip install ", "git clone ", "cd ")
+
+
+# --- command lines --------------------------------------------------------------------
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+
+
+def command_lines() -> list[str]:
+    """Every command of every page, once: indented ones, and those of the fenced blocks."""
+    found: set[str] = set()
+    for page in TEXT.values():
+        found |= {s.strip() for s in re.findall(r"^ {4,}perchctl .*$", page, re.MULTILINE)}
+        for block in blocks(page, "sh"):
+            for chain in block.splitlines():
+                found |= {part.strip() for part in chain.split("&&")}
+    return sorted(line for line in found if line and not line.startswith(SET_UP))
+
+
+def cheap(line: str) -> list[str]:
+    """The same command, kept from arming anything and from working for minutes."""
+    words = shlex.split(line)
+    match words[:2]:
+        case ["perchctl", "fly"] if "--dry-run" not in words:
+            words.append("--dry-run")
+        case ["perchctl", "simulate"]:
+            words += ["-p", "quick.yaml"]
+            for option in ("-n", "--only"):
+                if option in words:
+                    words[words.index(option) + 1] = "1"
+        case ["perchctl", "fit-weights"] if "--collect" in words:
+            words += ["--positions", "3", "--frames", "10"]
+        case ["perchctl", "track"]:  # without a camera
+            words = ["video:flight.mp4" if word == "camera:0" else word for word in words]
+        case ["python", "docs/tables.py"]:
+            words.append("--check")
+        case ["python", "docs/pictures/make.py"]:
+            words += ["--into", ".", "--log", "short.jsonl"]
+            words += ["--only", "strip.png", "flight.png", "panel.svg"]
+        case ["python", script] if script.startswith("benchmarks/"):
+            words.append("--help")
+    return words
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the commands name: pictures, a video and its calibration, profiles."""
+    folder = tmp_path_factory.mktemp("place")
+    make_recording(folder)
+    render_folder(folder / "board", load_calibration(folder / "camera.yaml"), CHARUCO, 8, seed=1)
+    write_session(known(positions=4, per=20), folder / "session.csv")
+    (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
+    (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")
+    shutil.copyfile(ROOT / "profiles" / "crazyflie.yaml", folder / "my_vehicle.yaml")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def short_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a whole flight."""
+    path = tmp_path_factory.mktemp("flown") / "short.jsonl"
+    fly_lockstep(short_profile(), SEED, path)
+    return path
+
+
+def run_python(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """`python SCRIPT ...` or `python -m MODULE ...`, in this process."""
+    script = ROOT / words[1]
+    monkeypatch.setattr(sys, "path", [str(script.parent), *sys.path])
+    monkeypatch.setattr(sys, "argv", words[1:])
+    code: Any = 0
+    try:
+        if words[1] == "-m":
+            monkeypatch.delitem(sys.modules, words[2], raising=False)
+            runpy.run_module(words[2], run_name="__main__")
+        else:
+            runpy.run_path(str(script), run_name="__main__")
+    except SystemExit as end:
+        code = end.code
+    finally:
+        sys.modules.pop("common", None)  # of benchmarks/
+    assert not code
+
+
+ONCE = {tuple(cheap(line)): line for line in command_lines() if not line.startswith(TOOLS)}
+"""Lines that come to the same command are run once."""
+
+
+@pytest.mark.parametrize("line", ONCE.values())
+def test_every_command_line_runs(
+    line: str,
+    tmp_path: Path,
+    place: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    request: pytest.FixtureRequest,
+) -> None:
+    words = cheap(line)
+    shutil.copytree(place, tmp_path, dirs_exist_ok=True)
+    if "--collect" in words:
+        (tmp_path / "session.csv").unlink()
+    if "short.jsonl" in words:
+        shutil.copyfile(request.getfixturevalue("short_log"), tmp_path / "short.jsonl")
+    before = set(tmp_path.rglob("*"))
+    monkeypatch.chdir(tmp_path)
+    if words[0] == "python":
+        run_python(words, monkeypatch)
+        said = capsys.readouterr().out
+    else:
+        result = CliRunner().invoke(app, words[1:])
+        assert result.exit_code == 0, result.output
+        said = result.stdout + "".join(re.findall(r"http://127\.0\.0\.1:\d+", result.stderr))
+    assert said.strip() or set(tmp_path.rglob("*")) > before or "--check" in words
+
+
+def test_there_are_commands_to_run() -> None:
+    lines = command_lines()
+    assert len(lines) > 20
+    assert {line.split()[0] for line in lines} <= {"perchctl", "python", "pytest", "ruff", "mypy"}
+
+
+# --- examples -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def notebook(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One folder for all examples: the last reads what the one before it has flown."""
+    return Path(shutil.copytree(place, tmp_path_factory.mktemp("notebook") / "place"))
+
+
+@pytest.mark.parametrize("number", range(len(blocks(TEXT[DOCS / "python.md"], "python"))))
+def test_every_example_runs(
+    number: int,
+    notebook: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    source = blocks(TEXT[DOCS / "python.md"], "python")[number]
+    assert len(source.strip().splitlines()) <= 10
+    if "import pandas" in source:
+        pytest.importorskip("pandas", reason="the example needs pandas (in the extra [dev])")
+    monkeypatch.chdir(notebook)
+    quick = source.replace('load_profile("sim"), seed', 'load_profile("quick.yaml"), seed')
+    exec(compile(quick, f"docs/python.md, example {number + 1}", "exec"), {})
+    assert capsys.readouterr().out.strip()
+
+
+def test_every_public_name_is_explained() -> None:
+    import perchctl
+
+    page = TEXT[DOCS / "python.md"]
+    for name in getattr(perchctl, "__all__", ()):
+        assert name.startswith("__") or f"| `{name}" in page, name
+
+
+# --- tables ---------------------------------------------------------------------------
+
+
+@cache
+def tables() -> dict[str, Any]:
+    return runpy.run_path(str(DOCS / "tables.py"))
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_tables_are_the_code_s(path: Path) -> None:
+    """`python docs/tables.py` writes them."""
+    assert tables()["filled"](TEXT[path]) == TEXT[path]
+
+
+def test_every_table_is_on_a_page() -> None:
+    everything = "".join(TEXT.values())
+    assert [n for n in tables()["PARTS"] if f"<!-- begin {n} -->" not in everything] == []
+
+
+def test_every_profile_key_has_its_meaning() -> None:
+    keys = {key.path for key in tables()["keys"](Profile())}
+    assert keys == set(tables()["MEANINGS"])
+
+
+def test_a_changed_table_is_seen() -> None:
+    page = TEXT[DOCS / "architecture.md"]
+    assert tables()["filled"](page.replace("| 1 | operator-stop |", "| 1 | operator |")) == page
+
+
+def test_every_shipped_profile_is_described() -> None:
+    for path in (ROOT / "profiles").glob("*.yaml"):
+        assert f"| `{path.stem}` |" in TEXT[DOCS / "profiles.md"]
+
+
+def test_the_extended_profile_loads(tmp_path: Path) -> None:
+    (example,) = blocks(TEXT[DOCS / "profiles.md"], "yaml")
+    (tmp_path / "mine.yaml").write_text(example, encoding="utf-8")
+    assert load_profile(str(tmp_path / "mine.yaml")).simulation.camera_drop_rate == 0.33
+
+
+def test_every_command_is_in_the_readme() -> None:
+    command: Any = typer.main.get_command(app)
+    for name in command.commands:
+        assert f"| `perchctl {name}` |" in README
+
+
+def test_every_room_is_described() -> None:
+    page = TEXT[DOCS / "architecture.md"]
+    for path in sorted((ROOT / "perchctl").iterdir()):
+        holds = [f for f in path.rglob("*.py") if f.name != "__init__.py"]
+        if (holds or path.suffix == ".py") and path.name != "__main__.py":
+            names = (path.name, path.stem)
+            assert any(f"| `perchctl/{name}` |" in page for name in names), path.name
+
+
+# --- what the pages name --------------------------------------------------------------
+
+LINK = re.compile(r"\[([^\]]*)\]\(([^)\s]+)\)")
+
+
+def slug(heading: str) -> str:
+    """A heading's anchor, as GitHub makes it."""
+    plain = re.sub(r"[^\w\- ]", "", heading.strip().lower())
+    return plain.replace(" ", "-")
+
+
+def headings(page: str) -> list[str]:
+    return re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```", "", page, flags=re.M | re.S), re.M)
+
+
+def source_of(path: Path) -> str:
+    files = sorted(path.rglob("*.py")) if path.is_dir() else [path]
+    return "\n".join(file.read_text(encoding="utf-8") for file in files)
+
+
+def broken_links(path: Path, page: str) -> list[str]:
+    """Links that lead nowhere; and those to code that no longer holds what they name."""
+    broken = []
+    for text, goal in LINK.findall(page):
+        if re.match(r"https?://", goal):
+            continue
+        file, _, anchor = goal.partition("#")
+        there = (path.parent / file).resolve() if file else path
+        if not there.exists():
+            broken.append(f"{goal} does not exist")
+        elif anchor and anchor not in map(slug, headings(there.read_text(encoding="utf-8"))):
+            broken.append(f"{goal}: no such heading")
+        elif there.suffix == ".py" or (there.is_dir() and ROOT / "perchctl" in there.parents):
+            names = [n for n in re.findall(r"`([^`]+)`", text) if re.fullmatch(r"[\w-]+", n)]
+            broken += [f"{goal} has no {n}" for n in names if n not in source_of(there)]
+    return broken
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(path: Path) -> None:
+    assert broken_links(path, TEXT[path]) == []
+
+
+def test_a_broken_link_is_seen() -> None:
+    page = (
+        "[a](nowhere.md) [b](faults.md#not-there) [`no_such_name`](../perchctl/geometry.py) "
+        "[`wrap_rad`](../perchctl/geometry.py) [c](faults.md#the-table)"
+    )
+    assert len(broken_links(DOCS / "x.md", page)) == 3
+
+
+def test_every_page_is_in_the_index() -> None:
+    for path in DOCS.glob("*.md"):
+        assert path.name == "README.md" or f"]({path.name})" in TEXT[DOCS / "README.md"]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_named_keys_are_the_schema_s(path: Path) -> None:
+    if path.name == "CHANGELOG.md":
+        return  # it names what is no more
+    keys = {key.path for key in tables()["keys"](Profile())}
+    sections = {".".join(k.split(".")[:n]) for k in keys for n in range(1, k.count(".") + 1)}
+    others = {"planner.py", "log.column", "pose.py"}
+    for name in re.findall(r"`([a-z]+(?:\.[a-z_0-9]+)+)(?:: [\w-]+)?`", TEXT[path]):
+        if name.split(".")[0] in Profile.model_fields and name not in others:
+            assert name in keys | sections, name
+
+
+def test_faults_have_their_numbers() -> None:
+    numbers = [int(n) for n in re.findall(r"^\| (\d+) \|", FAULTS, re.MULTILINE)]
+    assert numbers == list(range(1, 47))
+
+
+def test_what_is_missing_is_explained() -> None:
+    rows = re.findall(r"^\| (\d+) \|.*\| (yes|partly|no) \|$", FAULTS, re.MULTILINE)
+    assert len(rows) == 46
+    missing = {number for number, done in rows if done != "yes"}
+    told = re.findall(r"^- \*\*([\d, ]+)\*\*", FAULTS, re.MULTILINE)
+    assert {number for group in told for number in group.split(", ")} == missing
+
+
+def test_rows_that_the_faults_name_are_in_the_table() -> None:
+    rows = {row.name for row in TABLE}
+    named = re.findall(r"\brows? ((?:`[\w-]+`(?:, )?)+)", FAULTS)
+    assert len(named) > 20
+    assert {name for group in named for name in re.findall(r"`([\w-]+)`", group)} <= rows
+
+
+def test_what_code_cites_is_there() -> None:
+    """``docs/firmware.md, "Silence"`` names a heading, ``fault 33`` a fault."""
+    for folder in ("perchctl", "tests", "benchmarks"):
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            if file == Path(__file__):
+                continue
+            source = re.sub(r"\s+(?:# )?", " ", file.read_text(encoding="utf-8"))
+            for page, name in re.findall(r'docs/(\w+\.md), "([^"]+)"', source):
+                assert name in headings(TEXT[DOCS / page]), f"{file}: {page}, {name}"
+            for number in re.findall(r"\bfault (\d+)", source):
+                assert 1 <= int(number) <= 46, file
+
+
+# --- form -----------------------------------------------------------------------------
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= MOST_LINES
+
+
+def test_set_up_is_two_commands() -> None:
+    """`.ci/run` takes them from here."""
+    found = blocks(README, "sh")
+    assert [len(block.strip().splitlines()) for block in found] == [1, 1]
+    assert found[0].strip().endswith("perchctl fly")
+    assert found[1].strip().endswith("pytest")
+
+
+def test_pictures_are_small_made_by_the_command_and_shown() -> None:
+    files = [p for p in (DOCS / "pictures").iterdir() if p.suffix in (".png", ".svg")]
+    made = runpy.run_path(str(DOCS / "pictures" / "make.py"))["PICTURES"]
+    assert {p.name for p in files} == set(made)
+    assert sum(p.stat().st_size for p in files) <= MOST_PICTURE_BYTES
+    everything = "".join(TEXT.values())
+    assert [p.name for p in files if f"pictures/{p.name})" not in everything] == []
+
+
+def test_a_log_s_first_line_explains_its_fields(short_log: Path) -> None:
+    """As the page of the log says."""
+    header = decode(short_log.read_bytes().splitlines()[0])
+    assert {"profile", "fields", "seed"} <= set(header)
