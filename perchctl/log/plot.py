@@ -102,9 +102,11 @@ def _plot_errors(ax: Axes, log: FlightLog, t_s: Array) -> None:
 def _plot_raw_and_filtered(
     ax: Axes, log: FlightLog, t_s: Array, key: str, scale: float, label: str
 ) -> None:
+    # A frame is some 100 ms old when it is measured; the estimate is carried to the present.
+    frame_s = log.column("frame_t_s") - log.start_s
     for source, colour, marker in (("j", GREEN, "s"), ("l", SKY, "o"), ("s", ORANGE, "^")):
         raw = scale * log.column(f"{source}{key}")
-        ax.plot(t_s, raw, linestyle="none", marker=marker, markersize=3, color=colour)
+        ax.plot(frame_s, raw, linestyle="none", marker=marker, markersize=3, color=colour)
     filtered = _while_tracked(log, log.column(f"e{key}"))
     if key.startswith("yaw"):
         filtered = _unbroken(filtered)
