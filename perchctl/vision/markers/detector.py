@@ -41,17 +41,15 @@ _LOOSE_THRESHOLDS = Thresholds(15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """What `detect` needs, made once by `make_detector`.
+    """What `detect` needs, made once by `make_detector`; nothing in it changes later.
 
-    `loose` takes nearly any quadrilateral for a candidate; `mirror_index` is the mirror
-    image's place in the small marker's dictionary (None where it could be confused with
-    the marker itself), `patterns` how each marker looks, `ratio` the small marker's side over the
+    `dictionaries` are the large and the small marker's; `mirror_index` is the mirror
+    image's place in the small marker's (None where it could be confused with the marker
+    itself), `patterns` how each marker looks, `ratio` the small marker's side over the
     large one's; the rest is the profile's.
     """
 
-    detector: Any
-    loose: Any
-    parameters: Any
+    dictionaries: tuple[Any, Any]
     mirror_index: int | None
     patterns: dict[MarkerName, Pattern]
     ratio: float
@@ -75,18 +73,11 @@ def make_detector(config: DetectorConfig, target: TargetConfig) -> DetectorSetup
         mirror_index = len(small_patterns)
         small_patterns.append(mirror)
     ratio = target.small.side_m / target.large.side_m
-    dictionaries = [
-        _dictionary([large_bits], config.correction_bits_large),
-        _dictionary(small_patterns, config.correction_bits_small),
-    ]
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
-    parameters.minDistanceToBorder = 0
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     return DetectorSetup(
-        detector=cv2.aruco.ArucoDetector(dictionaries, parameters),
-        loose=cv2.aruco.ArucoDetector(dictionaries, _loose()),
-        parameters=parameters,
+        dictionaries=(
+            _dictionary([large_bits], config.correction_bits_large),
+            _dictionary(small_patterns, config.correction_bits_small),
+        ),
         mirror_index=mirror_index,
         patterns={
             "large": pattern_of(
@@ -103,22 +94,21 @@ def make_detector(config: DetectorConfig, target: TargetConfig) -> DetectorSetup
 
 
 def strict_detector(setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds) -> Any:
-    """OpenCV's detector for one pass over a picture of that size."""
-    parameters = setup.parameters
+    """OpenCV's detector for one pass over a picture of that size. Making one takes about a
+    microsecond, a pass a thousand times as long."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
+    parameters.minDistanceToBorder = 0
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.adaptiveThreshWinSizeMin = thresholds.least_px
     parameters.adaptiveThreshWinSizeMax = thresholds.most_px
     parameters.minMarkerPerimeterRate = min(1.0, _MIN_PERIMETER_PX / max(size_px))
-    setup.detector.setDetectorParameters(parameters)
-    return setup.detector
+    return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
 
 
 def loose_detector(setup: DetectorSetup) -> Any:
-    """One that takes nearly any quadrilateral for a candidate, for blurred pictures."""
-    return setup.loose
-
-
-def _loose() -> Any:
-    """Round corners, wide dark borders, small sides."""
+    """One that takes nearly any quadrilateral for a candidate, for blurred pictures: round
+    corners, wide dark borders, small sides."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.minDistanceToBorder = 0
     parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
@@ -126,7 +116,7 @@ def _loose() -> Any:
     parameters.adaptiveThreshWinSizeMax = _LOOSE_THRESHOLDS.most_px
     parameters.adaptiveThreshWinSizeStep = _LOOSE_THRESHOLDS.most_px - _LOOSE_THRESHOLDS.least_px
     parameters.minMarkerPerimeterRate = _LOOSE_PERIMETER_RATE
-    return parameters
+    return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
 
 
 def _rim(bits: NDArray[np.uint8], side_m: float) -> Rim:
