@@ -23,8 +23,8 @@ from common import (
 )
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.corners import side_lengths_px
 from perchctl.vision.markers.detect import detect
+from perchctl.vision.markers.square import side_lengths_px
 from perchctl.vision.types import MARKERS, Detection, Detections, Frame
 
 SIDES_PX = (

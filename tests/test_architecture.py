@@ -61,8 +61,6 @@ MOST_LINES_OF_A_FILE = 350
 MOST_LINES_OF_A_FUNCTION = 60
 TO_BE_SPLIT = (
     "calibration.solve", "cli", "commands.calibrate", "commands.track", "link.cflib_link",
-    "vision.markers.align",
-    "vision.markers.corners", "vision.markers.edges", "vision.pose",
 )  # fmt: skip
 LONG = "# long: "
 """Stands, with the reason, on the line above a function that is longer."""

@@ -1,4 +1,4 @@
-"""From pixels to rays and back: the only place that knows the lens.
+"""From pixels to rays and back: the only place with a model of the lens.
 
 Corners are undistorted, never pictures: undistorting the frame first loses
 markers at its rim and blurs the rest.

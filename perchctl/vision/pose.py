@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -21,21 +22,22 @@ from perchctl.geometry import R_MARKER_TARGET, Array, rotation_from_rpy, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.solve import (
+    Candidate,
+    Points,
     Scored,
+    TiltPrior,
     covariance,
     flat,
     gauss_newton,
     make_points,
     mirror_solution,
-    rms,
     solve,
-    tilt_rad,
 )
 from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerName, MarkerPose
 
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
-
+_Source = Literal["large", "small", "joint"]
 
 __all__ = [
     "PoseSetup",
@@ -108,6 +110,26 @@ def estimate_pose(
     None where the corners give no pose: no finite solution in front of the camera, or
     a reprojection error (RMS over the corners) above `pose.max_reprojection_px`.
     """
+    points = _points(detections, setup)
+    if points is None:
+        return None
+    R_level_body = level_rotation(attitude)
+    if attitude is not None:
+        R_level_cam = R_level_body @ setup.T_body_cam[:3, :3]
+        prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_RAD)
+    else:
+        prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_RAD)
+    solution = _continued(points, start, prior, setup.config) or _solved(
+        points, prior, setup.config
+    )
+    if solution is None:
+        return None
+    source = "joint" if len(detections) > 1 else detections[0].marker
+    return _level_pose(source, t_s, solution, points, R_level_body, setup)
+
+
+def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
+    """The corners through a pinhole, None where the lens cannot have imaged them."""
     if len(detections) > 1:
         object_m = np.concatenate([setup.object_points[d.marker] for d in detections])
         raw_px = np.concatenate([d.corners_px for d in detections])
@@ -116,36 +138,48 @@ def estimate_pose(
     image_px = undistort_px(raw_px, setup.camera)
     if not np.isfinite(image_px).all():
         return None
-    R_level_body = level_rotation(attitude)
-    R_level_cam = R_level_body @ setup.T_body_cam[:3, :3]
-    if attitude is not None:
-        expected_cam: Array | None = -R_level_cam[2]
-        spread_rad = _ATTITUDE_TILT_RAD
-    else:
-        expected_cam, spread_rad = previous_normal_cam, _PREVIOUS_TILT_RAD
-    config = setup.config
-    points = make_points(detections, object_m, image_px, setup.camera.K)
-    solution = None
-    if start is not None and config.refine:
-        solution = gauss_newton(points, (start.rvec_rad, start.tvec_m))
-        if solution is not None and (
-            not _fits(solution, config.max_reprojection_px)
-            or (expected_cam is not None and tilt_rad(solution[0], expected_cam) > spread_rad)
-        ):
-            solution = None
-    if solution is None:
-        solution = solve(points, config.solver, config.refine, expected_cam, spread_rad)
-    if not _fits(solution, config.max_reprojection_px) and config.solver != "sqpnp":
-        # EPnP and IPPE fail on exactly frontal views, which is where hovering happens.
-        solution = solve(points, "sqpnp", config.refine, expected_cam, spread_rad)
-    if solution is None or not _fits(solution, config.max_reprojection_px):
+    return make_points(detections, object_m, image_px, setup.camera.K)
+
+
+def _continued(
+    points: Points, start: MarkerPose | None, prior: TiltPrior, config: PoseConfig
+) -> Scored | None:
+    """The solution next to a start, None where there is none that fits."""
+    if start is None or not config.refine:
         return None
-    rvec, tvec, error_px, _ = solution
+    solution = gauss_newton(points, Candidate(start.rvec_rad, start.tvec_m))
+    if solution is None or not _fits(solution, config) or prior.contradicts(solution):
+        return None
+    return solution
+
+
+def _solved(points: Points, prior: TiltPrior, config: PoseConfig) -> Scored | None:
+    """The solution without a start, None where none fits."""
+    solution = solve(points, config.solver, config.refine, prior)
+    if not _fits(solution, config) and config.solver != "sqpnp":
+        # EPnP and IPPE fail on exactly frontal views, which is where hovering happens.
+        solution = solve(points, "sqpnp", config.refine, prior)
+    return solution if _fits(solution, config) else None
+
+
+def _fits(solution: Scored | None, config: PoseConfig) -> bool:
+    return solution is not None and solution.rms_px <= config.max_reprojection_px
+
+
+def _level_pose(
+    source: _Source,
+    t_s: float,
+    solution: Scored,
+    points: Points,
+    R_level_body: Array,
+    setup: PoseSetup,
+) -> MarkerPose:
+    """The solution, relative to the gear in the level frame, with its covariance there."""
+    R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
+    R_level_cam = R_level_body @ R_body_cam
     cov, chi2 = covariance(points, solution)
-    R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(rvec))
-    e_m = R_level_body @ (
-        setup.T_body_cam[:3, :3] @ tvec + setup.T_body_cam[:3, 3] - setup.gear_body_m
-    )
+    R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
+    e_m = R_level_body @ (R_body_cam @ solution.tvec + t_body_cam_m - setup.gear_body_m)
     heading = R_level_cam @ R @ R_MARKER_TARGET
     G = np.zeros((4, 6))  # change of (e, e_yaw) with (rvec, tvec)
     G[:3, 3:] = R_level_cam
@@ -153,22 +187,18 @@ def estimate_pose(
     cov_e = G @ cov @ G.T
     variance = np.maximum(np.diagonal(cov_e), 0.0)
     return MarkerPose(
-        source="joint" if len(detections) > 1 else detections[0].marker,
+        source=source,
         t_s=t_s,
-        rvec_rad=rvec,
-        tvec_m=tvec,
+        rvec_rad=solution.rvec,
+        tvec_m=solution.tvec,
         e_m=e_m,
         e_yaw_rad=yaw_of(heading),
         sigma_m=np.sqrt(variance[:3]),
         sigma_yaw_rad=math.sqrt(variance[3]),
-        reprojection_px=rms(error_px),
+        reprojection_px=solution.rms_px,
         chi2=chi2,
         cov=cov_e,
     )
-
-
-def _fits(solution: Scored | None, max_reprojection_px: float) -> bool:
-    return solution is not None and rms(solution[2]) <= max_reprojection_px
 
 
 def rotation_matrix(rvec: Array) -> Array:

@@ -16,8 +16,12 @@ from perchctl.vision.types import MARKERS, Attitude, MarkerName, MarkerPose, Sig
 def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
 ) -> tuple[dict[MarkerName, Array] | None, MarkerPose | None]:
-    """Where both markers' corners should be: the last sight of the target, moved by the
-    vehicle's own motion since; and that pose. None without an attitude at both times."""
+    """Where both markers' corners should be, (4, 2) px each: the last sighting of the target,
+    moved by the vehicle's own motion since; and that pose.
+
+    Without an attitude at both times there are no corners and the pose is unmoved. Both
+    are None where the sighting is too old or the target has gone behind the camera.
+    """
     if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude

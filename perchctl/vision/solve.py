@@ -24,8 +24,6 @@ from perchctl.geometry import Array
 from perchctl.vision.types import Detection
 
 Solver = Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
-Candidate = tuple[Array, Array]  # rvec, tvec
-Scored = tuple[Array, Array, Array, Array]  # and errors (n, 2), Jacobian (2n, 6)
 
 _FLAGS = {
     "sqpnp": cv2.SOLVEPNP_SQPNP,
@@ -35,9 +33,52 @@ _FLAGS = {
     "ippe_square": cv2.SOLVEPNP_IPPE_SQUARE,
 }
 _MIN_FLIP_RAD = math.radians(2.0)  # closer solutions are one
-_MIN_SCORE_SIGMA_PX = 0.05  # lens and print set a floor to what residuals can tell
+_MIN_SCORE_SIGMA_PX = 0.05  # lens and print set a floor to what residuals can show
 _MAX_STEPS = 8
 _TRUST = 8.0  # degrees of freedom that the claimed spread is worth beside the residuals
+
+_BEFORE = np.array([3, 0, 1, 2])
+_START = np.arange(4)  # side k runs from corner k ...
+_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
+_ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
+_COLUMNS = np.concatenate([2 * _START, 2 * _START + 1, 2 * _END, 2 * _END + 1] * 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """rvec (3,) rad and tvec (3,) m of the marker in the camera."""
+
+    rvec: Array
+    tvec: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Scored(Candidate):
+    """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6) with (rvec,
+    tvec)."""
+
+    error_px: Array
+    jacobian: Array
+
+    @property
+    def rms_px(self) -> float:
+        """Over the corners."""
+        return math.sqrt(float((self.error_px * self.error_px).sum()) / len(self.error_px))
+
+
+@dataclass(frozen=True, eq=False)
+class TiltPrior:
+    """The marker's normal (3,) as far as it is known, camera axes, to `spread_rad`."""
+
+    normal_cam: Array | None
+    spread_rad: float
+
+    def contradicts(self, candidate: Candidate) -> bool:
+        """Whether it is known and further away than its spread."""
+        return (
+            self.normal_cam is not None
+            and tilt_rad(candidate.rvec, self.normal_cam) > self.spread_rad
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +119,6 @@ def make_points(
     return Points(object_m, image_px, sigma_px, W, W @ shift, K)
 
 
-_BEFORE = [3, 0, 1, 2]
-_START = np.arange(4)  # side k runs from corner k ...
-_END = np.array([1, 2, 3, 0])  # ... to corner k + 1
-
-
 def _outward_normals(corners: Array) -> tuple[Array, Array]:
     """Unit normals of the four sides, out of the square whichever way round it is."""
     side = corners[_END] - corners
@@ -101,21 +137,9 @@ def _line_whitening(nx: Array, ny: Array, sigma_px: float) -> Array:
     return W
 
 
-_ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
-_COLUMNS = np.concatenate([2 * _START, 2 * _START + 1, 2 * _END, 2 * _END + 1] * 2)
-
-
-def solve(
-    points: Points,
-    solver: Solver,
-    refine: bool,
-    expected_cam: Array | None,
-    spread_rad: float,
-) -> Scored | None:
+def solve(points: Points, solver: Solver, refine: bool, prior: TiltPrior) -> Scored | None:
     """The better of both tilts, None without a finite one in front of the camera, or where
     a solver other than ``sqpnp`` gives a start from which nothing settles.
-
-    `expected_cam` (3,) is the marker's normal as far as it is known, to `spread_rad`.
     """
     candidates = _closed_form(points, solver)
     if refine:
@@ -123,34 +147,26 @@ def solve(
     scored = [_scored(c, points) for c in candidates if _usable(c)]
     if not scored:
         return None
-
-    def cost(s: Scored) -> float:
-        return _cost(s, points.sigma_px, expected_cam, spread_rad)
-
-    best = min(scored, key=cost) if len(scored) > 1 else scored[0]
-    if refine and (expected_cam is None or tilt_rad(best[0], expected_cam) > spread_rad):
-        other = mirror_solution(best[0], best[1])
-        turned = None if other is None else _refined(points, (other, best[1]))
-        if turned is not None and _usable(turned):
-            best = min(best, _scored(turned, points), key=cost)
-    if refine:
-        # The unweighted optimum is near enough for errors to be linear; where they are not,
-        # a weaker solver than SQPnP has led astray.
-        settled = gauss_newton(points, (best[0], best[1]))
-        if settled is None and solver != "sqpnp":
-            return None
-        best = settled or best
-    return best
+    best = _likeliest(scored, points, prior)
+    if not refine:
+        return best
+    if prior.normal_cam is None or prior.contradicts(best):
+        best = _likeliest([best, *_other_tilt(best, points)], points, prior)
+    # The unweighted optimum is near enough for errors to be linear; where they are not,
+    # a weaker solver than SQPnP has led astray.
+    settled = gauss_newton(points, best)
+    return best if settled is None and solver == "sqpnp" else settled
 
 
 def gauss_newton(points: Points, start: Candidate) -> Scored | None:
     """Gauss-Newton with each corner's own spread, from a start that is near (the frame
     before); None where it does not settle within some steps."""
-    candidate, before = start, math.inf
+    candidate: Candidate = start
+    before = math.inf
     W = points.whitening
     for _ in range(_MAX_STEPS):
         scored = _scored(candidate, points)
-        A, error = W @ scored[3], W @ scored[2].ravel()
+        A, error = W @ scored.jacobian, W @ scored.error_px.ravel()
         cost = float(error @ error)
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
             return None
@@ -162,7 +178,7 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
         # What the step would still gain, in squared standard deviations.
         if float(step @ g) < 1e-4 + 1e-6 * cost:
             return scored
-        candidate, before = (candidate[0] - step[:3], candidate[1] - step[3:]), cost
+        candidate, before = Candidate(candidate.rvec - step[:3], candidate.tvec - step[3:]), cost
         if not _usable(candidate):
             return None
     return None
@@ -170,9 +186,9 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
 
 def covariance(points: Points, scored: Scored) -> tuple[Array, float]:
     """Of (rvec, tvec), (6, 6), and the squared error per degree of freedom: the inverse
-    information, grown as far as the residuals say that the corners spread more than
+    information, grown as far as the residuals show that the corners spread more than
     they claim, and what the common shift does to the pose."""
-    A, error = points.whitening @ scored[3], points.whitening @ scored[2].ravel()
+    A, error = points.whitening @ scored.jacobian, points.whitening @ scored.error_px.ravel()
     freedom = len(error) - 6
     try:
         inverse = np.linalg.inv(A.T @ A)
@@ -208,10 +224,6 @@ def flat(values: Any) -> Array:
     return np.asarray(values, dtype=np.float64).ravel()
 
 
-def rms(error_px: Array) -> float:
-    return math.sqrt(float((error_px * error_px).sum()) / len(error_px))
-
-
 def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     """Angle between the marker's normal and the expected one."""
     normal = cv2.Rodrigues(rvec)[0][:, 2]
@@ -227,35 +239,50 @@ def _closed_form(points: Points, solver: Solver) -> list[Candidate]:
         )
     except cv2.error:
         return []  # degenerate corners: all on one line, or on one point
-    pairs = [(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
-    return [pair for pair in pairs if _usable(pair)]
+    candidates = [Candidate(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
+    return [candidate for candidate in candidates if _usable(candidate)]
 
 
 def _usable(candidate: Candidate) -> bool:
-    rvec, tvec = candidate
+    rvec, tvec = candidate.rvec, candidate.tvec
     return bool(np.isfinite(rvec).all() and np.isfinite(tvec).all() and tvec[2] > 0.0)
 
 
 def _refined(points: Points, start: Candidate) -> Candidate:
-    rvec, tvec = start[0].reshape(3, 1).copy(), start[1].reshape(3, 1).copy()
+    first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
-        moved = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, rvec, tvec)
+        rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
     except cv2.error:
         return start
-    return flat(moved[0]), flat(moved[1])
+    return Candidate(flat(rvec), flat(tvec))
 
 
 def _scored(candidate: Candidate, points: Points) -> Scored:
-    rvec, tvec = candidate
+    rvec, tvec = candidate.rvec, candidate.tvec
     projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
     error: Array = projected.reshape(-1, 2) - points.image_px
-    return rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64)
+    return Scored(rvec, tvec, error, np.asarray(jacobian[:, :6], dtype=np.float64))
 
 
-def _cost(scored: Scored, sigma_px: Array, expected_cam: Array | None, spread_rad: float) -> float:
-    rvec, _, error_px, _ = scored
-    sigma = np.maximum(sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
-    cost = float(((error_px / sigma) ** 2).sum())
-    if expected_cam is not None:
-        cost += (tilt_rad(rvec, expected_cam) / spread_rad) ** 2
-    return cost
+def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
+    """The best candidate near the mirror solution, if there is one."""
+    rvec = mirror_solution(scored.rvec, scored.tvec)
+    if rvec is None:
+        return []
+    turned = _refined(points, Candidate(rvec, scored.tvec))
+    return [_scored(turned, points)] if _usable(turned) else []
+
+
+def _likeliest(scored: list[Scored], points: Points, prior: TiltPrior) -> Scored:
+    """By the squared errors of corners and tilt, in units of their spread."""
+    if len(scored) == 1:
+        return scored[0]
+    sigma = np.maximum(points.sigma_px, _MIN_SCORE_SIGMA_PX)[:, None]
+
+    def cost(s: Scored) -> float:
+        total = float(((s.error_px / sigma) ** 2).sum())
+        if prior.normal_cam is not None:
+            total += (tilt_rad(s.rvec, prior.normal_cam) / prior.spread_rad) ** 2
+        return total
+
+    return min(scored, key=cost)

@@ -1,36 +1,40 @@
-"""A marker's drawing laid over the picture: for what edges and bits no longer tell.
+"""A marker's drawing laid over the picture: for what edges and bits no longer show.
 
 Where blur has run the cells together, or cells are a few pixels wide, the picture of
 the whole marker still is its drawing, blurred and lit. Gauss-Newton finds the
-homography together with the light (offset, gain, its slope over the marker), the blur,
-and the bend of the tone curve (clipped white, gamma): all of them shift edges if left
-out. What does not look like the drawing then, cell by cell, is not the marker.
+homography together with the light (`perchctl.vision.markers.light`) and the blur. What
+does not look like the drawing then, cell by cell, is not the marker.
 
-Coordinates: the marker's own, its corners at (-1, -1), (1, -1), (1, 1), (-1, 1) in the
-order of `Detection.corners_px`.
+The increment p of the homography H in a round is H (1 + P), with P's terms in the order
+of its rows and its last one 0. Coordinates are the marker's own, see
+`perchctl.vision.markers.square`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import distort, undistort_px
-from perchctl.vision.markers.drawing import (
-    Drawing,
-    Rendering,
-    beyond_sheet,
-    blurred,
-    drawn,
-    gram,
-    mixed,
-    pattern_seen,
+from perchctl.vision.camera_model import undistort_px
+from perchctl.vision.markers.drawing import Drawing, Rendering, beyond_sheet, blurred, drawn
+from perchctl.vision.markers.grid import (
+    Grid,
+    Patch,
+    lens_shift_px,
+    make_grid,
+    patch_around,
+    projected,
+    read,
+    through_lens,
 )
+from perchctl.vision.markers.light import BEND, Light, fit_light, lit_jacobian
+from perchctl.vision.markers.likeness import likeness, pattern_seen, repeated, worst_cell
+from perchctl.vision.markers.products import gram
+from perchctl.vision.markers.square import UNIT, from_unit
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18
@@ -38,16 +42,16 @@ _GRID_PX = 0.8  # picture pixels from node to node
 _ROUNDS = 12
 _STILL_PX = 0.02
 _LENS_PX = 0.3  # what the lens does is computed anew after this way
+_MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
 # How far shape may leave its start, as standard deviations, per unit of the marker's
-# half side: turns and scales; then the perspective, which a few pixels hardly tell.
+# half side: turns and scales; then the perspective, which a few pixels hardly show.
 _SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
 _BEND_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
 _BLUR_STEP = 0.03  # a smaller change of blur draws nothing anew
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
-_BLUR, _BEND = 8, 15  # columns of the Jacobian: eight of shape, blur, those of light
-_CORNERS: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+_SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # unknowns: the increment, blur, those of light
 _PRIOR: Array = (
     np.array(
         [_SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _SHAPE_SIGMA, _SHAPE_SIGMA, 1e3, _VIEW_SIGMA, _VIEW_SIGMA]
@@ -74,39 +78,50 @@ class Alignment:
     moved_px: float
 
 
-class _Field:
-    """The part of the picture around a marker, read at the nodes of a grid of its own."""
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What stays the same through all rounds: the picture, the nodes at which it is read,
+    the homography to start with and the lens's shift of the nodes through it, and the
+    drawing there without blur, after it perhaps what is beyond its sheet."""
 
-    def __init__(
-        self, image: NDArray[np.uint8], H: Array, n: int, reach: float, camera: CameraModel
-    ) -> None:
-        self.n, self._camera = n, camera
-        self.axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
-        u, v = np.meshgrid(self.axis, self.axis)
-        self.u, self.v = u.ravel(), v.ravel()
-        h, w = image.shape
-        self._low = np.zeros(2, dtype=np.intp)
-        self.look_through_lens(H)
-        seen = _project(H, self.u, self.v) + self._lens
-        self.inside = bool(seen.min() >= -1.0 and (seen <= (w, h)).all())
-        room = 0.15 * float(np.ptp(seen, axis=0).max()) + 3.0
-        low = np.clip(seen.min(axis=0) - room, 0, (w - 2, h - 2)).astype(np.intp)
-        high = np.clip(seen.max(axis=0) + room + 1.0, low + 2, (w, h)).astype(np.intp)
-        self._patch = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-        self._low = low
-        self._lens -= low
+    patch: Patch
+    grid: Grid
+    camera: CameraModel
+    H: Array
+    lens_px: Array
+    sharp: tuple[NDArray[np.float32], ...]
+    side_px: float
+    node_px: float
+    max_blur_px: float
 
-    def look_through_lens(self, H: Array) -> None:
-        """Compute how far the lens moves each node that is seen through H."""
-        pin = _project(H, self.u, self.v)
-        self._lens = distort(_normalised(pin, self._camera), self._camera) - pin - self._low
 
-    def read(self, H: Array) -> Array:
-        """Grey values at the nodes, (n * n,)."""
-        at = (_project(H, self.u, self.v) + self._lens).astype(np.float32)
-        x, y = (np.ascontiguousarray(at[:, k]).reshape(self.n, self.n) for k in (0, 1))
-        grey = cv2.remap(self._patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(grey, dtype=np.float64).ravel()
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The state of the fit: homography to pinhole pixels, the sum of its increments (8,),
+    the offset that the lens makes of it at the nodes and the way since that was computed,
+    the blur with the renderings that have it, and whether it stands still after so many
+    rounds."""
+
+    H: Array
+    total: Array
+    offset_px: Array
+    since_lens_px: float
+    blur_px: float
+    renderings: tuple[Rendering, ...]
+    rounds: int = 0
+    still: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """The light in which a fit looks most like the picture's grey values, what it leaves
+    over, and the normal equations N x = g of the next increment, per unit of noise."""
+
+    grey: Array
+    light: Light
+    error: Array
+    N: Array
+    g: Array
 
 
 def align(
@@ -121,6 +136,28 @@ def align(
     None where the marker leaves the picture, has no contrast, or the fit breaks down.
     """
     start = undistort_px(start_px, camera)
+    scene = _scene(image, start, drawing, camera)
+    if scene is None:
+        return None
+    fit = _first_fit(blur_px, scene)
+    while True:
+        fit = _seen_through_lens(fit, scene)
+        equations = _equations(fit, scene)
+        if equations is None:
+            return None
+        step = _solved(equations)
+        if step is None:
+            return None
+        fit = _stepped(fit, step, scene)
+        if fit.still or fit.rounds == _ROUNDS:
+            # What the last round left over, its step being next to nothing.
+            return _alignment(fit, equations, scene, start_px, drawing)
+
+
+def _scene(
+    image: NDArray[np.uint8], start: Array, drawing: Drawing, camera: CameraModel
+) -> _Scene | None:
+    """None where corners `start` (4, 2), pinhole px, are no marker inside the picture."""
     if not np.isfinite(start).all():
         return None
     sides = np.hypot(*(start - np.roll(start, 1, axis=0)).T)
@@ -128,151 +165,131 @@ def align(
     if float(sides.min()) < _MIN_SIDE_PX or side_px > _MAX_SIDE_PX:
         return None
     n = int(np.clip(math.ceil(reach * side_px / _GRID_PX), _MIN_GRID, _MAX_GRID))
-    node_px = reach * side_px / n
-    H = _homography(start)
-    field = _Field(image, H, n, reach, camera)
-    if not field.inside:
+    grid, H = make_grid(n, reach), from_unit(start)
+    lens_px = lens_shift_px(grid, H, camera)
+    patch = patch_around(image, grid, H, lens_px)
+    if patch is None:
         return None
-    sharp = [drawn(drawing, field.axis, reach / n)]
-    outside = beyond_sheet(drawing, field.axis, reach / n)
-    if outside is not None:
-        sharp.append(outside)
-    largest_px = _MAX_BLUR_CELLS * side_px / len(drawing.cells)
-    blur_px = min(max(blur_px, _MIN_BLUR_PX), largest_px)
-    renderings = [blurred(each, blur_px / node_px, field.axis) for each in sharp]
-    total, since_lens_px = np.zeros(8), 0.0
-    for _ in range(_ROUNDS):
-        if since_lens_px > _LENS_PX:
-            field.look_through_lens(H)
-            since_lens_px = 0.0
-        grey = field.read(H)
-        light, coefficients = _lit(renderings, grey, field)
-        if coefficients[3] < _MIN_GAIN:
-            return None
-        error = grey - mixed(light, coefficients)
-        N, g = _normal(renderings, light, coefficients, error, field)
-        N[range(8), range(8)] += _PRIOR
-        g[:8] -= _PRIOR * total
-        try:
-            step = np.linalg.solve(N, g)
-        except np.linalg.LinAlgError:
-            return None
-        p = step[:8]
-        if not np.isfinite(p).all() or np.abs(p).max() > 0.5:
-            return None
-        total += p
-        H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
-        H /= H[2, 2]
-        moved_px = 0.5 * side_px * float(np.abs(p[:6]).max())
-        since_lens_px += moved_px
-        squared = (blur_px / node_px) ** 2 + float(np.clip(step[_BLUR], -1.0, 1.0))
-        wanted_px = math.sqrt(max(squared, 1e-3)) * node_px
-        wanted_px = min(max(wanted_px, _MIN_BLUR_PX), largest_px)
-        if abs(wanted_px - blur_px) > _BLUR_STEP * blur_px:
-            blur_px = wanted_px
-            renderings = [blurred(each, blur_px / node_px, field.axis) for each in sharp]
-        elif moved_px < _STILL_PX and since_lens_px <= _LENS_PX:
-            break
-    corners = distort(_normalised(_project(H, *_CORNERS.T), camera), camera)
-    # What the last round left over, its step being next to nothing.
-    spread = grey - grey.mean()
-    explained = 1.0 - float((error**2).sum()) / max(float((spread**2).sum()), 1e-9)
-    pattern, strength = pattern_seen(
-        drawing, field.axis, blur_px / node_px, error, light, coefficients
+    paper = drawn(drawing, grid.axis, reach / n)
+    outside = beyond_sheet(drawing, grid.axis, reach / n)
+    return _Scene(
+        patch=patch,
+        grid=grid,
+        camera=camera,
+        H=H,
+        lens_px=lens_px,
+        sharp=(paper,) if outside is None else (paper, outside),
+        side_px=side_px,
+        node_px=reach * side_px / n,
+        max_blur_px=_MAX_BLUR_CELLS * side_px / len(drawing.cells),
     )
-    covariance = np.linalg.inv(N)[:8, :8] * _repeated(error.reshape(n, n))
-    J = _corner_jacobian(H)
-    return Alignment(
-        corners_px=corners,
-        sigma_px=math.sqrt(max(float(np.trace(J @ covariance @ J.T)) / 8.0, 0.0)),
-        likeness=math.sqrt(max(explained, 0.0)),
-        pattern=pattern,
-        strength=strength,
-        worst_cell=_worst_cell(error / coefficients[3], field, len(drawing.cells)),
+
+
+def _first_fit(blur_px: float, scene: _Scene) -> _Fit:
+    blur_px = min(max(blur_px, _MIN_BLUR_PX), scene.max_blur_px)
+    return _Fit(
+        H=scene.H,
+        total=np.zeros(8),
+        offset_px=scene.lens_px - scene.patch.first,
+        since_lens_px=0.0,
         blur_px=blur_px,
-        gain=float(coefficients[3]),
-        moved_px=float(np.abs(corners - start_px).max()),
+        renderings=_rendered(blur_px, scene),
     )
 
 
-def _lit(renderings: list[Rendering], grey: Array, field: _Field) -> tuple[Array, Array]:
-    """The light that explains the grey values best: columns (n * n, 7 or 8) for offset,
-    gain, their slopes, the bend of the tone curve and what is beyond the sheet, and their
-    coefficients."""
-    u, v, white = field.u, field.v, renderings[0].value
-    columns = [np.ones_like(u), u, v, white, white * u, white * v, white * (1.0 - white)]
-    columns += [rendering.value for rendering in renderings[1:]]
-    light: Array = np.stack(columns, axis=1)
-    A = gram(light, light) + 1e-6 * np.eye(len(columns))
-    A[6, 6] += 1e-3 * len(u)  # no bend unless it is seen
-    return light, np.asarray(np.linalg.solve(A, gram(light, grey)[:, 0]), dtype=np.float64)
+def _rendered(blur_px: float, scene: _Scene) -> tuple[Rendering, ...]:
+    sigma = blur_px / scene.node_px
+    return tuple(blurred(each, sigma, scene.grid.axis) for each in scene.sharp)
 
 
-def _normal(
-    renderings: list[Rendering], light: Array, coefficients: Array, error: Array, field: _Field
-) -> tuple[Array, Array]:
-    """Normal equations (16 or 17 unknowns) of shape, blur and light, per unit of noise."""
-    gain = float(coefficients[3])
-    bend = min(max(float(coefficients[6]) / gain, -0.9), 0.9)
-    slope = gain + coefficients[4] * field.u + coefficients[5] * field.v
-    slope = slope * (1.0 + bend * (1.0 - 2.0 * renderings[0].value))
-    change = renderings[0].jacobian * slope[:, None]
-    for rendering, height in zip(renderings[1:], coefficients[7:], strict=True):
-        change += rendering.jacobian * height
-    J = np.concatenate([change, light], axis=1)
+def _seen_through_lens(fit: _Fit, scene: _Scene) -> _Fit:
+    """With the lens computed anew if the fit has moved away from where it was."""
+    if fit.since_lens_px <= _LENS_PX:
+        return fit
+    offset_px = lens_shift_px(scene.grid, fit.H, scene.camera) - scene.patch.first
+    return replace(fit, offset_px=offset_px, since_lens_px=0.0)
+
+
+def _equations(fit: _Fit, scene: _Scene) -> _Equations | None:
+    """None without contrast. 16 or 17 unknowns: shape, blur and light."""
+    grey = read(scene.patch, scene.grid, fit.H, fit.offset_px)
+    light = fit_light(fit.renderings, grey, scene.grid)
+    gain = light.gain
+    if gain < _MIN_GAIN:
+        return None
+    error = grey - light.grey
+    J = np.concatenate([lit_jacobian(fit.renderings, light, scene.grid), light.columns], axis=1)
     noise = max(float((error**2).mean()), 1.0)
     N, g = gram(J, J) / noise, gram(J, error)[:, 0] / noise
+    bend = _LIGHT + BEND
     N[_BLUR, _BLUR] += 1.0  # about a node's width a round
-    N[_BEND, _BEND] += (_BEND_SIGMA * gain) ** -2.0
-    g[_BEND] -= coefficients[6] * (_BEND_SIGMA * gain) ** -2.0
-    N[range(9, len(g)), range(9, len(g))] += 1e-6
-    return N, g
+    N[bend, bend] += (_BEND_SIGMA * gain) ** -2.0
+    g[bend] -= light.coefficients[BEND] * (_BEND_SIGMA * gain) ** -2.0
+    N[range(_LIGHT, len(g)), range(_LIGHT, len(g))] += 1e-6
+    N[range(8), range(8)] += _PRIOR
+    g[_SHAPE] -= _PRIOR * fit.total
+    return _Equations(grey, light, error, N, g)
 
 
-def _homography(corners: Array) -> Array:
-    H = cv2.getPerspectiveTransform(_CORNERS.astype(np.float32), corners.astype(np.float32))
-    return np.asarray(H, dtype=np.float64)
+def _solved(equations: _Equations) -> Array | None:
+    """The step of all unknowns, None where it is not one that can be trusted."""
+    try:
+        step = np.asarray(np.linalg.solve(equations.N, equations.g), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    p = step[_SHAPE]
+    return step if np.isfinite(p).all() and np.abs(p).max() <= _MAX_INCREMENT else None
 
 
-def _project(H: Array, u: Array, v: Array) -> Array:
-    d = H[2, 0] * u + H[2, 1] * v + H[2, 2]
-    x = (H[0, 0] * u + H[0, 1] * v + H[0, 2]) / d
-    y = (H[1, 0] * u + H[1, 1] * v + H[1, 2]) / d
-    return np.stack([x, y], axis=1)
+def _stepped(fit: _Fit, step: Array, scene: _Scene) -> _Fit:
+    """The fit one step on."""
+    p = step[_SHAPE]
+    H = fit.H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
+    H /= H[2, 2]
+    moved_px = 0.5 * scene.side_px * float(np.abs(p[:6]).max())
+    since_lens_px = fit.since_lens_px + moved_px
+    squared = (fit.blur_px / scene.node_px) ** 2 + float(np.clip(step[_BLUR], -1.0, 1.0))
+    wanted_px = math.sqrt(max(squared, 1e-3)) * scene.node_px
+    wanted_px = min(max(wanted_px, _MIN_BLUR_PX), scene.max_blur_px)
+    redraw = abs(wanted_px - fit.blur_px) > _BLUR_STEP * fit.blur_px
+    return replace(
+        fit,
+        H=H,
+        total=fit.total + p,
+        since_lens_px=since_lens_px,
+        blur_px=wanted_px if redraw else fit.blur_px,
+        renderings=_rendered(wanted_px, scene) if redraw else fit.renderings,
+        rounds=fit.rounds + 1,
+        still=not redraw and moved_px < _STILL_PX and since_lens_px <= _LENS_PX,
+    )
 
 
-def _normalised(pin: Array, camera: CameraModel) -> Array:
-    K = camera.K
-    y = (pin[:, 1] - K[1, 2]) / K[1, 1]
-    x = (pin[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    return np.stack([x, y], axis=1)
-
-
-def _repeated(error: Array) -> float:
-    """How many neighbouring nodes tell the same: from the correlation along rows and
-    columns of what is left (nodes closer than a pixel; blur that is not round)."""
-    energy = max(float((error * error).mean()), 1e-9)
-    factor = 1.0
-    for a, b in ((error[1:], error[:-1]), (error[:, 1:], error[:, :-1])):
-        r = min(max(float((a * b).mean()) / energy, 0.0), 0.9)
-        factor *= (1.0 + r) / (1.0 - r)
-    return factor
-
-
-def _worst_cell(error: Array, field: _Field, n_cells: int) -> float:
-    """Largest mean departure over a cell's inner part."""
-    x, y = ((g + 1.0) * 0.5 * n_cells for g in (field.u, field.v))
-    inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
-    index = (y[inside].astype(np.intp)) * n_cells + x[inside].astype(np.intp)
-    total = np.bincount(index, weights=error[inside], minlength=n_cells**2)
-    count = np.bincount(index, minlength=n_cells**2)
-    return float(np.abs(total / np.maximum(count, 1)).max())
+def _alignment(
+    fit: _Fit, equations: _Equations, scene: _Scene, start_px: Array, drawing: Drawing
+) -> Alignment:
+    grid, light, error = scene.grid, equations.light, equations.error
+    corners_px = through_lens(projected(fit.H, *UNIT.T), scene.camera)
+    pattern = pattern_seen(drawing, grid, fit.blur_px / scene.node_px, light, error)
+    covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE]
+    covariance = covariance * repeated(error.reshape(grid.n, grid.n))
+    J = _corner_jacobian(fit.H)
+    return Alignment(
+        corners_px=corners_px,
+        sigma_px=math.sqrt(max(float(np.trace(J @ covariance @ J.T)) / 8.0, 0.0)),
+        likeness=likeness(equations.grey, error),
+        pattern=pattern.correlation,
+        strength=pattern.strength,
+        worst_cell=worst_cell(error / light.gain, grid, len(drawing.cells)),
+        blur_px=fit.blur_px,
+        gain=light.gain,
+        moved_px=float(np.abs(corners_px - start_px).max()),
+    )
 
 
 def _corner_jacobian(H: Array) -> Array:
     """Change of the four pinhole corners with the increment's terms, (8, 8)."""
     rows = []
-    for u, v in _CORNERS:
+    for u, v in UNIT:
         d = H[2] @ (u, v, 1.0)
         x, y = H[0] @ (u, v, 1.0) / d, H[1] @ (u, v, 1.0) / d
         A = np.array([(H[0, :2] - x * H[2, :2]) / d, (H[1, :2] - y * H[2, :2]) / d])

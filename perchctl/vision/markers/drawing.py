@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -100,36 +99,3 @@ def blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> Rendering:
     parts = [-u * du, -v * du, -du, -u * dv, -v * dv, -dv, u * along, v * along, 0.5 * laplace]
     flat = np.asarray(np.stack(parts, axis=-1), dtype=np.float64).reshape(n * n, 9)
     return Rendering(value.ravel().astype(np.float64), flat)
-
-
-def gram(A: Array, B: Array) -> Array:
-    """A^T B of tall matrices (n * n, a) and (n * n, b), block by block: large products
-    wake threads, which cost more than they save, and far more on a busy machine."""
-    n = math.isqrt(len(A))
-    blocks = np.matmul(A.reshape(n, n, -1).transpose(0, 2, 1), B.reshape(n, n, -1))
-    return np.asarray(blocks.sum(axis=0))
-
-
-def mixed(columns: Array, coefficients: Array) -> Array:
-    """The columns (r, k) times coefficients (k,), likewise."""
-    return np.asarray(np.einsum("rk,k->r", columns, coefficients))
-
-
-def pattern_seen(
-    drawing: Drawing, axis: Array, sigma: float, error: Array, light: Array, coefficients: Array
-) -> tuple[float, float]:
-    """Correlation and height of the inner pattern, beyond what a plain square explains."""
-    plain = Drawing(np.zeros_like(drawing.cells))
-    half = float(axis[1] - axis[0]) / 2
-    square = blurred(drawn(plain, axis, half), sigma, axis).value
-    # The sheet's end, where there is one, is the last column of the light.
-    known: Array = np.column_stack([light[:, :3], square, light[:, 7:]])
-    left: Array = np.stack([light[:, 3], mixed(light, coefficients) + error], axis=1)
-    A = gram(known, known) + 1e-9 * np.eye(known.shape[1])
-    mix = np.asarray(np.linalg.solve(A, gram(known, left)), dtype=np.float64)
-    bits, seen = (left[:, k] - mixed(known, mix[:, k]) for k in (0, 1))
-    energy, product = float((bits * bits).sum()), float((bits * seen).sum())
-    both = math.sqrt(energy * float((seen * seen).sum()))
-    if both < 1e-9:
-        return 0.0, 0.0
-    return product / both, product / max(energy, 1e-9) / float(coefficients[3])

@@ -1,182 +1,177 @@
 """Edges between black and white to a hundredth of a pixel, on grey profiles across them.
 
-1. sample grey profiles across each side, along its image through the lens, so
-   that distortion does not bend the side away from the samples;
-2. place the edge in each profile by the gradient's windowed centroid, and repeat
-   with the window centred on the side's own line (narrow, hence calm in noise).
+The edge in each profile is the gradient's windowed centroid; this is repeated with the
+window centred on the side's own line (narrow, hence calm in noise). A blur that is equal
+on both flanks of an edge does not move its centroid.
 
-A blur that is equal on both flanks of an edge does not move its centroid. All rows
-(a row is one side of one marker) run through the same arrays.
+All that a row (one side of one marker) shares is (rows,), what differs from profile to
+profile (rows, n). Single precision suffices.
 """
 
 from __future__ import annotations
 
-import cv2
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import distort
-from perchctl.vision.types import CameraModel
+from perchctl.vision.markers.profiles import ALONG, MIDDLES, PROFILES, STEPS, Floats
 
-PROFILES = 24  # across each side
-STEPS = 16  # gradient samples in each profile
-Floats = NDArray[np.float32]
-
-ALONG: Array = np.linspace(-1.0, 1.0, PROFILES)  # a side, between its margins
 _ALONG32 = ALONG.astype(np.float32)
 _POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
-_OFFSETS: Floats = np.linspace(-1.0, 1.0, STEPS + 1).astype(np.float32)
-_MIDDLES: Floats = (_OFFSETS[1:] + _OFFSETS[:-1]) * np.float32(0.5)
-# Values and slopes at the profiles from a polynomial through the nodes.
-_NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
-_INVERSE: Array = np.linalg.inv(_NODES[:, None] ** np.arange(5.0))
-_VALUES: Array = (ALONG[:, None] ** np.arange(5)) @ _INVERSE
-_SLOPES: Array = (np.arange(1, 5) * ALONG[:, None] ** np.arange(4)) @ _INVERSE[1:]
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-9)
 _PROFILE_ONES: Floats = np.ones(PROFILES, dtype=np.float32)
 _ONES: Floats = np.ones(STEPS, dtype=np.float32)
+_LEAST_SHARE = np.float32(0.3)  # of the row's mean gradient, for a profile to count
+_WIDE_FLOOR_PX, _FLOOR_PX = 0.3, 0.05  # of the scatter that is taken for noise
+_CENTRED_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _SETTLED_PX = 0.06
+_ROUNDS = 3
+_LEAST_WINDOW2 = np.float32(0.81)  # square of its sigma, px^2
 _FAR = np.float32(1e6)
 _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.float32)
 
 
-def places(lengths_px: Array) -> Array:
-    """How far along its side (rows,) of that length each profile is: (rows, n) in 0..1;
-    the ends keep clear of the neighbouring sides' blur."""
-    margin = np.minimum(np.maximum(2.5 / lengths_px, 0.04), 0.25)[:, None]
-    return np.asarray(margin + (0.5 - margin) * (1.0 + ALONG))
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What lies beside the edges.
 
-
-def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Where the profiles cross the sides, in the picture, and the unit normals there,
-    to the left of the way from start to end as the picture is seen (outwards for a
-    marker whose corners run clockwise): each (rows, n, 2).
-
-    A side's image through the lens is smooth: a few nodes tell all of it.
-
-    Args:
-        starts, ends: of the sides in normalised coordinates, (rows, 2).
-        s: places of the profiles along them, (rows, n), as of `places`.
+    depth_px: width of a cell, (rows,). inside, outside: 1 where a falling edge of the same
+    height lies one cell further in or out, (rows, n). possible: False where there is no
+    edge to be found, (rows, n).
     """
-    first, last = s[:, :1], s[:, -1:]
-    at = (0.5 * (first + last) + (0.5 * (last - first)) * _NODES)[..., None]
-    points = starts[:, None] + at * (ends - starts)[:, None]
-    nodes = distort(points.reshape(-1, 2), camera).reshape(points.shape)
-    origin = np.matmul(_VALUES, nodes)
-    tangent = np.matmul(_SLOPES, nodes)
-    tx, ty = tangent[..., 0], tangent[..., 1]
-    length = np.maximum(np.sqrt(tx * tx + ty * ty), 1e-12)
-    normal = np.empty_like(tangent)
-    np.divide(ty, length, out=normal[..., 0])
-    np.divide(tx, -length, out=normal[..., 1])
-    return origin, normal
+
+    depth_px: Array
+    inside: Array
+    outside: Array
+    possible: NDArray[np.bool_]
 
 
-def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array) -> Floats:
-    """Grey values along the profiles, (rows, n, steps + 1): bilinear, the picture's rim
-    repeated outside.
-
-    On float pictures OpenCV 5 interpolates at the exact position; on bytes, other
-    releases round it to 1/32 px, which is as large as the spread that is aimed at.
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """offset_px: an edge's place along the profile's normal, (rows, n). weight: of the
+    profiles, 0 for outliers, (rows, n). blur_px: of each row, a standard deviation, (rows,).
     """
-    h, w = image.shape
-    reach = float(half_px.max()) + 2.0
-    flat = origin.reshape(-1, 2)
-    (x0, y0), (x1, y1) = flat.min(axis=0).tolist(), flat.max(axis=0).tolist()
-    left, top = min(max(int(x0 - reach), 0), w - 2), min(max(int(y0 - reach), 0), h - 2)
-    right, bottom = min(int(x1 + reach) + 1, w), min(int(y1 + reach) + 1, h)
-    right, bottom = max(right, left + 2), max(bottom, top + 2)
-    patch = image[top:bottom, left:right].astype(np.float32)
-    at = (origin - (left, top)).astype(np.float32)
-    way = (normal * half_px[:, None, None]).astype(np.float32)
-    rows, n = origin.shape[:2]
-    x = way[:, :, 0, None] * _OFFSETS
-    x += at[:, :, 0, None]
-    y = way[:, :, 1, None] * _OFFSETS
-    y += at[:, :, 1, None]
-    shape = (rows, n * (STEPS + 1))
-    grey = cv2.remap(patch, x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR,
-                     borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
-    return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)
+
+    offset_px: Array
+    weight: Array
+    blur_px: Array
 
 
-def locate(
-    grey: Floats,
-    half_px: Array,
-    near_px: Array,
-    depth_px: Array,
-    inside: Array,
-    outside: Array,
-    possible: NDArray[np.bool_],
-) -> tuple[Array, Array, Array]:
+@dataclass(frozen=True, eq=False)
+class _Gradients:
+    """The profiles' gradients at places `u` (rows, steps) and what every window over them
+    needs: its reach `near`, the squares of the cells' width and of its largest sigma, the
+    flanks with a neighbouring edge (`both`, `side`: outside less inside), the
+    profiles that `can` show an edge, and `part`, which makes of a row's sum the least
+    value that counts."""
+
+    gradient: Floats
+    u: Floats
+    near: Floats
+    depth2: Floats
+    most2: Floats
+    both: Floats
+    side: Floats
+    can: Floats
+    part: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Centroids:
+    """Where the window saw the edges, px, which of them count, and the blur's square."""
+
+    edge: Floats
+    usable: NDArray[np.bool_]
+    blur2: Floats
+
+
+def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> Edges:
     """The place of an edge that rises along the profile.
 
     Args:
         grey: (rows, n, steps + 1), the profile from -half_px to +half_px.
-        near_px: reach of the windows, (rows,).
-        depth_px: width of a cell, (rows,).
-        inside, outside: 1 where a falling edge of the same height lies one cell further
-            in or out, (rows, n).
-        possible: False where there is no edge to be found, (rows, n).
-
-    Returns the edge's place in px along the normal (rows, n), the profiles' weights (0
-    for outliers), and each row's blur as a standard deviation, px (rows,).
+        half_px, near_px: reach of the profiles and of the windows, (rows,).
     """
-    half = half_px.astype(np.float32)
-    near = near_px.astype(np.float32)
-    depth2 = (depth_px * depth_px).astype(np.float32)
-    inside32, outside32 = inside.astype(np.float32), outside.astype(np.float32)
-    both, side = inside32 + outside32, outside32 - inside32
-    can = possible.astype(np.float32)
-    # Multiplies a sum over a row's profiles: a part of the mean over those possible.
-    part = np.float32(0.3) / np.maximum(can @ _PROFILE_ONES, np.float32(1.0))
-    gradient = grey[:, :, 1:] - grey[:, :, :-1]
-    u = half[:, None] * _MIDDLES  # (rows, steps)
-    window = np.exp(-0.5 * (u / (0.6 * near[:, None])) ** 2)
-    moments = np.maximum(gradient, _ZERO) @ np.stack([window, window * u], axis=2)
-    total = moments[..., 0] * can
-    usable = total > ((total @ _PROFILE_ONES) * part)[:, None]
-    edge = moments[..., 1] / np.where(usable, total, _ONE)
-    line, weight = robust_line(edge, usable, 0.3, 2)
-    blur2 = np.ones(len(grey), dtype=np.float32)
-    least, most = np.float32(0.81), (0.25 * near * near).astype(np.float32)
-    limit, moved_px = near[:, None], np.inf
-    for narrow in range(3):
-        if narrow == 1 and moved_px < 0.2:
-            continue  # the wide window was as good as centred
-        relative = u[:, None, :] - line[:, :, None]
-        # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
-        w2 = np.minimum(np.maximum(np.float32(2.25) * blur2, least), most)
-        squared = relative * relative
-        mass = squared * (np.float32(-0.5) / w2)[:, None, None]
-        np.exp(mass, out=mass)
-        mass *= gradient
-        total = (mass @ _ONES) * can
-        usable = total > np.maximum((total @ _PROFILE_ONES) * part, _TINY)[:, None]
-        # A neighbour seen through the window has this share, at this place, with this
-        # spread; the one outside lies at the same distance on the other flank.
-        wide2 = w2 + blur2
-        lost = np.exp(np.float32(-0.5) * depth2 / wide2)
-        place = np.sqrt(depth2) * w2 / wide2
-        share = np.minimum(both * lost[:, None], np.float32(0.9))
-        total = np.where(usable, total / (_ONE - share), _ONE)
-        relative *= mass
-        first = relative @ _ONES + total * side * (lost * place)[:, None]
-        mass *= squared
-        second = mass @ _ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
-        moment = (second * usable) @ _PROFILE_ONES
-        moment /= np.maximum((total * usable) @ _PROFILE_ONES, _TINY)
-        moment = np.minimum(np.maximum(moment, np.float32(0.01)), np.float32(0.8) * w2)
-        blur2 = moment * w2 / (w2 - moment)
-        # The window pulls the centroid towards its own middle: undo that.
-        centroid = first / total * (_ONE + blur2 / w2)[:, None]
-        edge = line + np.minimum(np.maximum(centroid, -limit), limit)
-        centre, weight = robust_line(edge, usable, 0.05, 2 if narrow == 2 else 1)
+    gradients = _gradients(grey, half_px, near_px, around)
+    seen = _wide(gradients)
+    line, weight = robust_line(seen.edge, seen.usable, _WIDE_FLOOR_PX, 2)
+    moved_px = np.inf
+    for k in range(_ROUNDS):
+        if k == 1 and moved_px < _CENTRED_PX:
+            continue
+        seen = _narrow(gradients, line, seen.blur2)
+        rounds = 2 if k == _ROUNDS - 1 else 1
+        centre, weight = robust_line(seen.edge, seen.usable, _FLOOR_PX, rounds)
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _SETTLED_PX:
             break
-    return edge.astype(np.float64), weight.astype(np.float64), np.sqrt(blur2).astype(np.float64)
+    return Edges(
+        offset_px=seen.edge.astype(np.float64),
+        weight=weight.astype(np.float64),
+        blur_px=np.sqrt(seen.blur2).astype(np.float64),
+    )
+
+
+def _gradients(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> _Gradients:
+    inside, outside = around.inside.astype(np.float32), around.outside.astype(np.float32)
+    near = near_px.astype(np.float32)
+    can = around.possible.astype(np.float32)
+    return _Gradients(
+        gradient=grey[:, :, 1:] - grey[:, :, :-1],
+        u=half_px.astype(np.float32)[:, None] * MIDDLES,
+        near=near,
+        depth2=(around.depth_px * around.depth_px).astype(np.float32),
+        most2=(0.25 * near * near).astype(np.float32),
+        both=inside + outside,
+        side=outside - inside,
+        can=can,
+        # Multiplies a sum over a row's profiles: a part of the mean over those possible.
+        part=_LEAST_SHARE / np.maximum(can @ _PROFILE_ONES, _ONE),
+    )
+
+
+def _wide(g: _Gradients) -> _Centroids:
+    """By one window around the middle of all profiles; the blur is not measured yet."""
+    window = np.exp(-0.5 * (g.u / (0.6 * g.near[:, None])) ** 2)
+    moments = np.maximum(g.gradient, _ZERO) @ np.stack([window, window * g.u], axis=2)
+    total = moments[..., 0] * g.can
+    usable = total > ((total @ _PROFILE_ONES) * g.part)[:, None]
+    edge = moments[..., 1] / np.where(usable, total, _ONE)
+    return _Centroids(edge, usable, np.ones(len(g.near), dtype=np.float32))
+
+
+def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
+    """By a window around the row's line (rows, n), as wide as its blur so far demands."""
+    relative = g.u[:, None, :] - line[:, :, None]
+    # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
+    w2 = np.minimum(np.maximum(np.float32(2.25) * blur2, _LEAST_WINDOW2), g.most2)
+    squared = relative * relative
+    mass = squared * (np.float32(-0.5) / w2)[:, None, None]
+    np.exp(mass, out=mass)
+    mass *= g.gradient
+    total = (mass @ _ONES) * g.can
+    usable = total > np.maximum((total @ _PROFILE_ONES) * g.part, _TINY)[:, None]
+    # A neighbour seen through the window has this share, at this place, with this
+    # spread; the one outside lies at the same distance on the other flank.
+    wide2 = w2 + blur2
+    lost = np.exp(np.float32(-0.5) * g.depth2 / wide2)
+    place = np.sqrt(g.depth2) * w2 / wide2
+    share = np.minimum(g.both * lost[:, None], np.float32(0.9))
+    total = np.where(usable, total / (_ONE - share), _ONE)
+    relative *= mass
+    first = relative @ _ONES + total * g.side * (lost * place)[:, None]
+    mass *= squared
+    second = mass @ _ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
+    moment = (second * usable) @ _PROFILE_ONES
+    moment /= np.maximum((total * usable) @ _PROFILE_ONES, _TINY)
+    moment = np.minimum(np.maximum(moment, np.float32(0.01)), np.float32(0.8) * w2)
+    found2 = moment * w2 / (w2 - moment)
+    # The window pulls the centroid towards its own middle: undo that.
+    centroid = first / total * (_ONE + found2 / w2)[:, None]
+    limit = g.near[:, None]
+    return _Centroids(line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2)
 
 
 def robust_line(

@@ -7,7 +7,9 @@ import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
-from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX, refine, rim_of_bits
+from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX
+from perchctl.vision.markers.lines import refine
+from perchctl.vision.markers.pattern import rim_of_bits
 from perchctl.vision.pose import square
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
@@ -92,7 +94,7 @@ def spoilt(image: Array, light: str) -> Array:
 
 @pytest.mark.parametrize("light", ["gamma", "clipped"])
 def test_a_shift_that_all_edges_share_is_taken_out(light: str) -> None:
-    """White that grows over black: the border's width tells by how much."""
+    """White that grows over black: the border's width shows by how much."""
     biases, raw_biases = [], []
     closed = {n: replace(rim, open=np.zeros_like(rim.open)) for n, rim in RIMS.items()}
     for values in POSES:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
 from perchctl.vision.markers.align import align
+from perchctl.vision.markers.by_drawing import verified
 from perchctl.vision.markers.drawing import Drawing, drawing_of
-from perchctl.vision.markers.follow import proven
 from perchctl.vision.pose import square
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
@@ -59,7 +59,7 @@ def test_corners_of_small_and_blurred_markers(
         image, true = view(name, side_px, seed, blur_px=blur_px, noise=3.0)
         found = align(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
         assert found is not None
-        assert proven(found)
+        assert verified(found)
         error = found.corners_px - true
         squares.append((error**2).mean())
         assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
@@ -87,7 +87,7 @@ def test_a_slope_of_the_light_moves_no_corner() -> None:
     ramp = np.linspace(0.45, 1.0, image.shape[1])
     found = align((image * ramp).astype(np.uint8), off(true, 3), DRAWINGS["large"], CAMERA, 1.0)
     assert found is not None
-    assert proven(found)
+    assert verified(found)
     assert np.abs(found.corners_px - true).max() < 0.1
 
 
@@ -103,7 +103,7 @@ def test_a_slope_of_the_light_moves_no_corner() -> None:
     ],
 )
 @pytest.mark.parametrize(("side_px", "blur_px"), [(16.0, 1.0), (24.0, 3.0), (40.0, 4.0)])
-def test_other_markers_are_not_proven(
+def test_other_markers_are_not_verified(
     name: str, dictionary: str, index: int, side_px: float, blur_px: float
 ) -> None:
     """A picture of another marker, aligned as well as it goes in all four turns."""
@@ -126,10 +126,10 @@ def test_other_markers_are_not_proven(
     corners = np.array([[-h, -h], [h, -h], [h, h], [-h, h]]) + np.array([320.3, 239.6])
     for k in range(4):
         found = align(image, np.roll(corners, k, axis=0), DRAWINGS[name], CAMERA, 1.0)
-        assert found is None or not proven(found)
+        assert found is None or not verified(found)
 
 
-def test_nothing_is_proven_where_there_is_no_marker() -> None:
+def test_nothing_is_verified_where_there_is_no_marker() -> None:
     rng = np.random.default_rng(7)
     smooth = np.zeros((480, 640))
     for step in (6, 12, 30):  # a texture of all sizes
@@ -143,7 +143,7 @@ def test_nothing_is_proven_where_there_is_no_marker() -> None:
         corners = centre + side / math.sqrt(2) * np.stack([np.cos(turns), np.sin(turns)], axis=1)
         for drawing in DRAWINGS.values():
             found = align(image, corners, drawing, CAMERA, 1.5)
-            assert found is None or not proven(found)
+            assert found is None or not verified(found)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,141 @@
+"""What finding the target's markers needs, made once: their dictionaries and patterns.
+
+Each marker has a dictionary that holds its one id, so nothing else can be taken for it
+(0/1 correction bits: no false accept in 28 pictures without a target; 0/3: 7 of 28).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
+from perchctl.profile.dictionaries import predefined
+from perchctl.vision.markers.drawing import drawing_of
+from perchctl.vision.markers.pattern import Pattern, Rim, pattern_of, rim_of_bits
+from perchctl.vision.types import MarkerName
+
+_PRINT_M = 2e-5  # half a dot of a printer
+_MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, of 640 px
+_LOOSE_PERIMETER_RATE = 0.05
+_LOOSE_ACCURACY_RATE = 0.1
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Windows of the adaptive threshold, px: OpenCV tries them from the least to the most
+    in steps of 10."""
+
+    least_px: int
+    most_px: int
+
+
+OPENCV_THRESHOLDS = Thresholds(3, 23)
+QUICK_THRESHOLDS = Thresholds(13, 13)  # enough where both markers were seen a frame ago
+_LOOSE_THRESHOLDS = Thresholds(15, 35)
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorSetup:
+    """What `detect` needs, made once by `make_detector`; nothing in it changes later.
+
+    `dictionaries` are the large and the small marker's; `mirror_index` is the mirror
+    image's place in the small marker's (None where it could be confused with the marker
+    itself), `patterns` how each marker looks, `ratio` the small marker's side over the
+    large one's; the rest is the profile's.
+    """
+
+    dictionaries: tuple[Any, Any]
+    mirror_index: int | None
+    patterns: dict[MarkerName, Pattern]
+    ratio: float
+    refinement: str
+    window: bool
+    blurred: bool
+    blurred_every: int
+
+    @property
+    def by_lines(self) -> bool:
+        return self.refinement == "line"
+
+
+def make_detector(config: DetectorConfig, target: TargetConfig) -> DetectorSetup:
+    """Dictionaries of just the target's ids, and how its markers look."""
+    large_bits, small_bits = _bits(target.large), _bits(target.small)
+    small_patterns = [small_bits]
+    mirror_index = None
+    mirror = np.ascontiguousarray(small_bits[:, ::-1])
+    if _distance(mirror, small_bits) > 2 * config.correction_bits_small + 1:
+        mirror_index = len(small_patterns)
+        small_patterns.append(mirror)
+    ratio = target.small.side_m / target.large.side_m
+    return DetectorSetup(
+        dictionaries=(
+            _dictionary([large_bits], config.correction_bits_large),
+            _dictionary(small_patterns, config.correction_bits_small),
+        ),
+        mirror_index=mirror_index,
+        patterns={
+            "large": pattern_of(
+                _rim(large_bits, target.large.side_m), drawing_of(large_bits, small_bits, ratio)
+            ),
+            "small": pattern_of(_rim(small_bits, target.small.side_m), drawing_of(small_bits)),
+        },
+        ratio=ratio,
+        refinement=config.refinement,
+        window=config.window,
+        blurred=config.blurred,
+        blurred_every=config.blurred_every,
+    )
+
+
+def strict_detector(setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds) -> Any:
+    """OpenCV's detector for one pass over a picture of that size. Making one takes about a
+    microsecond, a pass a thousand times as long."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.errorCorrectionRate = 1.0  # so that maxCorrectionBits is the limit itself
+    parameters.minDistanceToBorder = 0
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.adaptiveThreshWinSizeMin = thresholds.least_px
+    parameters.adaptiveThreshWinSizeMax = thresholds.most_px
+    parameters.minMarkerPerimeterRate = min(1.0, _MIN_PERIMETER_PX / max(size_px))
+    return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
+
+
+def loose_detector(setup: DetectorSetup) -> Any:
+    """One that takes nearly any quadrilateral for a candidate, for blurred pictures: round
+    corners, wide dark borders, small sides."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minDistanceToBorder = 0
+    parameters.polygonalApproxAccuracyRate = _LOOSE_ACCURACY_RATE
+    parameters.adaptiveThreshWinSizeMin = _LOOSE_THRESHOLDS.least_px
+    parameters.adaptiveThreshWinSizeMax = _LOOSE_THRESHOLDS.most_px
+    parameters.adaptiveThreshWinSizeStep = _LOOSE_THRESHOLDS.most_px - _LOOSE_THRESHOLDS.least_px
+    parameters.minMarkerPerimeterRate = _LOOSE_PERIMETER_RATE
+    return cv2.aruco.ArucoDetector(list(setup.dictionaries), parameters)
+
+
+def _rim(bits: NDArray[np.uint8], side_m: float) -> Rim:
+    return rim_of_bits(bits, _PRINT_M * (len(bits) + 2) / side_m)
+
+
+def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
+    source = predefined(marker.dictionary)
+    rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
+    return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
+
+
+def _dictionary(patterns: list[NDArray[np.uint8]], correction_bits: int) -> Any:
+    rows = [cv2.aruco.Dictionary.getByteListFromBits(np.ascontiguousarray(p)) for p in patterns]
+    return cv2.aruco.Dictionary(
+        np.ascontiguousarray(np.concatenate(rows)), patterns[0].shape[0], correction_bits
+    )
+
+
+def _distance(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> int:
+    """Fewest bits in which a, in any turn, differs from b."""
+    return min(int((np.rot90(a, turn) != b).sum()) for turn in range(4))

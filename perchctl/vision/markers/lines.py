@@ -1,0 +1,229 @@
+"""Corners to a hundredth of a pixel: lines fitted to a marker's sides, intersected.
+
+A side is hundreds of gradient samples instead of one point, and a blur that is equal on
+both of its flanks does not move it. So each side's edge points
+(`perchctl.vision.markers.sides`) are undistorted, a line is fitted to them by total least
+squares in normalised coordinates, and neighbours are intersected.
+
+White that is clipped, glares or went through a gamma curve does move edges: all of
+them, from white towards black, by the same number of pixels. The inner edge of a
+marker's border moves the opposite way, so the border's width, known to be one cell,
+gives the shift, and it is taken out.
+
+Where a residual shows that the sides are not lines (blur, occlusion, false
+candidates), each corner is refined on its own (`perchctl.vision.markers.corners`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.vision.camera_model import distort
+from perchctl.vision.markers.corners import RAW_SIGMA_PX, RefinedCorners, refine_each
+from perchctl.vision.markers.pattern import Rim
+from perchctl.vision.markers.profiles import PROFILES
+from perchctl.vision.markers.shift import Border, edge_shift
+from perchctl.vision.markers.sides import Markers, Measured, Samples, markers_of, measure
+from perchctl.vision.markers.square import BEFORE
+from perchctl.vision.types import CameraModel, EdgeShift
+
+MIN_LINE_SIGMA_PX = 0.015
+
+_MIN_CELL_PX = 1.0  # smaller cells blend into one grey
+_MAX_RESIDUAL_PX = 0.6
+_MIN_INLIERS = 0.5
+_TAILS = 1.3  # what robust weights take away from a residual's square
+_MIN_CONTRAST = 6.0  # grey levels between the flanks
+_SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
+_CLIPPED_PRIOR_PX = 0.4  # what clipping does
+_CLIPPED_GREY = 248.0
+_QUARTERS: Array = np.full(4, 0.25)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """Lines (4m, 3) as (nx, ny, c) with n.x = c and |n| = 1, normalised, and the weighted
+    RMS distance of their points, px (4m,)."""
+
+    lines: Array
+    residual_px: Array
+
+
+def refine(
+    image: NDArray[np.uint8],
+    corners_px: Array,
+    rims: Sequence[Rim],
+    camera: CameraModel,
+    method: str,
+) -> list[RefinedCorners]:
+    """Refine the corners of m markers.
+
+    Args:
+        image: grey picture (h, w).
+        corners_px: raw corners (m, 4, 2), in order around each marker.
+        rims: for each marker what lies inside of its border.
+        method: ``line``, ``subpix`` or ``none`` (the profile's `detector.refinement`).
+    """
+    corners_px = np.asarray(corners_px, dtype=np.float64).reshape(-1, 4, 2)
+    if method == "none":
+        return [RefinedCorners(raw, RAW_SIGMA_PX, False) for raw in corners_px]
+    by_lines: list[RefinedCorners | None] = [None] * len(corners_px)
+    if method == "line" and len(corners_px):
+        by_lines = refine_lines(image, corners_px, rims, camera)
+    return [
+        result if result is not None else refine_each(image, raw, rim.cells)
+        for result, raw, rim in zip(by_lines, corners_px, rims, strict=True)
+    ]
+
+
+def refine_lines(
+    image: NDArray[np.uint8],
+    raw_px: Array,
+    rims: Sequence[Rim],
+    camera: CameraModel,
+    known: EdgeShift | None = None,
+) -> list[RefinedCorners | None]:
+    """The line fit alone, for m markers (m, 4, 2); None where its residual, inliers,
+    contrast, blur or movement show that these are not a marker's sides. The shift of all
+    edges is measured unless it is known."""
+    nothing: list[RefinedCorners | None] = [None] * len(raw_px)
+    markers = markers_of(raw_px, rims, camera)
+    if markers is None:
+        return nothing
+    measured = measure(image, markers, camera, with_inner=known is None)
+    sides = measured.sides
+    fit = _fit_lines(markers, sides)
+    corners = _intersect(fit.lines)
+    if not np.isfinite(corners).all():
+        return nothing
+    shift = known if known is not None else _measured_shift(markers, measured, corners)
+    applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
+    if applied.shift_px != 0.0:
+        corners = _intersect(_moved_outwards(markers, fit, applied.shift_px))
+    corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
+    accepted = _accepted(markers, sides, fit, corners_px)
+    sigma_px = _sigma_px(markers, sides, fit)
+    return [
+        RefinedCorners(
+            corners_px=corners_px[i],
+            sigma_px=float(sigma_px[i]),
+            refined=True,
+            shift_sigma_px=applied.sigma_px,
+            blur_px=float(sides.blur_px[4 * i : 4 * i + 4].max()),
+            edge_shift=shift,
+        )
+        if accepted[i]
+        else None
+        for i in range(len(raw_px))
+    ]
+
+
+def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
+    """Total least squares on the points of each side."""
+    w = sides.weight / np.maximum(sides.weight.sum(axis=1), 1e-9)[:, None]
+    x, y = sides.points[..., 0], sides.points[..., 1]
+    cx, cy = (w * x).sum(axis=1), (w * y).sum(axis=1)
+    dx, dy = x - cx[:, None], y - cy[:, None]
+    wx = w * dx
+    sxx, sxy, syy = (wx * dx).sum(axis=1), (wx * dy).sum(axis=1), (w * dy * dy).sum(axis=1)
+    direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
+    nx, ny = -np.sin(direction), np.cos(direction)
+    residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
+    lines = np.empty((len(w), 3))
+    lines[:, 0], lines[:, 1], lines[:, 2] = nx, ny, nx * cx + ny * cy
+    return _Lines(lines, np.sqrt(np.maximum(residual2, 0.0)) * markers.px_per_unit)
+
+
+def _intersect(lines: Array) -> Array:
+    """Corner i of each marker, where side i - 1 meets side i: (m, 4, 2)."""
+    sides = lines.reshape(-1, 4, 3)
+    before = sides.take(BEFORE, axis=1)
+    ax, ay, ac = before[..., 0], before[..., 1], before[..., 2]
+    bx, by, bc = sides[..., 0], sides[..., 1], sides[..., 2]
+    det = ax * by - ay * bx
+    det = np.where(np.abs(det) < 1e-9, np.nan, det)
+    corners = np.empty((len(sides), 4, 2))
+    corners[..., 0] = (ac * by - ay * bc) / det
+    corners[..., 1] = (ax * bc - ac * bx) / det
+    return corners
+
+
+def _shift_prior_px(sides: Samples) -> float:
+    """How far edges are shifted before that is measured: by white as the camera sees it
+    beyond the sides."""
+    clipped = float(sides.grey[:, :, -1].mean()) > _CLIPPED_GREY
+    return _CLIPPED_PRIOR_PX if clipped else _SHIFT_PRIOR_PX
+
+
+def _measured_shift(markers: Markers, measured: Measured, corners: Array) -> EdgeShift | None:
+    """None where no inner edge was sampled."""
+    inner, k = measured.inner, measured.inner_of
+    if inner is None:
+        return None
+    border = Border(
+        corners=corners[k],
+        points=inner.points,
+        weight=inner.weight,
+        blur_px=inner.blur_px,
+        depth_px=markers.depth_px[k],
+        cells=markers.rims[k].cells,
+        cell_px=float(markers.cell_px[k]),
+        tolerance=markers.rims[k].tolerance,
+    )
+    return edge_shift(border, _shift_prior_px(measured.sides))
+
+
+def _moved_outwards(markers: Markers, fit: _Lines, shift_px: float) -> Array:
+    """The lines (4m, 3) moved out of their markers."""
+    out = (markers.corners - markers.corners.mean(axis=1)[:, None]).reshape(-1, 2)
+    lines = fit.lines.copy()
+    # The line's normal may point either way.
+    outwards = np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1])
+    lines[:, 2] += outwards * (shift_px / markers.px_per_unit)
+    return lines
+
+
+def _accepted(
+    markers: Markers, sides: Samples, fit: _Lines, corners_px: Array
+) -> NDArray[np.bool_]:
+    """Which of the m markers have lines for sides, near to where they were expected."""
+    inliers = np.count_nonzero(sides.weight, axis=1)
+    # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
+    contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).mean(axis=1)
+    good = (
+        (fit.residual_px < _MAX_RESIDUAL_PX)
+        & (inliers >= _MIN_INLIERS * PROFILES)
+        & (contrast > _MIN_CONTRAST)
+        & (sides.blur_px < 0.9 * sides.near_px)
+    ).reshape(-1, 4)
+    moved = corners_px - markers.raw_px
+    moved_px = np.sqrt((moved * moved).sum(axis=2).max(axis=1))
+    return np.asarray(
+        good.all(axis=1)
+        & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px))  # False for NaN
+        & (markers.cell_px > _MIN_CELL_PX)
+    )
+
+
+def _sigma_px(markers: Markers, sides: Samples, fit: _Lines) -> Array:
+    """Spread of the corners of the m markers."""
+    cell_px, residual_px = markers.cell_px, fit.residual_px
+    # The end of a line fitted to n samples spreads twice as far as its middle.
+    samples = np.minimum(sides.weight.sum(axis=1), markers.sides_px.ravel())
+    samples = np.maximum(samples, 4.0)
+    sigma2 = (_TAILS * 4.0 * residual_px * residual_px / samples).reshape(-1, 4) @ _QUARTERS
+    # Cells of few pixels let the inner pattern's blur reach the border's edge; and edges
+    # are not where they were meant to be printed.
+    print_px = np.array([rim.tolerance for rim in markers.rims]) * cell_px
+    return np.asarray(
+        np.sqrt(
+            np.maximum(sigma2, MIN_LINE_SIGMA_PX**2)
+            + 0.25 * np.exp(cell_px * (-2.0 / 1.8))
+            + print_px * print_px
+        )
+    )

@@ -1,0 +1,185 @@
+"""How a marker looks: the rim of its border, its cells, its drawing; and whether the picture
+shows these cells at given corners.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.vision.markers.drawing import Drawing
+from perchctl.vision.markers.square import from_unit, mapped
+
+LEAST_SIDE_PX = 7.0  # below it a marker is a spot
+_MIN_CONTRAST = 10.0  # grey levels
+_MARGIN = 0.1  # of the contrast that a cell must keep from the threshold
+_MOST = 0.8
+_MIN_RESEMBLANCE = 0.6
+_COVERED = 1.25  # half sides of a marker in the centre that may hide cells
+_SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
+
+
+@dataclass(frozen=True, eq=False)
+class Rim:
+    """What lies inside of a marker's border, side by side in the order of the corners,
+    the cells at both ends being the border's own: (4, n) each.
+
+    white: the row next to the border; open: where a white cell follows behind a
+    white one; tolerance: of a printed edge's place, in cells.
+    """
+
+    white: Array
+    open: Array
+    tolerance: float = 0.0
+
+    @property
+    def cells(self) -> int:
+        return int(self.white.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """How one marker looks.
+
+    rim: inside of its border. drawing: all of it. spots (n, 2): points in its own
+    coordinates (see `perchctl.vision.markers.square`) at which its cells are read; owner
+    (n,): the cell of each; white (cells,): what they must be; soft (4, n):
+    what blur of half a cell makes of them at the spots, without mean and of unit length,
+    for a marker whose corners are numbered on by 0 to 3.
+    """
+
+    rim: Rim
+    drawing: Drawing
+    spots: Array
+    owner: NDArray[np.intp]
+    spots_per_cell: Array
+    soft: Array
+    white: NDArray[np.bool_]
+
+
+def rim_of_bits(bits: NDArray[np.uint8], tolerance: float = 0.0) -> Rim:
+    """The rim of a marker with the inner bits (n, n), 1 = white.
+
+    At small sizes the rim's blur reaches the border's outer edge and would push it out.
+    """
+    n = len(bits)
+
+    def ring(depth: int) -> Array:
+        if 2 * depth >= n:
+            return np.ones((4, n))
+        last = n - 1 - depth
+        return np.asarray(
+            (bits[depth], bits[:, last], bits[last, ::-1], bits[::-1, depth]), dtype=np.float64
+        )
+
+    white = np.pad(ring(0), ((0, 0), (1, 1)))
+    second = np.pad(ring(1), ((0, 0), (1, 1)))
+    return Rim(white, white * second, tolerance)
+
+
+def pattern_of(rim: Rim, drawing: Drawing) -> Pattern:
+    """Spots in every cell, but for those that another marker in the centre covers."""
+    n = len(drawing.cells)
+    middle = (2.0 * np.arange(n) + 1.0) / n - 1.0
+    x, y = np.meshgrid(middle, middle)
+    centres = np.stack([x.ravel(), y.ravel()], axis=1)
+    spots = (centres[:, None] + _SPOTS * 2.0 / n).reshape(-1, 2)
+    owner = np.repeat(np.arange(n * n), len(_SPOTS))
+    free = np.abs(spots).max(axis=1) > _COVERED * drawing.ratio
+    kept = np.unique(owner[free])
+    turns, at = [], spots[free]
+    for _ in range(4):
+        soft = _softened(drawing, at)
+        soft -= soft.mean()
+        turns.append(soft / math.sqrt(float(soft @ soft)))
+        at = np.stack([-at[:, 1], at[:, 0]], axis=1)
+    own = np.searchsorted(kept, owner[free]).astype(np.intp)
+    return Pattern(
+        rim=rim,
+        drawing=drawing,
+        spots=np.ascontiguousarray(spots[free]),
+        owner=own,
+        spots_per_cell=np.bincount(own).astype(np.float64),
+        soft=np.stack(turns),
+        white=drawing.cells.ravel()[kept] > 0.5,
+    )
+
+
+def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+    """Whether every cell of the marker at these corners has its colour, clearly."""
+    means = _cell_means(image, corners_px, pattern)
+    if means is None:
+        return False
+    white, black = means[pattern.white], means[~pattern.white]
+    # The light may differ across the marker: white and black are the medians.
+    high = float(np.partition(white, len(white) // 2)[len(white) // 2])
+    low = float(np.partition(black, len(black) // 2)[len(black) // 2])
+    contrast = high - low
+    middle, margin = 0.5 * (high + low), _MARGIN * contrast
+    return bool(
+        contrast >= _MIN_CONTRAST
+        and white.min() > middle + margin
+        and black.max() < middle - margin
+    )
+
+
+def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+    """Whether nearly all cells have their colour, the others being covered."""
+    means = _cell_means(image, corners_px, pattern)
+    if means is None:
+        return False
+    high, low = np.median(means[pattern.white]), np.median(means[~pattern.white])
+    right = (means > 0.5 * (high + low)) == pattern.white
+    return bool(high - low >= _MIN_CONTRAST and right.mean() > _MOST)
+
+
+def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
+    """Whether the grey values in the cells go with the pattern, blurred as they may be."""
+    return float(resemblance(image, corners_px, pattern)[0]) > _MIN_RESEMBLANCE
+
+
+def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
+    """Correlation of the cells' grey values with the pattern for corners (4, 2) rolled on
+    by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
+    grey = _read(image, corners_px, pattern)
+    if grey is None:
+        return np.zeros(4)
+    grey -= grey.mean()
+    spread = math.sqrt(float(grey @ grey))
+    # Black and white each on about half of the spots are 2 spreads apart.
+    if spread < 0.5 * _MIN_CONTRAST * math.sqrt(len(grey)):
+        return np.zeros(4)
+    return np.asarray(pattern.soft @ grey / spread)
+
+
+def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
+    """Mean grey value of each cell that is read, None where one is outside of the picture."""
+    grey = _read(image, corners_px, pattern)
+    if grey is None:
+        return None
+    return np.asarray(np.bincount(pattern.owner, weights=grey) / pattern.spots_per_cell)
+
+
+def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
+    """Grey values at the pattern's spots, None where one is outside of the picture."""
+    at = mapped(from_unit(corners_px), pattern.spots)
+    (x0, y0), (x1, y1) = at.min(axis=0).tolist(), at.max(axis=0).tolist()
+    h, w = image.shape
+    if not (x0 >= 0.0 and y0 >= 0.0 and x1 <= w - 1 and y1 <= h - 1):
+        return None
+    nearest = (at + 0.5).astype(np.intp)
+    return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
+
+
+def _softened(drawing: Drawing, spots: Array) -> Array:
+    """Whiteness at the spots with a blur of half a cell."""
+    n, fine = len(drawing.cells), 8
+    sharp = np.kron(np.pad(drawing.cells, 2, constant_values=1.0), np.ones((fine, fine)))
+    white = np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.5 * fine), dtype=np.float64)
+    at = (((spots + 1.0) * 0.5 * n + 2.0) * fine).astype(np.intp)
+    return np.asarray(white[at[:, 1], at[:, 0]])

@@ -1,0 +1,86 @@
+"""A marker's square in the picture: its sides, its area, and the squares that share its centre.
+
+The unit square is a marker in its own coordinates: corners at (-1, -1), (1, -1), (1, 1),
+(-1, 1) in the order of `Detection.corners_px`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from perchctl.geometry import Array
+from perchctl.vision.camera_model import distort, undistort
+from perchctl.vision.types import CameraModel, MarkerName
+
+UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # corner i's neighbours
+_UNIT32 = UNIT.astype(np.float32)
+
+
+def from_unit(corners: Array) -> Array:
+    """Homography (3, 3) of the unit square to corners (4, 2)."""
+    H = cv2.getPerspectiveTransform(_UNIT32, corners.astype(np.float32))
+    return np.asarray(H, dtype=np.float64)
+
+
+def to_unit(corners: Array) -> Array:
+    """Homography (3, 3) of corners (4, 2) to the unit square."""
+    H = cv2.getPerspectiveTransform(corners.astype(np.float32), _UNIT32)
+    return np.asarray(H, dtype=np.float64)
+
+
+def mapped(H: Array, points: Array) -> Array:
+    """Points (..., 2) through a homography."""
+    images = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H)
+    return np.asarray(images, dtype=np.float64).reshape(points.shape)
+
+
+def side_lengths_px(corners_px: Array) -> Array:
+    """Lengths of the four sides, (..., 4)."""
+    d = corners_px.take(NEXT, axis=-2) - corners_px
+    return np.asarray(np.hypot(d[..., 0], d[..., 1]), dtype=np.float64)
+
+
+def mean_side_px(corners_px: Array) -> float:
+    """Mean length of the sides of one square (4, 2)."""
+    return float(side_lengths_px(corners_px).sum()) / 4.0
+
+
+def doubled_area(corners: Array) -> Array:
+    """Positive for corners (m, 4, 2) that run clockwise as the picture is seen, (m,)."""
+    a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def within(corners_px: Array, shape: tuple[int, ...]) -> bool:
+    """Whether all corners (4, 2) are finite and inside a picture of that shape."""
+    h, w = shape[:2]
+    return bool(
+        np.isfinite(corners_px).all()
+        and corners_px.min() >= 0.0
+        and (corners_px.max(axis=0) <= (w - 1, h - 1)).all()
+    )
+
+
+def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:
+    """Corners (4, 2) of a square `ratio` times as large with the same centre and plane;
+    without a camera, as if the lens did not bend the square's sides."""
+    straight = corners_px if camera is None else undistort(corners_px, camera)
+    found = mapped(from_unit(straight), (_UNIT32 * ratio).astype(np.float64))
+    return found if camera is None else distort(found, camera)
+
+
+def completed(
+    expected: Mapping[MarkerName, Array], ratio: float, camera: CameraModel
+) -> dict[MarkerName, Array]:
+    """With the other marker where the one that is expected puts it; `ratio` is the small
+    marker's side over the large one's."""
+    both = dict(expected)
+    if "small" not in both and "large" in both:
+        both["small"] = nested(both["large"], ratio, camera)
+    elif "large" not in both and "small" in both:
+        both["large"] = nested(both["small"], 1.0 / ratio, camera)
+    return both

@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
+from perchctl.profile.dictionaries import predefined
+from perchctl.vision.markers.detect import detect, make_detector
+from tests.helpers.markers import frame
+from tests.helpers.target_picture import CAMERA
+
+
+def test_a_small_marker_like_its_own_mirror_image_gives_no_hint() -> None:
+    target = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=0, side_m=0.025))
+    assert make_detector(DetectorConfig(), TargetConfig()).mirror_index == 1
+    setup = make_detector(DetectorConfig(), target)
+    bits = predefined("DICT_ARUCO_ORIGINAL")
+    grid = cv2.aruco.Dictionary.getBitsFromByteList(np.ascontiguousarray(bits.bytesList[0:1]), 5)
+    symmetric = any(np.array_equal(np.rot90(grid, k), grid[:, ::-1]) for k in range(4))
+    assert symmetric
+    assert setup.mirror_index is None
+
+
+def test_correction_bits_are_the_profiles() -> None:
+    grid = cv2.aruco.Dictionary.getBitsFromByteList(
+        np.ascontiguousarray(predefined("DICT_ARUCO_ORIGINAL").bytesList[5:6]), 5
+    )
+    for wrong in range(4):
+        bits = grid.copy()
+        bits.ravel()[[6, 12, 18][:wrong]] ^= 1
+        cells = np.pad(bits, 1)
+        image = np.full((480, 640), 230, np.uint8)
+        image[150:290, 250:390] = np.where(np.kron(cells, np.ones((20, 20))) > 0, 230, 20)
+        for allowed in range(4):
+            setup = make_detector(DetectorConfig(correction_bits_small=allowed), TargetConfig())
+            found = detect(frame(image), None, setup, CAMERA)
+            assert (found.small is not None) == (wrong <= allowed), (wrong, allowed)
