@@ -23,7 +23,7 @@ from perchctl.calibration.seen import larger_than, seen_instead
 from perchctl.calibration.solve import AUTO, calibrate
 from perchctl.calibration.types import Calibration, Grey, Rejection, View
 from perchctl.calibration.verdict import level, limit_mm, sentence
-from perchctl.calibration.writing import calibration_text, camera_text, check_free, write_all
+from perchctl.calibration.writing import calibration_text, camera_text
 from perchctl.camera.files import VideoSource, image_files, read_grey
 from perchctl.camera.open import open_source
 from perchctl.camera.source import check_size
@@ -33,6 +33,7 @@ from perchctl.commands.track import source_spec
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import InvalidValue, UsageError
+from perchctl.files import check_place, same_file, write_files
 from perchctl.target.boards import Board, parse_board
 from perchctl.vision.types import CameraModel
 
@@ -66,8 +67,7 @@ def resolve(source: str, board: str, **options: Any) -> CalibrateOptions:
             f"lens model {found.model!r} is unknown; allowed are {', '.join((AUTO, *MODEL_NAMES))}"
         )
     if found.output is not None:
-        check_free(found.output, found.force)
-        check_free(found.output.with_suffix(".png"), found.force)
+        _check_output(found.output, found.force)
     if not found.name.strip() or "/" in found.name:
         raise UsageError(f"--name {found.name!r} cannot name a file; use a word such as camera")
     return found
@@ -78,15 +78,14 @@ def run(options: CalibrateOptions) -> None:
     views, missing, size_px = _views(options)
     output = options.output or FOLDER / f"{options.name}_{size_px[0]}x{size_px[1]}.yaml"
     report = output.with_suffix(".png")
-    check_free(output, options.force)
-    check_free(report, options.force)
+    _check_output(output, options.force)
     _say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
     result = calibrate(views, options.board.notation(), options.model, options.rejecting, missing)
     from perchctl.calibration.plot import draw_calibration
 
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     text = calibration_text(result, options.name, now)
-    write_all([(output, text.encode()), (report, draw_calibration(result))])
+    write_files({output: text.encode(), report: draw_calibration(result)}, make_folders=True)
     for line in _lines(result):
         _say(line)
     _say(f"wrote {output} and {report}")
@@ -121,12 +120,12 @@ def run_convert(
     camera = load_calibration(file)
     w, h = camera.size_px
     target = output or FOLDER / f"{name}_{w}x{h}.yaml"
-    check_free(target, force)
-    if target.exists() and file.exists() and target.samefile(file):
+    check_place(target, replace=force, make_folders=True)
+    if same_file(target, file):
         raise UsageError(f"{target} is the file to convert; name another with --output")
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     notes = {"date": now, "converted_from": file.name}
-    write_all([(target, camera_text(camera, name, notes).encode())])
+    write_files({target: camera_text(camera, name, notes).encode()}, make_folders=True)
     _say(f"wrote {target} ({camera.model}, {w}x{h} px)")
     print(json.dumps(_camera_record(camera) | {"file": str(target)}) if as_json else target)
 
@@ -238,6 +237,11 @@ def _lines(result: Calibration) -> list[str]:
     return lines
 
 
+def _check_output(output: Path, force: bool) -> None:
+    for path in (output, output.with_suffix(".png")):
+        check_place(path, replace=force, make_folders=True)
+
+
 def _views(
     options: CalibrateOptions,
 ) -> tuple[list[View], list[Rejection], tuple[int, int]]:
@@ -346,7 +350,8 @@ def _page_state(moment: Moment) -> dict[str, Any]:
 
 def _keep(pictures: list[Grey], folder: Path) -> None:
     encoded = [cv2.imencode(".png", picture)[1].tobytes() for picture in pictures]
-    write_all([(folder / f"view_{i:03d}.png", png) for i, png in enumerate(encoded, start=1)])
+    files = {folder / f"view_{i:03d}.png": png for i, png in enumerate(encoded, start=1)}
+    write_files(files, make_folders=True)
     _say(f"kept {len(pictures)} pictures in {folder}")
 
 

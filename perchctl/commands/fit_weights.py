@@ -14,6 +14,7 @@ import numpy as np
 
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
+from perchctl.files import same_file, write_files
 from perchctl.profile import Profile, find_profile, find_weights, load_profile
 from perchctl.profile.places import data_folder, user_config_folder
 from perchctl.weights.check import check
@@ -65,7 +66,7 @@ def resolve(
     if plot is not None and plot.suffix.lower() != ".png":
         raise InvalidValue(f"--plot {plot} must end in .png")
     for target in (out, plot):
-        if target is not None and any(_same(target, source) for source in data):
+        if target is not None and any(same_file(target, source) for source in data):
             raise UsageError(f"{target} is the data itself; write the result to another file")
     return FitOptions(
         # The weights file may not be there yet: this command makes it.
@@ -82,18 +83,14 @@ def resolve(
     )
 
 
-def _same(one: Path, other: Path) -> bool:
-    return one.exists() and other.exists() and one.samefile(other)
-
-
 def run(options: FitOptions) -> None:
     """Fit, print, draw, write. Errors: NotFound, InvalidValue, PerchError when weights
     that are not recommended were to be written."""
     result = fit(options)
     if options.plot is not None:
-        from perchctl.weights.plot import plot_weights
+        from perchctl.weights.plot import draw_weights
 
-        plot_weights(result, options.plot)
+        write_files({options.plot: draw_weights(result)})
     if options.as_json:
         print(json.dumps(as_object(result), allow_nan=False))
     else:

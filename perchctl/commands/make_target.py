@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.errors import InvalidValue, UsageError
+from perchctl.files import check_place, write_files
 from perchctl.profile import (
     MarkerConfig,
     Profile,
@@ -147,7 +147,6 @@ def _print_board(request: TargetRequest, notation: str) -> tuple[str, dict[str, 
 def _write_pages(
     request: TargetRequest, pages: list[Any], title: str, date: Any = None
 ) -> list[Path]:
-    from perchctl.target.output import write_whole
     from perchctl.target.pdf import pdf_bytes
     from perchctl.target.png import png_bytes
     from perchctl.target.svg import svg_bytes
@@ -165,7 +164,7 @@ def _write_pages(
             files[pdf.with_name(f"{pdf.stem}{side}.svg")] = svg_bytes(page)
         if request.png_dpi is not None:
             files[pdf.with_name(f"{pdf.stem}{side}.png")] = png_bytes(page, request.png_dpi)
-    write_whole(files)
+    write_files(files)
     return list(files)
 
 
@@ -177,8 +176,7 @@ def _design(request: TargetRequest, camera_name: str) -> tuple[str, dict[str, An
     from perchctl.target.design import error_curve, make_design
     from perchctl.target.design_text import design_record, design_text
     from perchctl.target.limits import Optics
-    from perchctl.target.output import check_writable, write_whole
-    from perchctl.target.plot import plot_design
+    from perchctl.target.plot import draw_design
     from perchctl.target.suggest import suggest
 
     if request.suggest and request.output is not None:
@@ -191,7 +189,7 @@ def _design(request: TargetRequest, camera_name: str) -> tuple[str, dict[str, An
     path = find_calibration(camera_name)
     camera = load_calibration(path)
     plot = request.plot or Path(DEFAULT_PLOT)
-    check_writable(plot)
+    check_place(plot)
     optics = Optics(request.blur_px, request.noise)
     lines: list[str] = []
     record: dict[str, Any] = {}
@@ -203,15 +201,14 @@ def _design(request: TargetRequest, camera_name: str) -> tuple[str, dict[str, An
         design = make_design(_target(request, profile), camera, optics, profile, request.ceiling_m)
     curve = error_curve(design)
     lines.append(design_text(design, curve, str(path)))
-    picture = io.BytesIO()
-    plot_design(design, curve, picture)
+    picture = draw_design(design, curve)
     record |= design_record(design) | {"target": design.target.model_dump(mode="json")}
     written = []
     if request.output is not None:
         text, printed = _print_target(request, profile, design.target)
         lines.append(text)
         written = printed["files"]
-    write_whole({plot: picture.getvalue()})
+    write_files({plot: picture})
     lines.append(f"wrote {plot}")
     return "\n".join(lines), record | {"files": [*written, str(plot)]}
 
@@ -226,10 +223,9 @@ def _write_measured(request: TargetRequest) -> tuple[str, dict[str, Any]]:
         updated_profile_text,
         write_profile,
     )
-    from perchctl.target.output import check_writable
 
     base, path = _profile_to_write(request)
-    check_writable(path)
+    check_place(path)
     changed = path.exists() and request.output is None
     if path.exists() and not request.force:
         raise UsageError(

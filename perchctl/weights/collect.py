@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.errors import InvalidValue
+from perchctl.files import cannot_be_written
 from perchctl.geometry import Array
 from perchctl.pipeline import Pipeline, make_pipeline, step
 from perchctl.profile import Profile
@@ -145,7 +146,7 @@ class SessionFile:
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            raise InvalidValue(f"{self._path}: cannot be written: {error.strerror}") from None
+            raise cannot_be_written(self._path, error) from None
 
     def _continue(self, frames: int) -> None:
         try:
