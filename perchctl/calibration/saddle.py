@@ -174,7 +174,7 @@ def _step(J: Array, residual: Array, damping: Array) -> Array:
     scale = np.einsum("nii->ni", A)
     A[:, range(6), range(6)] += damping[:, None] * scale + 1e-9
     step = np.nan_to_num(np.linalg.solve(A, b[..., None])[..., 0])
-    return np.clip(step, -_LONGEST, _LONGEST)
+    return np.asarray(np.clip(step, -_LONGEST, _LONGEST))
 
 
 def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
