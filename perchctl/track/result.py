@@ -124,7 +124,7 @@ def _rotation(rvec: Array) -> Array:
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
-def record_of(tracked: Tracked) -> dict[str, Any]:
+def track_record(tracked: Tracked) -> dict[str, Any]:
     """The line of `track --json`; what is not finite becomes null."""
     target = tracked.target
     return {

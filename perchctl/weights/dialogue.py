@@ -13,7 +13,14 @@ from perchctl.errors import Interrupted, InvalidValue, NotFound, TimedOut
 from perchctl.geometry import Array, wrap_rad
 from perchctl.pipeline import Pipeline
 from perchctl.vision.types import Frame
-from perchctl.weights.collect import Eye, SessionFile, Sight, fault_of, rows_of, typical
+from perchctl.weights.collect import (
+    MarkerReader,
+    MarkerReading,
+    SessionFile,
+    fault_of,
+    rows_of,
+    typical,
+)
 from perchctl.weights.truth import Actual, Ask, Truth, moved
 
 SILENT_S = 5.0
@@ -67,19 +74,19 @@ class Experiment:
         except InvalidValue as error:
             return str(error)
         self._answer("hold still and press Enter (q stops): ")
-        eye = Eye(self._setup, before.attitude)
+        reader = MarkerReader(self._setup, before.attitude)
         with self._bar("frames", frames) as advance:
-            sights = []
+            readings = []
             for frame in self._frames(frames):
-                sights.append(eye.look(frame))
+                readings.append(reader.read(frame))
                 advance()
-        fault = fault_of(sights)
+        fault = fault_of(readings)
         if fault is None and self._truth.repeatable:
             fault = moved(before, self._truth.actual(self._answer))
         if fault is None:
-            fault = self._doubt(before, sights)
+            fault = self._doubt(before, readings)
         if fault is None:
-            self._session.append(number, rows_of(number, sights, before.pose))
+            self._session.append(number, rows_of(number, readings, before.pose))
         return fault
 
     def _answer(self, question: str) -> str:
@@ -94,8 +101,8 @@ class Experiment:
             )
         return text
 
-    def _doubt(self, actual: Actual, sights: list[Sight]) -> str | None:
-        seen = typical(sights)
+    def _doubt(self, actual: Actual, readings: list[MarkerReading]) -> str | None:
+        seen = typical(readings)
         off_m = float(np.linalg.norm(seen[:3] - actual.pose[:3]))
         off_rad = abs(wrap_rad(float(seen[3] - actual.pose[3])))
         if off_m <= FAR_M and off_rad <= FAR_RAD:

@@ -24,7 +24,7 @@ from perchctl.plot import (
     save_png,
 )
 from perchctl.weights.evidence import LABELS
-from perchctl.weights.report import Result
+from perchctl.weights.result import Result
 from perchctl.weights.types import AXES, PAPER_WEIGHTS
 
 SIZE_IN = (14.0, 10.5)
