@@ -1,8 +1,8 @@
 """The text of a calibration file: one YAML that ROS, OpenCV's FileStorage and PyYAML all read.
 
 ROS wants camera_info keys; FileStorage wants ``dt: d`` in each matrix and a first line
-``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and takes ``1e-05`` for a
-word.
+``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and reads
+``1e-05`` as a string.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def _matrix(key: str, values: Array) -> list[str]:
 
 
 def _number(value: float | int) -> str:
-    """Read back to the very same number; with a point, or PyYAML takes it for a word."""
+    """Read back to the very same number; with a point, or PyYAML reads a string."""
     if isinstance(value, int):
         return str(value)
     text = repr(float(value))

@@ -127,7 +127,7 @@ class MjpegSource(LiveSource):
 
     Reconnects when the stream ends, stalls or breaks; gives up after
     `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
-    says that there is no such stream before the first picture came. Goes straight
+    answers that there is no such stream before the first picture came. Goes straight
     to the camera: a proxy for the internet is not for it.
     """
 

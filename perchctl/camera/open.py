@@ -52,9 +52,9 @@ def open_source(
 
     Args:
         spec: one of `ALLOWED`; ``sim:`` belongs to the simulated vehicle, which
-            resolves it to its own stream before this function is asked.
+            resolves it to its own stream before this function is called.
         latency_s: time from exposure to arrival, taken off live frames' times.
-        size_px: wanted width and height (asked of ``camera:N`` only).
+        size_px: wanted width and height (requested of ``camera:N`` only).
         clock: the loop's clock, s.
         timeout_s: how long the first frame of a live source may take.
 

@@ -66,7 +66,7 @@ def calibrate(
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
 ) -> None:
-    """Calibrate the camera, and say what its error means in mm at the target.
+    """Calibrate the camera, and report what its error means in mm at the target.
 
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
     by more than 5 times its view's spread; both are named. --check exits with 1 on a fail.

@@ -14,7 +14,9 @@ from perchctl.cli.app import JsonOption, ProfileOption, reported
 def fit_weights(
     data: Annotated[
         list[Path] | None,
-        typer.Argument(help="CSV files, or logs (.jsonl) of lockstep flights, which know truth."),
+        typer.Argument(
+            help="CSV files, or logs (.jsonl) of lockstep flights, which hold the truth."
+        ),
     ] = None,
     profile: ProfileOption = "sim",
     session: Annotated[
@@ -70,7 +72,7 @@ def fit_weights(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit the merge weights to poses whose truth is known, and prove that they help.
+    """Fit the merge weights to poses whose truth is known, and verify that they help.
 
     A CSV row is a frame: position (a number for the place), t_s, then x_m, y_m, z_m and yaw_rad
     of large_, small_ and actual_; the cells of a marker that was not seen are empty. joint_

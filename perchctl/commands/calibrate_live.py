@@ -60,7 +60,7 @@ def captured_views(
                 page.show(moment.index, _sketch(moment))
                 page.tell(lambda: _page_state(moment))
 
-        views, pictures = capture(source, board, show, stopped=stop.asked.is_set)
+        views, pictures = capture(source, board, show, stopped=stop.requested.is_set)
     if pictures_folder is not None and pictures:
         _keep(pictures, pictures_folder)
     if not views:

@@ -125,7 +125,7 @@ def _collect_with_person(
     spec = profile.camera.source if request.source is None else request.source
     if spec.startswith("sim:"):
         raise UsageError(
-            "the simulated camera knows its own truth: add --truth sim, or name a real camera "
+            "the simulator has the truth itself: add --truth sim, or name a real camera "
             "with --source (camera:N, http://...)"
         )
     config = profile.camera

@@ -130,13 +130,13 @@ def track(
         for frame in frames(run.input.source, now, stop, run.notes):
             run.take(frame)
         ended_s = now()
-        if tally.frames == 0 and not stop.asked.is_set():
+        if tally.frames == 0 and not stop.requested.is_set():
             raise NotFound(f"{run.input.source.describe()} gave no frame at all")
         run.outputs.close(keep=True)
     say(tally.text(ended_s))
     if run.prints.judged:
         say(run.prints.verdict().text)
-    if stop.asked.is_set():
+    if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was written is complete")
     return tally
 
@@ -145,7 +145,7 @@ def frames(
     source: FrameSource, now: Callable[[], float], stop: Stopper, notes: Notes
 ) -> Iterator[Frame]:
     """A recording's every frame, a live source's newest ones, until the end or Ctrl-C."""
-    while not stop.asked.is_set():
+    while not stop.requested.is_set():
         now_s = now()
         frame = source.poll(now_s)
         if frame is not None:
@@ -158,7 +158,7 @@ def frames(
             say(gone)
             return
         notes.silence(source.problem(now_s) is not None, source.describe())
-        stop.asked.wait(POLL_S)
+        stop.requested.wait(POLL_S)
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ class _Viewer:
             return
         say("starts when the page is opened (Ctrl-C ends)")
         until_s = time.monotonic() + OPEN_PAGE_WITHIN_S
-        while not (self._stop.asked.is_set() or self._page.opened.wait(0.1)):
+        while not (self._stop.requested.is_set() or self._page.opened.wait(0.1)):
             if time.monotonic() > until_s:
                 return
 
@@ -276,4 +276,4 @@ class _Viewer:
             self._offset_s = self._now() - t_s
         left_s = t_s + self._offset_s - self._now()
         if left_s > 0.0:
-            self._stop.asked.wait(left_s)
+            self._stop.requested.wait(left_s)

@@ -21,7 +21,7 @@ NOTABLE_SCALE_ERROR = 0.01
 
 @dataclass(frozen=True)
 class Measured:
-    """The target with its measured sizes, and what they say of the print."""
+    """The target with its measured sizes, and what follows for the print."""
 
     target: TargetConfig
     notes: tuple[str, ...]

@@ -49,7 +49,7 @@ class CameraPose:
 class Tracked:
     """One frame. `frame` is the file's name, or the index where there is none.
 
-    `stage` says what this frame showed; a `target` at stage ``none`` is the filter's
+    `stage` is what this frame showed; a `target` at stage ``none`` is the filter's
     prediction.
     """
 

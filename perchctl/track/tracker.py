@@ -88,7 +88,7 @@ class Tracker:
 
 @dataclass(eq=False)
 class Tally:
-    """What the summary says."""
+    """The counts of the summary."""
 
     frames: int = 0
     large: int = 0
@@ -106,10 +106,10 @@ class Tally:
         took_s = max(now_s - self.started_s, 1e-6)
         share = 100.0 / max(self.frames, 1)
         plural = "frame" if self.frames == 1 else "frames"
-        said = "".join(f"; {note.partition(':')[0]} in {n}" for note, n in self.notes.items())
+        counted = "".join(f"; {note.partition(':')[0]} in {n}" for note, n in self.notes.items())
         return (
             f"{self.frames} {plural} in {took_s:.1f} s ({self.frames / took_s:.0f} a second): "
-            f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{said}"
+            f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{counted}"
         )
 
 

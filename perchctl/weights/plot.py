@@ -91,8 +91,8 @@ def _method(result: Result, name: str) -> str:
 
 
 def _label(result: Result, name: str) -> str:
-    said = LABELS[_method(result, name)]
-    return f"{said}, position left out of the fit" if name == "chosen" else said
+    label = LABELS[_method(result, name)]
+    return f"{label}, position left out of the fit" if name == "chosen" else label
 
 
 def _learning(ax: Axes, result: Result, k: int) -> None:

@@ -30,6 +30,7 @@ from perchctl.track.tracker import Notes, Tracker, camera_pipeline
 from perchctl.vision.camera_model import project
 from perchctl.vision.pose import square
 from perchctl.vision.types import Frame
+from tests.helpers.disk import full_disk
 from tests.helpers.recording import (
     CALIBRATION,
     STAGE_OF,
@@ -477,7 +478,7 @@ class PressingOut(io.StringIO):
 
     def write(self, text: str) -> int:
         written = super().write(text)
-        if self.getvalue().count("\n") == 3 and not self.stopper.asked.is_set():
+        if self.getvalue().count("\n") == 3 and not self.stopper.requested.is_set():
             self.stopper.press()
         return written
 
@@ -499,6 +500,15 @@ def test_ctrl_c_leaves_whole_files(video: Path, tmp_path: Path) -> None:
     capture = cv2.VideoCapture(str(tmp_path / "x.mp4"))
     assert sum(1 for _ in iter(lambda: capture.read()[0], False)) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.csv", "x.mp4"]
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_no_file(video: Path, tmp_path: Path) -> None:
+    old = tmp_path / "x.csv"
+    old.write_text("old")
+    with full_disk(room=4_000), pytest.raises(InvalidValue, match=r"x\.csv cannot be written"):
+        track(video, csv=old, overlay=tmp_path / "x.mp4")
+    assert old.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["x.csv"]
 
 
 def test_a_second_ctrl_c_does_not_wait() -> None:
