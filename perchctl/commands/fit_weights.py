@@ -1,16 +1,16 @@
-"""The work behind `perchctl fit-weights`: read, fit, prove, report, write."""
+"""The work behind `perchctl fit-weights`: collect, read, fit, verify, report, write."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from perchctl.commands.fit_weights_collect import CollectRequest, collect
+from perchctl.commands.fit_weights_request import CollectRequest, FitRequest
 from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
@@ -39,25 +39,6 @@ __all__ = ["CollectRequest", "FitRequest", "run"]
 
 
 @dataclass(frozen=True)
-class FitRequest:
-    """The command line as it was given; None is not given. What is collected is fitted too."""
-
-    data: tuple[Path, ...] = ()
-    profile: str = "sim"
-    collecting: CollectRequest = field(default_factory=CollectRequest)
-    method: str = "closed_form"
-    step: float | None = None
-    passes: int | None = None
-    order: str = "shuffled"
-    start: float = 0.5
-    test: Path | None = None
-    output: Path | None = None
-    plot: Path | None = None
-    anyway: bool = False
-    as_json: bool = False
-
-
-@dataclass(frozen=True)
 class FitOptions:
     """The command line on top of the profile, checked."""
 
@@ -82,6 +63,8 @@ def run(request: FitRequest) -> int:
     options = resolve(request)
     session = request.collecting.session
     if session is not None:
+        from perchctl.commands.fit_weights_collect import collect
+
         collect(request.collecting, session)
     result = fit(options)
     if options.plot is not None:

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from perchctl.calibration.files import load_calibration
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
+from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, UsageError
@@ -33,25 +33,6 @@ from perchctl.weights.truth import EstimateTruth, MocapTruth, Truth, TypedTruth,
 
 TRUTHS = ("typed", "mocap", "estimate", "sim")
 _DEGREES = (1.0, math.pi / 180.0)
-
-
-@dataclass(frozen=True)
-class CollectRequest:
-    """The options of collecting as they were given; `session` is None without `--collect`."""
-
-    session: Path | None = None
-    profile: str = "sim"
-    positions: int = 10
-    frames: int = 100
-    truth: str = "typed"
-    source: str | None = None
-    uri: str | None = None
-    mocap: str | None = None
-    bodies: str = "cf,target"
-    target: str | None = None
-    seed: int = 0
-    noise: float = 4.0
-    blur: float = 1.0
 
 
 def collect(request: CollectRequest, path: Path) -> None:

@@ -16,7 +16,8 @@ from typer.testing import CliRunner, Result
 
 from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
-from perchctl.commands import fit_weights_collect
+from perchctl.commands.fit_weights_collect import _truth
+from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.errors import InvalidValue
 from perchctl.geometry import rot_z
 from perchctl.profile import find_calibration, load_profile
@@ -372,11 +373,7 @@ def test_motion_capture_gives_the_median_or_names_the_bodies(
         other.actual(lambda question: "")
     other.close()
     with pytest.raises(Exception, match="--mocap TYPE:HOST"):
-        fit_weights_collect._truth(
-            fit_weights_collect.CollectRequest(Path("s.csv"), truth="mocap"),
-            load_profile("sim"),
-            lambda: 0.0,
-        )
+        _truth(CollectRequest(truth="mocap"), load_profile("sim"), lambda: 0.0)
 
 
 def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:
