@@ -8,6 +8,7 @@ import re
 import socket
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +16,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl import __version__, cli
+from perchctl import __version__
 from perchctl.cli import app
-from perchctl.errors import EXIT_CODES
+from perchctl.cli.app import reported
+from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.handle import SimProcess
 from tests.helpers.flights import ROOT, SEED, SHORT
@@ -116,6 +119,11 @@ def test_help_loads_nothing_heavy() -> None:
     )
     assert "simulate" in done.stdout
     assert done.stderr.strip() == "[]"
+
+
+def test_the_help_lists_the_commands_in_the_order_of_use() -> None:
+    commands = ["make-target", "calibrate", "fit-weights", "track", "fly", "simulate"]
+    assert re.findall(rf"^\W*({'|'.join(commands)}) ", run("--help").stdout, re.M) == commands
 
 
 def test_fly_help_lists_every_exit_code() -> None:
@@ -340,11 +348,11 @@ def test_what_nobody_foresaw_is_one_sentence_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail() -> None:
-        with cli.reported():
+        with reported():
             raise ZeroDivisionError("oh")
 
     monkeypatch.delenv("PERCHCTL_DEBUG", raising=False)
-    with pytest.raises(cli.typer.Exit) as left:
+    with pytest.raises(typer.Exit) as left:
         fail()
     assert left.value.exit_code == 1
     assert "unforeseen ZeroDivisionError: oh" in capsys.readouterr().err
@@ -354,10 +362,48 @@ def test_what_nobody_foresaw_is_one_sentence_too(
 
 
 def test_ctrl_c_before_the_flight_is_130(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(cli.typer.Exit) as left, cli.reported():
+    with pytest.raises(typer.Exit) as left, reported():
         raise KeyboardInterrupt
     assert left.value.exit_code == 130
     assert "Ctrl-C" in capsys.readouterr().err
+
+
+# --- Notes on the profile -----------------------------------------------------------------------
+
+
+def test_a_note_on_the_profile_is_one_sentence_once(capsys: pytest.CaptureFixture[str]) -> None:
+    """Other warnings are left to those who show them: here to pytest, else to Python."""
+
+    def warn() -> None:
+        with reported():
+            for key in ("a", "b", "a"):
+                warnings.warn(f"mine.yaml: {key} has another name", ProfileNote, stacklevel=1)
+            warnings.warn("something else", DeprecationWarning, stacklevel=1)
+
+    with pytest.warns(DeprecationWarning, match="something else") as others:
+        warn()
+    assert len(others) == 1
+    assert capsys.readouterr().err == (
+        "perchctl: mine.yaml: a has another name\nperchctl: mine.yaml: b has another name\n"
+    )
+    with pytest.raises(ProfileNote):
+        warnings.warn("an error again behind it", ProfileNote, stacklevel=1)
+
+
+def test_a_note_stands_before_the_sentence_of_a_failure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def load(name: str) -> None:
+        warnings.warn(f"{name}: camera.old is camera.new by now", ProfileNote, stacklevel=1)
+        raise InvalidValue(f"{name}: no good")
+
+    monkeypatch.setattr("perchctl.commands.fly.load_profile", load)
+    said = run("fly", "-p", "mine.yaml", "--dry-run")
+    assert said.code == 30
+    assert said.stderr.splitlines() == [
+        "perchctl: mine.yaml: camera.old is camera.new by now",
+        "perchctl: mine.yaml: no good",
+    ]
 
 
 # --- Campaigns ----------------------------------------------------------------------------------

@@ -253,7 +253,7 @@ def _scaled_solve(S: Array, g: Array) -> Array:
 
 
 def reduced_blocks(fit: Fit) -> list[tuple[Array, Array]]:
-    """For each view what it says about the lens once its pose is free: A (2n, p) with the
+    """What each view contributes to the lens once its pose is free: A (2n, p) with the
     pose's part projected out, and the weighted residuals (2n,)."""
     blocks = []
     for r, (A, B), w in zip(fit.residuals, fit.jacobians, fit.weights, strict=True):

@@ -2,14 +2,14 @@
 
 The new views give two solutions: the file's camera with only the boards' poses fitted,
 and a camera of the same model fitted to these views alone. The first's reprojection
-error tells of a wrong lens; but poses take up a wrong focal length, so the two cameras
+error shows a wrong lens; but poses take up a wrong focal length, so the two cameras
 are compared at the target as well, in mm. The check fails
 
 - when the file's RMS is more than twice that of the free camera and above 0.3 px, or
 - when the two put the target further apart, straight ahead, than half of the limit
   (1 mm, or 1 % of the distance) and than the 95 % line of the new pictures themselves.
 
-Pictures whose own 95 % line is above twice the limit cannot judge; that is said.
+Pictures whose own 95 % line is above twice the limit cannot judge, and the check is refused.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ UNSURE_FACTOR = 2.0
 @dataclass(frozen=True)
 class Deviation:
     """mm: between the target's places by the two cameras, straight ahead; mm95: how well
-    the new pictures know it."""
+    the new pictures fix it."""
 
     z_m: float
     mm: float
@@ -59,7 +59,7 @@ class CheckResult:
 def check(camera: CameraModel, views: Sequence[View]) -> CheckResult:
     """Judge a calibration by new views of a board.
 
-    Raises InvalidValue for too few views, or views that cannot tell.
+    Raises InvalidValue for too few views, or views that do not fix it.
     """
     if len(views) < MIN_CHECK_VIEWS:
         raise InvalidValue(
@@ -92,7 +92,7 @@ def check(camera: CameraModel, views: Sequence[View]) -> CheckResult:
     )
     passed, reason = _judged(fixed, free, deviations)
     if passed:
-        _can_tell(robust.views, free, deviations)
+        _check_evidence(robust.views, free, deviations)
     rms = [float(np.sqrt((r**2).sum(axis=1).mean())) for r in fixed.residuals]
     names = [v.name for v in robust.views]
     return CheckResult(
@@ -132,13 +132,14 @@ def _judged(fixed: Fit, free: Fit, deviations: Sequence[Deviation]) -> tuple[boo
 
 
 def _share(deviation: Deviation) -> float:
-    """Of the limit; zero where the pictures themselves do not know it so well."""
+    """Of the limit; zero where the pictures themselves do not fix it so well."""
     if deviation.mm <= deviation.mm95:
         return 0.0
     return deviation.mm / limit_mm(deviation.z_m)
 
 
-def _can_tell(views: Sequence[View], free: Fit, deviations: Sequence[Deviation]) -> None:
+def _check_evidence(views: Sequence[View], free: Fit, deviations: Sequence[Deviation]) -> None:
+    """Raises InvalidValue where the pictures could not show a wrong focal length."""
     unsure = not deviations or any(
         d.mm95 > UNSURE_FACTOR * limit_mm(d.z_m) for d in deviations if d.z_m in RANGES_M
     )

@@ -1,7 +1,7 @@
 """How far the lens parameters may be off.
 
 Two estimates are made. The first takes the corners' errors as independent: the residuals'
-variance times the inverse of the normal equations. The second asks the views: errors
+variance times the inverse of the normal equations. The second uses the views: errors
 within a view go together (blur, a bent board, a moving camera), so each view is left out
 once, in the linear approximation, and the spread of those solutions is the covariance
 (the jackknife over clusters). In every direction of parameter space the larger of the

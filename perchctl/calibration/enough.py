@@ -45,7 +45,7 @@ def check_variety(views: Sequence[View], poses: Array) -> None:
     if tilted < MIN_TILTED:
         raise InvalidValue(
             f"{tilted} of {len(views)} views are tilted by more than {MIN_TILT_DEG:g} deg (the "
-            f"most by {tilts.max():.0f}), so focal length and distance cannot be told apart: add "
+            f"most by {tilts.max():.0f}), so focal length and distance cannot be separated: add "
             f"{MIN_TILTED - tilted} or more with the board tilted by 20 to 45 deg, about both axes"
         )
     map_ = coverage(views)

@@ -118,7 +118,7 @@ def pick(views: Sequence[View], board: Board) -> list[View]:
 class Capture:
     """Memory of a guided capture; `Capture()` is a fresh start.
 
-    advice: what the person should know about the newest frame.
+    advice: what to do next, for the person with the board.
     """
 
     taken: tuple[View, ...] = ()
@@ -145,7 +145,7 @@ def consider(capture: Capture, seen: View | str, board: Board) -> Capture:
     if seen.blur_px > max(_BLUR_SHARE * width, 1.0) or seen.blur_px > 2.5 * sharpest:
         return Capture(taken, signatures, seen, "too blurred: more light, or hold still")
     if not is_new(here, signatures):
-        return Capture(taken, signatures, seen, _wish(signatures))
+        return Capture(taken, signatures, seen, _hint(signatures))
     grown = (*signatures, here)
     return Capture((*taken, seen), grown, seen, f"taken, {len(grown)} views", True)
 
@@ -159,13 +159,13 @@ def _moved_px(before: View | None, now: View) -> float:
     return float(np.median(np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)))
 
 
-def _wish(signatures: Sequence[Signature]) -> str:
+def _hint(signatures: Sequence[Signature]) -> str:
     done = progress(signatures)
     least = min(AXES, key=lambda axis: done[axis])
-    wishes = {
+    hints = {
         "x": "move the board to the left and right rims",
         "y": "move the board to the top and bottom rims",
         "size": "come nearer, and go farther away",
         "tilt": "tilt the board, about both axes",
     }
-    return wishes[least] if done[least] < 1.0 else "show the board somewhere new"
+    return hints[least] if done[least] < 1.0 else "show the board somewhere new"

@@ -20,11 +20,12 @@ from perchctl.target.boards import Board
 VIDEO_WINDOW = 8
 """Of so many frames in a row only the sharpest is searched for the board."""
 _SHARPNESS_WIDTH = 480
-Told = Callable[[int, int | None], None]
+Progress = Callable[[int, int | None], None]
+"""Called with the number of pictures done, and of all where it is known."""
 
 
 def views_of_images(
-    where: str, board: Board, refine: bool = True, told: Told = lambda done, total: None
+    where: str, board: Board, refine: bool = True, progress: Progress = lambda done, total: None
 ) -> tuple[list[View], list[Rejection]]:
     """Every picture of a folder or glob: the views, and those without a board.
 
@@ -56,12 +57,12 @@ def views_of_images(
                     f"keep pictures of one only"
                 )
             _sort(seen, name, views, missing)
-            told(done, len(paths))
+            progress(done, len(paths))
     return views, missing
 
 
 def views_of_video(
-    path: Path, board: Board, refine: bool = True, told: Told = lambda done, total: None
+    path: Path, board: Board, refine: bool = True, progress: Progress = lambda done, total: None
 ) -> tuple[list[View], list[Rejection]]:
     """The sharp and different views of a video.
 
@@ -81,7 +82,7 @@ def views_of_video(
                     searched += 1
                     if isinstance(seen, View):
                         found.append(seen)
-                told(searched, None)
+                progress(searched, None)
     finally:
         source.close()
     if not found:

@@ -58,9 +58,9 @@ def _banner(ax: Axes, calibration: Calibration) -> None:
     ax.add_patch(Rectangle((0, 0), 1, 1, transform=ax.transAxes, color=colour))
     # Outside of the layout: a long sentence must not squeeze the panels.
     style: dict[str, Any] = {"transform": ax.transAxes, "color": "white", "in_layout": False}
-    said = sentence(calibration)
-    size = 15 if len(said) < 100 else 11.5
-    ax.text(0.012, 0.64, said, fontsize=size, weight="bold", va="center", **style)
+    verdict = sentence(calibration)
+    size = 15 if len(verdict) < 100 else 11.5
+    ax.text(0.012, 0.64, verdict, fontsize=size, weight="bold", va="center", **style)
     lines = _notes(calibration)
     ax.text(0.012, 0.22, _plain("   |   ".join(lines)), fontsize=9.5, va="center", **style)
 

@@ -174,7 +174,7 @@ def _step(J: Array, residual: Array, damping: Array) -> Array:
     scale = np.einsum("nii->ni", A)
     A[:, range(6), range(6)] += damping[:, None] * scale + 1e-9
     step = np.nan_to_num(np.linalg.solve(A, b[..., None])[..., 0])
-    return np.clip(step, -_LONGEST, _LONGEST)
+    return np.asarray(np.clip(step, -_LONGEST, _LONGEST))
 
 
 def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
@@ -191,7 +191,7 @@ def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Ar
         parts.append((c, s, w, d, t, 1.0 - t * t, -s * x + c * y))
     (c1, s1, w1, d1, t1, g1, e1), (c2, s2, w2, d2, t2, g2, e2) = parts
     u, v, cross = offsets[..., 0], offsets[..., 1], t1 * t2
-    # In a window of few pixels the contrast's slope cannot be told from a shift.
+    # In a window of few pixels the contrast's slope cannot be distinguished from a shift.
     slope = cross * (np.abs(offsets).max(axis=(1, 2)) > _MIN_SLOPE_PX)[:, None]
     base = np.stack([np.ones_like(x), u, v, cross, u * slope, v * slope], axis=2)
     base *= weight[..., None]

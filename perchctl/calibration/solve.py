@@ -1,11 +1,12 @@
-"""From views of a board to a camera that knows its own error."""
+"""From views of a board to a camera and the error of its calibration."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.calibration.bundle import Fit, NoSolution, as_solution, start_fit
 from perchctl.calibration.compare import recommend, score
@@ -37,7 +38,6 @@ def calibrate(
     model: str = AUTO,
     rejecting: bool = True,
     missing: Sequence[Rejection] = (),
-    told: Callable[[str], None] = lambda step: None,
 ) -> Calibration:
     """Solve, reject, compare, predict.
 
@@ -45,55 +45,25 @@ def calibrate(
         model: a name of `MODEL_NAMES`, or ``auto`` for the recommended one.
         rejecting: leave out outliers (`perchctl.calibration.robust`).
         missing: pictures in which no board was found, for the report.
-        told: called with the name of each step, for progress.
 
     Raises:
         InvalidValue: too few views, all frontal, most of the image empty, focal length
         not fixed, or too many views that fit no camera.
     """
-    check_views(views, len(views) + len(missing))
-    told("outliers")
+    pictures = len(views) + len(missing)
+    check_views(views, pictures)
     robust = _without_outliers(views, rejecting)
-    check_views(robust.views, len(views) + len(missing))
-    # Tilt and coverage first: they say best what to add.
+    check_views(robust.views, pictures)
+    # Tilt and coverage first: their messages name best what to add.
     check_variety(robust.views, robust.fit.poses)
-    fits, scores = {}, []
-    for name in MODEL_NAMES:
-        told(name)
-        try:
-            fit = robust.fit if robust.fit.model == name else start_fit(robust.views, name)
-        except NoSolution as error:
-            scores.append(ModelScore(name, None, None, note=str(error)))
-            continue
-        fits[name] = fit
-        judged = score(robust.views, fit)
-        if not usable(fit):
-            judged = dataclasses.replace(judged, note=FOLDS_BACK)
-        scores.append(judged)
+    fits, scores = _fit_models(robust)
     recommended = recommend(scores)
-    chosen = recommended if model == AUTO else model
-    if chosen not in fits:
-        notes = {s.model: s.note for s in scores}
-        raise InvalidValue(f"the lens model {chosen} cannot be fitted: {notes[chosen]}")
-    told("prediction")
-    fit = fits[chosen]
+    fit = _chosen(fits, scores, recommended if model == AUTO else model)
     covariance = lens_covariance(fit)
     solution = as_solution(fit, covariance)
     check_focal(solution.std, solution.parameters)
     rms95, max95, _ = ray_errors_px(solution.camera, covariance)
-    map_ = coverage(robust.views)
-    warnings = []
-    if not usable(fit):
-        warnings.append(
-            f"the lens model {FOLDS_BACK}, where no corners were seen: add views at its rims"
-        )
-    if len(robust.views) < GOOD_VIEWS:
-        warnings.append(f"only {len(robust.views)} views: {GOOD_VIEWS} or more are better")
-    if map_.mean() < GOOD_COVERED:
-        warnings.append(
-            f"{100 * (1 - map_.mean()):.0f} % of the picture is uncovered: add views with the "
-            f"board {uncovered_text(map_)}"
-        )
+    covered = coverage(robust.views)
     return Calibration(
         board=board,
         solution=solution,
@@ -106,9 +76,51 @@ def calibrate(
         errors=predict_errors(solution.camera, covariance),
         ray_rms_px95=rms95,
         ray_max_px95=max95,
-        covered=map_,
-        warnings=tuple(warnings),
+        covered=covered,
+        warnings=tuple(_warnings(fit, len(robust.views), covered)),
     )
+
+
+def _fit_models(robust: Robust) -> tuple[dict[str, Fit], list[ModelScore]]:
+    """Every lens model that can be fitted to the views, and how each predicts."""
+    fits: dict[str, Fit] = {}
+    scores: list[ModelScore] = []
+    for name in MODEL_NAMES:
+        try:
+            fit = robust.fit if robust.fit.model == name else start_fit(robust.views, name)
+        except NoSolution as error:
+            scores.append(ModelScore(name, None, None, note=str(error)))
+            continue
+        fits[name] = fit
+        scored = score(robust.views, fit)
+        if not usable(fit):
+            scored = dataclasses.replace(scored, note=FOLDS_BACK)
+        scores.append(scored)
+    return fits, scores
+
+
+def _chosen(fits: Mapping[str, Fit], scores: Sequence[ModelScore], model: str) -> Fit:
+    if model not in fits:
+        notes = {s.model: s.note for s in scores}
+        raise InvalidValue(f"the lens model {model} cannot be fitted: {notes[model]}")
+    return fits[model]
+
+
+def _warnings(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[str]:
+    """What would make the calibration better."""
+    warnings = []
+    if not usable(fit):
+        warnings.append(
+            f"the lens model {FOLDS_BACK}, where no corners were seen: add views at its rims"
+        )
+    if views < GOOD_VIEWS:
+        warnings.append(f"only {views} views: {GOOD_VIEWS} or more are better")
+    if covered.mean() < GOOD_COVERED:
+        warnings.append(
+            f"{100 * (1 - covered.mean()):.0f} % of the picture is uncovered: add views with the "
+            f"board {uncovered_text(covered)}"
+        )
+    return warnings
 
 
 def _without_outliers(views: Sequence[View], rejecting: bool) -> Robust:

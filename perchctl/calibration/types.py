@@ -114,7 +114,7 @@ class RangeError:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """All that a calibration says.
+    """The result of a calibration.
 
     Attributes:
         views: those used, without rejected corners; `solution` belongs to them.

@@ -20,7 +20,7 @@ TITLES: dict[Level, str] = {
 
 def limit_mm(z_m: float) -> float:
     """1 mm, or 1 % of the distance where that is more: the gear settles within 4 mm a hand's
-    breadth under the target, and an approach from 1.5 m forgives centimetres."""
+    breadth under the target, and an approach from 1.5 m tolerates centimetres."""
     return max(LIMIT_FLOOR_MM, 1e3 * LIMIT_SHARE * z_m)
 
 

@@ -1,22 +1,18 @@
-"""Writing a calibration: one YAML that ROS, OpenCV's FileStorage and PyYAML all read.
+"""The text of a calibration file: one YAML that ROS, OpenCV's FileStorage and PyYAML all read.
 
 ROS wants camera_info keys; FileStorage wants ``dt: d`` in each matrix and a first line
-``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and takes ``1e-05`` for a
-word. Files appear whole or not at all.
+``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and reads
+``1e-05`` as a string.
 """
 
 from __future__ import annotations
 
-import os
-import secrets
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 
 import numpy as np
 
 from perchctl.calibration.lens import PARAMETERS, parameters_of
 from perchctl.calibration.types import Calibration
-from perchctl.errors import InvalidValue, PerchError
 from perchctl.geometry import Array
 from perchctl.vision.types import CameraModel
 
@@ -68,52 +64,6 @@ def calibration_text(calibration: Calibration, name: str, date: str) -> str:
     return text + "\n".join(more) + "\n"
 
 
-def check_free(path: Path, force: bool) -> None:
-    """Raises InvalidValue where a file would be overwritten, or a folder is in its place."""
-    if path.is_dir():
-        raise InvalidValue(f"{path} is a folder; name a file, such as {path / 'camera.yaml'}")
-    if path.exists() and not force:
-        raise InvalidValue(f"{path} exists already; add --force to replace it, or name another")
-
-
-def write_all(files: Sequence[tuple[Path, bytes]]) -> None:
-    """Write all files, or none: each to a temporary neighbour first, then renamed.
-
-    Raises PerchError with the file and the reason (a full disk, no rights).
-    """
-    temporary: list[tuple[Path, Path]] = []
-    made: list[Path] = []
-    path = files[0][0]
-    try:
-        for path, content in files:
-            _make_folder(path.parent, made)
-            part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-            temporary.append((part, path))
-            with part.open("xb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
-        for part, path in temporary:
-            os.replace(part, path)
-    except OSError as error:
-        for part, _ in temporary:
-            part.unlink(missing_ok=True)
-        for folder in reversed(made):
-            if not any(folder.iterdir()):
-                folder.rmdir()
-        raise PerchError(
-            f"{path} cannot be written: {error.strerror or error}; nothing was changed, free some "
-            f"space or choose another place with --output"
-        ) from None
-
-
-def _make_folder(folder: Path, made: list[Path]) -> None:
-    if not folder.exists():
-        _make_folder(folder.parent, made)
-        folder.mkdir()
-        made.append(folder)
-
-
 def _matrix(key: str, values: Array) -> list[str]:
     rows, cols = values.shape
     return [
@@ -126,7 +76,7 @@ def _matrix(key: str, values: Array) -> list[str]:
 
 
 def _number(value: float | int) -> str:
-    """Read back to the very same number; with a point, or PyYAML takes it for a word."""
+    """Read back to the very same number; with a point, or PyYAML reads a string."""
     if isinstance(value, int):
         return str(value)
     text = repr(float(value))

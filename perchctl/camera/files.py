@@ -18,16 +18,20 @@ DEFAULT_RATE_HZ = 30.0
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})
 
 
-class _Recording:
-    """What the two recordings share; `_read` gives the next picture and its time, or None."""
+class Recording:
+    """What the two recordings share; `_read` gives the next picture and its time, or None.
+
+    `rate_hz` is the frames' nominal rate, `count` their number, None where it is unknown.
+    """
 
     live = False
 
-    def __init__(self, name: str, latency_s: float) -> None:
+    def __init__(self, name: str, latency_s: float, rate_hz: float, count: int | None) -> None:
+        self.rate_hz, self.count = rate_hz, count
         self._name = name
         self._latency_s = latency_s
         self._index = 0
-        self._ahead = self._read()  # one picture ahead: tells the size and the end in time
+        self._ahead = self._read()  # one picture ahead, so that size and end are known in time
         if self._ahead is None:
             raise InvalidValue(f"{name} holds no readable frame; is it a picture or video file?")
         image = self._ahead[0]
@@ -64,17 +68,22 @@ class _Recording:
         raise NotImplementedError
 
 
-class VideoSource(_Recording):
+class VideoSource(Recording):
     """A video file; times from the container where they rise, else from its rate."""
 
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
         if not path.is_file():
             raise NotFound(f"video file {path} was not found")
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS)) if self._capture.isOpened() else 0.0
-        self._period_s = 1.0 / rate_hz if 0.1 < rate_hz < 1000.0 else 1.0 / DEFAULT_RATE_HZ
+        rate_hz, count = (
+            float(self._capture.get(key)) if self._capture.isOpened() else 0.0
+            for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT)
+        )
+        if not 0.1 < rate_hz < 1000.0:
+            rate_hz = DEFAULT_RATE_HZ
+        self._period_s = 1.0 / rate_hz
         self._last_s = -self._period_s
-        super().__init__(f"video:{path}", latency_s)
+        super().__init__(f"video:{path}", latency_s, rate_hz, round(count) if count > 0 else None)
 
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
         ok, image = self._capture.read()
@@ -92,16 +101,15 @@ class VideoSource(_Recording):
         self._capture.release()
 
 
-class ImagesSource(_Recording):
+class ImagesSource(Recording):
     """The pictures of a folder or a glob, in natural order (2 before 10), at `rate_hz`."""
 
     def __init__(
         self, where: str, latency_s: float = 0.0, rate_hz: float = DEFAULT_RATE_HZ
     ) -> None:
         self._paths = image_files(where)
-        self._rate_hz = rate_hz
         self._next = 0
-        super().__init__(f"images:{where}", latency_s)
+        super().__init__(f"images:{where}", latency_s, rate_hz, len(self._paths))
 
     @property
     def paths(self) -> list[Path]:
@@ -111,7 +119,7 @@ class ImagesSource(_Recording):
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
         if self._next >= len(self._paths):
             return None
-        path, t_s = self._paths[self._next], self._next / self._rate_hz
+        path, t_s = self._paths[self._next], self._next / self.rate_hz
         self._next += 1
         return read_grey(path), t_s
 

@@ -1,7 +1,7 @@
 """Whether a frame can be a measurement at all: frozen, snow, uniform, dark.
 
 Pure: `assess` is ``(state, frame) -> (state, verdict)``. A frame judged bad
-gives no measurement; the detector need not look at it.
+gives no measurement; the detector need not search it.
 """
 
 from __future__ import annotations

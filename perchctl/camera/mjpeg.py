@@ -26,6 +26,13 @@ _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
 _STANDALONE = frozenset(range(0xD0, 0xD8)) | {0x01}  # markers without a length
 
 
+def without_password(url: str) -> str:
+    """The URL without the name and password that it may hold; other text as it is."""
+    scheme, slashes, rest = url.partition("://")
+    host, slash, path = rest.partition("/")
+    return f"{scheme}{slashes}{host.rpartition('@')[2]}{slash}{path}" if slashes else url
+
+
 class Damaged(Exception):
     """The bytes at a start-of-image marker are no whole JPEG."""
 
@@ -120,7 +127,7 @@ class MjpegSource(LiveSource):
 
     Reconnects when the stream ends, stalls or breaks; gives up after
     `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
-    says that there is no such stream before the first picture came. Goes straight
+    answers that there is no such stream before the first picture came. Goes straight
     to the camera: a proxy for the internet is not for it.
     """
 
@@ -132,9 +139,7 @@ class MjpegSource(LiveSource):
         read_timeout_s: float = READ_TIMEOUT_S,
         reconnect_wait_s: float = RECONNECT_WAIT_S,
     ) -> None:
-        parts = urlsplit(url)
-        shown = parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
-        super().__init__(shown, latency_s, clock)
+        super().__init__(without_password(url), latency_s, clock)
         self._url = url
         self._read_timeout_s = read_timeout_s
         self._reconnect_wait_s = reconnect_wait_s

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from perchctl.camera.device import DeviceSource
-from perchctl.camera.files import ImagesSource, VideoSource
+from perchctl.camera.files import IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
 from perchctl.errors import InvalidValue, NotFound, TimedOut
@@ -13,6 +13,27 @@ from perchctl.errors import InvalidValue, NotFound, TimedOut
 ALLOWED = "camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, sim:"
 
 FIRST_FRAME_WITHIN_S = 8.0
+_SCHEMES = ("camera:", "video:", "images:", "http://", "https://", "sim:")
+
+
+def source_spec(source: str) -> str:
+    """The source as `open_source` takes it; a bare path names a video, picture or folder.
+
+    Errors: NotFound for a path that is not there.
+    """
+    if source.startswith(_SCHEMES):
+        return source
+    path = Path(source).expanduser()
+    if path.is_dir() or any(c in source for c in "*?["):
+        return f"images:{source}"
+    if path.is_file():
+        return f"{'images' if path.suffix.lower() in IMAGE_SUFFIXES else 'video'}:{source}"
+    if path.suffix or "/" in source:
+        raise NotFound(
+            f"{source} does not exist; a source is a video, picture or folder of pictures, or "
+            f"one of camera:N, video:FILE, images:DIR, http://HOST:PORT/PATH"
+        )
+    return source  # `open_source` names what is allowed
 
 
 def is_live(spec: str) -> bool:
@@ -31,9 +52,9 @@ def open_source(
 
     Args:
         spec: one of `ALLOWED`; ``sim:`` belongs to the simulated vehicle, which
-            resolves it to its own stream before this function is asked.
+            resolves it to its own stream before this function is called.
         latency_s: time from exposure to arrival, taken off live frames' times.
-        size_px: wanted width and height (asked of ``camera:N`` only).
+        size_px: wanted width and height (requested of ``camera:N`` only).
         clock: the loop's clock, s.
         timeout_s: how long the first frame of a live source may take.
 

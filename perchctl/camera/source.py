@@ -25,7 +25,7 @@ class FrameSource(Protocol):
     """A source of frames.
 
     A live source keeps only the newest frame and stamps it when it arrives; a
-    recorded one gives every frame once, at the pace it is asked, with the times
+    recorded one gives every frame once, at the pace it is polled, with the times
     of the recording.
     """
 

@@ -1,10 +1,8 @@
-"""The work behind `perchctl fit-weights`: read, fit, prove, report, write."""
+"""The work behind `perchctl fit-weights`: collect, read, fit, verify, report, write."""
 
 from __future__ import annotations
 
-import json
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,23 +10,37 @@ from pathlib import Path
 
 import numpy as np
 
+from perchctl.commands.fit_weights_request import CollectRequest, FitRequest
+from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
+from perchctl.files import check_place, same_file, write_files
 from perchctl.profile import Profile, find_profile, find_weights, load_profile
 from perchctl.profile.places import data_folder, user_config_folder
 from perchctl.weights.check import check
-from perchctl.weights.evidence import FITTED, evidence, fit_all, on_other_data
+from perchctl.weights.evidence import FITTED, Fitted, evidence, fit_all, on_other_data
 from perchctl.weights.files import write_weights
-from perchctl.weights.fit import biases, check_determined, errors_of, odd_positions, sums_of
+from perchctl.weights.fit import (
+    Errors,
+    Sums,
+    biases,
+    check_determined,
+    errors_of,
+    odd_positions,
+    sums_of,
+)
 from perchctl.weights.lms import LmsOptions
-from perchctl.weights.report import Result, as_object, file_content, text
+from perchctl.weights.report import report_text
+from perchctl.weights.result import Result, file_content, weights_record
 from perchctl.weights.table import chunks_of, read_csv
 from perchctl.weights.types import AXES, Measurements, joined
+
+__all__ = ["CollectRequest", "FitRequest", "run"]
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What the command line asked for, after collecting."""
+    """The command line on top of the profile, checked."""
 
     profile: Profile
     profile_path: Path
@@ -36,71 +48,75 @@ class FitOptions:
     lms: LmsOptions
     method: str = "closed_form"
     test: Path | None = None
-    out: Path | None = None
+    output: Path | None = None
     plot: Path | None = None
     as_json: bool = False
     anyway: bool = False
 
 
-def resolve(
-    data: list[Path],
-    profile_name: str,
-    *,
-    method: str,
-    step: float | None,
-    passes: int | None,
-    order: str,
-    start: float,
-    test: Path | None,
-    out: Path | None,
-    plot: Path | None,
-    as_json: bool,
-    anyway: bool,
-) -> FitOptions:
-    """The command line on top of the profile. Errors: NotFound, InvalidValue."""
-    if method not in FITTED:
-        raise InvalidValue(f"--method {method!r} is unknown; allowed are {', '.join(FITTED)}")
-    if order not in ("shuffled", "recorded"):
-        raise InvalidValue(f"--order {order!r} is unknown; allowed are shuffled and recorded")
-    if plot is not None and plot.suffix.lower() != ".png":
-        raise InvalidValue(f"--plot {plot} must end in .png")
-    for target in (out, plot):
-        if target is not None and any(_same(target, source) for source in data):
+def run(request: FitRequest) -> int:
+    """Collect, fit, print, draw, write; returns the exit code.
+
+    Errors: NotFound, InvalidValue, UsageError; PerchError when weights that are not
+    recommended were to be written; those of collecting.
+    """
+    options = resolve(request)
+    session = request.collecting.session
+    if session is not None:
+        from perchctl.commands.fit_weights_collect import collect
+
+        collect(request.collecting, session)
+    result = fit(options)
+    if options.plot is not None:
+        from perchctl.weights.plot import draw_weights
+
+        write_files({options.plot: draw_weights(result)})
+    if options.as_json:
+        print_record(weights_record(result))
+    else:
+        print(report_text(result))
+    if options.plot is not None:
+        say(f"plot: {options.plot}")
+    _write(options, result)
+    return 0
+
+
+def resolve(request: FitRequest) -> FitOptions:
+    """What can be refused before any work. Errors: NotFound, InvalidValue, UsageError."""
+    session = request.collecting.session
+    data = request.data if session is None else (*request.data, session)
+    if request.method not in FITTED:
+        allowed = ", ".join(FITTED)
+        raise InvalidValue(f"--method {request.method!r} is unknown; allowed are {allowed}")
+    if request.order not in ("shuffled", "recorded"):
+        raise InvalidValue(
+            f"--order {request.order!r} is unknown; allowed are shuffled and recorded"
+        )
+    if request.plot is not None:
+        if request.plot.suffix.lower() != ".png":
+            raise InvalidValue(f"--plot {request.plot} must end in .png")
+        check_place(request.plot)
+    for target in (request.output, request.plot):
+        if target is not None and any(same_file(target, source) for source in data):
             raise UsageError(f"{target} is the data itself; write the result to another file")
     return FitOptions(
         # The weights file may not be there yet: this command makes it.
-        profile=load_profile(profile_name, with_weights=False),
-        profile_path=find_profile(profile_name),
-        data=tuple(data),
-        lms=LmsOptions(step, passes, "shuffled" if order == "shuffled" else "recorded", start),
-        method=method,
-        test=test,
-        out=out,
-        plot=plot,
-        as_json=as_json,
-        anyway=anyway,
+        profile=load_profile(request.profile, with_weights=False),
+        profile_path=find_profile(request.profile),
+        data=data,
+        lms=LmsOptions(
+            request.step,
+            request.passes,
+            "shuffled" if request.order == "shuffled" else "recorded",
+            request.start,
+        ),
+        method=request.method,
+        test=request.test,
+        output=request.output,
+        plot=request.plot,
+        as_json=request.as_json,
+        anyway=request.anyway,
     )
-
-
-def _same(one: Path, other: Path) -> bool:
-    return one.exists() and other.exists() and one.samefile(other)
-
-
-def run(options: FitOptions) -> None:
-    """Fit, print, draw, write. Errors: NotFound, InvalidValue, PerchError when weights
-    that are not recommended were to be written."""
-    result = fit(options)
-    if options.plot is not None:
-        from perchctl.weights.plot import plot_weights
-
-        plot_weights(result, options.plot)
-    if options.as_json:
-        print(json.dumps(as_object(result), allow_nan=False))
-    else:
-        print(text(result))
-    if options.plot is not None:
-        _say(f"plot: {options.plot}")
-    _write(options, result)
 
 
 def fit(options: FitOptions) -> Result:
@@ -119,7 +135,24 @@ def fit(options: FitOptions) -> Result:
     if options.test is not None:
         other_errors = errors_of(_read(options.test, lambda: None))
         other = on_other_data(other_errors, fits)
-    notes = list(data.notes)
+    return Result(
+        errors=errors,
+        sums=sums,
+        bias=biases(sums),
+        fits=fits,
+        runs=runs,
+        evidence=proof,
+        other=other,
+        other_name=str(options.test) if options.test is not None else "",
+        chosen=options.method,
+        notes=(*data.notes, *_notes(errors, sums, fits)),
+        sha256=data.sha256,
+    )
+
+
+def _notes(errors: Errors, sums: Sums, fits: Mapping[str, Fitted]) -> list[str]:
+    """Sentences on clipped weights, odd positions, and too few of them."""
+    notes = []
     for name, found in fits.items():
         outside = [
             f"{axis} {w:.3f}"
@@ -138,19 +171,7 @@ def fit(options: FitOptions) -> Result:
         notes.append(
             f"{len(errors.positions)} positions are few: intervals are wide (10 are usual)"
         )
-    return Result(
-        errors=errors,
-        sums=sums,
-        bias=biases(sums),
-        fits=fits,
-        runs=runs,
-        evidence=proof,
-        other=other,
-        other_name=str(options.test) if options.test is not None else "",
-        chosen=options.method,
-        notes=tuple(notes),
-        sha256=data.sha256,
-    )
+    return notes
 
 
 def _read(path: Path, advance: Callable[[], None]) -> Measurements:
@@ -165,19 +186,19 @@ def _read(path: Path, advance: Callable[[], None]) -> Measurements:
 
 
 def _write(options: FitOptions, result: Result) -> None:
-    target = options.out or _named_by(options)
+    target = options.output or _named_by(options)
     if target is None:
         if any(result.proven):
-            _say("no file written: name one with -o, or in the profile (merge.weights_file)")
+            say("no file written: name one with -o, or in the profile (merge.weights_file)")
         return
     if not any(result.proven) and not options.anyway:
         sentence = (
             f"{target} not written: on no axis do the weights beat the better single marker beyond "
             f"the interval; take more positions, or write them all the same with --anyway"
         )
-        if options.out is not None:
+        if options.output is not None:
             raise PerchError(sentence)
-        _say(sentence)
+        say(sentence)
         return
     date = datetime.now(UTC).isoformat(timespec="seconds")
     content = file_content(result, date)
@@ -186,9 +207,9 @@ def _write(options: FitOptions, result: Result) -> None:
         content["axes"] = dict.fromkeys(AXES, "merged")
     aside = write_weights(target, content)
     kept = "" if aside is None else f" (the old one is kept as {aside.name})"
-    _say(f"weights: {target}{kept}")
+    say(f"weights: {target}{kept}")
     if options.profile.merge.method != "weights":
-        _say(
+        say(
             f"profile {options.profile.name} merges by {options.profile.merge.method}: these "
             f"weights fly with merge.method: weights and merge.weights_file: {target.name}"
         )
@@ -209,7 +230,3 @@ def _named_by(options: FitOptions) -> Path | None:
         if folder == data_folder("profiles").resolve():
             folder = user_config_folder() / "weights"
         return folder / name
-
-
-def _say(sentence: str) -> None:
-    print(f"perchctl: {sentence}", file=sys.stderr)

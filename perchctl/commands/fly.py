@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import load_calibration
 from perchctl.commands.interrupt import signals_to
+from perchctl.commands.output import print_record, say
+from perchctl.commands.page import page_port
 from perchctl.display.page.flight import FlightPage, flight_page
 from perchctl.display.panel import make_reporter
 from perchctl.display.watch import DisplayWatcher
@@ -20,6 +22,7 @@ from perchctl.errors import (
     Interrupted,
     SafetyAbort,
     TargetNotFound,
+    UsageError,
 )
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.session import FlyOptions, SessionResult, check_options, fly_session
@@ -47,22 +50,62 @@ EXIT_CODE_OF: dict[Outcome, int] = {
 }
 
 
-def resolve(
-    profile_name: str, uri: str | None, source: str | None, seed: int, log_dir: Path | None
-) -> FlyOptions:
+@dataclass(frozen=True)
+class FlyRequest:
+    """The command line as it was given; None is not given."""
+
+    profile: str = "sim"
+    uri: str | None = None
+    source: str | None = None
+    seed: int = 0
+    log_dir: Path | None = None
+    dry_run: bool = False
+    yes: bool = False
+    as_json: bool = False
+    view: bool = False
+    view_port: int = 0
+
+
+def run(request: FlyRequest) -> int:
+    """Fly, or show the plan; returns the exit code.
+
+    Errors: those before the flight, and unforeseen ones after the vehicle was landed.
+    """
+    options = resolve(request)
+    if request.dry_run:
+        if request.as_json:
+            print_record(plan(options))
+        else:
+            print(plan_text(options))
+        return 0
+    if not (request.yes or options.simulated):
+        ask_before_arming(options.uri)
+    return fly(options, request.as_json, page_port(request.view, request.view_port))
+
+
+def resolve(request: FlyRequest) -> FlyOptions:
     """The command line on top of the profile. Errors: NotFound, InvalidValue, UsageError."""
-    profile = load_profile(profile_name)
+    profile = load_profile(request.profile)
     options = FlyOptions(
         profile=profile,
-        profile_path=find_profile(profile_name),
-        # An empty one is an unset shell variable, not a wish for the simulated vehicle.
-        uri=profile.link.uri if uri is None else uri,
-        source=profile.camera.source if source is None else source,
-        seed=seed,
-        log_dir=log_dir or Path(profile.log.directory),
+        profile_path=find_profile(request.profile),
+        # An empty URI or source is an unset shell variable: not the profile's, but an error.
+        uri=profile.link.uri if request.uri is None else request.uri,
+        source=profile.camera.source if request.source is None else request.source,
+        seed=request.seed,
+        log_dir=request.log_dir or Path(profile.log.directory),
     )
     check_options(options)
     return options
+
+
+def ask_before_arming(uri: str) -> None:
+    """Raises UsageError without a yes from the terminal."""
+    if not sys.stdin.isatty():
+        raise UsageError(f"about to arm {uri}, and there is nobody to ask: add --yes")
+    answer = input(f"About to arm and fly {uri}. Is the space under the target clear? [y/N] ")
+    if answer.strip().lower() not in ("y", "yes"):
+        raise UsageError("not confirmed: nothing was started")
 
 
 def plan(options: FlyOptions) -> dict[str, Any]:
@@ -77,10 +120,6 @@ def plan(options: FlyOptions) -> dict[str, Any]:
         "log_directory": str(options.log_dir),
         "profile": options.profile.model_dump(mode="json"),
     }
-
-
-def plan_json(options: FlyOptions) -> str:
-    return json.dumps(plan(options))
 
 
 def plan_text(options: FlyOptions) -> str:
@@ -129,16 +168,12 @@ def weights_text(options: FlyOptions) -> str:
     origin = [fitted.date and f"of {fitted.date}", fitted.method]
     if fitted.data.sha256:
         origin.append(f"data {fitted.data.sha256[:12]}")
-    said = ", ".join(part for part in origin if part)
-    return f"weights {numbers} (from {path}{': ' + said if said else ''})"
+    details = ", ".join(part for part in origin if part)
+    return f"weights {numbers} (from {path}{': ' + details if details else ''})"
 
 
-def run(options: FlyOptions, *, as_json: bool = False, page_port: int | None = None) -> int:
-    """Fly, log, plot, say how it ended; returns the exit code. Errors before the flight
-    and unforeseen ones are raised, after the vehicle has been landed.
-
-    `page_port`: where to serve the live page (0: any free port); None: no page.
-    """
+def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
+    """Fly, log, plot, report how it ended; returns the exit code. `port` of the live page."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir, options.profile, options.uri, options.source, simulated_seed
@@ -148,9 +183,9 @@ def run(options: FlyOptions, *, as_json: bool = False, page_port: int | None = N
     if options.profile.merge.method == "weights":
         merges = f"; merges with {weights_text(options)}"
         log.event(Event(time.monotonic(), EventKind.NOTE, merges.removeprefix("; ")))
-    print(f"perchctl: connecting to {options.uri}{merges}", file=sys.stderr)
+    say(f"connecting to {options.uri}{merges}")
     try:
-        result = _fly(options, (log, DisplayWatcher(reporter)), page_port)
+        result = _session(options, (log, DisplayWatcher(reporter)), port)
     except BaseException as error:
         log.abandon(str(error) or type(error).__name__)
         raise
@@ -163,16 +198,14 @@ def run(options: FlyOptions, *, as_json: bool = False, page_port: int | None = N
     print(summary_text(summary, log.path, plot), file=sys.stderr)
     code = EXIT_CODE_OF[result.report.outcome]
     if as_json:
-        print(json.dumps(summary.as_record() | {"exit_code": code, "log": str(log.path)}))
+        print_record(summary.as_record() | {"exit_code": code, "log": str(log.path)})
     return code
 
 
-def _fly(
-    options: FlyOptions, watchers: tuple[Watcher, ...], page_port: int | None
-) -> SessionResult:
-    """The session, with Ctrl-C on its switch and the live page, if asked for, around it."""
+def _session(options: FlyOptions, watchers: tuple[Watcher, ...], port: int | None) -> SessionResult:
+    """The session with Ctrl-C on its switch, and with the live page where there is a port."""
     switch = OperatorSwitch()
-    with signals_to(switch.press), live_page(options, page_port, switch) as page:
+    with signals_to(switch.press), live_page(options, port, switch) as page:
         if page is None:
             return fly_session(options, watchers, switch)
         return fly_session(options, (*watchers, page), switch, page.watched)
@@ -192,7 +225,7 @@ def live_page(
         options.profile.target.large.side_m,
         port,
         switch.land,
-        lambda text: print(f"perchctl: {text}", file=sys.stderr),
+        say,
     )
 
 
@@ -206,6 +239,6 @@ def _plot(path: Path, profile: Profile) -> Path | None:
     try:
         plot_flight(read_log(path), picture)
     except Exception as error:
-        print(f"perchctl: the plot could not be drawn: {error}", file=sys.stderr)
+        say(f"the plot could not be drawn: {error}")
         return None
     return picture

@@ -27,15 +27,15 @@ def signals_to(handler: Handler) -> Iterator[None]:
 
 
 class Stopper:
-    """Ctrl-C as a wish to end after this frame; a second one ends at once."""
+    """Ctrl-C as a request to end after this frame; a second one ends at once."""
 
     def __init__(self) -> None:
-        self.asked = threading.Event()
+        self.requested = threading.Event()
 
     def press(self, _signal: int = 0, _frame: FrameType | None = None) -> None:
-        if self.asked.is_set():
+        if self.requested.is_set():
             raise KeyboardInterrupt
-        self.asked.set()
+        self.requested.set()
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[Stopper]:

@@ -1,45 +1,41 @@
-"""Progress of a campaign or a recording: a bar on a terminal, nothing in a pipe or a file."""
+"""Bars of progress on stderr: on a terminal only, nothing in a pipe or a file."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
-from typing import TextIO
+from functools import partial
+from typing import Any, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 from perchctl.flight.results import FlightResult
+
+_REFRESH_HZ = 4
 
 
 @contextlib.contextmanager
 def progress_bar(
     total: int, stream: TextIO | None = None
 ) -> Iterator[Callable[[FlightResult], None]]:
-    """Yields the function to call with each finished flight; writes to stderr."""
-    console = Console(file=stream or sys.stderr)
-    if not console.is_terminal:
-        yield lambda result: None
-        return
-    columns = (
-        TextColumn("flights"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )
-    # stdout is for data and is left alone.
-    with Progress(
-        *columns, console=console, refresh_per_second=4, redirect_stdout=False
-    ) as progress:
-        task = progress.add_task("", total=total)
-        ends: dict[str, int] = {}
+    """Yields the function to call with each finished flight."""
+    ends: dict[str, int] = {}
+    columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
+    with _bar("flights", *columns, total=total, stream=stream) as update:
 
         def advance(result: FlightResult) -> None:
             ends[result.outcome] = ends.get(result.outcome, 0) + 1
             text = ", ".join(f"{n} {end}" for end, n in ends.items())
-            progress.update(task, advance=1, description=text)
+            update(advance=1, description=text)
 
         yield advance
 
@@ -49,13 +45,34 @@ def count_bar(
     what: str, total: int | None, wanted: bool = True, stream: TextIO | None = None
 ) -> Iterator[Callable[[], None]]:
     """Yields the function to call for each one done; `total` None is an unknown number."""
+    with _bar(what, TimeRemainingColumn(), total=total, stream=stream, wanted=wanted) as update:
+        yield lambda: update(advance=1)
+
+
+@contextlib.contextmanager
+def search_bar(
+    what: str, stream: TextIO | None = None
+) -> Iterator[Callable[[int, int | None], None]]:
+    """Yields the function to call with the number done, and the number to do if known."""
+    with _bar(what, total=None, stream=stream) as update:
+        yield lambda done, total: update(completed=done, total=total)
+
+
+@contextlib.contextmanager
+def _bar(
+    what: str,
+    *more: ProgressColumn,
+    total: int | None,
+    stream: TextIO | None,
+    wanted: bool = True,
+) -> Iterator[Callable[..., Any]]:
+    """Yields what changes the bar, as `Progress.update` does. stdout is left alone."""
     console = Console(file=stream or sys.stderr)
     if not (wanted and console.is_terminal):
-        yield lambda: None
+        yield lambda **changes: None
         return
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), *more)
     with Progress(
-        *columns, console=console, refresh_per_second=4, redirect_stdout=False
+        *columns, console=console, refresh_per_second=_REFRESH_HZ, redirect_stdout=False
     ) as progress:
-        task = progress.add_task("", total=total)
-        yield lambda: progress.advance(task)
+        yield partial(progress.update, progress.add_task("", total=total))

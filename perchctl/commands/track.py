@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-import cv2
-
 from perchctl.calibration.files import load_calibration
-from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource
+from perchctl.camera.files import ImagesSource, Recording
 from perchctl.camera.mirror import UnmirroredSource
-from perchctl.camera.open import open_source
+from perchctl.camera.mjpeg import without_password
+from perchctl.camera.open import open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.commands.interrupt import Stopper
+from perchctl.commands.output import say
+from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import count_bar
 from perchctl.display.page.flight import AXES_OF_SIDE
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import Interrupted, NotFound, UsageError
+from perchctl.files import same_file
 from perchctl.profile import Profile, find_calibration, load_profile
-from perchctl.track.files import CsvFile, OverlayFile, check_output
-from perchctl.track.result import Tracked, record_of, text_line, text_rows
+from perchctl.track.files import check_output
+from perchctl.track.outputs import OutputOptions, Outputs
+from perchctl.track.result import Tracked
 from perchctl.track.tracker import (
     Notes,
     PrintCheck,
@@ -38,21 +40,20 @@ from perchctl.track.tracker import (
     sketch_of,
     track_state,
 )
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision.types import Frame
 
 POLL_S = 0.002
 OPEN_PAGE_WITHIN_S = 60.0
 """How long a recording waits, on a terminal, for somebody to open the page."""
-_SCHEMES = ("camera:", "video:", "images:", "http://", "https://", "sim:")
 
 
 @dataclass(frozen=True)
-class TrackOptions:
-    """What the command line asked for, on top of the profile."""
+class TrackRequest:
+    """The command line as it was given; None is not given."""
 
     source: str
-    profile: Profile
-    calibration: Path
+    profile: str = "sim"
+    calibration: Path | None = None
     stills: bool = False
     as_json: bool = False
     csv: Path | None = None
@@ -61,59 +62,51 @@ class TrackOptions:
     view_port: int = 0
 
 
-def resolve(
-    source: str,
-    profile_name: str,
-    calibration: Path | None,
-    *,
-    stills: bool = False,
-    as_json: bool = False,
-    csv: Path | None = None,
-    overlay: Path | None = None,
-    view: bool = False,
-    view_port: int = 0,
-) -> TrackOptions:
-    """The command line on top of the profile. Errors: NotFound, InvalidValue, UsageError."""
-    profile = load_profile(profile_name)
-    spec = source_spec(source)
-    for path, suffix in ((csv, ".csv"), (overlay, ".mp4")):
+@dataclass(frozen=True)
+class TrackOptions:
+    """The command line on top of the profile, checked. `source` as `open_source` takes it."""
+
+    source: str
+    profile: Profile
+    calibration: Path
+    stills: bool
+    outputs: OutputOptions
+    page_port: int | None
+
+
+def run(request: TrackRequest) -> int:
+    """Track to the source's end; returns the exit code. Errors: as `resolve` and `track`."""
+    track(resolve(request))
+    return 0
+
+
+def resolve(request: TrackRequest) -> TrackOptions:
+    """What can be refused before anything is opened. Errors: NotFound, InvalidValue,
+    UsageError."""
+    profile = load_profile(request.profile)
+    source = source_spec(request.source)
+    for path, suffix in ((request.csv, ".csv"), (request.overlay, ".mp4")):
         if path is not None:
             check_output(path, suffix)
-            if path.exists() and spec.partition(":")[2] and _same(path, spec):
+            place = source.partition(":")[2]
+            if place and same_file(path, Path(place).expanduser()):
                 raise UsageError(f"{path} is the source itself; write the result to another file")
-    if calibration is None:
-        file = find_calibration(profile.camera.calibration)
+    if request.calibration is None:
+        calibration = find_calibration(profile.camera.calibration)
     else:
-        file = find_calibration(str(calibration))
-    return TrackOptions(spec, profile, file, stills, as_json, csv, overlay, view, view_port)
+        calibration = find_calibration(str(request.calibration))
+    port = page_port(request.view, request.view_port)
+    elsewhere = request.csv or request.overlay or port is not None
+    outputs = OutputOptions(
+        lines=request.as_json or not elsewhere,
+        as_json=request.as_json,
+        csv=request.csv,
+        overlay=request.overlay,
+    )
+    return TrackOptions(source, profile, calibration, request.stills, outputs, port)
 
 
-def source_spec(source: str) -> str:
-    """The source as `open_source` takes it; a bare path names a video, picture or folder.
-
-    Errors: NotFound for a path that is not there.
-    """
-    if source.startswith(_SCHEMES):
-        return source
-    path = Path(source).expanduser()
-    if path.is_dir() or any(c in source for c in "*?["):
-        return f"images:{source}"
-    if path.is_file():
-        return f"{'images' if path.suffix.lower() in IMAGE_SUFFIXES else 'video'}:{source}"
-    if path.suffix or "/" in source:
-        raise NotFound(
-            f"{source} does not exist; a source is a video, picture or folder of pictures, or "
-            f"one of camera:N, video:FILE, images:DIR, http://HOST:PORT/PATH"
-        )
-    return source  # `open_source` says what is allowed
-
-
-def _same(path: Path, spec: str) -> bool:
-    named = Path(spec.partition(":")[2]).expanduser()
-    return named.exists() and named.samefile(path)
-
-
-def run(
+def track(
     options: TrackOptions,
     out: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,
@@ -124,80 +117,35 @@ def run(
     Errors: NotFound (source, no frame at all), InvalidValue (sizes, ports, files),
     TimedOut (a silent camera), Interrupted (Ctrl-C; the files are complete).
     """
-    out = sys.stdout if out is None else out
-    camera = load_calibration(options.calibration)
-    setup = camera_pipeline(options.profile, camera, options.stills)
     start_s = clock()
-    tally = Tally()
 
     def now() -> float:
         return clock() - start_s
 
     with contextlib.ExitStack() as stack:
-        config = options.profile.camera
-        raw = open_source(options.source, config.latency_s, camera.size_px, now)
-        source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
-        stack.callback(source.close)
-        paths = raw.paths if isinstance(raw, ImagesSource) else None
-        name = str(paths[0]) if paths else source.describe()
-        check_size(source.size_px, camera, name)
-        count, rate_hz = _length(options.source, paths, source.live)
-        sinks = _Sinks(options, camera, rate_hz, out, stack)
-        stop = stack.enter_context((stopper or Stopper()).installed())
-        page = _page(options, camera, stack)
-        tracker = Tracker(
-            setup,
-            live=source.live,
-            stills=options.stills,
-            recorded_stills=paths is not None,
-            disagreement_frames=options.profile.merge.disagreement_frames,
-        )
-        show_bar = (count is not None or not source.live) and not (
-            sinks.lines_shown and out.isatty()
-        )
-        advance = stack.enter_context(count_bar("frames", count, show_bar))
-        pace = _Pace(now) if page is not None and not source.live else None
-        if page is not None and not source.live:
-            _await_reader(page, stop)
-        prints = PrintCheck(camera, options.profile.target)
-        say = Notes()
-        axis_m = AXES_OF_SIDE * options.profile.target.large.side_m
+        stop = stopper or Stopper()
+        run = _Run(options, now, sys.stdout if out is None else out, stop, stack)
+        tally = run.tally
         tally.started_s = now()
-        for frame in frames(source, now, stop, say):
-            shown = paths[frame.index].name if paths else frame.index
-            file = str(paths[frame.index]) if paths else source.describe()
-            check_size((frame.image.shape[1], frame.image.shape[0]), camera, file)
-            tracked = tracker.track(frame, shown)
-            if tracked is None:
-                continue
-            tally.add(tracked, tracker.notes)
-            prints.add(tracker.output)
-            say.changes(shown, tracker.notes)
-            sketch = sketch_of(frame, tracked, axis_m)
-            sinks.add(tracked, sketch)
-            if page is not None:
-                page.show(frame.index, sketch)
-                page.tell(partial(track_state, tracked, tracker.notes))
-            if pace is not None:
-                pace.wait_until(frame.t_s, stop)
-            advance()
+        for frame in frames(run.input.source, now, stop, run.notes):
+            run.take(frame)
         ended_s = now()
-        if tally.frames == 0 and not stop.asked.is_set():
-            raise NotFound(f"{source.describe()} gave no frame at all")
-        sinks.keep()
-    print(f"perchctl: {tally.text(ended_s)}", file=sys.stderr)
-    if prints.judged:
-        print(f"perchctl: {prints.verdict().text}", file=sys.stderr)
-    if stop.asked.is_set():
+        if tally.frames == 0 and not stop.requested.is_set():
+            raise NotFound(f"{run.input.source.describe()} gave no frame at all")
+        run.outputs.close(keep=True)
+    say(tally.text(ended_s))
+    if run.prints.judged:
+        say(run.prints.verdict().text)
+    if stop.requested.is_set():
         raise Interrupted("Ctrl-C: stopped; what was written is complete")
     return tally
 
 
 def frames(
-    source: FrameSource, now: Callable[[], float], stop: Stopper, say: Notes
+    source: FrameSource, now: Callable[[], float], stop: Stopper, notes: Notes
 ) -> Iterator[Frame]:
     """A recording's every frame, a live source's newest ones, until the end or Ctrl-C."""
-    while not stop.asked.is_set():
+    while not stop.requested.is_set():
         now_s = now()
         frame = source.poll(now_s)
         if frame is not None:
@@ -207,119 +155,125 @@ def frames(
             return
         # With no time passed nothing can be late: what is a problem even so is the end.
         if (gone := source.problem(-math.inf)) is not None:
-            say.line(gone)
+            say(gone)
             return
-        say.silence(source.problem(now_s) is not None, source.describe())
-        stop.asked.wait(POLL_S)
+        notes.silence(source.problem(now_s) is not None, source.describe())
+        stop.requested.wait(POLL_S)
 
 
-class _Sinks:
-    """Where results go: lines on `out`, CSV, video. Files that are not kept are removed."""
+@dataclass(frozen=True)
+class _Input:
+    """The open source. `paths` are those of pictures; a recording has a rate, and mostly a
+    number of frames."""
+
+    source: FrameSource
+    paths: list[Path] | None
+    rate_hz: float | None
+    count: int | None
+
+    def frame_name(self, index: int) -> str | int:
+        """How results name a frame."""
+        return self.paths[index].name if self.paths else index
+
+    def file_name(self, index: int) -> str:
+        """How messages name the file that a frame is from."""
+        return str(self.paths[index]) if self.paths else self.source.describe()
+
+
+def _open(options: TrackOptions, size_px: tuple[int, int], now: Callable[[], float]) -> _Input:
+    config = options.profile.camera
+    raw = open_source(options.source, config.latency_s, size_px, now)
+    source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
+    paths = raw.paths if isinstance(raw, ImagesSource) else None
+    if isinstance(raw, Recording):
+        return _Input(source, paths, raw.rate_hz, raw.count)
+    return _Input(source, paths, None, None)
+
+
+class _Run:
+    """All that one run holds open, on the stack; `take` is what happens to a frame."""
 
     def __init__(
         self,
         options: TrackOptions,
-        camera: CameraModel,
-        rate_hz: float | None,
+        now: Callable[[], float],
         out: TextIO,
+        stop: Stopper,
         stack: contextlib.ExitStack,
     ) -> None:
-        self._out, self._as_json = out, options.as_json
-        self._flush = rate_hz is None  # a live result is worth nothing late
-        wanted_elsewhere = options.csv or options.overlay or options.view
-        self.lines_shown = options.as_json or not wanted_elsewhere
-        self._csv = CsvFile(options.csv) if options.csv else None
-        stack.callback(self._close)
-        self._overlay: OverlayFile | None = None
-        if options.overlay:
-            self._overlay = OverlayFile(options.overlay, camera, rate_hz)
+        self.camera = load_calibration(options.calibration)
+        setup = camera_pipeline(options.profile, self.camera, options.stills)
+        self.tally, self.notes = Tally(), Notes(say)
+        self.prints = PrintCheck(self.camera, options.profile.target)
+        self.input = _open(options, self.camera.size_px, now)
+        source = self.input.source
+        stack.callback(source.close)
+        check_size(source.size_px, self.camera, self.input.file_name(0))
+        self.outputs = Outputs(options.outputs, self.camera, self.input.rate_hz, out)
+        stack.callback(self.outputs.close, keep=False)
+        stack.enter_context(stop.installed())  # until here Ctrl-C ends at once
+        self._tracker = Tracker(
+            setup,
+            live=source.live,
+            stills=options.stills,
+            recorded_stills=self.input.paths is not None,
+            disagreement_frames=options.profile.merge.disagreement_frames,
+        )
+        self._axis_m = AXES_OF_SIDE * options.profile.target.large.side_m
+        title = f"perchctl track {without_password(options.source)}"
+        page = stack.enter_context(live_page(self.camera, title, options.page_port))
+        bar = not source.live and not (options.outputs.lines and out.isatty())
+        self._advance = stack.enter_context(count_bar("frames", self.input.count, bar))
+        self._viewer = None if page is None else _Viewer(page, source.live, now, stop)
 
-    def add(self, tracked: Tracked, sketch: Sketch) -> None:
-        if self._as_json:
-            line = json.dumps(record_of(tracked), allow_nan=False)
-            print(line, file=self._out, flush=self._flush)
-        elif self.lines_shown:
-            print(text_line(tracked), file=self._out, flush=self._flush)
-        if self._csv is not None:
-            self._csv.add(tracked)
-        if self._overlay is not None:
-            text = tuple(f"{name} {value}" for name, value in text_rows(tracked))
-            self._overlay.add(tracked.t_s, replace(sketch, text=text))
-
-    def keep(self) -> None:
-        self._close(keep=True)
-
-    def _close(self, keep: bool = False) -> None:
-        csv, overlay, self._csv, self._overlay = self._csv, self._overlay, None, None
-        if csv is not None:
-            csv.close(keep)
-        if overlay is not None:
-            overlay.close(keep)
+    def take(self, frame: Frame) -> None:
+        """Track a frame, and hand the result to files, lines, page and tally."""
+        size_px = (frame.image.shape[1], frame.image.shape[0])
+        check_size(size_px, self.camera, self.input.file_name(frame.index))
+        name = self.input.frame_name(frame.index)
+        tracked = self._tracker.track(frame, name)
+        if tracked is None:
+            return
+        notes = self._tracker.notes
+        self.tally.add(tracked, notes)
+        self.prints.add(self._tracker.output)
+        self.notes.changes(name, notes)
+        sketch = sketch_of(frame, tracked, self._axis_m)
+        self.outputs.add(tracked, sketch)
+        if self._viewer is not None:
+            self._viewer.show(frame, sketch, tracked, notes)
+        self._advance()
 
 
-class _Pace:
-    """Lets a recording that is looked at run as fast as it was recorded."""
+class _Viewer:
+    """Shows frames on the live page. A recording starts when the page is opened, and then
+    runs as fast as it was recorded."""
 
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
+    def __init__(self, page: LivePage, live: bool, now: Callable[[], float], stop: Stopper) -> None:
+        self._page, self._live, self._now, self._stop = page, live, now, stop
         self._offset_s: float | None = None
+        if not live:
+            self._wait_for_reader()
 
-    def wait_until(self, t_s: float, stop: Stopper) -> None:
+    def show(self, frame: Frame, sketch: Sketch, tracked: Tracked, notes: tuple[str, ...]) -> None:
+        self._page.show(frame.index, sketch)
+        self._page.tell(partial(track_state, tracked, notes))
+        if not self._live:
+            self._keep_pace(frame.t_s)
+
+    def _wait_for_reader(self) -> None:
+        """Only where a person can be expected: on a terminal."""
+        if not sys.stderr.isatty():
+            return
+        say("starts when the page is opened (Ctrl-C ends)")
+        until_s = time.monotonic() + OPEN_PAGE_WITHIN_S
+        while not (self._stop.requested.is_set() or self._page.opened.wait(0.1)):
+            if time.monotonic() > until_s:
+                return
+
+    def _keep_pace(self, t_s: float) -> None:
         if self._offset_s is None:
             self._offset_s = self._now() - t_s
         left_s = t_s + self._offset_s - self._now()
         if left_s > 0.0:
-            stop.asked.wait(left_s)
-
-
-def _page(
-    options: TrackOptions, camera: CameraModel, stack: contextlib.ExitStack
-) -> LivePage | None:
-    if not options.view:
-        return None
-    page = LivePage(camera, f"perchctl track {_public(options.source)}", options.view_port)
-    stack.callback(_close_page, page)
-    print(f"perchctl: live page: {page.url}", file=sys.stderr)
-    return page
-
-
-def _close_page(page: LivePage) -> None:
-    page.close()
-    if page.problem is not None:
-        print(f"perchctl: the live page failed: {page.problem}", file=sys.stderr)
-
-
-def _public(source: str) -> str:
-    """The source without the name and password that a stream's address may hold."""
-    scheme, slashes, rest = source.partition("://")
-    host, slash, path = rest.partition("/")
-    return f"{scheme}{slashes}{host.rpartition('@')[2]}{slash}{path}" if slashes else source
-
-
-def _await_reader(page: LivePage, stop: Stopper) -> None:
-    """On a terminal a recording starts when its page is opened; else at once."""
-    if not sys.stderr.isatty():
-        return
-    print("perchctl: starts when the page is opened (Ctrl-C ends)", file=sys.stderr)
-    until_s = time.monotonic() + OPEN_PAGE_WITHIN_S
-    while not (stop.asked.is_set() or page.opened.wait(0.1) or time.monotonic() > until_s):
-        pass
-
-
-def _length(spec: str, paths: list[Path] | None, live: bool) -> tuple[int | None, float | None]:
-    """Frames (None: unknown) and frames a second (None: live) of a source."""
-    if live:
-        return None, None
-    if paths is not None:
-        return len(paths), DEFAULT_RATE_HZ
-    capture = cv2.VideoCapture(str(Path(spec.partition(":")[2]).expanduser()), cv2.CAP_FFMPEG)
-    try:
-        count, rate_hz = (
-            float(capture.get(key)) for key in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS)
-        )
-    finally:
-        capture.release()
-    return (
-        round(count) if count > 0 else None,
-        rate_hz if 0.1 < rate_hz < 1000.0 else DEFAULT_RATE_HZ,
-    )
+            self._stop.requested.wait(left_s)

@@ -59,7 +59,7 @@ def check_target(target: TargetConfig, magnet_m: float) -> TargetCheck:
         if _turns_onto_itself(marker):
             raise InvalidValue(
                 f"{name} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
-                f"so that its heading cannot be told: take another id"
+                f"so that its heading is ambiguous: take another id"
             )
     white_ids = white_centre_ids(large.dictionary, small.side_m / large.side_m)
     check = TargetCheck(draw_target(target).ring_m, large.id in white_ids, white_ids)

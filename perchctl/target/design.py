@@ -116,7 +116,7 @@ def _ranges(
 
 
 def gear_ranges(target: TargetConfig, camera: CameraModel, profile: Profile) -> GearRanges:
-    """With the camera where the profile says, the vehicle level."""
+    """With the camera mounted as in the profile, the vehicle level."""
     T_body_cam = profile.camera.mount.T_body_cam
     R_cam_body = T_body_cam[:3, :3].T
     gear_cam = R_cam_body @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])

@@ -29,7 +29,7 @@ RING_MIN_PER_LARGE_SIDE = 1 / 150
 one the small marker is never found (measured for ids whose centre is black)."""
 
 SAMPLED_MARGIN = 0.13
-"""Share of a cell, at each of its sides, that cv2.aruco does not look at."""
+"""Share of a cell, at each of its sides, that cv2.aruco does not sample."""
 MAX_WHITE_IN_BLACK_CELL = 0.3
 """White that the small marker and its ring may bring into a black cell of the large
 one; half is where it reads as white, and the detector samples a cell coarsely."""
@@ -144,7 +144,7 @@ def _merged(edges_m: Array) -> Array:
     """Sorted edges without the doubles that differ by rounding only."""
     edges = np.sort(edges_m)
     keep = np.concatenate([[True], np.diff(edges) > 1e-9])
-    return edges[keep]
+    return np.asarray(edges[keep])
 
 
 def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> NDArray[np.bool_]:
@@ -152,7 +152,7 @@ def _lookup(cells: NDArray[np.bool_], side_m: float, xs: Array, ys: Array) -> ND
     col = np.floor((xs / side_m + 0.5) * n).astype(int)
     row = np.floor((0.5 - ys / side_m) * n).astype(int)
     inside = (col >= 0) & (col < n) & (row >= 0) & (row < n)
-    return inside & cells[np.clip(row, 0, n - 1), np.clip(col, 0, n - 1)]
+    return np.asarray(inside & cells[np.clip(row, 0, n - 1), np.clip(col, 0, n - 1)])
 
 
 def overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:

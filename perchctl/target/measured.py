@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,9 @@ from typing import Any
 import yaml
 
 from perchctl.errors import InvalidValue, PerchError
+from perchctl.files import PartFile, cannot_be_written
 from perchctl.profile import MarkerConfig, Profile, TargetConfig, load_profile
 from perchctl.target.lengths import millimetres
-from perchctl.target.output import write_whole
 
 MAX_SCALE_ERROR = 0.1
 """A print off by more than this was not measured in the unit that was meant."""
@@ -22,7 +21,7 @@ NOTABLE_SCALE_ERROR = 0.01
 
 @dataclass(frozen=True)
 class Measured:
-    """The target with its measured sizes, and what they say of the print."""
+    """The target with its measured sizes, and what follows for the print."""
 
     target: TargetConfig
     notes: tuple[str, ...]
@@ -84,23 +83,30 @@ def updated_profile_text(path: Path, text: str, target: TargetConfig) -> str:
 
 
 def write_profile(path: Path, text: str, expected: Profile) -> None:
-    """Write it whole, after it has been read back as this very profile (but for its name).
+    """Write it, once it has been read back as this very profile (but for its name).
 
-    Raises InvalidValue: the profile does not hold.
+    Raises InvalidValue: the text is another profile, or cannot be written.
     """
-    trial = path.with_name(f".{path.stem}.{os.getpid()}.yaml")
-    write_whole({trial: text.encode("utf-8")})
+    file = PartFile(path)
     try:
-        held: Profile | None = load_profile(str(trial.absolute()))
-    except PerchError:
-        held = None
+        file.write(text.encode("utf-8"))
+        if not _reads_as(file.part, expected):
+            raise InvalidValue(
+                f"{path}: the sizes could not be put into this file: edit target by hand"
+            )
+        file.keep()
+    except OSError as error:
+        raise cannot_be_written(path, error) from None
     finally:
-        trial.unlink(missing_ok=True)
-    if held is None or held.model_copy(update={"name": expected.name}) != expected:
-        raise InvalidValue(
-            f"{path}: the sizes could not be put into this file: edit target by hand"
-        )
-    write_whole({path: text.encode("utf-8")})
+        file.drop()
+
+
+def _reads_as(path: Path, expected: Profile) -> bool:
+    try:
+        read = load_profile(str(path.absolute()))
+    except PerchError:
+        return False
+    return read.model_copy(update={"name": expected.name}) == expected
 
 
 def _markers(target: TargetConfig) -> list[tuple[str, MarkerConfig]]:

@@ -161,7 +161,7 @@ def text_width(text: str, size: float) -> float:
 
 
 def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
-    """Every text in as many lines as `width` mm asks for; words are never cut."""
+    """Every text in as many lines as `width` mm needs; words are never cut."""
     lines: list[str] = []
     for text in texts:
         line = ""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from io import BytesIO
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,8 +21,8 @@ STYLES = {"large": (BLUE, "-", 1.4), "small": (ORANGE, "-", 1.4), "both": (BLACK
 PANELS = (("x, y [mm]", 1e3), ("z [mm]", 1e3), ("turn [deg]", 180.0 / math.pi))
 
 
-def plot_design(design: Design, curve: ErrorCurve, file: Path | BinaryIO) -> None:
-    """Bars from the nearest to the farthest range, and the error bound below them."""
+def draw_design(design: Design, curve: ErrorCurve) -> bytes:
+    """A PNG: bars from the nearest to the farthest range, and the error bound below them."""
     figure = new_figure(*SIZE_IN)
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(0.8, 1, 1, 1))
     _plot_spans(axes[0], design)
@@ -49,7 +49,9 @@ def plot_design(design: Design, curve: ErrorCurve, file: Path | BinaryIO) -> Non
         f"bound for corners of 0.2 px",
         fontsize=11,
     )
-    save_png(figure, file)
+    content = BytesIO()
+    save_png(figure, content)
+    return content.getvalue()
 
 
 def _plain_ticks(axis: Axis) -> None:

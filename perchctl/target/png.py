@@ -1,4 +1,4 @@
-"""A page as a PNG that knows its resolution."""
+"""A page as a PNG that holds its resolution."""
 
 from __future__ import annotations
 

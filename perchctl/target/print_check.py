@@ -33,8 +33,8 @@ _SETTLED = 1e-10
 
 @dataclass(frozen=True)
 class SizeRatio:
-    """`value` is the small marker's size, relative to the large one's, over what the
-    profile says: 1.01 is printed 1 % too large. `sigma` is its spread; `bias` what the
+    """`value` is the small marker's size, relative to the large one's, over the
+    ratio in the profile: 1.01 is printed 1 % too large. `sigma` is its spread; `bias` what the
     corners may err systematically. `small_px` is the small marker's side in the picture."""
 
     value: float
@@ -62,7 +62,7 @@ def size_ratio(
     """From one frame's corners, (4, 2) px each, with the spread of the large and of the
     small marker's: pose and ratio are solved together by least squares.
 
-    None where the corners give no pose, or spread so far that they say nothing.
+    None where the corners give no pose, or spread so far that the ratio is unknown.
     """
     X_large, X_small = (marker_corners_m(m.side_m) for m in (target.large, target.small))
     seen = undistort_px(np.concatenate([large_px, small_px]), camera)
@@ -131,15 +131,15 @@ def verdict(ratio: SizeRatio | None, target: TargetConfig) -> PrintVerdict:
         )
     off, total = ratio.value - 1.0, math.hypot(ratio.sigma, ratio.bias)
     nominal = target.small.side_m / target.large.side_m
-    said = (
+    ratio_text = (
         f"the small marker is {ratio.value * nominal:.4f} of the large one, the profile says "
         f"{nominal:.4f} ({100 * off:+.2f} %, sigma {100 * total:.2f} %)"
     )
     if abs(off) <= max(SIGMAS * total, MIN_ERROR):
-        return PrintVerdict(False, f"print good within its noise: {said}")
+        return PrintVerdict(False, f"print good within its noise: {ratio_text}")
     return PrintVerdict(
         True,
-        f"print error: {said}; measure both black squares and give them to "
+        f"print error: {ratio_text}; measure both black squares and give them to "
         f"perchctl make-target --measured-large MM --measured-small MM",
     )
 

@@ -16,7 +16,7 @@ from perchctl.vision.types import MARKERS, MarkerName
 
 class PlainReader:
     """cv2.aruco with its default parameters, and for each marker a dictionary of just
-    its id (the other ids of a nested dictionary are not asked for)."""
+    its id (the other ids of a nested dictionary are not searched)."""
 
     def __init__(self, target: TargetConfig) -> None:
         dictionaries = [_own(target.large), _own(target.small)]

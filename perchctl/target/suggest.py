@@ -31,7 +31,7 @@ _LARGE_LIMITS_M = (0.03, 1.0)
 
 @dataclass(frozen=True)
 class Suggestion:
-    """`page` holds the target; `notes` say which wish could not be met."""
+    """`page` holds the target; `notes` name what could not be met."""
 
     target: TargetConfig
     page: str
@@ -78,7 +78,7 @@ def suggest(
             )
     large_m = math.ceil(FAR_MARGIN * search_m * large_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
     if not _LARGE_LIMITS_M[0] <= large_m <= _LARGE_LIMITS_M[1]:
-        notes.append(f"a large marker of {1e3 * large_m:.0f} mm would be asked for")
+        notes.append(f"a large marker of {1e3 * large_m:.0f} mm would be needed")
         large_m = min(max(large_m, _LARGE_LIMITS_M[0]), _LARGE_LIMITS_M[1])
     large_near_m = view.nearest_m(turned_outline(large_m), np.eye(3), np.zeros(3))
     least_m = 0.0 if large_near_m is None else OVERLAP_MARGIN * large_near_m * small_px / f

@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 
 from perchctl.display.page.sketch import Sketch, draw
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue
+from perchctl.files import PartFile, cannot_be_written, check_place
 from perchctl.track.result import CSV_COLUMNS, Tracked, csv_row
 from perchctl.vision.types import CameraModel
 
@@ -21,51 +22,57 @@ def check_output(path: Path, suffix: str) -> None:
     """Whether a file can be made there. Errors: InvalidValue (name), NotFound (folder)."""
     if path.suffix.lower() != suffix:
         raise InvalidValue(f"{path} must end in {suffix}, which is the format that is written")
-    if path.is_dir():
-        raise InvalidValue(f"{path} is a folder; name a file in it")
-    if not path.parent.is_dir():
-        raise NotFound(f"folder {path.parent} for {path.name} does not exist; create it first")
+    check_place(path)
 
 
-class _Part:
-    """The temporary file beside the wanted one."""
+class _ResultFile:
+    """A file that grows under a temporary name; `close` puts it in its place or removes it."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.part = path.with_name(f".{path.stem}.part{path.suffix}")
+    def __init__(self, path: Path, suffix: str) -> None:
+        check_output(path, suffix)
+        self._path = path
+        self._file = PartFile(path)
 
-    def keep(self) -> None:
-        self.part.replace(self.path)
+    def close(self, keep: bool) -> None:
+        """Errors: InvalidValue for a file that cannot be completed; it is then removed."""
+        try:
+            self._end()
+            if keep:
+                self._file.sync()
+                self._file.keep()
+        except OSError as error:
+            if keep:
+                raise cannot_be_written(self._path, error) from None
+        finally:
+            self._file.drop()
 
-    def drop(self) -> None:
-        self.part.unlink(missing_ok=True)
+    def _end(self) -> None:
+        raise NotImplementedError
 
 
-class CsvFile:
+class CsvFile(_ResultFile):
     """One row a frame, `t_s` first. Errors: InvalidValue where it cannot be written."""
 
     def __init__(self, path: Path) -> None:
-        check_output(path, ".csv")
-        self._file = _Part(path)
+        super().__init__(path, ".csv")
         try:
             self._stream = self._file.part.open("w", encoding="utf-8", newline="")
         except OSError as error:
-            raise InvalidValue(f"{path} cannot be written: {error.strerror}") from None
+            raise cannot_be_written(path, error) from None
         self._writer = csv.writer(self._stream, lineterminator="\n")
         self._writer.writerow(CSV_COLUMNS)
 
     def add(self, tracked: Tracked) -> None:
-        self._writer.writerow(csv_row(tracked))
+        try:
+            self._writer.writerow(csv_row(tracked))
+        except OSError as error:
+            raise cannot_be_written(self._path, error) from None
 
-    def close(self, keep: bool) -> None:
+    def _end(self) -> None:
         self._stream.close()
-        if keep:
-            self._file.keep()
-        else:
-            self._file.drop()
 
 
-class OverlayFile:
+class OverlayFile(_ResultFile):
     """The pictures with what was found, as MPEG-4 video.
 
     Args:
@@ -74,8 +81,7 @@ class OverlayFile:
     """
 
     def __init__(self, path: Path, camera: CameraModel, rate_hz: float | None) -> None:
-        check_output(path, ".mp4")
-        self._file = _Part(path)
+        super().__init__(path, ".mp4")
         self._camera = camera
         self._live = rate_hz is None
         self._rate_hz = rate_hz or LIVE_RATE_HZ
@@ -97,12 +103,8 @@ class OverlayFile:
             self._video.write(picture)
             self._written += 1
 
-    def close(self, keep: bool) -> None:
+    def _end(self) -> None:
         self._video.release()
-        if keep:
-            self._file.keep()
-        else:
-            self._file.drop()
 
     def _due(self, t_s: float) -> int:
         if not self._live:

@@ -49,7 +49,7 @@ class CameraPose:
 class Tracked:
     """One frame. `frame` is the file's name, or the index where there is none.
 
-    `stage` says what this frame showed; a `target` at stage ``none`` is the filter's
+    `stage` is what this frame showed; a `target` at stage ``none`` is the filter's
     prediction.
     """
 
@@ -124,7 +124,7 @@ def _rotation(rvec: Array) -> Array:
     return np.asarray(cv2.Rodrigues(rvec)[0], dtype=np.float64)
 
 
-def record_of(tracked: Tracked) -> dict[str, Any]:
+def track_record(tracked: Tracked) -> dict[str, Any]:
     """The line of `track --json`; what is not finite becomes null."""
     target = tracked.target
     return {

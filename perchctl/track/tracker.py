@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from perchctl.camera.health import HealthState, Verdict, assess
@@ -19,7 +19,7 @@ from perchctl.target.print_check import (
     size_ratio,
     verdict,
 )
-from perchctl.track.result import Tracked, record_of, text_rows, tracked_of
+from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
 
 MOST_NOTES = 20
@@ -88,7 +88,7 @@ class Tracker:
 
 @dataclass(eq=False)
 class Tally:
-    """What the summary says."""
+    """The counts of the summary."""
 
     frames: int = 0
     large: int = 0
@@ -106,10 +106,10 @@ class Tally:
         took_s = max(now_s - self.started_s, 1e-6)
         share = 100.0 / max(self.frames, 1)
         plural = "frame" if self.frames == 1 else "frames"
-        said = "".join(f"; {note.partition(':')[0]} in {n}" for note, n in self.notes.items())
+        counted = "".join(f"; {note.partition(':')[0]} in {n}" for note, n in self.notes.items())
         return (
             f"{self.frames} {plural} in {took_s:.1f} s ({self.frames / took_s:.0f} a second): "
-            f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{said}"
+            f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{counted}"
         )
 
 
@@ -150,9 +150,13 @@ class PrintCheck:
 
 
 class Notes:
-    """Sentences on stderr: one when a condition begins, and not without end."""
+    """Sentences for the user: one when a condition begins, `MOST_NOTES` at the most.
 
-    def __init__(self) -> None:
+    `say` prints one.
+    """
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
         self._before: frozenset[str] = frozenset()
         self._left = MOST_NOTES
         self._silent = False
@@ -164,19 +168,16 @@ class Notes:
             where = frame if isinstance(frame, str) else f"frame {frame}"
             self._left -= 1
             if self._left >= 0:
-                self.line(f"{where}: {note}")
+                self._say(f"{where}: {note}")
             if self._left == 0:
-                self.line("more of this kind is only counted from here on")
+                self._say("more of this kind is only counted from here on")
         self._before = frozenset(notes)
         self._silent = False
 
     def silence(self, silent: bool, source: str) -> None:
         if silent and not self._silent:
-            self.line(f"{source} delivers no frame; waiting for it (Ctrl-C ends)")
+            self._say(f"{source} delivers no frame; waiting for it (Ctrl-C ends)")
         self._silent = self._silent or silent
-
-    def line(self, text: str) -> None:
-        print(f"perchctl: {text}", file=sys.stderr)
 
 
 def sketch_of(frame: Frame, tracked: Tracked, axis_m: float) -> Sketch:
@@ -194,5 +195,5 @@ def track_state(tracked: Tracked, notes: tuple[str, ...]) -> State:
     return {
         "rows": [list(row) for row in text_rows(tracked)],
         "note": "; ".join(notes),
-        "track": record_of(tracked),
+        "track": track_record(tracked),
     }

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.errors import InvalidValue
+from perchctl.files import cannot_be_written
 from perchctl.geometry import Array
 from perchctl.pipeline import Pipeline, make_pipeline, step
 from perchctl.profile import Profile
@@ -31,9 +32,10 @@ _LEAST_FRAMES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """One frame's poses (x, y, z, yaw), each (4,) or None; `center_px` of both markers'
-    corners, None where one is missing."""
+class MarkerReading:
+    """What one frame gives: poses (x, y, z, yaw), each (4,) or None where it was not found.
+
+    `center_px` (2,) is the mean of both markers' corners, None where one is missing."""
 
     t_s: float
     large: Array | None
@@ -48,20 +50,20 @@ def collecting_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
     return make_pipeline(profile.model_copy(update={"merge": merge}), camera)
 
 
-class Eye:
-    """Frames of one place through the pipeline; a new place is a new eye."""
+class MarkerReader:
+    """Takes the frames of one place through the pipeline; a new place needs a new reader."""
 
     def __init__(self, setup: Pipeline, attitude: Attitude | None = None) -> None:
         self._setup, self._attitude = setup, attitude
         self._state = PipelineState()
 
-    def look(self, frame: Frame) -> Sight:
+    def read(self, frame: Frame) -> MarkerReading:
         self._state, output = step(self._state, frame, self._attitude, self._setup)
         detections = output.detections
         seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
         both = len(seen) == 2
         joint = estimate_pose(seen, frame.t_s, self._attitude, self._setup.pose) if both else None
-        return Sight(
+        return MarkerReading(
             frame.t_s,
             _vector(output.poses.get("large")),
             _vector(output.poses.get("small")),
@@ -74,19 +76,19 @@ def _vector(pose: MarkerPose | None) -> Array | None:
     return None if pose is None else np.array([*pose.e_m, pose.e_yaw_rad])
 
 
-def fault_of(sights: list[Sight]) -> str | None:
+def fault_of(readings: list[MarkerReading]) -> str | None:
     """Why a position must be taken again, in one sentence; None when it is good."""
-    count = len(sights)
+    count = len(readings)
     if count < _LEAST_FRAMES:
         return f"only {count} frames came"
     for name in MARKERS:
-        seen = sum(getattr(sight, name) is not None for sight in sights)
+        seen = sum(getattr(reading, name) is not None for reading in readings)
         if seen < SEEN_SHARE * count:
             return (
                 f"half seen: the {name} marker was found in {seen} of {count} frames; move so "
                 f"that both markers are whole in the picture"
             )
-    centers = np.array([s.center_px for s in sights if s.center_px is not None])
+    centers = np.array([r.center_px for r in readings if r.center_px is not None])
     if len(centers) < _LEAST_FRAMES:
         return f"half seen: both markers at once were found in {len(centers)} of {count} frames"
     spread_px = float(np.linalg.norm(centers.std(axis=0)))
@@ -100,15 +102,15 @@ def fault_of(sights: list[Sight]) -> str | None:
     return None
 
 
-def typical(sights: list[Sight]) -> Array:
+def typical(readings: list[MarkerReading]) -> Array:
     """Median of the large marker's pose, (4,); yaw about the first one's."""
-    poses = np.array([s.large for s in sights if s.large is not None])
+    poses = np.array([r.large for r in readings if r.large is not None])
     poses[:, 3] = np.unwrap(poses[:, 3])
     return np.asarray(np.median(poses, axis=0))
 
 
-def rows_of(position: int, sights: Iterable[Sight], actual: Array) -> str:
-    return "".join(row_text(position, s.t_s, [s.large, s.small, actual, s.joint]) for s in sights)
+def rows_of(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
+    return "".join(row_text(position, r.t_s, [r.large, r.small, actual, r.joint]) for r in readings)
 
 
 class SessionFile:
@@ -145,7 +147,7 @@ class SessionFile:
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            raise InvalidValue(f"{self._path}: cannot be written: {error.strerror}") from None
+            raise cannot_be_written(self._path, error) from None
 
     def _continue(self, frames: int) -> None:
         try:

@@ -13,7 +13,14 @@ from perchctl.errors import Interrupted, InvalidValue, NotFound, TimedOut
 from perchctl.geometry import Array, wrap_rad
 from perchctl.pipeline import Pipeline
 from perchctl.vision.types import Frame
-from perchctl.weights.collect import Eye, SessionFile, Sight, fault_of, rows_of, typical
+from perchctl.weights.collect import (
+    MarkerReader,
+    MarkerReading,
+    SessionFile,
+    fault_of,
+    rows_of,
+    typical,
+)
 from perchctl.weights.truth import Actual, Ask, Truth, moved
 
 SILENT_S = 5.0
@@ -26,8 +33,8 @@ Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 class Experiment:
     """Takes positions with a person until the session is full.
 
-    `ask` puts a question and returns the answer, `say` tells; `bar` shows progress; `now`
-    and `wait` are the clock.
+    `ask` prints a question and returns the answer, `say` prints a sentence; `bar` shows
+    progress; `now` and `wait` are the clock.
     """
 
     def __init__(
@@ -67,19 +74,19 @@ class Experiment:
         except InvalidValue as error:
             return str(error)
         self._answer("hold still and press Enter (q stops): ")
-        eye = Eye(self._setup, before.attitude)
+        reader = MarkerReader(self._setup, before.attitude)
         with self._bar("frames", frames) as advance:
-            sights = []
+            readings = []
             for frame in self._frames(frames):
-                sights.append(eye.look(frame))
+                readings.append(reader.read(frame))
                 advance()
-        fault = fault_of(sights)
+        fault = fault_of(readings)
         if fault is None and self._truth.repeatable:
             fault = moved(before, self._truth.actual(self._answer))
         if fault is None:
-            fault = self._doubt(before, sights)
+            fault = self._mismatch(before, readings)
         if fault is None:
-            self._session.append(number, rows_of(number, sights, before.pose))
+            self._session.append(number, rows_of(number, readings, before.pose))
         return fault
 
     def _answer(self, question: str) -> str:
@@ -94,20 +101,22 @@ class Experiment:
             )
         return text
 
-    def _doubt(self, actual: Actual, sights: list[Sight]) -> str | None:
-        seen = typical(sights)
+    def _mismatch(self, actual: Actual, readings: list[MarkerReading]) -> str | None:
+        """A sentence if the camera measures another pose, and the person does not keep it."""
+        seen = typical(readings)
         off_m = float(np.linalg.norm(seen[:3] - actual.pose[:3]))
         off_rad = abs(wrap_rad(float(seen[3] - actual.pose[3])))
         if off_m <= FAR_M and off_rad <= FAR_RAD:
             return None
-        self._say(f"the camera sees {spoken(seen)}, but the actual pose is {spoken(actual.pose)}")
+        expected = pose_text(actual.pose)
+        self._say(f"the camera measures {pose_text(seen)}, but the actual pose is {expected}")
         if self._answer("keep it all the same? [y/N] ").strip().lower() in ("y", "yes"):
             return None
         return "the actual pose does not fit what the camera sees"
 
     def _frames(self, count: int) -> Iterator[Frame]:
         if self._source.live:
-            self._source.poll(self._now())  # older than the person's word
+            self._source.poll(self._now())  # taken before Enter was pressed
         since_s = self._now()
         got = 0
         while got < count:
@@ -135,6 +144,6 @@ class Experiment:
             self._wait(0.002)
 
 
-def spoken(pose: Array) -> str:
+def pose_text(pose: Array) -> str:
     x, y, z = (float(v) * 100.0 for v in pose[:3])
     return f"({x:.1f}, {y:.1f}, {z:.1f}) cm at {math.degrees(wrap_rad(float(pose[3]))):.0f} deg"

@@ -1,8 +1,8 @@
 """Do the weights help? Leave-one-position-out cross-validation with intervals.
 
 Frames of one position share its errors, so whole positions are held out: the weights are
-fitted to the others and judged on the one they have not seen, bias included, as a flight
-would feel it. Intervals are Student's t over positions (for a root mean square by the
+fitted to the others and tested on the one that was left out, bias included, as it acts in
+a flight. Intervals are Student's t over positions (for a root mean square by the
 delta method), 95 %.
 """
 
@@ -44,7 +44,7 @@ LABELS = {
 
 @dataclass(frozen=True, eq=False)
 class MethodErrors:
-    """Root mean square errors of one method, per axis, on positions it did not see.
+    """Root mean square errors of one method, per axis, on positions it was not fitted to.
 
     Attributes:
         rms: over all positions, (4,), m and rad; low, high: its 95 % interval.

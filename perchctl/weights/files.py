@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from perchctl.errors import InvalidValue
+from perchctl.files import write_files
 
 FORMAT = "perchctl-merge-weights"
 _HEAD = """\
@@ -25,29 +22,4 @@ def write_weights(path: Path, content: dict[str, Any]) -> Path | None:
     Errors: InvalidValue when it cannot be written; the old file then stays in place.
     """
     text = _HEAD + yaml.safe_dump({"format": FORMAT, **content}, sort_keys=False)
-    beside = path.with_name(f".{path.name}.new")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside.write_text(text, encoding="utf-8")
-        aside = _keep_aside(path)
-        os.replace(beside, path)
-    except OSError as error:
-        with suppress(OSError):
-            beside.unlink(missing_ok=True)
-        raise InvalidValue(f"{path}: cannot be written: {error.strerror}") from None
-    return aside
-
-
-def _keep_aside(path: Path) -> Path | None:
-    """Copy by a hard name: ``weights.yaml.bak1``, ``.bak2``, ... the next that is free."""
-    if not path.exists():
-        return None
-    for number in count(1):
-        aside = path.with_name(f"{path.name}.bak{number}")
-        try:
-            with aside.open("xb") as stream:
-                stream.write(path.read_bytes())
-            return aside
-        except FileExistsError:
-            continue
-    raise AssertionError("unreachable")
+    return write_files({path: text.encode("utf-8")}, make_folders=True, keep_old=True).get(path)

@@ -140,12 +140,12 @@ def inliers(error: Array, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
     use = np.ones(error.shape, dtype=bool)
     ends = np.append(starts[1:], len(error))
     if len(starts) * LEAST_ROWS > len(error):
-        return use  # too few rows a position to tell what is usual
+        return use  # too few rows a position to estimate what is usual
     for start, end in zip(starts, ends, strict=True):
         part = error[start:end]
         away = np.abs(part - np.median(part, axis=0))
         spread = _MAD_TO_SIGMA * np.median(away, axis=0)
-        # Where most values are alike (a coarse scale), the mean deviation still tells.
+        # Where most values are alike (a coarse scale), the mean deviation is still of use.
         spread = np.where(spread > 0.0, spread, away.mean(axis=0))
         use[start:end] = away <= OUTLIER_SIGMAS * spread + 1e-12
     return use

@@ -26,7 +26,7 @@ from perchctl.weights.types import AXES, UNITS, Measurements, wrap
 
 STRETCH_S = 1.0
 LEAST_ROWS = 5
-"""A stretch with fewer frames of both markers says too little of its own."""
+"""A stretch with fewer frames of both markers is too little evidence."""
 
 
 def read_flight_log(path: Path) -> Measurements:
@@ -76,9 +76,9 @@ def _truth_of(log: FlightLog) -> tuple[Scenario, float]:
     """The scenario that was flown, and how much later than logged the frames were taken."""
     if not np.isfinite(log.column("true_x_m")).any():
         raise InvalidValue(
-            f"{log.path}: line 2: no truth in this log (true_x_m is missing): only flights in "
-            f"lockstep know it (perchctl simulate --only SEED --log-dir DIR); --collect a session "
-            f"of a real vehicle"
+            f"{log.path}: line 2: no truth in this log (true_x_m is missing): only logs of "
+            f"lockstep flights hold it (perchctl simulate --only SEED --log-dir DIR); --collect a "
+            f"session of a real vehicle"
         )
     header: dict[str, Any] = log.header
     try:

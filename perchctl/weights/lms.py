@@ -217,7 +217,7 @@ def lms_folds(
 ) -> Array:
     """The weights without each position in turn, (g, 4).
 
-    Of large data (`thinned`) an even share of `FOLD_ROWS` rows speaks, and of many positions
+    Of large data (`thinned`) an even share of `FOLD_ROWS` rows is used, and of many positions
     a `MOST_FOLDS`th is held out at a time: one position then moves the weights by far less
     than their spread.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from perchctl.plot import (
     save_png,
 )
 from perchctl.weights.evidence import LABELS
-from perchctl.weights.report import Result
+from perchctl.weights.result import Result
 from perchctl.weights.types import AXES, PAPER_WEIGHTS
 
 SIZE_IN = (14.0, 10.5)
@@ -47,11 +48,8 @@ MOST_POINTS = 2000
 MOST_POSITIONS = 200
 
 
-def plot_weights(result: Result, png_path: Path) -> None:
-    """Learning curves, errors by position, weights with intervals; a column an axis.
-
-    Raises InvalidValue for a file that cannot be written.
-    """
+def draw_weights(result: Result) -> bytes:
+    """A PNG: learning curves, errors by position, weights with intervals; a column an axis."""
     figure = new_figure(*SIZE_IN)
     axes = figure.subplots(3, 4)
     for k in range(len(AXES)):
@@ -83,7 +81,9 @@ def plot_weights(result: Result, png_path: Path) -> None:
         ),
         fontsize=12,
     )  # fmt: skip
-    save_png(figure, png_path)
+    content = BytesIO()
+    save_png(figure, content)
+    return content.getvalue()
 
 
 def _method(result: Result, name: str) -> str:
@@ -91,8 +91,8 @@ def _method(result: Result, name: str) -> str:
 
 
 def _label(result: Result, name: str) -> str:
-    said = LABELS[_method(result, name)]
-    return f"{said}, position left out of the fit" if name == "chosen" else said
+    label = LABELS[_method(result, name)]
+    return f"{label}, position left out of the fit" if name == "chosen" else label
 
 
 def _learning(ax: Axes, result: Result, k: int) -> None:

@@ -48,7 +48,7 @@ class Truth(Protocol):
 
     @property
     def repeatable(self) -> bool:
-        """Whether asking again tells if the body moved."""
+        """Whether a second reading shows that the body moved."""
 
 
 def relative(
@@ -202,7 +202,7 @@ def _median(
 class EstimateTruth:
     """The vehicle's own state estimate; `telemetry` gives what arrived since the last call.
 
-    Where the target is in the world of that estimate is given, or learned once by holding
+    Where the target is in the world of that estimate is given, or measured once by holding
     the gear's tip to the target's centre, nose along the target's x axis.
     """
 
@@ -228,7 +228,7 @@ class EstimateTruth:
             position, rpy = self._now()
             tip = position + rotation_from_rpy(*rpy) @ self._gear
             self._target = np.array([*tip, rpy[2]])
-            ask("learned where the target is; now put the vehicle in place and press Enter: ")
+            ask("the target's place is measured; now put the vehicle in place and press Enter: ")
         position, rpy = self._now()
         return relative(position, rpy, self._target, self._gear)
 

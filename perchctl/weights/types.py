@@ -32,7 +32,7 @@ class Measurements:
         large, small: (n, 4), NaN where the marker was not seen.
         actual: (n, 4), the truth.
         joint: (n, 4), both markers solved together; NaN where it is missing. None where
-            the data know nothing of it.
+            the data do not hold it.
         line: the row's line in its file, (n,).
         notes: sentences about the data that are no faults.
     """

@@ -18,7 +18,7 @@ from perchctl.calibration.lens import parameters_of
 from perchctl.calibration.novelty import Capture, consider
 from perchctl.calibration.types import View
 from perchctl.cli import app
-from perchctl.commands.coverage import coverage_bars
+from perchctl.commands.calibrate_live import coverage_bars
 from perchctl.errors import TimedOut
 from perchctl.vision.types import CameraModel, Frame
 from tests.helpers.boards import (

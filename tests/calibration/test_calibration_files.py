@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 
 import cv2
@@ -15,8 +14,7 @@ from hypothesis import strategies as st
 from perchctl.calibration.files import load_calibration
 from perchctl.calibration.lens import COEFFICIENTS, MODEL_NAMES, parameters_of
 from perchctl.calibration.solve import calibrate
-from perchctl.calibration.writing import calibration_text, camera_text, check_free, write_all
-from perchctl.errors import InvalidValue, PerchError
+from perchctl.calibration.writing import calibration_text, camera_text
 from perchctl.vision.types import CameraModel
 from tests.helpers.boards import corner_views, draw_camera
 
@@ -109,31 +107,3 @@ def test_kalibr_s_file_is_read(tmp_path: Path) -> None:
     assert parameters_of(written).tolist() == [
         400.5, 401.5, 320.25, 240.75, -0.2, 0.05, 0.001, -0.002, 0.0,
     ]  # fmt: skip
-
-
-def test_an_existing_file_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "camera.yaml"
-    path.write_text("mine")
-    with pytest.raises(InvalidValue, match="exists already; add --force"):
-        check_free(path, force=False)
-    check_free(path, force=True)
-    with pytest.raises(InvalidValue, match="is a folder"):
-        check_free(tmp_path, force=True)
-
-
-def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
-    old = tmp_path / "camera.yaml"
-    old.write_text("old")
-    small, large = (old, b"new"), (tmp_path / "made" / "report.png", bytes(400_000))
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))  # as a disk that is full
-    try:
-        with pytest.raises(PerchError, match=r"cannot be written.*nothing was changed"):
-            write_all([small, large])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert old.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["camera.yaml"]
-    write_all([small, large])
-    assert old.read_bytes() == b"new"
-    assert large[0].stat().st_size == 400_000

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera.files import ImagesSource, VideoSource
-from perchctl.camera.open import is_live, open_source
+from perchctl.camera.files import ImagesSource, Recording, VideoSource
+from perchctl.camera.mjpeg import without_password
+from perchctl.camera.open import is_live, open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size, to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision.types import CameraModel, Frame
@@ -38,6 +39,8 @@ def test_images_come_all_and_in_natural_order(tmp_path: Path) -> None:
     write_images(tmp_path, 12)
     (tmp_path / "notes.txt").write_text("no picture")
     source = open_source(f"images:{tmp_path}", 0.07, None, clock)
+    assert isinstance(source, Recording)
+    assert (source.rate_hz, source.count) == (30.0, 12)
     assert source.size_px == (32, 24)
     assert not source.live
     frames = drain(source)
@@ -81,6 +84,8 @@ def write_video(path: Path, count: int, rate_hz: float) -> None:
 def test_a_video_gives_every_frame_with_its_time(tmp_path: Path) -> None:
     write_video(tmp_path / "flight.avi", 20, 25.0)
     source = open_source(f"video:{tmp_path}/flight.avi", 0.0, None, clock)
+    assert isinstance(source, Recording)
+    assert (source.rate_hz, source.count) == (25.0, 20)
     assert source.size_px == (64, 48)
     frames = drain(source)
     assert len(frames) == 20
@@ -89,6 +94,26 @@ def test_a_video_gives_every_frame_with_its_time(tmp_path: Path) -> None:
     assert [f.t_s - frames[0].t_s for f in frames] == pytest.approx([k / 25 for k in range(20)])
     source.close()
     assert source.finished
+
+
+def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
+    write_images(tmp_path, 1)
+    video, picture = tmp_path / "flight.avi", tmp_path / "shot_0.png"
+    video.write_bytes(b"")
+    assert source_spec(str(tmp_path)) == f"images:{tmp_path}"
+    assert source_spec(f"{tmp_path}/*.png") == f"images:{tmp_path}/*.png"
+    assert source_spec(str(picture)) == f"images:{picture}"
+    assert source_spec(str(video)) == f"video:{video}"
+    for spec in ("camera:0", "http://host/stream", "webcam"):
+        assert source_spec(spec) == spec
+    with pytest.raises(NotFound, match=r"none\.mp4 does not exist"):
+        source_spec("none.mp4")
+
+
+def test_a_password_is_not_shown() -> None:
+    assert without_password("http://me:secret@host:81/a@b") == "http://host:81/a@b"
+    assert without_password("http://host/") == "http://host/"
+    assert without_password("video:mail@home.mp4") == "video:mail@home.mp4"
 
 
 def test_videos_that_are_none(tmp_path: Path) -> None:

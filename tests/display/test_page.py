@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from perchctl.commands.fly import live_page
-from perchctl.commands.track import resolve, run
+from perchctl.commands.track import TrackRequest, resolve, track
 from perchctl.display.page.flight import FlightPage
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.server import MAX_STREAMS, TOKEN_HEADER, is_loopback
@@ -398,7 +398,10 @@ def test_track_serves_its_numbers_while_it_runs(
 ) -> None:
     pictures = write_pictures(tmp_path / "pictures")
     out = Looking(capsys)
-    run(resolve(str(pictures), "sim", CALIBRATION, stills=True, as_json=True, view=True), out)
+    request = TrackRequest(
+        str(pictures), calibration=CALIBRATION, stills=True, view=True, as_json=True
+    )
+    track(resolve(request), out)
     lines = [json.loads(line) for line in out.getvalue().splitlines()]
     assert len(lines) == len(VIEWS)
     assert out.state["track"] == lines[1]  # the newest when the third line was written

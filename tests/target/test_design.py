@@ -21,7 +21,7 @@ from perchctl.target.design import Design, Ranges, error_curve, make_design
 from perchctl.target.design_text import design_record, design_text
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.limits import Optics
-from perchctl.target.plot import plot_design
+from perchctl.target.plot import draw_design
 from perchctl.target.suggest import suggest
 from perchctl.target.visible import FieldOfView, square_outline, turned_outline
 from perchctl.vision.types import CameraModel
@@ -182,10 +182,9 @@ def test_what_no_target_can_cover_is_said(profile: Profile) -> None:
     assert any("small marker would have to be" in note for note in found.notes)
 
 
-def test_the_plot_and_the_record(paper_design: Design, tmp_path: Path) -> None:
-    path = tmp_path / "design.png"
-    plot_design(paper_design, error_curve(paper_design), path)
-    picture = cv2.imread(str(path))
+def test_the_plot_and_the_record(paper_design: Design) -> None:
+    png = draw_design(paper_design, error_curve(paper_design))
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     assert min(picture.shape[:2]) > 500
     record = design_record(paper_design)

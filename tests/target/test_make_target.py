@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from perchctl.cli import app
 from perchctl.profile import load_profile
+from tests.helpers.disk import full_disk
 
 CAMERA = "example_640x480.yaml"
 
@@ -114,18 +115,10 @@ def test_a_file_that_cannot_be_written_leaves_no_other(monkeypatch: pytest.Monke
     assert files() == {"t.png"}
 
 
-def test_a_full_disk_leaves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = Path.write_bytes
-
-    def full(path: Path, data: bytes) -> int:
-        if ".png" in path.name:
-            whole(path, data[: len(data) // 2])
-            raise OSError(28, "No space left on device")
-        return whole(path, data)
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    _, err = call("-o", "t.pdf", "--png", "60", code=30)
-    assert "No space left on device" in err
+def test_a_full_disk_leaves_nothing() -> None:
+    with full_disk(room=20_000):
+        _, err = call("-o", "t.pdf", "--png", "300", code=30)
+    assert "cannot be written: File too large" in err
     assert files() == set()
 
 

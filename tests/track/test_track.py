@@ -18,7 +18,10 @@ from typer.testing import CliRunner
 
 from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
-from perchctl.commands.track import Stopper, frames, resolve, run
+from perchctl.commands.interrupt import Stopper
+from perchctl.commands.output import say
+from perchctl.commands.track import TrackRequest, frames, resolve
+from perchctl.commands.track import track as track_source
 from perchctl.errors import Interrupted, InvalidValue, NotFound, UsageError
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import TargetConfig, load_profile
@@ -27,6 +30,7 @@ from perchctl.track.tracker import Notes, Tracker, camera_pipeline
 from perchctl.vision.camera_model import project
 from perchctl.vision.pose import square
 from perchctl.vision.types import Frame
+from tests.helpers.disk import full_disk
 from tests.helpers.recording import (
     CALIBRATION,
     STAGE_OF,
@@ -58,7 +62,8 @@ def track(source: str | Path, profile: str = "sim", **options: Any) -> list[dict
     """The JSON lines of one run."""
     out = io.StringIO()
     options.setdefault("calibration", CALIBRATION)
-    run(resolve(str(source), profile, as_json=True, **options), out)
+    request = TrackRequest(str(source), profile, as_json=True, **options)
+    track_source(resolve(request), out)
     return [json.loads(line, parse_constant=pytest.fail) for line in out.getvalue().splitlines()]
 
 
@@ -424,7 +429,7 @@ class Script:
 def test_a_live_source_is_waited_for_and_its_end_is_told(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), Notes())]
+    seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), Notes(say))]
     assert seen == [2, 1, 0]
     said = capsys.readouterr().err
     assert "http://camera delivers no frame; waiting" in said
@@ -473,7 +478,7 @@ class PressingOut(io.StringIO):
 
     def write(self, text: str) -> int:
         written = super().write(text)
-        if self.getvalue().count("\n") == 3 and not self.stopper.asked.is_set():
+        if self.getvalue().count("\n") == 3 and not self.stopper.requested.is_set():
             self.stopper.press()
         return written
 
@@ -482,17 +487,28 @@ def test_ctrl_c_leaves_whole_files(video: Path, tmp_path: Path) -> None:
     stopper = Stopper()
     out = PressingOut(stopper)
     options = resolve(
-        str(video), "sim", CALIBRATION, as_json=True,
-        csv=tmp_path / "x.csv", overlay=tmp_path / "x.mp4",
+        TrackRequest(
+            str(video), "sim", CALIBRATION, as_json=True,
+            csv=tmp_path / "x.csv", overlay=tmp_path / "x.mp4",
+        )
     )  # fmt: skip
     with pytest.raises(Interrupted) as caught:
-        run(options, out, stopper=stopper)
+        track_source(options, out, stopper=stopper)
     assert caught.value.exit_code == 130
     assert len(out.getvalue().splitlines()) == 3
     assert len((tmp_path / "x.csv").read_text().splitlines()) == 4
     capture = cv2.VideoCapture(str(tmp_path / "x.mp4"))
     assert sum(1 for _ in iter(lambda: capture.read()[0], False)) == 3
     assert sorted(p.name for p in tmp_path.iterdir()) == ["x.csv", "x.mp4"]
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_no_file(video: Path, tmp_path: Path) -> None:
+    old = tmp_path / "x.csv"
+    old.write_text("old")
+    with full_disk(room=4_000), pytest.raises(InvalidValue, match=r"x\.csv cannot be written"):
+        track(video, csv=old, overlay=tmp_path / "x.mp4")
+    assert old.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["x.csv"]
 
 
 def test_a_second_ctrl_c_does_not_wait() -> None:
@@ -546,7 +562,7 @@ def test_bad_input_is_one_sentence(
 
 def test_the_source_is_not_overwritten(video: Path) -> None:
     with pytest.raises(UsageError, match="source itself"):
-        resolve(str(video), "sim", CALIBRATION, overlay=video)
+        resolve(TrackRequest(str(video), "sim", CALIBRATION, overlay=video))
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
@@ -584,9 +600,9 @@ def test_a_print_error_is_named(video: Path, capsys: pytest.CaptureFixture[str])
     profile = load_profile("sim")
     small = profile.target.small.model_copy(update={"side_m": 0.024})
     target = profile.target.model_copy(update={"small": small})
-    options = resolve(str(video), "sim", CALIBRATION, as_json=True)
+    options = resolve(TrackRequest(str(video), "sim", CALIBRATION, as_json=True))
     wrong = options.profile.model_copy(update={"target": target})
-    run(dataclasses.replace(options, profile=wrong), io.StringIO())
+    track_source(dataclasses.replace(options, profile=wrong), io.StringIO())
     said = capsys.readouterr().err
     assert "print error: the small marker is 0.16" in said
     assert "make-target --measured-large" in said

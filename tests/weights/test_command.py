@@ -16,12 +16,13 @@ from typer.testing import CliRunner, Result
 
 from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
-from perchctl.commands import collect_weights
+from perchctl.commands.fit_weights_collect import _truth
+from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.errors import InvalidValue
 from perchctl.geometry import rot_z
 from perchctl.profile import find_calibration, load_profile
 from perchctl.weights import truth
-from perchctl.weights.collect import Eye, SessionFile, collecting_pipeline, fault_of
+from perchctl.weights.collect import MarkerReader, SessionFile, collecting_pipeline, fault_of
 from perchctl.weights.table import HEADER, NEEDED, read_csv
 from tests.helpers.weights_data import BEST, independent, known, write
 
@@ -278,13 +279,13 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     camera = load_calibration(find_calibration(profile.camera.calibration))
     stand = Stand(profile, camera, 2, 0, 4.0, 1.0)
     place = stand.place(1)
-    eye = Eye(collecting_pipeline(profile, camera))
-    good = [eye.look(frame) for frame in stand.frames(1, place, 6)]
+    reader = MarkerReader(collecting_pipeline(profile, camera))
+    good = [reader.read(frame) for frame in stand.frames(1, place, 6)]
     assert fault_of(good) is None
     moved = place.T_world_cam.copy()
     moved[0, 3] += 0.002
     other = type(place)(moved, place.actual)
-    late = [eye.look(frame) for frame in stand.frames(1, other, 6)]
+    late = [reader.read(frame) for frame in stand.frames(1, other, 6)]
     assert "shaken" in (fault_of([*good, *late]) or "")
     blind = [type(s)(s.t_s, s.large, None, None, None) for s in good]
     assert "the small marker was found in 6 of 12" in (fault_of([*good, *blind]) or "")
@@ -372,11 +373,7 @@ def test_motion_capture_gives_the_median_or_names_the_bodies(
         other.actual(lambda question: "")
     other.close()
     with pytest.raises(Exception, match="--mocap TYPE:HOST"):
-        collect_weights._truth(
-            collect_weights.CollectOptions(Path("s.csv"), "sim", truth="mocap"),
-            load_profile("sim"),
-            lambda: 0.0,
-        )
+        _truth(CollectRequest(truth="mocap"), load_profile("sim"), lambda: 0.0)
 
 
 def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:

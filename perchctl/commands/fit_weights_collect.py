@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,19 @@ from perchctl.calibration.files import load_calibration
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
+from perchctl.commands.fit_weights_request import CollectRequest
+from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.profile import Profile, load_profile
 from perchctl.vision.types import CameraModel
-from perchctl.weights.collect import Eye, SessionFile, collecting_pipeline, fault_of, rows_of
+from perchctl.weights.collect import (
+    MarkerReader,
+    SessionFile,
+    collecting_pipeline,
+    fault_of,
+    rows_of,
+)
 from perchctl.weights.dialogue import Experiment
 from perchctl.weights.truth import EstimateTruth, MocapTruth, Truth, TypedTruth, four_numbers
 
@@ -28,56 +35,39 @@ TRUTHS = ("typed", "mocap", "estimate", "sim")
 _DEGREES = (1.0, math.pi / 180.0)
 
 
-@dataclass(frozen=True)
-class CollectOptions:
-    """What to collect, and where its truth is from."""
-
-    session: Path
-    profile: str
-    positions: int = 10
-    frames: int = 100
-    truth: str = "typed"
-    source: str | None = None
-    uri: str | None = None
-    mocap: str | None = None
-    bodies: str = "cf,target"
-    target: str | None = None
-    seed: int = 0
-    noise: float = 4.0
-    blur: float = 1.0
-
-
-def collect(options: CollectOptions) -> None:
+def collect(request: CollectRequest, path: Path) -> None:
     """Fill the session's file with positions; it is continued where it was stopped.
 
     Errors: UsageError, NotFound, InvalidValue, TimedOut, Interrupted, ConnectionFailed.
     """
-    if options.truth not in TRUTHS:
-        raise InvalidValue(f"--truth {options.truth!r} is unknown; allowed are {', '.join(TRUTHS)}")
+    if request.truth not in TRUTHS:
+        raise InvalidValue(f"--truth {request.truth!r} is unknown; allowed are {', '.join(TRUTHS)}")
     for name, least in (("positions", 2), ("frames", 10)):
-        if getattr(options, name) < least:
-            raise InvalidValue(f"--{name} {getattr(options, name)} must be at least {least}")
+        if getattr(request, name) < least:
+            raise InvalidValue(f"--{name} {getattr(request, name)} must be at least {least}")
     for name in ("noise", "blur"):
-        if not 0.0 <= getattr(options, name) <= 50.0:
-            raise InvalidValue(f"--{name} {getattr(options, name):g} must be between 0 and 50")
-    profile = load_profile(options.profile, with_weights=False)
+        if not 0.0 <= getattr(request, name) <= 50.0:
+            raise InvalidValue(f"--{name} {getattr(request, name):g} must be between 0 and 50")
+    profile = load_profile(request.profile, with_weights=False)
     camera = load_calibration(profile.camera.calibration)
-    if options.truth == "sim":
-        _collect_simulated(options, profile, camera)
+    if request.truth == "sim":
+        _collect_simulated(request, path, profile, camera)
     else:
-        _collect_with_person(options, profile, camera)
+        _collect_with_person(request, path, profile, camera)
 
 
-def _session(options: CollectOptions) -> SessionFile:
-    session = SessionFile(options.session, options.frames)
+def _open_session(path: Path, frames: int) -> SessionFile:
+    session = SessionFile(path, frames)
     if session.note:
-        _say(session.note)
+        say(session.note)
     if session.done:
-        _say(f"{session.path} holds {len(session.done)} positions already")
+        say(f"{session.path} holds {len(session.done)} positions already")
     return session
 
 
-def _collect_simulated(options: CollectOptions, profile: Profile, camera: CameraModel) -> None:
+def _collect_simulated(
+    request: CollectRequest, path: Path, profile: Profile, camera: CameraModel
+) -> None:
     try:
         from perchctl.weights.simulated import Stand
     except ImportError as error:
@@ -86,40 +76,42 @@ def _collect_simulated(options: CollectOptions, profile: Profile, camera: Camera
             f"{sys.executable} -m pip install 'perchctl[sim]'"
         ) from None
 
-    session = _session(options)
-    stand = Stand(profile, camera, options.positions, options.seed, options.noise, options.blur)
+    session = _open_session(path, request.frames)
+    stand = Stand(profile, camera, request.positions, request.seed, request.noise, request.blur)
     setup = collecting_pipeline(profile, camera)
-    left = max(0, options.positions - len(session.done))
-    with count_bar("frames", left * options.frames) as advance:
+    left = max(0, request.positions - len(session.done))
+    with count_bar("frames", left * request.frames) as advance:
         for position in range(session.next_position, session.next_position + left):
-            place, eye, sights = stand.place(position), Eye(setup), []
-            for frame in stand.frames(position, place, options.frames):
-                sights.append(eye.look(frame))
+            place, reader, readings = stand.place(position), MarkerReader(setup), []
+            for frame in stand.frames(position, place, request.frames):
+                readings.append(reader.read(frame))
                 advance()
-            fault = fault_of(sights)
+            fault = fault_of(readings)
             if fault is not None:
                 raise InvalidValue(
                     f"position {position} of the simulated experiment cannot be used ({fault}); "
                     f"less --noise or --blur, or another --seed, makes it seen"
                 )
-            session.append(position, rows_of(position, sights, place.actual))
+            session.append(position, rows_of(position, readings, place.actual))
 
 
-def _collect_with_person(options: CollectOptions, profile: Profile, camera: CameraModel) -> None:
+def _collect_with_person(
+    request: CollectRequest, path: Path, profile: Profile, camera: CameraModel
+) -> None:
     start_s = time.monotonic()
 
     def now() -> float:
         return time.monotonic() - start_s
 
-    spec = profile.camera.source if options.source is None else options.source
+    spec = profile.camera.source if request.source is None else request.source
     if spec.startswith("sim:"):
         raise UsageError(
-            "the simulated camera knows its own truth: add --truth sim, or name a real camera "
+            "the simulator has the truth itself: add --truth sim, or name a real camera "
             "with --source (camera:N, http://...)"
         )
     config = profile.camera
     with ExitStack() as stack:
-        truth = _truth(options, profile, now)
+        truth = _truth(request, profile, now)
         stack.callback(truth.close)
         source: FrameSource = open_source(
             spec, config.latency_s, camera.size_px, now, config.start_timeout_s
@@ -128,32 +120,32 @@ def _collect_with_person(options: CollectOptions, profile: Profile, camera: Came
         if config.mirrored:
             source = UnmirroredSource(source)
         experiment = Experiment(
-            _session(options),
+            _open_session(path, request.frames),
             source,
             collecting_pipeline(profile, camera),
             truth,
             ask=_ask,
-            say=_say,
+            say=say,
             bar=count_bar,
             now=now,
             wait=time.sleep,
         )
-        experiment.run(options.positions, options.frames)
+        experiment.run(request.positions, request.frames)
 
 
-def _truth(options: CollectOptions, profile: Profile, now: Callable[[], float]) -> Truth:
+def _truth(request: CollectRequest, profile: Profile, now: Callable[[], float]) -> Truth:
     gear = np.asarray(profile.vehicle.gear_body_m, dtype=np.float64)
-    given = None if options.target is None else four_numbers(options.target, _DEGREES)
-    if options.truth == "typed":
+    given = None if request.target is None else four_numbers(request.target, _DEGREES)
+    if request.truth == "typed":
         return TypedTruth()
-    if options.truth == "mocap":
-        if options.mocap is None or ":" not in options.mocap:
+    if request.truth == "mocap":
+        if request.mocap is None or ":" not in request.mocap:
             raise UsageError("--truth mocap needs --mocap TYPE:HOST, as in vicon:192.168.1.2")
-        body, _, target = options.bodies.partition(",")
-        return MocapTruth(options.mocap, body, target if given is None else given, gear)
+        body, _, target = request.bodies.partition(",")
+        return MocapTruth(request.mocap, body, target if given is None else given, gear)
     from perchctl.link.estimate import EstimateLink
 
-    link = EstimateLink(profile.link.uri if options.uri is None else options.uri, profile.link, now)
+    link = EstimateLink(profile.link.uri if request.uri is None else request.uri, profile.link, now)
     link.connect()
     return EstimateTruth(link.telemetry, given, gear, link.close)
 
@@ -165,7 +157,3 @@ def _ask(question: str) -> str:
     if not line:
         raise EOFError
     return line.rstrip("\n")
-
-
-def _say(sentence: str) -> None:
-    print(f"perchctl: {sentence}", file=sys.stderr)

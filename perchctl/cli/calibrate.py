@@ -1,0 +1,93 @@
+"""The options of `perchctl calibrate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perchctl.cli.app import JsonOption, ViewOption, ViewPortOption, reported
+
+
+# long: a list of options
+def calibrate(
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path."
+        ),
+    ] = None,
+    board: Annotated[
+        str,
+        typer.Option(
+            "--board",
+            "-b",
+            help="chessboard:9x6:25mm (inner corners) or charuco:10x7:25mm:18mm:DICT_5X5_100 "
+            "(squares; :legacy behind it for OpenCV's old layout).",
+        ),
+    ] = "charuco:10x7:25mm:18mm:DICT_5X5_100",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Calibration file; the report goes beside it as .png. "
+            "Default: calib/NAME_WIDTHxHEIGHT.yaml.",
+        ),
+    ] = None,
+    name: Annotated[str, typer.Option("--name", help="The camera's name.")] = "camera",
+    model: Annotated[
+        str,
+        typer.Option(
+            "--model", help="auto (the recommended), plumb_bob, rational_polynomial or fisheye."
+        ),
+    ] = "auto",
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    check: Annotated[
+        Path | None,
+        typer.Option("--check", help="Judge this calibration by the source's pictures instead."),
+    ] = None,
+    convert: Annotated[
+        Path | None,
+        typer.Option("--convert", help="Read an OpenCV, Kalibr or ROS file and write --output."),
+    ] = None,
+    reject: Annotated[
+        bool, typer.Option("--reject/--no-reject", help="Leave out outlier views and corners.")
+    ] = True,
+    plain_corners: Annotated[
+        bool, typer.Option("--plain-corners", help="OpenCV's corners, not the fitted ones.")
+    ] = False,
+    keep_pictures: Annotated[
+        Path | None,
+        typer.Option("--keep-pictures", help="Folder for the pictures taken of a live camera."),
+    ] = None,
+    as_json: JsonOption = False,
+    view: ViewOption = False,
+    view_port: ViewPortOption = 0,
+) -> None:
+    """Calibrate the camera, and report what its error means in mm at the target.
+
+    A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
+    by more than 5 times its view's spread; both are named. --check exits with 1 on a fail.
+    """
+    with reported():
+        from perchctl.commands.calibrate import CalibrateRequest, run
+
+        request = CalibrateRequest(
+            source=source,
+            board=board,
+            output=output,
+            name=name,
+            model=model,
+            force=force,
+            check=check,
+            convert=convert,
+            reject=reject,
+            plain_corners=plain_corners,
+            keep_pictures=keep_pictures,
+            as_json=as_json,
+            view=view,
+            view_port=view_port,
+        )
+        raise typer.Exit(run(request))

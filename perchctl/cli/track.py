@@ -1,0 +1,64 @@
+"""The options of `perchctl track`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, reported
+
+
+def track(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="camera:N, video:FILE, images:DIR (or a pattern), http://..., or a path."
+        ),
+    ],
+    profile: ProfileOption = "sim",
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
+        ),
+    ] = None,
+    stills: Annotated[
+        bool, typer.Option("--stills", help="Each picture alone: no window, no filter.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", help="Write the results as CSV, t_s first.")
+    ] = None,
+    overlay: Annotated[
+        Path | None, typer.Option("--overlay", help="Write the pictures with results as .mp4.")
+    ] = None,
+    view: ViewOption = False,
+    view_port: ViewPortOption = 0,
+) -> None:
+    """Find the target in a camera, video or pictures, without a vehicle.
+
+    Poses are in the OpenCV camera frame with cv2.aruco's marker axes: X_cam = R(rvec) X_marker +
+    tvec. A JSON line holds frame, t_s, stage (large, both, small, none), large and small (null,
+    or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px) and target (null, or rvec_rad,
+    tvec_m, yaw_rad, sigma_m, sigma_yaw_rad). With both markers in sight target is their joint
+    pose; without --stills it is filtered, and goes on for a few frames after stage none.
+    yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
+    along the camera's x, y, z.
+    """
+    with reported():
+        from perchctl.commands.track import TrackRequest, run
+
+        request = TrackRequest(
+            source=source,
+            profile=profile,
+            calibration=calibration,
+            stills=stills,
+            as_json=as_json,
+            csv=csv,
+            overlay=overlay,
+            view=view,
+            view_port=view_port,
+        )
+        raise typer.Exit(run(request))

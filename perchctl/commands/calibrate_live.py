@@ -1,0 +1,133 @@
+"""The guided capture of `perchctl calibrate`: a live camera, four bars of coverage, a page."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+import cv2
+import numpy as np
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from perchctl.calibration.guided import Moment, capture
+from perchctl.calibration.types import Grey, View
+from perchctl.camera.open import open_source
+from perchctl.commands.interrupt import Stopper
+from perchctl.commands.output import say
+from perchctl.commands.page import live_page
+from perchctl.display.page.sketch import Sketch
+from perchctl.errors import InvalidValue
+from perchctl.files import write_files
+from perchctl.target.boards import Board
+from perchctl.vision.types import CameraModel
+
+_BAR_WIDTH = 30
+_REFRESH_HZ = 8
+_SIZE_UNTIL_KNOWN_PX = (640, 480)
+
+
+def captured_views(
+    spec: str, board: Board, pictures_folder: Path | None, port: int | None
+) -> list[View]:
+    """Views of a live camera, taken until all is covered or Ctrl-C ends it.
+
+    Args:
+        pictures_folder: where to keep their pictures; None: nowhere.
+        port: of the live page; None: no page.
+
+    Raises:
+        InvalidValue: no view was taken. Those of `open_source`, `capture` and `write_files`.
+    """
+    with contextlib.ExitStack() as stack:
+        source = open_source(spec, 0.0, None, time.monotonic)
+        stack.callback(source.close)
+        stop = stack.enter_context(Stopper().installed())
+        camera = _any_camera(source.size_px or _SIZE_UNTIL_KNOWN_PX)
+        page = stack.enter_context(live_page(camera, "perchctl calibrate", port))
+        bars = stack.enter_context(coverage_bars())
+        say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
+
+        def show(moment: Moment) -> None:
+            bars(moment.covered, moment.taken, moment.advice)
+            if page is not None:
+                page.show(moment.index, _sketch(moment))
+                page.tell(lambda: _page_state(moment))
+
+        views, pictures = capture(source, board, show, stopped=stop.requested.is_set)
+    if pictures_folder is not None and pictures:
+        _keep(pictures, pictures_folder)
+    if not views:
+        raise InvalidValue(f"no view of the board {board.notation()} was taken from {spec}")
+    return views
+
+
+@contextlib.contextmanager
+def coverage_bars(
+    stream: TextIO | None = None,
+) -> Iterator[Callable[[Mapping[str, float], int, str], None]]:
+    """Yields the function to call with the coverage (0..1 each), the views taken, and the
+    advice of the moment. A pipe gets one line a view."""
+    console = Console(file=stream or sys.stderr)
+    if not console.is_terminal:
+        last: list[int] = [-1]
+
+        def line(covered: Mapping[str, float], taken: int, advice: str) -> None:
+            if taken == last[0]:
+                return
+            last[0] = taken
+            shares = ", ".join(f"{name} {100 * share:.0f} %" for name, share in covered.items())
+            console.print(f"perchctl: {taken} views; {shares}", markup=False, highlight=False)
+
+        yield line
+        return
+    with Live(console=console, refresh_per_second=_REFRESH_HZ, redirect_stdout=False) as live:
+        yield lambda covered, taken, advice: live.update(_table(covered, taken, advice))
+
+
+def _table(covered: Mapping[str, float], taken: int, advice: str) -> Table:
+    table = Table.grid(padding=(0, 1))
+    for name, share in covered.items():
+        full = round(_BAR_WIDTH * min(max(share, 0.0), 1.0))
+        colour = "green" if share >= 1.0 else "yellow"
+        bar = Text("#" * full, style=colour) + Text("." * (_BAR_WIDTH - full), style="dim")
+        table.add_row(name, bar, f"{100 * share:3.0f} %")
+    table.add_row("views", Text(str(taken)), "")
+    table.add_row("", Text(advice, style="bold"), "")
+    return table
+
+
+def _any_camera(size_px: tuple[int, int]) -> CameraModel:
+    """The page draws the picture and its corners, but no axes: any camera serves."""
+    w, h = size_px
+    K = np.array([[w, 0.0, w / 2], [0.0, w, h / 2], [0.0, 0.0, 1.0]])
+    return CameraModel(size_px, K, np.zeros(5))
+
+
+def _sketch(moment: Moment) -> Sketch:
+    outlines: tuple[tuple[str, Any], ...] = ()
+    if len(moment.corners_px) >= 3:
+        hull = cv2.convexHull(moment.corners_px.astype(np.float32)).reshape(-1, 2)
+        outlines = (("small" if moment.shot else "large", hull.astype(np.float64)),)
+    return Sketch(moment.image, outlines, None, (moment.advice,))
+
+
+def _page_state(moment: Moment) -> dict[str, Any]:
+    rows = [
+        [name, "#" * round(20 * share) + "." * (20 - round(20 * share)) + f" {100 * share:.0f} %"]
+        for name, share in moment.covered.items()
+    ]
+    return {"rows": [*rows, ["views", str(moment.taken)]], "phase": moment.advice}
+
+
+def _keep(pictures: list[Grey], folder: Path) -> None:
+    encoded = [cv2.imencode(".png", picture)[1].tobytes() for picture in pictures]
+    files = {folder / f"view_{i:03d}.png": png for i, png in enumerate(encoded, start=1)}
+    write_files(files, make_folders=True)
+    say(f"kept {len(pictures)} pictures in {folder}")
