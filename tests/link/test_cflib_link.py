@@ -91,6 +91,12 @@ def newest(link: CflibLink) -> Telemetry:
     return samples[-1]
 
 
+def cf(link: CflibLink) -> Any:
+    """cflib's object behind an open link."""
+    assert link.connection is not None
+    return link.connection.cf
+
+
 def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
     """Collects the supervisor's bits at each raw setpoint that goes out from now on."""
     bits: list[int] = []
@@ -99,7 +105,7 @@ def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
         if packet.port == PITCH_PORT:
             bits.append(info(sim))
 
-    link._cf.packet_sent.add_callback(note)
+    cf(link).packet_sent.add_callback(note)
     return bits
 
 
@@ -114,8 +120,8 @@ def take_off(link: CflibLink, sim: SimProcess) -> None:
 def test_connecting_sets_parameters_and_reads_them_back(sim: SimProcess) -> None:
     config = LinkConfig(parameters={"stabilizer.estimator": 1, "ctrlMel.mass": 0.031})
     with linked(sim, config) as link:
-        assert link._cf.param.get_value("stabilizer.estimator") == "1"
-        assert float(link._cf.param.get_value("ctrlMel.mass")) == pytest.approx(0.031)
+        assert cf(link).param.get_value("stabilizer.estimator") == "1"
+        assert float(cf(link).param.get_value("ctrlMel.mass")) == pytest.approx(0.031)
         assert link.problem(time.monotonic()) is None
 
 
@@ -184,7 +190,7 @@ def test_a_silent_link_says_so(sim: SimProcess) -> None:
 def test_idle_sends_nothing(sim: SimProcess) -> None:
     with linked(sim) as link:
         sent: list[int] = []
-        link._cf.packet_sent.add_callback(
+        cf(link).packet_sent.add_callback(
             lambda packet: sent.append(packet.port) if packet.port in (3, 7, 8) else None
         )
         link.send(Idle())
