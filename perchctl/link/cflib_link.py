@@ -25,20 +25,27 @@ SILENCE_S = 1.5
 SENDER_STUCK_S = 0.5
 DRAIN_S = 1.0
 LANDING_WAIT_S = 6.0
-"""How long `close` waits for a vehicle that still flies."""
 
 
 class CflibLink:
     """`perchctl.link.protocol.Link` on an unmodified cflib.
 
-    `connection` is None before `connect` and after `close`.
+    `connection` is None before `connect` and after `close`. `landing_wait_s`: how long
+    `close` waits for a vehicle that still flies.
     """
 
-    def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        uri: str,
+        config: LinkConfig,
+        clock: Callable[[], float],
+        landing_wait_s: float = LANDING_WAIT_S,
+    ) -> None:
         check_uri(uri)
         self._uri = uri
         self._config = config
         self._clock = clock
+        self._landing_wait_s = landing_wait_s
         self._blocks = LogBlocks(clock)
         self._sender: Sender | None = None
         self.connection: Connection | None = None
@@ -49,7 +56,8 @@ class CflibLink:
             self._prepare(self.connection)
         except BaseException:
             # As long as nothing is known of the vehicle, it may be flying for another.
-            self._leave(safe=self._blocks.newest is not None and not self._still_flying())
+            known = self._blocks.newest is not None
+            self._leave(farewell=known and not self._still_flying())
             raise
 
     def telemetry(self) -> list[Telemetry]:
@@ -80,13 +88,13 @@ class CflibLink:
         """
         if self._sender is not None:
             self._sender.drain(DRAIN_S)
-        end_s = self._clock() + LANDING_WAIT_S
+        end_s = self._clock() + self._landing_wait_s
         while self._still_flying() and self._clock() < end_s:
             time.sleep(0.05)
-        safe = not self._still_flying()
+        farewell = not self._still_flying()
         if self._sender is not None:
             self._sender.stop()
-        self._leave(safe=safe)
+        self._leave(farewell=farewell)
 
     def _prepare(self, connection: Connection) -> None:
         """From connected to ready to fly."""
@@ -144,11 +152,12 @@ class CflibLink:
         newest = self._blocks.newest
         return self.connection is not None and newest is not None and newest.has(FLYING)
 
-    def _leave(self, *, safe: bool) -> None:
+    def _leave(self, *, farewell: bool) -> None:
+        """`farewell`: let cflib send its zero setpoint, which drops a flying vehicle."""
         connection, self.connection = self.connection, None
         if connection is None:
             return
-        if safe:
+        if farewell:
             connection.close()
         else:
             connection.abandon()

@@ -8,7 +8,11 @@ from perchctl.link.prepare import check_firmware
 
 
 class EstimateLink(CflibLink):
-    """A `CflibLink` that only listens. Errors as there."""
+    """A `CflibLink` that commands nothing, not even at its end. Errors as there."""
+
+    def close(self) -> None:
+        """Leave at once and without cflib's farewell: the vehicle may fly for another."""
+        self._leave(farewell=False)
 
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)

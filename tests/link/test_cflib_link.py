@@ -17,7 +17,8 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link.cflib_link import SILENCE_S, CflibLink
+from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S, CflibLink
+from perchctl.link.estimate import EstimateLink
 from perchctl.profile import LinkConfig
 from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.scenario import Scenario
@@ -40,6 +41,7 @@ LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
 WAIT_S = 20.0
 PAUSE = threading.Event()
 PITCH_PORT = 3  # raw setpoints: attitude and thrust
+COMMAND_PORTS = (PITCH_PORT, 7, 8, 9)
 
 
 def until(true: Callable[[], Any], limit_s: float = WAIT_S) -> Any:
@@ -74,10 +76,12 @@ def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
 
 
 @contextmanager
-def linked(sim: SimProcess, config: LinkConfig = CONFIG) -> Iterator[CflibLink]:
+def linked(
+    sim: SimProcess, config: LinkConfig = CONFIG, landing_wait_s: float = LANDING_WAIT_S
+) -> Iterator[CflibLink]:
     """A connection to a vehicle new on the floor; closed at the end if the test has not."""
     sim.replace_vehicle(LOW_CEILING)
-    link = CflibLink(sim.uri, config, time.monotonic)
+    link = CflibLink(sim.uri, config, time.monotonic, landing_wait_s)
     until(lambda: info(sim) & CAN_FLY)
     link.connect()
     try:
@@ -95,6 +99,18 @@ def cf(link: CflibLink) -> Any:
     """cflib's object behind an open link."""
     assert link.connection is not None
     return link.connection.cf
+
+
+def commands_sent(link: CflibLink) -> list[int]:
+    """Collects the ports of the packets that command the vehicle from now on."""
+    ports: list[int] = []
+
+    def note(packet: Any) -> None:
+        if packet.port in COMMAND_PORTS:
+            ports.append(packet.port)
+
+    cf(link).packet_sent.add_callback(note)
+    return ports
 
 
 def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
@@ -189,10 +205,7 @@ def test_a_silent_link_says_so(sim: SimProcess) -> None:
 
 def test_idle_sends_nothing(sim: SimProcess) -> None:
     with linked(sim) as link:
-        sent: list[int] = []
-        cf(link).packet_sent.add_callback(
-            lambda packet: sent.append(packet.port) if packet.port in (3, 7, 8) else None
-        )
+        sent = commands_sent(link)
         link.send(Idle())
         let_pass(sim, 0.2)
         assert sent == []
@@ -253,7 +266,7 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
     """Firmware facts: high-level hover never times out; the zero setpoint of close_link would
     end it at once, and so neither a close that gives up waiting nor a refused connection
     may send one."""
-    with linked(sim) as link:
+    with linked(sim, landing_wait_s=1.0) as link:
         take_off(link, sim)
         raw = sent_raw(link, sim)
         link.close()  # nobody lands it: waits, gives up
@@ -262,6 +275,12 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
         second = CflibLink(sim.uri, CONFIG, time.monotonic)
         with pytest.raises(ConnectionFailed, match="flying already: land it"):
             second.connect()
+        listener = EstimateLink(sim.uri, CONFIG, time.monotonic)
+        listener.connect()
+        sent = commands_sent(listener)
+        assert newest(listener).has(FLYING)
+        listener.close()
+        assert sent == []
         let_pass(sim, 1.0)
         assert sim.truth()["position_m"][2] > 0.3
         assert not info(sim) & LOCKED
