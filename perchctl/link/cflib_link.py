@@ -7,19 +7,18 @@ zero setpoint, which drops a flying vehicle (firmware facts, "When setpoints sto
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 
-from perchctl import vehicle as say
 from perchctl.errors import ConnectionFailed
 from perchctl.link.connection import Connection, open_connection
+from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
 from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.prepare import check_firmware, set_parameters
 from perchctl.link.sender import Sender
 from perchctl.link.uri import check_uri
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import ARMED, FLYING, Command, Telemetry
+from perchctl.vehicle import ARMED, FLYING, Command, Idle, Telemetry
 
 SILENCE_S = 1.5
 SENDER_STUCK_S = 0.5
@@ -64,7 +63,7 @@ class CflibLink:
         return self._blocks.take()
 
     def send(self, command: Command) -> None:
-        if self._sender is not None and not isinstance(command, say.Idle):
+        if self._sender is not None and not isinstance(command, Idle):
             self._sender.put(command)
 
     def problem(self, now_s: float) -> str | None:
@@ -113,40 +112,20 @@ class CflibLink:
         newest = self._blocks.newest
         if newest is None or newest.has(ARMED):
             return
-        connection.cf.supervisor.send_arming_request(True)
+        connection.send(ARM)
 
     def _unlock_thrust(self, connection: Connection) -> None:
-        """One zero-thrust packet since boot, on the ground, then give the priority back:
-        without the first a raw thrust stays 0, without the second a take-off is not
-        flown (firmware facts, "Raw thrust")."""
+        """On the ground only: its zero thrust cuts the motors."""
         if self._still_flying():
             raise ConnectionFailed(
                 f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
             )
-        connection.cf.commander.send_setpoint(0.0, 0.0, 0.0, 0)
-        connection.cf.commander.send_notify_setpoint_stop()
+        connection.send(UNLOCK_THRUST)
 
     def _hand_over(self, command: Command) -> None:
-        """In the sender's thread. Degrees leave here, radians stay behind."""
-        if self.connection is None:
-            return
-        cf = self.connection.cf
-        low, high = cf.commander, cf.high_level_commander
-        match command:
-            case say.PositionSetpoint(x, y, z, yaw):
-                low.send_position_setpoint(x, y, z, math.degrees(yaw))
-            case say.RawThrust(thrust):
-                low.send_setpoint(0.0, 0.0, 0.0, thrust)
-            case say.TakeOff(height, duration):
-                high.takeoff(height, duration)
-            case say.Land(height, duration):
-                low.send_notify_setpoint_stop()
-                high.land(height, duration)
-            case say.StopMotors():
-                low.send_stop_setpoint()
-                low.send_notify_setpoint_stop()
-            case say.EmergencyStop():
-                cf.supervisor.send_emergency_stop()
+        """In the sender's thread."""
+        if self.connection is not None:
+            self.connection.send(encode(command))
 
     def _still_flying(self) -> bool:
         newest = self._blocks.newest

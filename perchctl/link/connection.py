@@ -11,6 +11,7 @@ from typing import Any
 from perchctl.errors import ConnectionFailed
 from perchctl.link.uri import UDEV_HELP
 from perchctl.profile.places import user_cache_folder
+from perchctl.sim.crtp.codec import Packet
 
 CONNECT_TRIES = 2
 CLOSE_TIMEOUT_S = 3.0
@@ -40,6 +41,16 @@ class Connection:
         opener = threading.Thread(target=self.cf.open_link, args=(uri,), daemon=True)
         opener.start()
         return self._settled.wait(timeout_s)
+
+    def send(self, packets: Iterable[Packet]) -> None:
+        """Send as they are, through cflib's lock and driver."""
+        from cflib.crtp.crtpstack import CRTPPacket
+
+        for packet in packets:
+            outgoing = CRTPPacket()
+            outgoing.set_header(packet.port, packet.channel)
+            outgoing.data = packet.data
+            self.cf.send_packet(outgoing)
 
     def close(self) -> None:
         """Close with cflib's farewell, a zero setpoint: only when nothing flies."""
