@@ -20,7 +20,7 @@ def check_firmware(cf: Any, uri: str) -> None:
     version = cf.platform.get_protocol_version()
     if version < NEEDED_PROTOCOL:
         raise ConnectionFailed(
-            f"the firmware at {uri} speaks protocol {version}, perchctl needs "
+            f"the firmware at {uri} has protocol {version}, perchctl needs "
             f"{NEEDED_PROTOCOL} or later (release 2026.08): update the firmware"
         )
     for name in NEEDED:

@@ -50,7 +50,7 @@ class Client:
         self.cf.packet_sent.add_callback(
             lambda pk: self.sent.append((pk.port, pk.channel, bytes(pk.data)))
         )
-        self.cf.console.receivedChar.add_callback(self._hear)
+        self.cf.console.receivedChar.add_callback(self._take_text)
 
     def connect(self, wait_s: float = WAIT_S) -> bool:
         self.cf.open_link(self.uri)
@@ -93,13 +93,13 @@ class Client:
         return self.ask(15, 0, ping, wait_s, begins=ping) == ping
 
     def supervisor_info(self) -> int:
-        """Asked of the supervisor port; cflib's getters may answer from a cache."""
+        """Read from the supervisor port; cflib's getters may answer from a cache."""
         answer = self.ask(9, 0, b"\x0c")
         assert answer is not None
         assert answer[0] == 0x8C
         return int.from_bytes(answer[1:3], "little")
 
-    def _hear(self, text: str) -> None:
+    def _take_text(self, text: str) -> None:
         self.console += text
 
 

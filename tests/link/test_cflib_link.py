@@ -166,19 +166,19 @@ def test_telemetry_is_si_and_right_handed(sim: SimProcess) -> None:
         assert true["rpy_rad"] == pytest.approx((0.15, 0.25, 0.6), abs=1e-3)
 
         def arrived() -> bool:
-            told = newest(link)
+            sample = newest(link)
             return (
-                math.dist(told.position_m, true["position_m"]) < 0.02
+                math.dist(sample.position_m, true["position_m"]) < 0.02
                 # The estimate of a vehicle turned by hand follows slowly, but the right way.
-                and 0.03 < told.roll_rad < 0.18
-                and 0.06 < told.pitch_rad < 0.28
-                and 0.12 < told.yaw_rad < 0.65
+                and 0.03 < sample.roll_rad < 0.18
+                and 0.06 < sample.pitch_rad < 0.28
+                and 0.12 < sample.yaw_rad < 0.65
             )
 
         until(arrived)
-        told = newest(link)
-        assert told.battery_v == pytest.approx(true["battery_v"], abs=0.02)
-        assert told.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
+        sample = newest(link)
+        assert sample.battery_v == pytest.approx(true["battery_v"], abs=0.02)
+        assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
 
 
 def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None:
@@ -192,13 +192,13 @@ def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None
         assert link.telemetry() == [] or link.telemetry()[0].t_s > times[-1]
 
 
-def test_a_silent_link_says_so(sim: SimProcess) -> None:
+def test_a_silent_link_is_reported(sim: SimProcess) -> None:
     with linked(sim) as link:
         assert link.problem(time.monotonic()) is None
         sim.silence(SILENCE_S + 2.0)
         began_s = time.monotonic()
-        said = until(lambda: link.problem(time.monotonic()))
-        assert "nothing heard for" in said
+        problem = until(lambda: link.problem(time.monotonic()))
+        assert "nothing heard for" in problem
         assert time.monotonic() - began_s >= SILENCE_S - 0.2
         until(lambda: link.problem(time.monotonic()) is None)
 

@@ -351,7 +351,7 @@ def test_memory_is_read_and_written_in_chunks(client: Client) -> None:
     assert client.ask(4, 1, beyond + b"\x05") == beyond + bytes((errno.EACCES,))
 
 
-def test_console_says_what_happened(pilot: Pilot) -> None:
+def test_console_reports_boot_and_lock(pilot: Pilot) -> None:
     """Port 0: the boot's text, and the lock's."""
     pilot.console = ""
     pilot.fresh()

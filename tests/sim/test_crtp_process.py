@@ -113,7 +113,7 @@ def test_hooks_change_the_vehicle() -> None:
         assert sim.truth()["t_s"] == pytest.approx(0.5 + 0.3)
 
 
-def test_a_request_that_fails_is_told_and_harmless() -> None:
+def test_a_request_that_fails_is_reported_and_harmless() -> None:
     with SimProcess.start(pace="realtime") as sim:
         with pytest.raises(InvalidValue, match="only a stepped vehicle"):
             sim.advance(1.0)
@@ -244,13 +244,13 @@ def test_ctrl_c_does_not_reach_the_vehicle() -> None:
         assert sim.is_running()
 
 
-def test_a_stranger_cannot_take_the_parents_place() -> None:
-    """Who connects without the token is sent away before anything is unpickled."""
+def test_a_foreign_connection_cannot_take_the_parents_place() -> None:
+    """A connection without the token is closed before anything is unpickled."""
     from perchctl.sim.process import control
 
     with control.listen() as listener:
-        stranger = socket.create_connection(listener.getsockname())
-        stranger.sendall(b"0" * 64)
+        foreign = socket.create_connection(listener.getsockname())
+        foreign.sendall(b"0" * 64)
         friend = control.connect(listener.getsockname()[1], "f" * 64)
         channel = control.accept(listener, "f" * 64, 5.0, lambda: True)
         assert channel is not None
@@ -260,7 +260,7 @@ def test_a_stranger_cannot_take_the_parents_place() -> None:
         with pytest.raises(EOFError):
             channel.receive(5.0)
         channel.close()
-        stranger.close()
+        foreign.close()
 
 
 # --- Video ----------------------------------------------------------------------------
@@ -359,7 +359,7 @@ def test_standalone_runs_until_ctrl_c() -> None:
         assert process.wait(WAIT_S) == 0
 
 
-def test_standalone_says_when_its_port_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_standalone_reports_when_its_port_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
         mine.bind(("127.0.0.1", 0))
         port = mine.getsockname()[1]
@@ -370,7 +370,7 @@ def test_standalone_says_when_its_port_is_taken(capsys: pytest.CaptureFixture[st
 def test_lossy_link_is_the_same_for_a_seed() -> None:
     """Loss is drawn by its own seed: the same packets are lost in each run."""
 
-    def heard(seed: int) -> list[int]:
+    def received(seed: int) -> list[int]:
         link = LinkOptions(loss_rate=0.3, loss_seed=seed)
         with SimProcess.start(pace="stepped", link=link) as sim:
             port = int(sim.uri.rsplit(":", 1)[1])
@@ -387,7 +387,7 @@ def test_lossy_link_is_the_same_for_a_seed() -> None:
                     except BlockingIOError:
                         return numbers
 
-    first = heard(1)
+    first = received(1)
     assert 5 < len(first) < 35
-    assert heard(1) == first
-    assert heard(2) != first
+    assert received(1) == first
+    assert received(2) != first

@@ -59,7 +59,7 @@ def test_cflib_names_the_bits(pilot: Pilot) -> None:
 
 
 def test_updates_at_25_hz(pilot: Pilot) -> None:
-    """Row "Updates at 25 Hz": a cut asked for between two updates comes at the next one."""
+    """Row "Updates at 25 Hz": a cut requested between two updates comes at the next one."""
     pilot.take_off(0.4, settle_s=1.0)
     pilot.advance(0.006)  # off the grid, which starts at boot
     pilot.cf.supervisor.send_emergency_stop()
