@@ -195,7 +195,7 @@ def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None
 def test_a_silent_link_is_reported(sim: SimProcess) -> None:
     with linked(sim) as link:
         assert link.problem(time.monotonic()) is None
-        sim.silence(SILENCE_S + 2.0)
+        sim.silence(SILENCE_S + 1.0)
         began_s = time.monotonic()
         problem = until(lambda: link.problem(time.monotonic()))
         assert "nothing heard for" in problem
