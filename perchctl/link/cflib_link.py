@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link.connection import Connection, open_connection
+from perchctl.link.connection import Connection, open_connection, send_packets
 from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
 from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.prepare import check_firmware, set_parameters
@@ -112,7 +112,7 @@ class CflibLink:
         newest = self._blocks.newest
         if newest is None or newest.has(ARMED):
             return
-        connection.send(ARM)
+        send_packets(connection.cf, ARM)
 
     def _unlock_thrust(self, connection: Connection) -> None:
         """On the ground only: its zero thrust cuts the motors."""
@@ -120,12 +120,12 @@ class CflibLink:
             raise ConnectionFailed(
                 f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
             )
-        connection.send(UNLOCK_THRUST)
+        send_packets(connection.cf, UNLOCK_THRUST)
 
     def _hand_over(self, command: Command) -> None:
         """In the sender's thread."""
         if self.connection is not None:
-            self.connection.send(encode(command))
+            send_packets(self.connection.cf, encode(command))
 
     def _still_flying(self) -> bool:
         newest = self._blocks.newest

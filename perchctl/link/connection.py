@@ -1,4 +1,4 @@
-"""One opened `cflib.crazyflie.Crazyflie`: opened, sent to and closed, each within a bound."""
+"""One opened `cflib.crazyflie.Crazyflie`: opened and closed within bounds, and sent to."""
 
 from __future__ import annotations
 
@@ -41,16 +41,6 @@ class Connection:
         opener = threading.Thread(target=self.cf.open_link, args=(uri,), daemon=True)
         opener.start()
         return self._settled.wait(timeout_s)
-
-    def send(self, packets: Iterable[Packet]) -> None:
-        """Send as they are, through cflib's lock and driver."""
-        from cflib.crtp.crtpstack import CRTPPacket
-
-        for packet in packets:
-            outgoing = CRTPPacket()
-            outgoing.set_header(packet.port, packet.channel)
-            outgoing.data = packet.data
-            self.cf.send_packet(outgoing)
 
     def close(self) -> None:
         """Close with cflib's farewell, a zero setpoint: only when nothing flies."""
@@ -95,6 +85,17 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
         f"no Crazyflie at {uri}: no answer within {share_s:.0f} s "
         f"(is it switched on, is the address right?)"
     )
+
+
+def send_packets(cf: Any, packets: Iterable[Packet]) -> None:
+    """Send them as they are, through the lock and the driver of cflib's `Crazyflie`."""
+    from cflib.crtp.crtpstack import CRTPPacket
+
+    for packet in packets:
+        outgoing = CRTPPacket()
+        outgoing.set_header(packet.port, packet.channel)
+        outgoing.data = packet.data
+        cf.send_packet(outgoing)
 
 
 def plain_cause(message: str) -> str:

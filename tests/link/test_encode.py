@@ -1,4 +1,4 @@
-"""Commands as bytes: those of an unmodified cflib for the same calls."""
+"""Commands as bytes: those of an unmodified cflib, for the same calls."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
+from perchctl.link.connection import send_packets
 from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
 from perchctl.sim.crtp.codec import MAX_DATA, Packet
 from perchctl.vehicle import (
@@ -32,12 +33,22 @@ from perchctl.vehicle import (
 PROTOCOL = 12
 THRUST_MAX = 0xFFFF
 
-reals = st.floats(width=32)  # also infinite ones and NaN: refusing them is the vehicle's part
-radians = st.floats(-1e3, 1e3)
+
+def commands(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[Command]:
+    """All commands; `numbers` for lengths, times and the yaw in degrees."""
+    return st.one_of(
+        st.just(Idle()),
+        st.builds(PositionSetpoint, numbers, numbers, numbers, st.floats(-1e3, 1e3)),
+        st.builds(RawThrust, st.integers(0, THRUST_MAX)),
+        st.builds(TakeOff, numbers, numbers),
+        st.builds(Land, numbers, numbers),
+        st.just(StopMotors()),
+        st.just(EmergencyStop()),
+    )
 
 
 class Recorder:
-    """Where cflib's own encoders send: the datagrams that would leave."""
+    """The part of cflib's `Crazyflie` that its own encoders use; keeps what would be sent."""
 
     def __init__(self) -> None:
         self.datagrams: list[bytes] = []
@@ -53,89 +64,62 @@ class Recorder:
         assert packet.is_data_size_valid()
         self.datagrams.append(bytes((packet.get_header(),)) + bytes(packet.data))
 
+    def unlock_thrust(self) -> None:
+        self.commander.send_setpoint(0.0, 0.0, 0.0, 0)
+        self.commander.send_notify_setpoint_stop()
+
+    def call(self, command: Command) -> None:
+        """The calls that a program without perchctl makes for this command."""
+        match command:
+            case Idle():
+                pass
+            case PositionSetpoint(x, y, z, yaw):
+                self.commander.send_position_setpoint(x, y, z, math.degrees(yaw))
+            case RawThrust(thrust):
+                self.commander.send_setpoint(0.0, 0.0, 0.0, thrust)
+            case TakeOff(height, duration):
+                self.high_level.takeoff(height, duration, yaw=None)  # keeps the heading
+            case Land(height, duration):
+                self.commander.send_notify_setpoint_stop()
+                self.high_level.land(height, duration, yaw=None)
+            case StopMotors():
+                self.commander.send_stop_setpoint()
+                self.commander.send_notify_setpoint_stop()
+            case EmergencyStop():
+                self.supervisor.send_emergency_stop()
+
+
+def by_cflib(command: Command) -> list[bytes]:
+    recorder = Recorder()
+    recorder.call(command)
+    return recorder.datagrams
+
 
 def datagrams(packets: tuple[Packet, ...]) -> list[bytes]:
     return [packet.encode() for packet in packets]
 
 
-def by_cflib(calls: Callable[[Recorder], Any]) -> list[bytes]:
-    recorder = Recorder()
-    calls(recorder)
-    return recorder.datagrams
+# --- Bytes ------------------------------------------------------------------------------------
 
 
-def test_idle_is_no_packet() -> None:
-    assert encode(Idle()) == ()
+@given(commands(st.floats(width=32)))  # NaN and infinities too: refusing them is the vehicle's part
+def test_packets_are_cflibs(command: Command) -> None:
+    assert datagrams(encode(command)) == by_cflib(command)
 
 
-@given(reals, reals, reals, radians)
-def test_position_setpoint(x: float, y: float, z: float, yaw: float) -> None:
-    assert datagrams(encode(PositionSetpoint(x, y, z, yaw))) == by_cflib(
-        lambda cf: cf.commander.send_position_setpoint(x, y, z, math.degrees(yaw))
-    )
+def test_arming_and_the_thrust_unlock_are_cflibs() -> None:
+    unlock, arm = Recorder(), Recorder()
+    unlock.unlock_thrust()
+    arm.supervisor.send_arming_request(True)
+    assert datagrams(UNLOCK_THRUST) == unlock.datagrams
+    assert datagrams(ARM) == arm.datagrams
 
 
-@given(st.integers(0, THRUST_MAX))
-def test_raw_thrust(thrust: int) -> None:
-    assert datagrams(encode(RawThrust(thrust))) == by_cflib(
-        lambda cf: cf.commander.send_setpoint(0.0, 0.0, 0.0, thrust)
-    )
-
-
-@given(reals, reals)
-def test_take_off_keeps_the_heading(height: float, duration: float) -> None:
-    assert datagrams(encode(TakeOff(height, duration))) == by_cflib(
-        lambda cf: cf.high_level.takeoff(height, duration, yaw=None)
-    )
-
-
-@given(reals, reals)
-def test_land_keeps_the_heading(height: float, duration: float) -> None:
-    def calls(cf: Recorder) -> None:
-        cf.commander.send_notify_setpoint_stop()
-        cf.high_level.land(height, duration, yaw=None)
-
-    assert datagrams(encode(Land(height, duration))) == by_cflib(calls)
-
-
-def test_stop_motors() -> None:
-    def calls(cf: Recorder) -> None:
-        cf.commander.send_stop_setpoint()
-        cf.commander.send_notify_setpoint_stop()
-
-    assert datagrams(encode(StopMotors())) == by_cflib(calls)
-
-
-def test_emergency_stop() -> None:
-    assert datagrams(encode(EmergencyStop())) == by_cflib(
-        lambda cf: cf.supervisor.send_emergency_stop()
-    )
-
-
-def test_arming_and_the_thrust_unlock() -> None:
-    def unlock(cf: Recorder) -> None:
-        cf.commander.send_setpoint(0.0, 0.0, 0.0, 0)
-        cf.commander.send_notify_setpoint_stop()
-
-    assert datagrams(UNLOCK_THRUST) == by_cflib(unlock)
-    assert datagrams(ARM) == by_cflib(lambda cf: cf.supervisor.send_arming_request(True))
-
-
-def test_every_command_has_its_packets() -> None:
-    """At most 30 bytes each (firmware facts, "Link")."""
-    commands: tuple[Command, ...] = (
-        PositionSetpoint(1.0, 2.0, 3.0, 4.0),
-        RawThrust(THRUST_MAX),
-        TakeOff(1.0, 2.0),
-        Land(0.0, 2.0),
-        StopMotors(),
-        EmergencyStop(),
-    )
-    assert {type(c) for c in commands} | {Idle} == set(get_args(Command))
-    for command in commands:
-        packets = encode(command)
-        assert packets
-        assert all(0 < len(packet.data) <= MAX_DATA for packet in packets)
+@pytest.mark.parametrize("kind", [kind for kind in get_args(Command) if kind is not Idle])
+def test_every_command_has_packets_of_at_most_30_bytes(kind: type[Any]) -> None:
+    packets = encode(kind(*(1 for _ in kind.__match_args__)))
+    assert packets
+    assert all(0 < len(packet.data) <= MAX_DATA for packet in packets)
 
 
 @pytest.mark.parametrize(
@@ -144,3 +128,13 @@ def test_every_command_has_its_packets() -> None:
 def test_a_number_that_does_not_fit_is_refused(command: Command) -> None:
     with pytest.raises(InvalidValue, match="does not fit into a packet"):
         encode(command)
+
+
+# --- The real link ----------------------------------------------------------------------------
+
+
+@given(commands(st.floats(width=32)))
+def test_the_real_link_sends_these_packets(command: Command) -> None:
+    recorder = Recorder()
+    send_packets(recorder, encode(command))
+    assert recorder.datagrams == by_cflib(command)
