@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from perchctl.link.cflib_link import CflibLink
-from perchctl.profile import LinkConfig
+from perchctl.link.connection import Connection
+from perchctl.link.prepare import check_firmware
 
 
 class EstimateLink(CflibLink):
-    """A `CflibLink` that only listens. Errors as there."""
+    """A `CflibLink` that commands nothing, not even at its end. Errors as there."""
 
-    def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
-        super().__init__(uri, config.model_copy(update={"parameters": {}}), clock)
+    def close(self) -> None:
+        """Leave at once and without cflib's farewell: the vehicle may fly for another."""
+        self._leave(farewell=False)
 
-    def connect(self) -> None:
-        """Connect, check the firmware, start telemetry. Bounded."""
-        self._open()
-        try:
-            self._check_firmware()
-            self._start_logging()
-        except BaseException:
-            self._close_link()
-            raise
+    def _prepare(self, connection: Connection) -> None:
+        check_firmware(connection.cf, self._uri)
+        self._start_logging(connection)

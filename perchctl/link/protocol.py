@@ -1,4 +1,4 @@
-"""The small door through which the flight reaches a vehicle."""
+"""The link's protocol: what a flight needs of a vehicle's link."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Link(Protocol):
         """Hand one command to the vehicle. Never blocks for long."""
 
     def problem(self, now_s: float) -> str | None:
-        """None while the link works, otherwise one sentence that says why not."""
+        """None while the link works, otherwise one sentence with the cause."""
 
     def close(self) -> None:
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""

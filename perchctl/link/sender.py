@@ -67,7 +67,7 @@ class Sender:
                 self._busy_since_s = time.monotonic()
             try:
                 self._hand_over(command)
-            except Exception as error:  # the library's, whatever it is: reported by alive()
+            except Exception as error:  # the library's, whatever it is: reported by `problem`
                 self.problem = f"a command could not be sent: {error}"
             with self._ready:
                 self._busy_since_s = None

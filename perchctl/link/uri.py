@@ -1,4 +1,4 @@
-"""What a vehicle's URI may look like, and what to do without rights to the radio."""
+"""The forms of a vehicle's URI, and what to do without rights to the radio."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ log in again, and plug the radio in again."""
 
 
 def check_uri(uri: str) -> str:
-    """The URI's scheme; InvalidValue says what is allowed."""
+    """The URI's scheme. Raises InvalidValue, which names what is allowed."""
     scheme = uri.split("://", 1)[0]
     if scheme in FORMS and re.fullmatch(FORMS[scheme], uri):
         port = uri.rpartition(":")[2] if scheme in ("udp", "tcp") else "1"

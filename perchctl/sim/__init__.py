@@ -1,0 +1,1 @@
+"""The simulated vehicle, its room and its camera, stepped by simulated time."""

@@ -71,7 +71,7 @@ class SimCamera:
     def advance(self, t_s: float, pose_at: Callable[[float], BodyState]) -> None:
         """Take all exposures that end at or before `t_s`.
 
-        `pose_at` is asked for times within the exposures that ended since the last
+        `pose_at` is called with times within the exposures that ended since the last
         call: with calls every control period, no older than one exposure and period.
         """
         self._t_s = t_s

@@ -75,7 +75,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
 
 
 def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
-    """What the profile does not know: up to `mount_error_deg` and `mount_error_m`."""
+    """A turn and a shift that the profile lacks: up to `mount_error_deg` and `mount_error_m`."""
     sim = profile.simulation
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)

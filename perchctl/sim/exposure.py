@@ -65,4 +65,4 @@ def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:
         fx, fy = x - i, y - j
         weights = np.outer([1.0 - fy, fy], [1.0 - fx, fx])
         kernel[j + half : j + half + 2, i + half : i + half + 2] += weights.astype(np.float32)
-    return kernel / kernel.sum()
+    return np.asarray(kernel / kernel.sum(), np.float32)

@@ -18,7 +18,7 @@ MAGNET_TOUCH_M = 0.001
 
 
 class Magnet:
-    """One magnet gear under one ceiling; asked once a control period."""
+    """One magnet gear under one ceiling; evaluated once a control period."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario

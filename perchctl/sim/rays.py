@@ -16,7 +16,7 @@ FINE_PX, COARSE_PX = 2, 8
 """Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks."""
 
 FAR_AWAY_M = 1e4
-"""Where rays that miss the plane are said to meet it."""
+"""The coordinates given to rays that miss the plane."""
 LEAST_RISE = 0.02
 """z of a ray (target axes, depth 1 in the view) that still meets the plane."""
 

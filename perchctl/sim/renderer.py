@@ -130,7 +130,7 @@ class Renderer:
             picture = spoil(picture, self._analogue, rng)
         return np.asarray(picture, np.uint8)
 
-    # -- what the lens sees -------------------------------------------------
+    # -- through the lens ---------------------------------------------------
 
     def _optical(self, maps: list[Array], motion_px: Array) -> Picture:
         """The picture before defocus, at the ray grids' padded size."""
@@ -257,7 +257,7 @@ class Renderer:
         size = (max(_NOISE_BANK_PX, height + 256), max(_NOISE_BANK_PX, width + 256))
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = rng.standard_normal(size, np.float32) * np.float32(sigma)
-        return np.rint(bank).astype(np.int16)
+        return np.asarray(np.rint(bank), np.int16)
 
 
 class _Mean:
@@ -292,4 +292,4 @@ def _vignetting(fine: RayGrid, size_px: tuple[int, int]) -> Picture:
     r2 = (fine.rays[:2] ** 2).sum(axis=0)
     light = (255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32)
     full = cv2.resize(light, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
-    return np.rint(full[: size_px[1], : size_px[0]]).astype(np.uint8)
+    return np.asarray(np.rint(full[: size_px[1], : size_px[0]]), np.uint8)

@@ -27,6 +27,7 @@ import mujoco
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
+from perchctl.sim.body import build_model
 from perchctl.sim.magnet import MAGNET_RANGE_M, Magnet
 from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -36,34 +37,10 @@ ARM_M = 0.046  # hub to motor axis, X configuration
 YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
 DRAG_LEVEL_NSPM = 0.009
 DRAG_VERTICAL_NSPM = 0.009
-FRAME_HALF_M = (0.035, 0.035, 0.012)
-REST_HEIGHT_M = FRAME_HALF_M[2]
-GEAR_RADIUS_M = 0.006
 SUCTION_GAIN = 0.10
 SUCTION_LENGTH_M = 0.02
-# Crazyflie 2.1 at 27 g; scaled by mass.
-INERTIA_REFERENCE_KG = 0.027
-INERTIA_REFERENCE_KGM2 = (1.66e-5, 1.67e-5, 2.93e-5)
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
-
-_MODEL = """
-<mujoco>
-  <option timestep="{dt}" gravity="0 0 -{g}" cone="elliptic" impratio="10" iterations="30"/>
-  <default><geom solref="0.006 1" solimp="0.95 0.99 0.0005" friction="1 0.003 0.0005"
-    condim="4"/></default>
-  <worldbody>
-    <geom name="floor" type="plane" size="30 30 1"/>
-    <geom name="ceiling" type="plane" size="30 30 1" pos="0 0 {ceiling}" quat="0 1 0 0"/>
-    <body name="vehicle" pos="0 0 {rest}">
-      <freejoint/>
-      <inertial pos="0 0 0" mass="{mass}" diaginertia="{inertia}"/>
-      <geom name="frame" type="box" size="{frame}"/>
-      <geom name="gear" type="cylinder" size="{radius} 0.002" pos="{gear}"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 
 @dataclass(frozen=True)
@@ -95,26 +72,11 @@ class World:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        mass = scenario.mass_kg
-        scale = mass / INERTIA_REFERENCE_KG
-        gear = scenario.gear_body_m
-        self._model = mujoco.MjModel.from_xml_string(
-            _MODEL.format(
-                dt=CONTROL_PERIOD_S,
-                g=GRAVITY_MPS2,
-                ceiling=scenario.ceiling_z_m,
-                rest=REST_HEIGHT_M,
-                mass=mass,
-                inertia=" ".join(repr(i * scale) for i in INERTIA_REFERENCE_KGM2),
-                frame=" ".join(map(repr, FRAME_HALF_M)),
-                radius=GEAR_RADIUS_M,
-                gear=f"{gear[0]!r} {gear[1]!r} {gear[2] - 0.002!r}",
-            )
-        )
+        self._model = build_model(scenario)
         self._data = mujoco.MjData(self._model)
         self._floor, self._ceiling = (self._model.geom(n).id for n in ("floor", "ceiling"))
         # Farther than this below the ceiling the gear cannot touch it.
-        self._reach_m = math.dist(gear, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
+        self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._steps = 0
         self._powertrain = Powertrain(scenario.battery_rest_v)
         self._wind_mps = (0.0, 0.0, 0.0)
@@ -245,7 +207,7 @@ class World:
     ) -> None:
         """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`.
 
-        No gyroscope sees it happen (see `perchctl.sim.firmware.estimator`).
+        No gyroscope measures it (see `perchctl.sim.firmware.estimator`).
         """
         R = rotation_from_rpy(*rpy_rad)
         quaternion = np.zeros(4)

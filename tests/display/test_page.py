@@ -1,4 +1,4 @@
-"""The live page over HTTP: picture, numbers, and who may press STOP."""
+"""The live page over HTTP: picture, numbers, and what STOP accepts."""
 
 from __future__ import annotations
 
@@ -217,7 +217,7 @@ def test_stop_needs_the_token(page: LivePage, stops: Stops) -> None:
     assert stops.count == 0
     assert stop(page.url, token_of(page.url)) == 200
     assert stops.count == 1
-    assert json.loads(ask(page.url, "/state")[1])["stop"] == "asked"
+    assert json.loads(ask(page.url, "/state")[1])["stop"] == "requested"
 
 
 def test_stop_again_changes_nothing(page: LivePage, stops: Stops) -> None:
@@ -317,37 +317,37 @@ OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 
 def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
     switch = OperatorSwitch(listening=True)
-    with live_page(OPTIONS, 0, switch) as view:
-        assert view is not None
-        assert view.page.url in capsys.readouterr().err
+    with live_page(OPTIONS, 0, switch) as flight:
+        assert flight is not None
+        assert flight.page.url in capsys.readouterr().err
         assert switch.read() is Operator.NONE
-        assert stop(view.page.url, "guess") == 403
+        assert stop(flight.page.url, "guess") == 403
         assert switch.read() is Operator.NONE
         for _ in range(2):
-            assert stop(view.page.url, view.page.token) == 200
+            assert stop(flight.page.url, flight.page.token) == 200
             assert switch.read() is Operator.LAND
         switch.press()
-        assert switch.read() is Operator.LAND  # the first Ctrl-C says what STOP said
+        assert switch.read() is Operator.LAND  # the first Ctrl-C repeats STOP
         switch.press()
         assert switch.read() is Operator.STOP
 
 
 def test_without_view_no_page_is_opened(capsys: pytest.CaptureFixture[str]) -> None:
-    with live_page(OPTIONS, None, OperatorSwitch()) as view:
-        assert view is None
+    with live_page(OPTIONS, None, OperatorSwitch()) as flight:
+        assert flight is None
     assert capsys.readouterr().err == ""
 
 
 def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> None:
-    view = FlightPage(page, 0.15)
+    flight = FlightPage(page, 0.15)
     frame = Frame(7, 1.0, np.full((480, 640), 90, np.uint8))
-    source = view.watched(OneFrame(frame))
+    source = flight.watched(OneFrame(frame))
     assert json.loads(ask(page.url, "/state")[1])["phase"] == "WAITING"
     assert source.poll(1.0) is frame
     assert source.poll(1.1) is None
     assert source.problem(1.1) == "silent"
     assert page.jpeg_after(0) is not None  # before the first tick too
-    view.tick(tick(2.5, seen_in(frame)))
+    flight.tick(tick(2.5, seen_in(frame)))
     state = json.loads(ask(page.url, "/state")[1])
     assert state["phase"] == "ALIGN"
     assert state["battery"] == "3.88 V"
@@ -357,16 +357,16 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     decoded = cv2.imdecode(np.frombuffer(newest[1], np.uint8), cv2.IMREAD_COLOR)
     drawn = np.asarray(decoded).astype(int)
     assert np.abs(drawn[150, 250:350] - 90).max() > 50
-    assert view.problem is None
+    assert flight.problem is None
 
 
-def test_a_view_that_fails_is_no_reason_to_land(page: LivePage) -> None:
-    view = FlightPage(page, 0.15)
-    view.watched(OneFrame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
-    view.tick(None)  # type: ignore[arg-type]
-    view.event(note(0.0, "something"))
-    assert view.problem is None
-    view.tick(tick(1.0, "no output"))  # type: ignore[arg-type]
+def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:
+    flight = FlightPage(page, 0.15)
+    flight.watched(OneFrame(Frame(0, 0.0, np.zeros((480, 640), np.uint8)))).poll(0.0)
+    flight.tick(None)  # type: ignore[arg-type]
+    flight.event(note(0.0, "something"))
+    assert flight.problem is None
+    flight.tick(tick(1.0, "no output"))  # type: ignore[arg-type]
     json.loads(ask(page.url, "/state")[1])
     assert page.problem is not None
 
@@ -380,15 +380,15 @@ class Looking(io.StringIO):
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         super().__init__()
         self.capsys = capsys
-        self.said = ""
+        self.printed = ""
         self.state: dict[str, Any] = {}
         self.lines = 0
 
     def write(self, text: str) -> int:
         self.lines += text.count("\n")
         if self.lines == 3 and not self.state:
-            self.said = self.capsys.readouterr().err
-            url = self.said.split("live page: ")[1].split()[0]
+            self.printed = self.capsys.readouterr().err
+            url = self.printed.split("live page: ")[1].split()[0]
             self.state = json.loads(ask(url, "/state")[1])
         return super().write(text)
 

@@ -21,6 +21,7 @@ from perchctl.sim.scenario import Scenario
 
 WAIT_S = 10.0
 LOG_PERIOD_S = 0.010
+AIRBORNE_S = 2.0  # after a take-off: enough where only the supervisor is tested
 CHUNK_S = 0.4  # so few packets fit into cflib's receive buffer
 BLOCKS = (
     {f"stateEstimate.{n}": "float" for n in ("x", "y", "z", "vx", "vy", "vz")}
@@ -50,7 +51,7 @@ class Client:
         self.cf.packet_sent.add_callback(
             lambda pk: self.sent.append((pk.port, pk.channel, bytes(pk.data)))
         )
-        self.cf.console.receivedChar.add_callback(self._hear)
+        self.cf.console.receivedChar.add_callback(self._take_text)
 
     def connect(self, wait_s: float = WAIT_S) -> bool:
         self.cf.open_link(self.uri)
@@ -93,13 +94,13 @@ class Client:
         return self.ask(15, 0, ping, wait_s, begins=ping) == ping
 
     def supervisor_info(self) -> int:
-        """Asked of the supervisor port; cflib's getters may answer from a cache."""
+        """Read from the supervisor port; cflib's getters may answer from a cache."""
         answer = self.ask(9, 0, b"\x0c")
         assert answer is not None
         assert answer[0] == 0x8C
         return int.from_bytes(answer[1:3], "little")
 
-    def _hear(self, text: str) -> None:
+    def _take_text(self, text: str) -> None:
         self.console += text
 
 
@@ -128,7 +129,7 @@ class Pilot(Client):
             block.start()
             assert started.wait(WAIT_S)
 
-    def fresh(self, *, settle_s: float = 1.0, **scenario: Any) -> Pilot:
+    def fresh(self, *, settle_s: float = 0.6, **scenario: Any) -> Pilot:
         """A new vehicle on the floor, its raw thrust unlocked as the facts advise."""
         self.sim.replace_vehicle(Scenario(**scenario))
         self.t_s = 0.0
@@ -146,9 +147,12 @@ class Pilot(Client):
         self.cf.high_level_commander.takeoff(height_m, duration_s)
         self.advance(duration_s + settle_s)
 
-    def fly_to(self, height_m: float, hold_s: float = 2.0) -> None:
-        """Take off and hold a position setpoint: one mode from then on."""
-        self.take_off(height_m)
+    def fly_to(self, height_m: float, hold_s: float = 2.0, settle_s: float = 4.0) -> None:
+        """Take off and hold a position setpoint: one mode from then on.
+
+        Still in height after the default; on its way there after `AIRBORNE_S`.
+        """
+        self.take_off(height_m, settle_s=settle_s)
         self.stream(hold_s, lambda: self.hold(height_m))
 
     def hold(self, height_m: float) -> None:
@@ -156,7 +160,7 @@ class Pilot(Client):
 
     def perch(self) -> None:
         """Hang on the magnet: take off, rise, press, as the floor to beat does."""
-        self.fly_to(1.6, 0.5)
+        self.fly_to(1.6, 0.5, AIRBORNE_S)
         self.stream(4.0, lambda: self.hold(2.5))
         assert self.sim.truth()["magnet_engaged"]
 
@@ -177,13 +181,17 @@ class Pilot(Client):
             self.advance(period_s)
 
     def until(self, done: Callable[[dict[str, Any]], bool], limit_s: float) -> float:
-        """Step by 2 ms until the truth fulfils `done`; how long that took."""
-        for step in range(round(limit_s / 0.002) + 1):
+        """Step until the truth fulfils `done`; how long that took.
+
+        By 2 ms, where a second or more is allowed by 10 ms.
+        """
+        step_s = 0.002 if limit_s < 1.0 else 0.010
+        for step in range(round(limit_s / step_s) + 1):
             if done(self.sim.truth()):
                 self._sync()
-                return step * 0.002
-            self.sim.advance(0.002)
-            self.t_s = round(self.t_s + 0.002, 6)
+                return step * step_s
+            self.sim.advance(step_s)
+            self.t_s = round(self.t_s + step_s, 6)
         raise AssertionError(f"not within {limit_s} s: {self.sim.truth()}")
 
     def log(self, name: str, since_s: float = -1.0) -> list[tuple[float, float]]:

@@ -17,7 +17,8 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link.cflib_link import SILENCE_S, CflibLink
+from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S, CflibLink
+from perchctl.link.estimate import EstimateLink
 from perchctl.profile import LinkConfig
 from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.scenario import Scenario
@@ -40,6 +41,7 @@ LOW_CEILING = Scenario(mass_kg=0.036, ceiling_z_m=0.9)
 WAIT_S = 20.0
 PAUSE = threading.Event()
 PITCH_PORT = 3  # raw setpoints: attitude and thrust
+COMMAND_PORTS = (PITCH_PORT, 7, 8, 9)
 
 
 def until(true: Callable[[], Any], limit_s: float = WAIT_S) -> Any:
@@ -74,10 +76,12 @@ def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
 
 
 @contextmanager
-def linked(sim: SimProcess, config: LinkConfig = CONFIG) -> Iterator[CflibLink]:
+def linked(
+    sim: SimProcess, config: LinkConfig = CONFIG, landing_wait_s: float = LANDING_WAIT_S
+) -> Iterator[CflibLink]:
     """A connection to a vehicle new on the floor; closed at the end if the test has not."""
     sim.replace_vehicle(LOW_CEILING)
-    link = CflibLink(sim.uri, config, time.monotonic)
+    link = CflibLink(sim.uri, config, time.monotonic, landing_wait_s)
     until(lambda: info(sim) & CAN_FLY)
     link.connect()
     try:
@@ -91,6 +95,24 @@ def newest(link: CflibLink) -> Telemetry:
     return samples[-1]
 
 
+def cf(link: CflibLink) -> Any:
+    """cflib's object behind an open link."""
+    assert link.connection is not None
+    return link.connection.cf
+
+
+def commands_sent(link: CflibLink) -> list[int]:
+    """Collects the ports of the packets that command the vehicle from now on."""
+    ports: list[int] = []
+
+    def note(packet: Any) -> None:
+        if packet.port in COMMAND_PORTS:
+            ports.append(packet.port)
+
+    cf(link).packet_sent.add_callback(note)
+    return ports
+
+
 def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
     """Collects the supervisor's bits at each raw setpoint that goes out from now on."""
     bits: list[int] = []
@@ -99,7 +121,7 @@ def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
         if packet.port == PITCH_PORT:
             bits.append(info(sim))
 
-    link._cf.packet_sent.add_callback(note)
+    cf(link).packet_sent.add_callback(note)
     return bits
 
 
@@ -114,8 +136,8 @@ def take_off(link: CflibLink, sim: SimProcess) -> None:
 def test_connecting_sets_parameters_and_reads_them_back(sim: SimProcess) -> None:
     config = LinkConfig(parameters={"stabilizer.estimator": 1, "ctrlMel.mass": 0.031})
     with linked(sim, config) as link:
-        assert link._cf.param.get_value("stabilizer.estimator") == "1"
-        assert float(link._cf.param.get_value("ctrlMel.mass")) == pytest.approx(0.031)
+        assert cf(link).param.get_value("stabilizer.estimator") == "1"
+        assert float(cf(link).param.get_value("ctrlMel.mass")) == pytest.approx(0.031)
         assert link.problem(time.monotonic()) is None
 
 
@@ -144,19 +166,19 @@ def test_telemetry_is_si_and_right_handed(sim: SimProcess) -> None:
         assert true["rpy_rad"] == pytest.approx((0.15, 0.25, 0.6), abs=1e-3)
 
         def arrived() -> bool:
-            told = newest(link)
+            sample = newest(link)
             return (
-                math.dist(told.position_m, true["position_m"]) < 0.02
+                math.dist(sample.position_m, true["position_m"]) < 0.02
                 # The estimate of a vehicle turned by hand follows slowly, but the right way.
-                and 0.03 < told.roll_rad < 0.18
-                and 0.06 < told.pitch_rad < 0.28
-                and 0.12 < told.yaw_rad < 0.65
+                and 0.03 < sample.roll_rad < 0.18
+                and 0.06 < sample.pitch_rad < 0.28
+                and 0.12 < sample.yaw_rad < 0.65
             )
 
         until(arrived)
-        told = newest(link)
-        assert told.battery_v == pytest.approx(true["battery_v"], abs=0.02)
-        assert told.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
+        sample = newest(link)
+        assert sample.battery_v == pytest.approx(true["battery_v"], abs=0.02)
+        assert sample.acc_z_g == pytest.approx(true["specific_force_mps2"][2] / 9.81, abs=0.1)
 
 
 def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None:
@@ -170,23 +192,20 @@ def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None
         assert link.telemetry() == [] or link.telemetry()[0].t_s > times[-1]
 
 
-def test_a_silent_link_says_so(sim: SimProcess) -> None:
+def test_a_silent_link_is_reported(sim: SimProcess) -> None:
     with linked(sim) as link:
         assert link.problem(time.monotonic()) is None
-        sim.silence(SILENCE_S + 2.0)
+        sim.silence(SILENCE_S + 1.0)
         began_s = time.monotonic()
-        said = until(lambda: link.problem(time.monotonic()))
-        assert "nothing heard for" in said
+        problem = until(lambda: link.problem(time.monotonic()))
+        assert "nothing heard for" in problem
         assert time.monotonic() - began_s >= SILENCE_S - 0.2
         until(lambda: link.problem(time.monotonic()) is None)
 
 
 def test_idle_sends_nothing(sim: SimProcess) -> None:
     with linked(sim) as link:
-        sent: list[int] = []
-        link._cf.packet_sent.add_callback(
-            lambda packet: sent.append(packet.port) if packet.port in (3, 7, 8) else None
-        )
+        sent = commands_sent(link)
         link.send(Idle())
         let_pass(sim, 0.2)
         assert sent == []
@@ -247,7 +266,7 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
     """Firmware facts: high-level hover never times out; the zero setpoint of close_link would
     end it at once, and so neither a close that gives up waiting nor a refused connection
     may send one."""
-    with linked(sim) as link:
+    with linked(sim, landing_wait_s=1.0) as link:
         take_off(link, sim)
         raw = sent_raw(link, sim)
         link.close()  # nobody lands it: waits, gives up
@@ -256,6 +275,12 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
         second = CflibLink(sim.uri, CONFIG, time.monotonic)
         with pytest.raises(ConnectionFailed, match="flying already: land it"):
             second.connect()
+        listener = EstimateLink(sim.uri, CONFIG, time.monotonic)
+        listener.connect()
+        sent = commands_sent(listener)
+        assert newest(listener).has(FLYING)
+        listener.close()
+        assert sent == []
         let_pass(sim, 1.0)
         assert sim.truth()["position_m"][2] > 0.3
         assert not info(sim) & LOCKED

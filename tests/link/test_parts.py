@@ -46,7 +46,7 @@ def test_pitch_and_degrees_turn_at_the_edge() -> None:
     assert sample.supervisor == 0x021E
     assert sample.t_s == 1.5
     assert sample.position_variance_m2 is None
-    assert sample.battery_v == 0.0  # unknown, which the planner tells from empty
+    assert sample.battery_v == 0.0  # unknown, which to the planner is not empty
 
 
 @given(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -33,8 +32,3 @@ def shared_pilot(toc_cache: str) -> Iterator[object]:
 def pilot(shared_pilot: object) -> object:
     """The connection with a new 42 g vehicle, ready on the floor."""
     return shared_pilot.fresh()  # type: ignore[attr-defined]
-
-
-@pytest.fixture
-def truth_file(tmp_path: Path) -> Path:
-    return tmp_path / "truth.jsonl"

@@ -9,7 +9,6 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-import cflib.crtp
 import pytest
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
@@ -21,6 +20,7 @@ from cflib.utils.power_switch import PowerSwitch
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.scenario import Scenario
 from tests.helpers.crtp_rig import LOCKED_BIT, READY, WAIT_S, Client, Pilot
 
 
@@ -351,7 +351,7 @@ def test_memory_is_read_and_written_in_chunks(client: Client) -> None:
     assert client.ask(4, 1, beyond + b"\x05") == beyond + bytes((errno.EACCES,))
 
 
-def test_console_says_what_happened(pilot: Pilot) -> None:
+def test_console_reports_boot_and_lock(pilot: Pilot) -> None:
     """Port 0: the boot's text, and the lock's."""
     pilot.console = ""
     pilot.fresh()
@@ -364,47 +364,51 @@ def test_console_says_what_happened(pilot: Pilot) -> None:
 # --- Reboot, other firmware, bad links ---------------------------------------------
 
 
-def test_only_a_reboot_clears_the_lock(toc_cache: str) -> None:
+@pytest.fixture
+def spoiled(sim: SimProcess) -> Iterator[SimProcess]:
+    """The vehicle of these tests, new before and after."""
+
+    def renew() -> None:
+        sim.replace_vehicle(Scenario())
+        sim.advance(1.0)
+
+    renew()
+    yield sim
+    renew()
+
+
+def test_only_a_reboot_clears_the_lock(spoiled: SimProcess, client: Client) -> None:
     """Row "the supervisor locks: only a reboot clears it", by cflib's own power switch."""
-    with SimProcess.start(pace="stepped") as process:
-        process.advance(1.0)
-        client = Client(process.uri, toc_cache)
-        assert client.connect()
-        try:
-            client.cf.supervisor.send_emergency_stop()
-            process.advance(1.0)
-            assert client.supervisor_info() & LOCKED_BIT
-            switch = PowerSwitch(process.uri)
-            switch.reboot_to_fw()
-            switch.close()
-            process.advance(1.0)
-            assert client.supervisor_info() == READY
-        finally:
-            client.close()
+    client.cf.supervisor.send_emergency_stop()
+    spoiled.advance(1.0)
+    assert client.supervisor_info() & LOCKED_BIT
+    switch = PowerSwitch(spoiled.uri)
+    switch.reboot_to_fw()
+    switch.close()
+    spoiled.advance(1.0)
+    assert client.supervisor_info() == READY
 
 
-def _fail_in_flight(process: SimProcess, cache: str) -> None:
-    with SyncCrazyflie(process.uri, cf=Crazyflie(rw_cache=cache)) as scf:
+def _fail_in_flight(sim: SimProcess, cache: str) -> None:
+    with SyncCrazyflie(sim.uri, cf=Crazyflie(rw_cache=cache)) as scf:
         scf.cf.commander.send_setpoint(0, 0, 0, 0)
         scf.cf.commander.send_notify_setpoint_stop()
         scf.cf.high_level_commander.takeoff(0.8, 2.0)
-        process.advance(5.0)
-        assert process.truth()["position_m"][2] > 0.7
+        sim.advance(5.0)
+        assert sim.truth()["position_m"][2] > 0.7
         raise RuntimeError("any")
 
 
-def test_an_exception_in_a_with_block_drops_the_vehicle(toc_cache: str) -> None:
+def test_an_exception_in_a_with_block_drops_the_vehicle(
+    spoiled: SimProcess, toc_cache: str
+) -> None:
     """Row "SyncCrazyflie.__exit__ does the same, so an exception inside drops the vehicle"."""
-    with SimProcess.start(pace="stepped") as process:
-        process.advance(1.0)
-        if not cflib.crtp.CLASSES:
-            cflib.crtp.init_drivers()
-        with pytest.raises(RuntimeError, match="any"):
-            _fail_in_flight(process, toc_cache)
-        process.advance(0.006)
-        assert max(process.truth()["motors"]) == 0
-        process.advance(3.0)
-        assert process.truth()["supervisor_info"] & LOCKED_BIT
+    with pytest.raises(RuntimeError, match="any"):
+        _fail_in_flight(spoiled, toc_cache)
+    spoiled.advance(0.006)
+    assert max(spoiled.truth()["motors"]) == 0
+    spoiled.advance(3.0)
+    assert spoiled.truth()["supervisor_info"] & LOCKED_BIT
 
 
 def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
@@ -457,21 +461,6 @@ def test_a_silent_peer_is_never_reported(pilot: Pilot) -> None:
     assert pilot.echo(6)
     pilot.advance(0.1)
     assert lost == []
-
-
-def test_silence_at_a_given_time(toc_cache: str) -> None:
-    """The peer goes silent by the simulated clock and comes back."""
-    link = LinkOptions(silent_from_s=2.0, silent_for_s=1.0)
-    with SimProcess.start(pace="stepped", link=link) as process:
-        client = Client(process.uri, toc_cache)
-        assert client.connect()
-        try:
-            process.advance(2.1)
-            assert not client.echo(7, wait_s=0.3)
-            process.advance(1.0)
-            assert client.echo(8)
-        finally:
-            client.close()
 
 
 @pytest.mark.parametrize("wrong", [{"protocol_version": 3}, {"loss_rate": 1.5}])

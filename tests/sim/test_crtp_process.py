@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -12,7 +13,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -22,13 +23,17 @@ import pytest
 import perchctl
 from perchctl.calibration.files import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
+from perchctl.link.encode import encode
 from perchctl.profile.places import data_file
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.child import main
+from perchctl.sim.process.control import HostSetup
 from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.process.mjpeg import MjpegServer
 from perchctl.sim.process.runner import MAX_LAG_S, Runner
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.vehicle import TakeOff
 from perchctl.vision.types import CameraModel
 from tests.helpers.crtp_rig import Client
 
@@ -64,68 +69,113 @@ def camera() -> CameraModel:
     return load_calibration(path)
 
 
+@pytest.fixture(scope="module")
+def stepped() -> Iterator[SimProcess]:
+    """A process for the tests that leave it running."""
+    with SimProcess.start(pace="stepped") as sim:
+        assert sim.truth()["t_s"] == 0.0
+        yield sim
+
+
+@pytest.fixture(scope="module")
+def live() -> Iterator[tuple[SimProcess, float]]:
+    """A process in real time, and the clock before its start."""
+    before_s = time.monotonic()
+    with SimProcess.start(pace="realtime") as sim:
+        yield sim, before_s
+
+
+@contextlib.contextmanager
+def wired(uri: str) -> Iterator[socket.socket]:
+    """A socket to a vehicle's link: one datagram, one packet."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
+        mine.connect(("127.0.0.1", int(uri.rsplit(":", 1)[1])))
+        mine.setblocking(False)
+        yield mine
+
+
+def received(mine: socket.socket) -> list[bytes]:
+    """The datagrams that have arrived."""
+    datagrams = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            datagrams.append(mine.recv(64))
+    return datagrams
+
+
 # --- Handle -----------------------------------------------------------------------
 
 
-def test_stepped_time_passes_only_by_advance() -> None:
-    with SimProcess.start(Scenario(seed=5), "stepped") as sim:
-        assert sim.uri.startswith("udp://127.0.0.1:")
-        assert sim.stream_url == ""
-        assert sim.truth()["t_s"] == 0.0
-        assert sim.advance(0.5) == pytest.approx(0.5)
-        assert sim.truth()["t_s"] == pytest.approx(0.5)
-        with pytest.raises(InvalidValue, match="back"):
-            sim.advance(-0.1)
+def test_stepped_time_passes_only_by_advance(stepped: SimProcess) -> None:
+    assert stepped.uri.startswith("udp://127.0.0.1:")
+    assert stepped.stream_url == ""
+    start_s = stepped.truth()["t_s"]
+    assert stepped.truth()["t_s"] == start_s
+    assert stepped.advance(0.5) == pytest.approx(start_s + 0.5)
+    assert stepped.truth()["t_s"] == pytest.approx(start_s + 0.5)
+    with pytest.raises(InvalidValue, match="back"):
+        stepped.advance(-0.1)
 
 
-def test_the_same_scenario_gives_the_same_flight(toc_cache: str) -> None:
-    def flight() -> dict[str, object]:
-        with SimProcess.start(Scenario(seed=11), "stepped") as sim:
-            client = Client(sim.uri, toc_cache)
-            assert client.connect()
-            sim.advance(1.0)
-            client.cf.high_level_commander.takeoff(0.5, 2.0)
+def test_the_same_scenario_gives_the_same_flight(stepped: SimProcess) -> None:
+    """In a process of its own, and as a new vehicle in one that has flown others."""
+    scenario = Scenario(seed=11)
+
+    def flight(sim: SimProcess) -> dict[str, object]:
+        sim.advance(1.0)
+        with wired(sim.uri) as mine:
+            for packet in encode(TakeOff(0.5, 2.0)):
+                mine.send(packet.encode())
             sim.advance(4.0)
-            truth = sim.truth()
-            client.close()
-            return truth
-
-    assert flight() == flight()
-
-
-def test_hooks_change_the_vehicle() -> None:
-    with SimProcess.start(pace="stepped") as sim:
-        sim.set_pose((0.1, 0.2, 1.0), (0.0, 0.0, 0.5), hold=True)
-        sim.advance(0.1)
         truth = sim.truth()
-        assert truth["position_m"] == pytest.approx((0.1, 0.2, 1.0))
-        assert truth["rpy_rad"][2] == pytest.approx(0.5)
-        sim.let_go()
-        sim.advance(0.2)
-        assert sim.truth()["position_m"][2] < 0.9
-        sim.replace_vehicle(Scenario(mass_kg=0.03))
-        assert sim.truth()["position_m"][2] < 0.05
-        sim.set_battery(3.5)
-        sim.push((0.1, 0.0, 0.0))
-        sim.advance(0.5)
-        assert sim.truth()["battery_v"] == pytest.approx(3.5, abs=0.01)
-        sim.reboot()
-        assert sim.truth()["t_s"] == pytest.approx(0.5 + 0.3)
+        assert truth["position_m"][2] > 0.3
+        return truth
+
+    start_s = stepped.truth()["t_s"]
+    stepped.replace_vehicle(scenario)
+    replaced = flight(stepped)
+    assert replaced.pop("t_s") == pytest.approx(start_s + 5.0)
+    with SimProcess.start(scenario, "stepped") as sim:
+        new = flight(sim)
+    assert new.pop("t_s") == pytest.approx(5.0)
+    assert new == replaced
 
 
-def test_a_request_that_fails_is_told_and_harmless() -> None:
-    with SimProcess.start(pace="realtime") as sim:
-        with pytest.raises(InvalidValue, match="only a stepped vehicle"):
-            sim.advance(1.0)
-        assert eventually(lambda: sim.truth()["t_s"] > 0.1)
+def test_hooks_change_the_vehicle(stepped: SimProcess) -> None:
+    sim = stepped
+    sim.replace_vehicle(Scenario())
+    sim.set_pose((0.1, 0.2, 1.0), (0.0, 0.0, 0.5), hold=True)
+    sim.advance(0.1)
+    truth = sim.truth()
+    assert truth["position_m"] == pytest.approx((0.1, 0.2, 1.0))
+    assert truth["rpy_rad"][2] == pytest.approx(0.5)
+    sim.let_go()
+    sim.advance(0.2)
+    assert sim.truth()["position_m"][2] < 0.9
+    sim.replace_vehicle(Scenario(mass_kg=0.03))
+    assert sim.truth()["position_m"][2] < 0.05
+    sim.set_battery(3.5)
+    sim.push((0.1, 0.0, 0.0))
+    sim.advance(0.5)
+    assert sim.truth()["battery_v"] == pytest.approx(3.5, abs=0.01)
+    before_s = sim.truth()["t_s"]
+    sim.reboot()
+    assert sim.truth()["t_s"] == before_s
 
 
-def test_real_time_never_runs_ahead() -> None:
-    before_s = time.monotonic()
-    with SimProcess.start(pace="realtime") as sim:
-        assert eventually(lambda: sim.truth()["t_s"] > 0.5)
-        simulated_s = sim.truth()["t_s"]
-        assert simulated_s <= time.monotonic() - before_s
+def test_a_request_that_fails_is_reported_and_harmless(live: tuple[SimProcess, float]) -> None:
+    sim, _ = live
+    with pytest.raises(InvalidValue, match="only a stepped vehicle"):
+        sim.advance(1.0)
+    now_s = sim.truth()["t_s"]
+    assert eventually(lambda: sim.truth()["t_s"] > now_s + 0.1)
+
+
+def test_real_time_never_runs_ahead(live: tuple[SimProcess, float]) -> None:
+    sim, before_s = live
+    assert eventually(lambda: sim.truth()["t_s"] > 0.5)
+    simulated_s = sim.truth()["t_s"]
+    assert simulated_s <= time.monotonic() - before_s
 
 
 class _Steps:
@@ -203,54 +253,59 @@ def test_a_killed_child_is_reported() -> None:
 # --- Without a parent ----------------------------------------------------------------
 
 _PARENT = """
-import sys, time
+import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
+from perchctl.sim.process.control import HostSetup
 from perchctl.sim.process.handle import SimProcess
-sim = SimProcess.start(pace={pace!r}, truth_file=Path({truth!r}), linger_s={linger})
-print(sim.pid, sim.uri, flush=True)
+from perchctl.sim.process.host import VehicleHost
+started = []
+for pace in ("realtime", "stepped"):
+    sim = SimProcess.start(pace=pace, truth_file=Path({folder!r}, pace), linger_s=3.0)
+    print(pace, sim.pid, sim.uri, flush=True)
+    started.append(sim)
 sys.stdin.readline()
 """
 
 
-@pytest.mark.parametrize("pace", ["realtime", "stepped"])
-def test_flies_on_when_the_parent_is_killed(truth_file: Path, toc_cache: str, pace: str) -> None:
+def test_flies_on_when_the_parent_is_killed(tmp_path: Path, toc_cache: str) -> None:
     """The vehicle outlives a kill -9 of its parent, answers meanwhile, and then ends."""
-    code = _PARENT.format(root=ROOT, pace=pace, truth=str(truth_file), linger=1.5)
+    code = _PARENT.format(root=ROOT, folder=str(tmp_path))
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as parent:
         assert parent.stdout is not None
-        pid_text, uri = parent.stdout.readline().split()
-        pid = int(pid_text)
+        started = [parent.stdout.readline().split() for _ in range(2)]
         parent.kill()
         parent.wait()
-        client = Client(uri, toc_cache)
-        assert client.connect()
-        assert alive(pid)
-        client.close()
-    assert eventually(lambda: not alive(pid))
-    lines = [json.loads(line) for line in truth_file.read_text().splitlines()]
-    assert lines[-1]["t_s"] > 1.0
-    assert lines[-1]["supervisor_info"] == 0x020E
+        for _, pid, uri in started:
+            client = Client(uri, toc_cache)
+            assert client.connect()
+            assert alive(int(pid))
+            client.close()
+    for pace, pid, _ in started:
+        assert eventually(lambda pid=pid: not alive(int(pid)))
+        lines = [json.loads(line) for line in (tmp_path / pace).read_text().splitlines()]
+        assert lines[-1]["t_s"] > 1.0
+        assert lines[-1]["supervisor_info"] == 0x020E
 
 
-def test_ctrl_c_does_not_reach_the_vehicle() -> None:
+def test_ctrl_c_does_not_reach_the_vehicle(stepped: SimProcess) -> None:
     """Neither SIGINT itself nor one to the terminal's process group ends it."""
-    with SimProcess.start(pace="stepped") as sim:
-        assert os.getsid(sim.pid) != os.getsid(0)
-        os.kill(sim.pid, signal.SIGINT)
-        assert sim.advance(0.1) == pytest.approx(0.1)
-        assert sim.is_running()
+    assert os.getsid(stepped.pid) != os.getsid(0)
+    os.kill(stepped.pid, signal.SIGINT)
+    before_s = stepped.truth()["t_s"]
+    assert stepped.advance(0.1) == pytest.approx(before_s + 0.1)
+    assert stepped.is_running()
 
 
-def test_a_stranger_cannot_take_the_parents_place() -> None:
-    """Who connects without the token is sent away before anything is unpickled."""
+def test_a_foreign_connection_cannot_take_the_parents_place() -> None:
+    """A connection without the token is closed before anything is unpickled."""
     from perchctl.sim.process import control
 
     with control.listen() as listener:
-        stranger = socket.create_connection(listener.getsockname())
-        stranger.sendall(b"0" * 64)
+        foreign = socket.create_connection(listener.getsockname())
+        foreign.sendall(b"0" * 64)
         friend = control.connect(listener.getsockname()[1], "f" * 64)
         channel = control.accept(listener, "f" * 64, 5.0, lambda: True)
         assert channel is not None
@@ -260,7 +315,7 @@ def test_a_stranger_cannot_take_the_parents_place() -> None:
         with pytest.raises(EOFError):
             channel.receive(5.0)
         channel.close()
-        stranger.close()
+        foreign.close()
 
 
 # --- Video ----------------------------------------------------------------------------
@@ -359,7 +414,7 @@ def test_standalone_runs_until_ctrl_c() -> None:
         assert process.wait(WAIT_S) == 0
 
 
-def test_standalone_says_when_its_port_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_standalone_reports_when_its_port_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
         mine.bind(("127.0.0.1", 0))
         port = mine.getsockname()[1]
@@ -367,27 +422,40 @@ def test_standalone_says_when_its_port_is_taken(capsys: pytest.CaptureFixture[st
     assert "choose another" in capsys.readouterr().err
 
 
+# --- Bad links, in this process ------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def hosted(link: LinkOptions) -> Iterator[VehicleHost]:
+    with contextlib.closing(VehicleHost(HostSetup(link=link), live=False)) as host:
+        yield host
+
+
 def test_lossy_link_is_the_same_for_a_seed() -> None:
     """Loss is drawn by its own seed: the same packets are lost in each run."""
 
-    def heard(seed: int) -> list[int]:
-        link = LinkOptions(loss_rate=0.3, loss_seed=seed)
-        with SimProcess.start(pace="stepped", link=link) as sim:
-            port = int(sim.uri.rsplit(":", 1)[1])
-            numbers = []
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
-                mine.connect(("127.0.0.1", port))
-                for number in range(40):
-                    mine.send(bytes((0xFC, number)))
-                sim.advance(0.002)  # all have been served by its end
-                mine.setblocking(False)
-                while True:
-                    try:
-                        numbers.append(mine.recv(64)[1])
-                    except BlockingIOError:
-                        return numbers
+    def answered(seed: int) -> list[int]:
+        with (
+            hosted(LinkOptions(loss_rate=0.3, loss_seed=seed)) as host,
+            wired(host.uri) as mine,
+        ):
+            for number in range(40):
+                mine.send(bytes((0xFC, number)))
+            host.step()  # all have been served by its end
+            return [datagram[1] for datagram in received(mine)]
 
-    first = heard(1)
+    first = answered(1)
     assert 5 < len(first) < 35
-    assert heard(1) == first
-    assert heard(2) != first
+    assert answered(1) == first
+    assert answered(2) != first
+
+
+def test_silence_at_a_given_time() -> None:
+    """The peer goes silent by the simulated clock and comes back."""
+    link = LinkOptions(silent_from_s=0.2, silent_for_s=0.1)
+    with hosted(link) as host, wired(host.uri) as mine:
+        for number, answers in ((1, True), (2, False), (3, True)):
+            mine.send(bytes((0xFC, number)))
+            host.serve()
+            assert (bytes((0xFC, number)) in received(mine)) == answers
+            host.advance(0.21 if number == 1 else 0.1)

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from tests.helpers.crtp_rig import (
+    AIRBORNE_S,
     ARMED_BIT,
     CAN_FLY_BIT,
     CRASHED_BIT,
@@ -59,7 +60,7 @@ def test_cflib_names_the_bits(pilot: Pilot) -> None:
 
 
 def test_updates_at_25_hz(pilot: Pilot) -> None:
-    """Row "Updates at 25 Hz": a cut asked for between two updates comes at the next one."""
+    """Row "Updates at 25 Hz": a cut requested between two updates comes at the next one."""
     pilot.take_off(0.4, settle_s=1.0)
     pilot.advance(0.006)  # off the grid, which starts at boot
     pilot.cf.supervisor.send_emergency_stop()
@@ -69,7 +70,7 @@ def test_updates_at_25_hz(pilot: Pilot) -> None:
 
 def test_flying_clears_two_seconds_after_the_motors_stop(pilot: Pilot) -> None:
     """Row "flying = a motor was above idle in the last 2.0 s"."""
-    pilot.fly_to(0.3, 0.5)
+    pilot.fly_to(0.3, 0.5, AIRBORNE_S)
     pilot.cf.commander.send_stop_setpoint()
     pilot.cf.commander.send_notify_setpoint_stop()
     took_s = pilot.until(lambda t: not t["supervisor_info"] & FLYING_BIT, 3.0)
@@ -90,7 +91,7 @@ def test_arms_itself_and_rearms_on_the_ground(pilot: Pilot) -> None:
 
 def test_disarm_in_flight_cuts_without_locking(pilot: Pilot) -> None:
     """Row "Disarm in flight cuts the motors within one update; it does not lock"."""
-    pilot.fly_to(0.5, 0.5)
+    pilot.fly_to(0.5, 0.5, AIRBORNE_S)
     since_s = pilot.t_s
     pilot.cf.supervisor.send_arming_request(False)
     assert pilot.until(off, 0.2) <= UPDATE_S + 0.002
@@ -127,7 +128,7 @@ def test_rearms_5_s_after_a_landing(pilot: Pilot) -> None:
 def test_silence_levels_out_then_cuts_and_locks(pilot: Pilot) -> None:
     """Row "Low-level stream silent": level at +0.5 s, cut at +2.0 s, locked for good."""
     pilot.fresh(mass_kg=0.030)
-    pilot.fly_to(0.8, 2.0)
+    pilot.fly_to(0.8, 2.0, AIRBORNE_S)
     pilot.stream(0.1, lambda: pilot.cf.commander.send_position_setpoint(1.5, 0, 0.8, 0))
     silent_s = pilot.t_s
     pilot.advance(0.3)
@@ -150,7 +151,7 @@ def test_silence_levels_out_then_cuts_and_locks(pilot: Pilot) -> None:
 
 def test_silence_of_1200_ms_recovers(pilot: Pilot) -> None:
     """Row "Silence of 1.2 s and then resuming recovers"."""
-    pilot.fly_to(0.8)
+    pilot.fly_to(0.8, settle_s=AIRBORNE_S)
     pilot.advance(1.2)
     pilot.stream(5.0, lambda: pilot.hold(0.8))
     assert pilot.info == LOW_LEVEL
@@ -163,7 +164,7 @@ def test_stop_alone_cuts_at_once_and_locks(pilot: Pilot, perched: bool) -> None:
     if perched:
         pilot.perch()
     else:
-        pilot.fly_to(0.8, 0.5)
+        pilot.fly_to(0.8, 0.5, AIRBORNE_S)
     pilot.cf.commander.send_stop_setpoint()
     start_s = pilot.t_s
     assert pilot.until(off, 0.1) <= 0.007
@@ -174,7 +175,7 @@ def test_stop_alone_cuts_at_once_and_locks(pilot: Pilot, perched: bool) -> None:
 
 def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
     """Row "stop followed by notify": off, no lock, 0x020E after 2.1 s, take-off works later."""
-    pilot.fly_to(0.3, 0.5)
+    pilot.fly_to(0.3, 0.5, AIRBORNE_S)
     since_s = pilot.t_s
     pilot.cf.commander.send_stop_setpoint()
     pilot.cf.commander.send_notify_setpoint_stop()
@@ -191,7 +192,7 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
 
 def test_the_farewell_packet_drops_a_flying_vehicle(pilot: Pilot) -> None:
     """Row "close_link() sends send_setpoint(0,0,0,0)": falls at once and locks."""
-    pilot.fly_to(0.8, 0.5)
+    pilot.fly_to(0.8, 0.5, AIRBORNE_S)
     pilot.cf.commander.send_setpoint(0, 0, 0, 0)
     assert pilot.until(off, 0.1) <= 0.007
     pilot.advance(3.0)
@@ -245,7 +246,7 @@ def test_emergency_stop_watchdog(pilot: Pilot) -> None:
 
 def test_hl_without_notify_is_not_flown(pilot: Pilot) -> None:
     """Row "HL command after low-level without notify": HL active, not flown, locks after 2 s."""
-    pilot.fly_to(0.8, 1.0)
+    pilot.fly_to(0.8, 1.0, AIRBORNE_S)
     last_s = pilot.t_s
     pilot.cf.high_level_commander.go_to(0, 0, 1.4, 0, 1.5)
     pilot.advance(0.3)
@@ -260,7 +261,7 @@ def test_hl_without_notify_is_not_flown(pilot: Pilot) -> None:
 
 def test_hl_after_notify_flies(pilot: Pilot) -> None:
     """Row "With notify first it flies"."""
-    pilot.fly_to(0.8, 1.0)
+    pilot.fly_to(0.8, 1.0, AIRBORNE_S)
     pilot.cf.commander.send_notify_setpoint_stop()
     pilot.cf.high_level_commander.go_to(0, 0, 1.2, 0, 2.0)
     pilot.advance(6.0)
@@ -274,7 +275,7 @@ def test_hl_after_notify_flies(pilot: Pilot) -> None:
 def test_pressing_on_the_ceiling_is_no_crash(pilot: Pilot) -> None:
     """Row "Hitting a ceiling ... and 3 s of full-thrust pressing": no tumble, no lock, +1 g."""
     pilot.fresh(no_target=True)
-    pilot.fly_to(1.6, 0.5)
+    pilot.fly_to(1.6, 0.5, AIRBORNE_S)
     since_s = pilot.t_s
     pilot.stream(2.0, lambda: pilot.hold(3.0))
     peak_g = max(abs(v) for _, v in pilot.log("acc.z", since_s))
@@ -287,7 +288,7 @@ def test_pressing_on_the_ceiling_is_no_crash(pilot: Pilot) -> None:
 
 def test_upside_down_crashes_and_recovers(pilot: Pilot) -> None:
     """Row "Upside down in flight": motors off, crashed within 0.7 s; recovery after righting."""
-    pilot.fly_to(0.8, 0.5)
+    pilot.fly_to(0.8, 0.5, AIRBORNE_S)
     start_s = pilot.t_s
     pilot.sim.set_pose((0, 0, 1.5), (math.pi, 0, 0), hold=True)
     pilot.stream(0.7, lambda: pilot.hold(0.8))

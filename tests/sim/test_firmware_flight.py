@@ -6,6 +6,7 @@ import math
 
 import pytest
 
+from perchctl.sim.body import REST_HEIGHT_M
 from perchctl.sim.firmware.commands import (
     HlGoTo,
     HlLand,
@@ -17,7 +18,6 @@ from perchctl.sim.firmware.commands import (
     VelocityWorldCommand,
     ZDistanceCommand,
 )
-from perchctl.sim.world import REST_HEIGHT_M
 from perchctl.vehicle import HL_ACTIVE, HL_FINISHED
 from tests.helpers.firmware_rig import PERFECT, make_rig
 
@@ -66,12 +66,12 @@ def test_the_unlock_is_forgotten_at_boot() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "flown"), [(999, 0.0), (1000, 1000.0), (30000, 30000.0), (65535, 60000.0)]
+    ("sent", "flown"), [(999, 0.0), (1000, 1000.0), (30000, 30000.0), (65535, 60000.0)]
 )
-def test_raw_thrust_is_limited(asked: int, flown: float) -> None:
+def test_raw_thrust_is_limited(sent: int, flown: float) -> None:
     rig = make_rig()
     rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
-    rig.run(0.02, RawSetpoint(0.0, 0.0, 0.0, asked))
+    rig.run(0.02, RawSetpoint(0.0, 0.0, 0.0, sent))
     assert rig.firmware.log_value("stabilizer.thrust") == flown
 
 

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from perchctl.sim.body import REST_HEIGHT_M
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.commands import HlGoTo, PositionCommand
 from perchctl.sim.firmware.controller import Pid
 from perchctl.sim.firmware.planner import AxisState, Polynomial
-from perchctl.sim.world import REST_HEIGHT_M
 from tests.helpers.firmware_rig import PERFECT, make_rig
 
 HERE = PositionCommand(0.0, 0.0, 0.8, 0.0)

@@ -156,20 +156,20 @@ def test_another_seed_has_another_phase() -> None:
     assert len({round(t, 6) for t in first}) == 5
 
 
-def test_poses_are_asked_within_the_last_exposure_only() -> None:
+def test_poses_are_requested_within_the_last_exposure_only() -> None:
     scene = Scenario()
     now = 0.0
-    asked = []
+    requested = []
 
     def watched(t_s: float) -> State:
-        asked.append((t_s, now))
+        requested.append((t_s, now))
         return pose_at(t_s)
 
     camera = SimCamera(scene, cast(Renderer, Stub()))
     for k in range(1, 500):
         now = k * CONTROL_PERIOD_S
         camera.advance(now, watched)
-    ages = [now_s - t_s for t_s, now_s in asked]
+    ages = [now_s - t_s for t_s, now_s in requested]
     assert min(ages) > -1e-8
     assert max(ages) <= scene.camera_exposure_s + CONTROL_PERIOD_S + 1e-9
 

@@ -11,15 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_rpy
+from perchctl.sim.body import GEAR_RADIUS_M, REST_HEIGHT_M
 from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, MOTOR_LAG_S
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.world import (
-    DRAG_LEVEL_NSPM,
-    DRAG_VERTICAL_NSPM,
-    GEAR_RADIUS_M,
-    REST_HEIGHT_M,
-    World,
-)
+from perchctl.sim.world import DRAG_LEVEL_NSPM, DRAG_VERTICAL_NSPM, World
 
 OFF = (0.0, 0.0, 0.0, 0.0)
 GEAR_Z_M = 0.03

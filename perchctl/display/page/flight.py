@@ -1,4 +1,4 @@
-"""The live page of a flight: what the loop sees and does, and a STOP button that lands."""
+"""The live page of a flight: pictures, numbers, and a STOP button that lands."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ AXES_OF_SIDE = 0.5
 
 
 class FlightPage:
-    """Looks on as a watcher, and sees the pictures through `watched`.
+    """A flight's watcher; the pictures come through `watched`.
 
-    A page that fails is no reason to land: `problem` is None, ever; `page.problem` tells.
+    A page that fails is no reason to land: `problem` is always None, `page.problem` holds
+    the error.
     """
 
     def __init__(self, page: LivePage, large_side_m: float) -> None:
@@ -111,14 +112,17 @@ def flight_page(
     large_side_m: float,
     port: int,
     land: Callable[[], None],
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> Iterator[FlightPage]:
-    """A page for one flight; `land` is what STOP does. Errors: InvalidValue (the port)."""
+    """A page for one flight. Raises InvalidValue for a port in use.
+
+    `land` is called by STOP; `report` prints a line.
+    """
     page = LivePage(camera, title, port, on_stop=land)
-    say(f"live page with a STOP button: {page.url}")
+    report(f"live page with a STOP button: {page.url}")
     try:
         yield FlightPage(page, large_side_m)
     finally:
         page.close()
         if page.problem is not None:
-            say(f"the live page failed: {page.problem}")
+            report(f"the live page failed: {page.problem}")

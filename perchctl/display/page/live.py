@@ -38,7 +38,7 @@ class LivePage:
         port: 0 lets the operating system choose.
         on_stop: called by the STOP button, from a thread of the page; None: no button.
 
-    `url` holds the token that STOP asks for. Errors: InvalidValue for a port in use.
+    `url` holds the token that STOP needs. Errors: InvalidValue for a port in use.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class LivePage:
         self.closed = False
         self.opened = threading.Event()
         self._on_stop = on_stop
-        self._stop_asked = False
+        self._stop_requested = False
         self._clock = clock
         self._changed = threading.Condition()
         self._drawing = threading.Lock()
@@ -78,7 +78,7 @@ class LivePage:
         self._thread = threading.Thread(
             target=self._server.serve_forever,
             kwargs={"poll_interval": 0.1},
-            name="view",
+            name="page",
             daemon=True,
         )
         self._thread.start()
@@ -95,22 +95,22 @@ class LivePage:
             self._changed.notify_all()
 
     def tell(self, describe: Callable[[], State]) -> None:
-        """The newest numbers, put into words only when somebody looks."""
+        """The newest numbers; formatted only when a reader polls."""
         self._describe = describe
 
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> State:
         """What the page polls: `describe`'s keys (rows, note, phase, battery), and title,
-        rate_hz, stop (``none``, ``ready``, ``asked``)."""
+        rate_hz, stop (``none``, ``ready``, ``requested``)."""
         try:
-            told = self._describe()
+            described = self._describe()
         except Exception as error:
             self.remember(error)
-            told = {}
-        stop = "none" if self._on_stop is None else "asked" if self._stop_asked else "ready"
+            described = {}
+        stop = "none" if self._on_stop is None else "requested" if self._stop_requested else "ready"
         fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
-        return told | fixed | {"page_problem": self.problem}
+        return described | fixed | {"page_problem": self.problem}
 
     def rate_hz(self) -> float:
         """Frames a second, 0 once none has come for a second."""
@@ -127,7 +127,7 @@ class LivePage:
             newest, sketch = self._number, self._sketch
         if sketch is None or newest <= number:
             return None
-        with self._drawing:  # once, for all who look
+        with self._drawing:  # once, for all readers
             if self._jpeg[0] < newest:
                 quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
                 ok, jpeg = cv2.imencode(".jpg", draw(sketch, self.camera), quality)
@@ -148,7 +148,7 @@ class LivePage:
     def stop(self) -> None:
         """The STOP button; pressing it again changes nothing."""
         with self._changed:
-            first, self._stop_asked = not self._stop_asked, True
+            first, self._stop_requested = not self._stop_requested, True
         if first and self._on_stop is not None:
             self._on_stop()
 

@@ -1,4 +1,4 @@
-"""HTTP of the live page: loopback only, and only under loopback's names.
+"""HTTP of the live page: on loopback only, and only under loopback's names.
 
 A site in the same browser can send requests to 127.0.0.1 too. So the Host header must
 name this machine (a rebound DNS name does not), STOP needs the token of the printed
@@ -37,7 +37,7 @@ def is_loopback(host: str | None) -> bool:
 
 
 class Content(Protocol):
-    """What the server asks of the page that it serves; `perchctl.display.page.live` is it."""
+    """What the server needs of the page that it serves: `perchctl.display.page.live`."""
 
     opened: threading.Event
     closed: bool
@@ -67,7 +67,7 @@ class PageServer(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A reader that goes away is no error; others are kept for the page's owner."""
+        """A reader that goes away is no error; others are kept in the page's `problem`."""
         error = sys.exception()
         if error is not None and not isinstance(error, OSError):
             self.page.remember(error)
@@ -103,7 +103,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(403, "STOP needs the token of the address that perchctl printed")
         else:
             page.stop()
-            self._send(200, "application/json", b'{"stop": "asked"}')
+            self._send(200, "application/json", b'{"stop": "requested"}')
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not worth a line on the terminal."""

@@ -17,7 +17,7 @@ _OUTLINE = {"large": (0, 200, 255), "small": (255, 200, 0)}
 _AXES = ((60, 60, 255), (60, 220, 60), (255, 120, 60))
 _TEXT, _SHADOW = (255, 255, 255), (0, 0, 0)
 _SUBPIXEL_BITS = 4
-_FAR_PX = 8000.0  # beyond this a line's end says nothing, and would overflow
+_FAR_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
 
 
 @dataclass(frozen=True, eq=False)

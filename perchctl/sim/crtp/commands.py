@@ -204,5 +204,5 @@ def _all_finite(command: LowLevelCommand | HighLevelCommand) -> bool:
 
 
 def link_source() -> bytes:
-    """What answers the question who is there (port 15, channel 1)."""
+    """The answer to a link-source request (port 15, channel 1)."""
     return b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")

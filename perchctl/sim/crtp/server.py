@@ -1,6 +1,6 @@
 """A Crazyflie's end of the link: packets in, firmware calls, packets out.
 
-Knows no socket and no clock; `perchctl.sim.crtp.udp` carries the packets. Everything
+Uses no socket and no clock; `perchctl.sim.crtp.udp` carries the packets. Everything
 an unmodified cflib sends is answered as listed in the firmware facts, "Link".
 """
 

@@ -22,8 +22,8 @@ Address = tuple[str, int]
 class UdpEndpoint:
     """The socket of a simulated vehicle, bound to loopback.
 
-    Answers go to whoever asked. What the vehicle sends by itself goes to the peer: the
-    last one that sent anything but a scan's probe.
+    Answers go to the requesting address. What the vehicle sends by itself goes to the
+    peer: the last address that sent anything but a scan's probe.
     """
 
     def __init__(self, port: int, options: LinkOptions) -> None:
@@ -50,7 +50,7 @@ class UdpEndpoint:
         self.socket.close()
 
     def silence(self, from_s: float, duration_s: float) -> None:
-        """Hear and say nothing for a while of simulated time."""
+        """Receive and send nothing for a while of simulated time."""
         self._silent = (from_s, from_s + duration_s)
 
     def serve(self, server: CrtpServer, t_s: float) -> None:
@@ -72,7 +72,7 @@ class UdpEndpoint:
             self._send(server.handle(packet), address, t_s)
 
     def send_due(self, server: CrtpServer, t_s: float) -> None:
-        """Send what the vehicle says by itself; nothing is kept for a missing peer."""
+        """Send what the vehicle sends by itself; nothing is kept for a missing peer."""
         if self._peer is not None:
             self._send(server.due(), self._peer, t_s)
 

@@ -1,4 +1,4 @@
-"""What a Crazyflie can be told, as values; units and signs as cflib's calls have them.
+"""A Crazyflie's commands as values; units and signs as cflib's calls have them.
 
 Both doors build these: the CRTP server by decoding packets, the mock link directly.
 """

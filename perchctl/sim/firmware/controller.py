@@ -17,7 +17,7 @@ POSITION_DT_S = 0.01
 POSITION_EVERY = 5
 INT16_MAX = 32767.0
 UINT16_MAX = 65535.0
-_OVERHEAD = 1.1  # a loop may ask for a little more than its successor's limit
+_OVERHEAD = 1.1  # a loop may request a little more than its successor's limit
 _THRUST_SCALE = 1000.0
 
 

@@ -1,4 +1,4 @@
-"""The state estimate: the truth, as a Crazyflie on a flow deck or under mocap knows it.
+"""The state estimate: the truth with the errors of a flow deck or of motion capture.
 
 Drift runs from the moment the motors first turn. With outside positions (scenario
 `extra["external_position"]` and parameter `stabilizer.estimator` = 2) the estimate
@@ -6,7 +6,7 @@ follows those instead, and slides away once they stop coming.
 
 The attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
 the filter's other measurements can: a vehicle that is put on its back by hand, faster
-than any gyroscope sees, goes on believing that it is level.
+than any gyroscope measures, is still estimated as level.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
 
 
 class Sensed(Protocol):
-    """The part of `World` an estimator may look at."""
+    """The part of `World` that an estimator may read."""
 
     x_m: float
     y_m: float
@@ -202,7 +202,7 @@ class Estimator:
         )
 
     def _slid(self, t_s: float) -> tuple[float, float, float]:
-        """The estimate's error while it lives on outside positions."""
+        """The estimate's error while it follows outside positions."""
         x, y, z = self._external_error
         last_s = self._reset_s if self._external_s is None else self._external_s
         blind_s = t_s - last_s - _EXTERNAL_STALE_S

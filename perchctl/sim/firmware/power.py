@@ -1,4 +1,4 @@
-"""The power management's view of the battery: voltage, level, and the low-power state."""
+"""The battery as the power management reports it: voltage, level, and the low-power state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The supervisor: who may spin the motors, decided 25 times a second.
+"""The supervisor: whether the motors may spin, decided 25 times a second.
 
 States, conditions and times are those of firmware facts, "Supervisor", "When setpoints
 stop" and "Contact, tumble, crash".

@@ -1,0 +1,1 @@
+"""The simulated vehicle as a process of its own: handle, messages, child, pace."""

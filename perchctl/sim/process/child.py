@@ -1,4 +1,4 @@
-"""The child process: be the vehicle that the parent describes, or one started by hand.
+"""The child process: runs the vehicle that the parent describes, or one started by hand.
 
 ``python -m perchctl.sim.process --port 19850`` runs one in the foreground.
 """
@@ -16,15 +16,14 @@ import cv2
 from perchctl.calibration.files import load_calibration
 from perchctl.errors import PerchError
 from perchctl.profile.places import data_file
-from perchctl.sim.process.control import HostSetup, connect
-from perchctl.sim.process.handle import START_TIMEOUT_S
+from perchctl.sim.process.control import START_TIMEOUT_S, HostSetup, connect
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.process.runner import Runner
 from perchctl.sim.scenario import Scenario
 
 
 def serve_parent() -> None:
-    """The child: be the vehicle that the parent describes, until it says stop or is gone."""
+    """Run the vehicle that the parent describes, until it sends stop or is gone."""
     cv2.setNumThreads(1)  # the picture must not take the physics' core
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     port, token = sys.stdin.readline().split()

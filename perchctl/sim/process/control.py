@@ -1,8 +1,8 @@
-"""Messages between the process that flies and the one that is the simulated vehicle.
+"""Messages between the process that flies and the simulated vehicle's.
 
 A loopback connection of length-prefixed pickles. Only the child connects, and only
-after it has shown the token that it was handed on its standard input, so neither side
-unpickles a stranger's bytes.
+after it has sent the token that it received on its standard input, so neither side
+unpickles foreign bytes.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ import struct
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from perchctl.profile import TargetConfig
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.scenario import Scenario
 from perchctl.vision.types import CameraModel
 
+Pace = Literal["realtime", "stepped"]
+START_TIMEOUT_S = 30.0
 TOKEN_BYTES = 32
 LINGER_S = 12.0
 _ACCEPT_POLL_S = 0.05
@@ -28,16 +30,15 @@ _ACCEPT_POLL_S = 0.05
 
 @dataclass(frozen=True)
 class HostSetup:
-    """What the simulated vehicle's process is to be.
+    """How the simulated vehicle's process is set up.
 
-    `pace`: "realtime" or "stepped". `camera` None: no camera and no stream. Ports 0:
-    chosen by the operating system. `truth_file`: JSON lines of the true state, 50 a
-    simulated second, for who looks after the tool has died. `linger_s`: how long the
-    vehicle lives on, in wall-clock time, when its parent is gone.
+    `camera` None: no camera and no stream. Ports 0: chosen by the operating system.
+    `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
+    parent has ended. `linger_s`: how long the vehicle then runs on, in wall-clock time.
     """
 
     scenario: Scenario = field(default_factory=Scenario)
-    pace: str = "realtime"
+    pace: Pace = "realtime"
     camera: CameraModel | None = None
     target: TargetConfig | None = None
     link: LinkOptions = field(default_factory=LinkOptions)

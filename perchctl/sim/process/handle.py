@@ -1,8 +1,8 @@
 """The simulated vehicle as a process of its own: a Crazyflie on UDP, its camera on HTTP.
 
-`SimProcess` is the handle in the process that flies. The child does not share its
-terminal's Ctrl-C and outlives a killed parent by a few seconds (`runner`), as a
-real vehicle would.
+`SimProcess` is the handle in the process that flies, `child` runs in the other one. The
+child does not share its terminal's Ctrl-C and outlives a killed parent by a few seconds
+(`runner`), as a real vehicle would.
 """
 
 from __future__ import annotations
@@ -15,19 +15,24 @@ import tempfile
 import threading
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, Literal
+from typing import IO, Any, get_args
 
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
+from perchctl.profile import TargetConfig
+from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.process.control import (
+    LINGER_S,
+    START_TIMEOUT_S,
+    TOKEN_BYTES,
+    Channel,
+    HostSetup,
+    Pace,
+    accept,
+    listen,
+)
 from perchctl.sim.scenario import Scenario
+from perchctl.vision.types import CameraModel
 
-if TYPE_CHECKING:
-    from perchctl.profile import TargetConfig
-    from perchctl.sim.crtp.server import LinkOptions
-    from perchctl.sim.process.control import Channel
-    from perchctl.vision.types import CameraModel
-
-Pace = Literal["realtime", "stepped"]
-START_TIMEOUT_S = 30.0
 ANSWER_TIMEOUT_S = 15.0
 SLOWEST_PACE = 20.0
 """Wall-clock seconds allowed for one simulated second of `advance`."""
@@ -69,23 +74,19 @@ class SimProcess:
         port: int = 0,
         http_port: int = 0,
         truth_file: Path | None = None,
-        linger_s: float | None = None,
+        linger_s: float = LINGER_S,
         timeout_s: float = START_TIMEOUT_S,
     ) -> SimProcess:
         """Start the vehicle and wait, for at most `timeout_s`, until it answers.
 
         Ports 0 are chosen by the operating system. `truth_file` receives JSON lines of
-        `truth()`, 50 a simulated second. `linger_s` is how long the vehicle lives on
-        after this process has gone (None: `control.LINGER_S`). Raises
-        `ConnectionFailed` when the child ends or does not come up, `InvalidValue` for an
-        unknown pace.
+        `truth()`, 50 a simulated second. `linger_s` is how long the vehicle runs on after
+        this process has gone. Raises `ConnectionFailed` when the child ends or does not
+        come up, `InvalidValue` for an unknown pace.
         """
-        from perchctl.sim.crtp.server import LinkOptions
-        from perchctl.sim.process import control
-
-        if pace not in ("realtime", "stepped"):
+        if pace not in get_args(Pace):
             raise InvalidValue(f"pace {pace!r} is unknown, choose 'realtime' or 'stepped'")
-        setup = control.HostSetup(
+        setup = HostSetup(
             scenario=scenario or Scenario(),
             pace=pace,
             camera=camera,
@@ -94,16 +95,16 @@ class SimProcess:
             port=port,
             http_port=http_port,
             truth_file=str(truth_file) if truth_file is not None else None,
-            linger_s=linger_s if linger_s is not None else control.LINGER_S,
+            linger_s=linger_s,
         )
-        token = secrets.token_hex(control.TOKEN_BYTES)
+        token = secrets.token_hex(TOKEN_BYTES)
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
-        with control.listen() as listener:
+        with listen() as listener:
             child = _spawn(stderr)
             assert child.stdin is not None
             with contextlib.suppress(OSError), child.stdin:
                 child.stdin.write(f"{listener.getsockname()[1]} {token}\n".encode())
-            channel = control.accept(listener, token, timeout_s, lambda: child.poll() is None)
+            channel = accept(listener, token, timeout_s, lambda: child.poll() is None)
         if channel is None:
             raise _gave_up(child, stderr, f"did not come up within {timeout_s:.0f} s")
         process = cls(child, channel, stderr)
@@ -163,7 +164,7 @@ class SimProcess:
         self._ask("push", force_n=force_n)
 
     def silence(self, duration_s: float) -> None:
-        """The vehicle hears and says nothing for `duration_s` of simulated time."""
+        """The link receives and sends nothing for `duration_s` of simulated time."""
         self._ask("silence", duration_s=duration_s)
 
     def reboot(self) -> None:
@@ -246,7 +247,7 @@ def _gave_up(child: subprocess.Popen[bytes], stderr: IO[bytes], why: str) -> Con
 
 
 def _last_line(stderr: IO[bytes]) -> str:
-    """The child's last words, for a message."""
+    """The last line of the child's error output, for a message."""
     if stderr.closed:
         return ""
     stderr.seek(0)

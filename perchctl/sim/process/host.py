@@ -19,7 +19,7 @@ from perchctl.sim.world import TrueState
 
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
 _PAST_S = 1.0  # how far the picture may lag behind the physics
-_WAKE_EVERY = 5  # control periods between two looks of the renderer at the physics
+_WAKE_EVERY = 5  # control periods between two wake-ups of the renderer
 
 
 class VehicleHost:
@@ -38,6 +38,7 @@ class VehicleHost:
         self.endpoint = UdpEndpoint(setup.port, setup.link)
         self.stream: MjpegServer | None = None
         self._truth: TextIO | None = None
+        self._feed: _PictureFeed | None = None
         try:
             if setup.camera is not None:
                 self.stream = MjpegServer(setup.http_port)
@@ -81,7 +82,7 @@ class VehicleHost:
             self.step()
 
     def truth(self) -> dict[str, Any]:
-        """What no Crazyflie could tell: the true state, SI and radians, plus what it says."""
+        """The true state, SI and radians, and the firmware's outputs: no Crazyflie reports it."""
         world, firmware = self.vehicle.world, self.vehicle.firmware
         state = world.state()
         return {
@@ -127,9 +128,8 @@ class VehicleHost:
         return _PictureFeed(self.vehicle, self.stream)
 
     def _close_feed(self) -> None:
-        feed: _PictureFeed | None = getattr(self, "_feed", None)
-        if feed is not None:
-            feed.close()
+        if self._feed is not None:
+            self._feed.close()
 
 
 class _PictureFeed:
@@ -174,7 +174,7 @@ class _PictureFeed:
             return None if self._closed else self._past[-1].t_s
 
     def _state_at(self, t_s: float) -> TrueState:
-        """The true state nearest to `t_s` of those still known."""
+        """The true state nearest to `t_s` of those still kept."""
         with self._changed:
             back = round((self._past[-1].t_s - t_s) / CONTROL_PERIOD_S)
             return self._past[max(-len(self._past), -1 - max(0, back))]

@@ -23,7 +23,7 @@ _CLIENT_TIMEOUT_S = 5.0
 
 
 class _Newest:
-    """The newest picture; encoded once, by the first client that wants it."""
+    """The newest picture; encoded once, by the first client that requests it."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

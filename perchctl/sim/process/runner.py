@@ -5,7 +5,7 @@
   answered, so that cflib connects without simulated time passing.
 
 When the parent is gone, however it went, the vehicle flies on in real time for
-`HostSetup.linger_s` and then ends: what the firmware does after its tool has died can be seen.
+`HostSetup.linger_s` and then ends, so that the firmware's reaction can be observed.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from perchctl.sim.scenario import CONTROL_PERIOD_S
 MAX_LAG_S = 1.0
 """A longer hiccup (a suspended computer) is cut off instead of being caught up with."""
 _IDLE_S = 0.25
-_BATCH = 50  # steps between two looks at the control connection while catching up
+_BATCH = 50  # steps between two polls of the control connection while catching up
 
 
 class Runner:
-    """Runs one host until it is told to stop or its parent has been gone for a while."""
+    """Runs one host until it is stopped or its parent has been gone for a while."""
 
     def __init__(
         self,
@@ -88,9 +88,9 @@ class Runner:
         if self._host.endpoint.socket in ready:
             self._host.serve()
         if self._channel is not None and self._channel.socket in ready:
-            self._obey(self._channel)
+            self._answer(self._channel)
 
-    def _obey(self, channel: Channel) -> None:
+    def _answer(self, channel: Channel) -> None:
         """One request of the parent: (name, arguments) -> (True, result) or (False, text)."""
         try:
             name, arguments = channel.receive()

@@ -1,0 +1,130 @@
+"""One opened `cflib.crazyflie.Crazyflie`: opened and closed within bounds, and sent to."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from perchctl.errors import ConnectionFailed
+from perchctl.link.uri import UDEV_HELP
+from perchctl.profile.places import user_cache_folder
+from perchctl.sim.crtp.codec import Packet
+
+CONNECT_TRIES = 2
+CLOSE_TIMEOUT_S = 3.0
+
+
+class Connection:
+    """`lost` is None while connected, then the cause in one sentence.
+
+    `cf` is cflib's object, for its tables, parameters and log blocks.
+    """
+
+    def __init__(self) -> None:
+        from cflib.crazyflie import Crazyflie
+
+        cache = user_cache_folder() / "toc"
+        cache.mkdir(parents=True, exist_ok=True)
+        self.cf: Any = Crazyflie(rw_cache=str(cache))
+        self.lost: str | None = None
+        self._settled = threading.Event()  # connected, or failed
+        self.cf.fully_connected.add_callback(lambda _uri: self._settled.set())
+        self.cf.connection_failed.add_callback(self._on_lost)
+        self.cf.connection_lost.add_callback(self._on_lost)
+
+    def open(self, uri: str, timeout_s: float) -> bool:
+        """Whether the vehicle is fully connected, or refused (`lost`), within `timeout_s`."""
+        # Opening a radio may block in its driver: it gets a thread and a bound.
+        opener = threading.Thread(target=self.cf.open_link, args=(uri,), daemon=True)
+        opener.start()
+        return self._settled.wait(timeout_s)
+
+    def close(self) -> None:
+        """Close with cflib's farewell, a zero setpoint: only when nothing flies."""
+        _run_bounded([self.cf.close_link])
+
+    def abandon(self) -> None:
+        """Release the driver and clean up, sending nothing more."""
+        # Without its driver, close_link has nowhere to send the zero setpoint.
+        driver, self.cf.link = self.cf.link, None
+        _run_bounded([self.cf.close_link] if driver is None else [driver.close, self.cf.close_link])
+
+    def _on_lost(self, _uri: str, message: str) -> None:
+        self.lost = plain_cause(message)
+        self._settled.set()
+
+
+def open_connection(uri: str, timeout_s: float) -> Connection:
+    """A vehicle's connection with all tables and parameters read.
+
+    `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
+    connect for good (firmware facts, "Link"). Raises `ConnectionFailed`.
+    """
+    import cflib.crtp
+
+    _hush_cflib()
+    if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
+        cflib.crtp.init_drivers()
+    share_s = timeout_s / CONNECT_TRIES
+    for _ in range(CONNECT_TRIES):
+        connection = Connection()
+        try:
+            answered = connection.open(uri, share_s)
+        except BaseException:
+            connection.abandon()
+            raise
+        if answered and connection.lost is None:
+            return connection
+        connection.abandon()
+        if answered:
+            raise ConnectionFailed(f"no Crazyflie at {uri}: {connection.lost}")
+    raise ConnectionFailed(
+        f"no Crazyflie at {uri}: no answer within {share_s:.0f} s "
+        f"(is it switched on, is the address right?)"
+    )
+
+
+def send_packets(cf: Any, packets: Iterable[Packet]) -> None:
+    """Send them as they are, through the lock and the driver of cflib's `Crazyflie`."""
+    from cflib.crtp.crtpstack import CRTPPacket
+
+    for packet in packets:
+        outgoing = CRTPPacket()
+        outgoing.set_header(packet.port, packet.channel)
+        outgoing.data = packet.data
+        cf.send_packet(outgoing)
+
+
+def plain_cause(message: str) -> str:
+    """cflib's message without its traceback, and with the remedy where there is one."""
+    line = message.strip().splitlines()[0] if message.strip() else "unknown cause"
+    line = line.removeprefix("Couldn't load link driver: ")
+    if "Crazyradio" in message or "Access denied" in message or "insufficient" in message.lower():
+        missing = "Cannot find" in message
+        what = "no Crazyradio is plugged in, or " if missing else ""
+        return f"{what}there is no permission to use it ({line}).\n{UDEV_HELP}"
+    if "Connection refused" in message:
+        return "nothing listens there (connection refused)"
+    if "No driver found" in message:
+        return "cflib has no driver for this kind of URI"
+    return line
+
+
+def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
+    def run() -> None:
+        for call in calls:
+            call()
+
+    closer = threading.Thread(target=run, daemon=True)
+    closer.start()
+    closer.join(CLOSE_TIMEOUT_S)
+
+
+def _hush_cflib() -> None:
+    """cflib logs tracebacks of what it reports by callback as well; one sentence is enough."""
+    logger = logging.getLogger("cflib")
+    logger.addHandler(logging.NullHandler())
+    logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))

@@ -1,0 +1,91 @@
+"""A command as the CRTP packets that the vehicle receives: the one place that encodes.
+
+`CflibLink` sends these packets, `MockLink` hands the same bytes to the simulated vehicle.
+Layouts are those of cflib 0.1.34 (`commander`, `high_level_commander`, `supervisor`) for
+protocol 12 and later; degrees leave here, radians stay behind (firmware facts, "Link" and
+"Signs and units").
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+from perchctl.errors import InvalidValue
+from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.vehicle import (
+    Command,
+    EmergencyStop,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+    TakeOff,
+)
+
+# Port 7: the channels, then the setpoints' types.
+_SETPOINT, _META = 0, 1
+_STOP, _POSITION = 0, 7
+_NOTIFY_SETPOINT_STOP = 0
+# Port 8.
+_TAKEOFF_2, _LAND_2 = 7, 8
+_ALL_GROUPS = 0
+# Port 9, channel 1.
+_REQUEST = 1
+_ARM, _EMERGENCY_STOP = 1, 3
+
+
+def encode(command: Command) -> tuple[Packet, ...]:
+    """The packets in the order in which they are sent; none for `Idle`.
+
+    Raises InvalidValue for a number that its field cannot hold.
+    """
+    try:
+        return _packets(command)
+    except (struct.error, OverflowError) as error:
+        raise InvalidValue(f"{command} does not fit into a packet: {error}") from None
+
+
+def _packets(command: Command) -> tuple[Packet, ...]:
+    match command:
+        case Idle():
+            return ()
+        case PositionSetpoint(x, y, z, yaw):
+            data = struct.pack("<Bffff", _POSITION, x, y, z, math.degrees(yaw))
+            return (Packet(Port.COMMANDER_GENERIC, _SETPOINT, data),)
+        case RawThrust(thrust):
+            return (_raw(thrust),)
+        case TakeOff(height, duration):
+            return (_vertical(_TAKEOFF_2, height, duration),)
+        case Land(height, duration):
+            return _NOTIFY, _vertical(_LAND_2, height, duration)
+        case StopMotors():
+            stop = Packet(Port.COMMANDER_GENERIC, _SETPOINT, bytes((_STOP,)))
+            return stop, _NOTIFY
+        case EmergencyStop():
+            return (Packet(Port.SUPERVISOR, _REQUEST, bytes((_EMERGENCY_STOP,))),)
+
+
+def _raw(thrust: int) -> Packet:
+    """Level and not turning; -0.0, since a setpoint's pitch is negated on its way out."""
+    return Packet(Port.COMMANDER, 0, struct.pack("<fffH", 0.0, -0.0, 0.0, thrust))
+
+
+def _vertical(kind: int, height_m: float, duration_s: float) -> Packet:
+    """A take-off or landing that keeps the heading: cflib's `yaw=None`.
+
+    With a yaw of its own, 0 by default, the vehicle turns to it on the way.
+    """
+    yaw_rad, keep_yaw = 0.0, True
+    data = struct.pack("<BBff?f", kind, _ALL_GROUPS, height_m, yaw_rad, keep_yaw, duration_s)
+    return Packet(Port.HIGH_LEVEL, 0, data)
+
+
+_NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPOINT_STOP, 0))
+
+ARM = (Packet(Port.SUPERVISOR, _REQUEST, bytes((_ARM, True))),)
+UNLOCK_THRUST = (_raw(0), _NOTIFY)
+"""One zero-thrust packet since boot, on the ground, then the priority back: without the
+first a raw thrust stays 0, without the second a take-off is not flown (firmware facts,
+"Raw thrust")."""

@@ -1,0 +1,140 @@
+"""Commands as bytes: those of an unmodified cflib, for the same calls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import pytest
+from cflib.crazyflie.commander import Commander
+from cflib.crazyflie.high_level_commander import HighLevelCommander
+from cflib.crazyflie.supervisor import Supervisor
+from cflib.crtp.crtpstack import CRTPPacket
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.errors import InvalidValue
+from perchctl.link.connection import send_packets
+from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
+from perchctl.sim.crtp.codec import MAX_DATA, Packet
+from perchctl.vehicle import (
+    Command,
+    EmergencyStop,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+    TakeOff,
+)
+
+PROTOCOL = 12
+THRUST_MAX = 0xFFFF
+
+
+def commands(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[Command]:
+    """All commands; `numbers` for lengths, times and the yaw in degrees."""
+    return st.one_of(
+        st.just(Idle()),
+        st.builds(PositionSetpoint, numbers, numbers, numbers, st.floats(-1e3, 1e3)),
+        st.builds(RawThrust, st.integers(0, THRUST_MAX)),
+        st.builds(TakeOff, numbers, numbers),
+        st.builds(Land, numbers, numbers),
+        st.just(StopMotors()),
+        st.just(EmergencyStop()),
+    )
+
+
+class Recorder:
+    """The part of cflib's `Crazyflie` that its own encoders use; keeps what would be sent."""
+
+    def __init__(self) -> None:
+        self.datagrams: list[bytes] = []
+        self.platform = SimpleNamespace(get_protocol_version=lambda: PROTOCOL)
+        self.commander = Commander(self)
+        self.high_level = HighLevelCommander(self)
+        self.supervisor = Supervisor(self)
+
+    def add_port_callback(self, port: int, callback: Callable[..., None]) -> None:
+        """The supervisor's answers; none come."""
+
+    def send_packet(self, packet: CRTPPacket) -> None:
+        assert packet.is_data_size_valid()
+        self.datagrams.append(bytes((packet.get_header(),)) + bytes(packet.data))
+
+    def unlock_thrust(self) -> None:
+        self.commander.send_setpoint(0.0, 0.0, 0.0, 0)
+        self.commander.send_notify_setpoint_stop()
+
+    def call(self, command: Command) -> None:
+        """The calls that a program without perchctl makes for this command."""
+        match command:
+            case Idle():
+                pass
+            case PositionSetpoint(x, y, z, yaw):
+                self.commander.send_position_setpoint(x, y, z, math.degrees(yaw))
+            case RawThrust(thrust):
+                self.commander.send_setpoint(0.0, 0.0, 0.0, thrust)
+            case TakeOff(height, duration):
+                self.high_level.takeoff(height, duration, yaw=None)  # keeps the heading
+            case Land(height, duration):
+                self.commander.send_notify_setpoint_stop()
+                self.high_level.land(height, duration, yaw=None)
+            case StopMotors():
+                self.commander.send_stop_setpoint()
+                self.commander.send_notify_setpoint_stop()
+            case EmergencyStop():
+                self.supervisor.send_emergency_stop()
+
+
+def by_cflib(command: Command) -> list[bytes]:
+    recorder = Recorder()
+    recorder.call(command)
+    return recorder.datagrams
+
+
+def datagrams(packets: tuple[Packet, ...]) -> list[bytes]:
+    return [packet.encode() for packet in packets]
+
+
+# --- Bytes ------------------------------------------------------------------------------------
+
+
+@given(commands(st.floats(width=32)))  # NaN and infinities too: refusing them is the vehicle's part
+def test_packets_are_cflibs(command: Command) -> None:
+    assert datagrams(encode(command)) == by_cflib(command)
+
+
+def test_arming_and_the_thrust_unlock_are_cflibs() -> None:
+    unlock, arm = Recorder(), Recorder()
+    unlock.unlock_thrust()
+    arm.supervisor.send_arming_request(True)
+    assert datagrams(UNLOCK_THRUST) == unlock.datagrams
+    assert datagrams(ARM) == arm.datagrams
+
+
+@pytest.mark.parametrize("kind", [kind for kind in get_args(Command) if kind is not Idle])
+def test_every_command_has_packets_of_at_most_30_bytes(kind: type[Any]) -> None:
+    packets = encode(kind(*(1 for _ in kind.__match_args__)))
+    assert packets
+    assert all(0 < len(packet.data) <= MAX_DATA for packet in packets)
+
+
+@pytest.mark.parametrize(
+    "command", [RawThrust(-1), RawThrust(THRUST_MAX + 1), PositionSetpoint(1e39, 0.0, 0.0, 0.0)]
+)
+def test_a_number_that_does_not_fit_is_refused(command: Command) -> None:
+    with pytest.raises(InvalidValue, match="does not fit into a packet"):
+        encode(command)
+
+
+# --- The real link ----------------------------------------------------------------------------
+
+
+@given(commands(st.floats(width=32)))
+def test_the_real_link_sends_these_packets(command: Command) -> None:
+    recorder = Recorder()
+    send_packets(recorder, encode(command))
+    assert recorder.datagrams == by_cflib(command)
