@@ -2,7 +2,7 @@
 
 Nothing here blocks without a bound, nothing blocking is called from cflib's
 callbacks, and the link is closed only when nothing flies: `close_link` sends a
-zero setpoint, which drops a flying vehicle (firmware facts, "When setpoints stop").
+zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints stop").
 """
 
 from __future__ import annotations

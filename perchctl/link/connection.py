@@ -61,7 +61,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
     """A vehicle's connection with all tables and parameters read.
 
     `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
-    connect for good (firmware facts, "Link"). Raises `ConnectionFailed`.
+    connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`.
     """
     import cflib.crtp
 

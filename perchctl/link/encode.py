@@ -2,7 +2,7 @@
 
 `CflibLink` sends these packets, `MockLink` hands the same bytes to the simulated vehicle.
 Layouts are those of cflib 0.1.34 (`commander`, `high_level_commander`, `supervisor`) for
-protocol 12 and later; degrees leave here, radians stay behind (firmware facts, "Link" and
+protocol 12 and later; degrees leave here, radians stay behind (docs/firmware.md, "Link" and
 "Signs and units").
 """
 
@@ -87,5 +87,5 @@ _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPO
 ARM = (Packet(Port.SUPERVISOR, _REQUEST, bytes((_ARM, True))),)
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
 """One zero-thrust packet since boot, on the ground, then the priority back: without the
-first a raw thrust stays 0, without the second a take-off is not flown (firmware facts,
+first a raw thrust stays 0, without the second a take-off is not flown (docs/firmware.md,
 "Raw thrust")."""

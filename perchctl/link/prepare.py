@@ -11,7 +11,7 @@ from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut
 from perchctl.link.telemetry import NEEDED
 
 NEEDED_PROTOCOL = 12
-"""From firmware 2026.08 on: the supervisor's own port (firmware facts, "Link")."""
+"""From firmware 2026.08 on: the supervisor's own port (docs/firmware.md, "Link")."""
 PARAMETER_TIMEOUT_S = 2.0
 
 

@@ -1,7 +1,7 @@
 """A Crazyflie's log variables, and their one conversion into `Telemetry`.
 
 Here, and only here, degrees become radians and the Crazyflie's nose-up pitch
-becomes the right-handed nose-down one (firmware facts, "Signs and units").
+becomes the right-handed nose-down one (docs/firmware.md, "Signs and units").
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 WRAP_MS = 1 << 24
-"""Log time stamps have three bytes (firmware facts, "Link")."""
+"""Log time stamps have three bytes (docs/firmware.md, "Link")."""
 CLOCK_SKEW = 1e-4
 """How fast the two clocks may run apart: far above a crystal's, far below a fault's."""
 

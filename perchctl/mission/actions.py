@@ -1,7 +1,8 @@
 """What each phase sends: one small function a phase, (view) -> (state, command).
 
 Before each command ask: what if it is the last packet? A position setpoint left
-alone levels out after 0.5 s and is cut after 2 s (firmware facts), so anything
+alone levels out after 0.5 s and is cut after 2 s (docs/firmware.md,
+"Silence"), so anything
 that ends a flight is handed to the vehicle's own high-level commander, which
 needs no further packet.
 """

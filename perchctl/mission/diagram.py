@@ -1,6 +1,6 @@
-"""The mission's table as text for the README: a diagram of the phases, a list of the rows.
+"""The mission's table as text for docs/architecture.md: a diagram of the phases, a list of the rows.
 
-``python -m perchctl.mission.diagram`` prints both; a test holds the README to them.
+``python -m perchctl.mission.diagram`` prints both; a test holds the page to them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The mission as one ordered table: first match wins, safety rows on top.
 
-The README's diagram and `perchctl fly --help` are drawn from `TABLE`.
+The diagram and the table of docs/architecture.md are drawn from `TABLE`.
 """
 
 from __future__ import annotations

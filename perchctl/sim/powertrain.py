@@ -1,12 +1,12 @@
 """Four motors and the cell that feeds them: commands in, newtons out.
 
 - 0.12 N a motor at full command with a fresh battery, thrust proportional to the
-  command, because the firmware compensates for the battery (firmware facts, "Thrust
+  command, because the firmware compensates for the battery (docs/firmware.md, "Thrust
   budget"). What compensation cannot give back is the loss of `THRUST_LOSS_PER_V`:
   100 % at 4.2 V at rest, 95 % at 3.7 V.
 - Thrust follows its command with a first-order lag. `MOTOR_LAG_S` is the value with
   which the raw burst, the dips after a change of setpoint mode and the take-off of the
-  firmware facts come out nearest to what was measured, all at once.
+  firmware's page come out nearest to what was measured, all at once.
 - A 250 mAh cell: about 4.4 A at full thrust, and what that does to its voltage.
 """
 

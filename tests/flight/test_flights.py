@@ -229,4 +229,4 @@ def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
     assert report.phase is Phase.ABORTED
     assert report.outcome is Outcome.EMERGENCY
     assert EXIT_CODE_OF[report.outcome] == 53
-    assert flown.flight.locked  # firmware facts, "When setpoints stop": the emergency stop locks
+    assert flown.flight.locked  # docs/firmware.md, "Emergency stop"

@@ -316,7 +316,7 @@ def test_a_failure_on_the_ground_starts_nothing() -> None:
 @pytest.mark.parametrize("after_s", [0.0, 0.02, 0.1])
 def test_a_failure_right_after_the_take_off_order_lands(after_s: float) -> None:
     """The order does not show in the telemetry yet, and a vehicle in high-level flight would
-    hover for ever (firmware facts, "When setpoints stop")."""
+    hover for ever (docs/firmware.md, "When setpoints stop")."""
     rig = Rig(Vehicle(delay_s=0.15))
 
     def leave(tick: Tick) -> None:

@@ -1,4 +1,4 @@
-"""Thrust, setpoint modes, signs and battery: firmware facts, seen through cflib."""
+"""Thrust, setpoint modes, signs and battery: docs/firmware.md, seen through cflib."""
 
 from __future__ import annotations
 

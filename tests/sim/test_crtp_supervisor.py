@@ -1,4 +1,4 @@
-"""The supervisor's rows of the firmware facts, seen through cflib's `udp://` driver."""
+"""The supervisor's rows of docs/firmware.md, seen through cflib's `udp://` driver."""
 
 from __future__ import annotations
 

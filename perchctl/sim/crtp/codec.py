@@ -1,7 +1,7 @@
 """CRTP on the wire: the header byte, the ports and the number types.
 
-One packet is a header ``port << 4 | 0x0C | channel`` and at most 30 bytes (firmware
-facts, "Link").
+One packet is a header ``port << 4 | 0x0C | channel`` and at most 30 bytes
+(docs/firmware.md, "Link").
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Packets that command the vehicle, turned into the firmware model's calls.
 
-Ports and layouts: firmware facts, "Link"; signs: "Signs and units".
+Ports and layouts: docs/firmware.md, "Link"; signs: "Signs and units".
 """
 
 from __future__ import annotations

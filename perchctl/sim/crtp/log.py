@@ -1,7 +1,7 @@
 """The log port: blocks of variables, sent with their period while they run.
 
 Limits as measured: 26 bytes a block, period 10 ms x 1..254, 16 blocks, 128 variables
-(firmware facts, "Link").
+(docs/firmware.md, "Link").
 """
 
 from __future__ import annotations

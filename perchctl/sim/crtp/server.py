@@ -1,7 +1,7 @@
 """A Crazyflie's end of the link: packets in, firmware calls, packets out.
 
 Uses no socket and no clock; `perchctl.sim.crtp.udp` carries the packets. Everything
-an unmodified cflib sends is answered as listed in the firmware facts, "Link".
+an unmodified cflib sends is answered as in docs/firmware.md, "Connect sequence".
 """
 
 from __future__ import annotations

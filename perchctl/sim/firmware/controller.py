@@ -2,7 +2,7 @@
 
 Gains and limits are the firmware's defaults for the Crazyflie 2.x; they can be changed
 through the parameters of the same names. Angles in degrees, pitch nose up, as inside
-the firmware. Every change of setpoint mode resets all integrators (firmware facts,
+the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
 "Setpoint modes"), so the thrust starts again from `thrustBase`.
 """
 

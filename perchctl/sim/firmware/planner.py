@@ -75,7 +75,7 @@ class Planner:
         return self.state != IDLE
 
     def finished(self, t_s: float) -> bool:
-        """By the clock, not by height (firmware facts, "Setpoint modes")."""
+        """By the clock, not by height (docs/firmware.md, "Setpoint modes")."""
         return self.state == IDLE or t_s - self._begin_s >= self._duration_s
 
     def stop(self) -> None:

@@ -12,7 +12,7 @@ _LEVELS_V = (3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
 
 
 class PowerMonitor:
-    """`update` at 25 Hz. Low below `pm.lowVoltage` for 5 s (firmware facts, "Link")."""
+    """`update` at 25 Hz. Low below `pm.lowVoltage` for 5 s (docs/firmware.md, "Link")."""
 
     def __init__(self, battery_v: float) -> None:
         self.battery_v = battery_v

@@ -88,7 +88,7 @@ class Decoder:
     """Turns commands into setpoints; holds the raw thrust's lock.
 
     Raw thrust is forced to 0 until one packet with thrust 0 has come since boot
-    (firmware facts, "Raw thrust").
+    (docs/firmware.md, "Raw thrust").
     """
 
     def __init__(self) -> None:

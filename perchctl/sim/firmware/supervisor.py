@@ -1,6 +1,6 @@
 """The supervisor: whether the motors may spin, decided 25 times a second.
 
-States, conditions and times are those of firmware facts, "Supervisor", "When setpoints
+States, conditions and times are those of docs/firmware.md, "Supervisor", "When setpoints
 stop" and "Contact, tumble, crash".
 """
 

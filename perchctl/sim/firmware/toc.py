@@ -1,7 +1,7 @@
 """The tables of log variables and parameters a Crazyflie announces.
 
 Groups and names follow the real firmware's; each table is filled up to the measured
-size (firmware facts, "Link": 385 log variables, 257 parameters).
+size (docs/firmware.md, "Link": 385 log variables, 257 parameters).
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ _MOTORS_STATES = (State.READY, State.FLYING, State.LANDED)
 class Firmware:
     """A Crazyflie 2.1 as firmware release 2026.08 (CRTP protocol 12) behaves.
 
-    Every behaviour is a row of the firmware facts. `step` senses, estimates,
+    Every behaviour is a fact of docs/firmware.md. `step` senses, estimates,
     supervises, controls, drives the motors and advances the world by
     `CONTROL_PERIOD_S`. Commands take effect in the next step.
     """
@@ -180,7 +180,7 @@ class Firmware:
 
     @property
     def supervisor_info(self) -> int:
-        """`supervisor.info`, uint16 (firmware facts, "Supervisor")."""
+        """`supervisor.info`, uint16 (docs/firmware.md, "Supervisor")."""
         return self.supervisor.info(
             hl_active=self.planner.active, hl_finished=self.planner.finished(self.t_s)
         )
