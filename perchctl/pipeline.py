@@ -67,8 +67,8 @@ class Pipeline:
 
 
 def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
-    """The profile's pipeline for a calibrated camera. One serves one thread: it owns an
-    OpenCV detector."""
+    """The profile's pipeline for a calibrated camera. It is never changed: several streams may
+    share one, each with a `PipelineState` of its own."""
     mount, gear_body_m = profile.camera.mount, profile.vehicle.gear_body_m
     pose = make_pose_setup(profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera)
     return Pipeline(
