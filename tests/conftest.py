@@ -1,0 +1,32 @@
+"""Slow modules first: a module is one worker's work, and the last one begun ends the run."""
+
+from __future__ import annotations
+
+import pytest
+
+SLOW_FIRST = (
+    "flight/test_flights.py",
+    "flight/test_realtime.py",
+    "test_docs.py",
+    "test_cli.py",
+    "flight/test_one_error.py",
+    "target/test_make_target.py",
+    "target/test_design.py",
+    "link/test_cflib_link.py",
+    "calibration/test_calibration_command.py",
+    "sim/test_crtp_process.py",
+    "sim/test_crtp_link.py",
+    "weights/test_command.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """In the order above, then as collected."""
+
+    def place(item: pytest.Item) -> int:
+        path = item.path.as_posix()
+        return next(
+            (i for i, name in enumerate(SLOW_FIRST) if path.endswith(name)), len(SLOW_FIRST)
+        )
+
+    items.sort(key=place)
