@@ -1,7 +1,7 @@
-"""The lockstep sibling of the cflib link: same protocol, no wall clock.
+"""The lockstep sibling of the cflib link: same protocol, same packets, no wall clock.
 
 `MockLink` flies a `SimulatedVehicle`; `ScriptedLink` plays back a list of
-telemetry and remembers what it was told.
+telemetry and records the commands.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from collections import deque
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from perchctl import vehicle as say
 from perchctl.errors import ConnectionFailed
+from perchctl.link.encode import UNLOCK_THRUST, encode
 from perchctl.link.telemetry import NEEDED, OPTIONAL, telemetry_from
-from perchctl.sim.firmware import commands as cf
+from perchctl.sim.crtp.codec import Packet
+from perchctl.sim.crtp.commands import CommandService
+from perchctl.sim.crtp.server import PROTOCOL_VERSION
 from perchctl.vehicle import FLYING, Command, Telemetry
 
 if TYPE_CHECKING:
@@ -25,10 +27,14 @@ SETTLE_S = 1.0
 
 
 class MockLink:
-    """The simulated vehicle in lockstep; `advance_to` is the flight's clock."""
+    """The simulated vehicle in lockstep; `advance_to` is the flight's clock.
+
+    Commands reach it as bytes, through the decoder of the simulated link's server.
+    """
 
     def __init__(self, vehicle: SimulatedVehicle, telemetry_period_s: float = 0.01) -> None:
         self.vehicle = vehicle
+        self._service = CommandService(vehicle.firmware, PROTOCOL_VERSION)
         self._period_s = telemetry_period_s
         self._samples: deque[Telemetry] = deque()
         self._next_sample_s = 0.0
@@ -38,7 +44,7 @@ class MockLink:
         return self.vehicle.firmware.t_s
 
     def advance_to(self, t_s: float) -> None:
-        """Let the vehicle live until `t_s`, sampling its telemetry on the way."""
+        """Step the vehicle until `t_s`, sampling its telemetry on the way."""
         while self._next_sample_s <= t_s:
             self.vehicle.advance_to(self._next_sample_s)
             self._samples.append(self._sample())
@@ -47,9 +53,7 @@ class MockLink:
 
     def connect(self) -> None:
         self.advance_to(self.now_s + SETTLE_S)
-        firmware = self.vehicle.firmware
-        firmware.low_level(cf.RawSetpoint(0.0, 0.0, 0.0, 0))
-        firmware.notify_setpoint_stop()
+        self._hand_over(UNLOCK_THRUST)
         self.advance_to(self.now_s + 0.1)
 
     def telemetry(self) -> list[Telemetry]:
@@ -59,24 +63,7 @@ class MockLink:
         return arrived
 
     def send(self, command: Command) -> None:
-        firmware = self.vehicle.firmware
-        match command:
-            case say.Idle():
-                pass
-            case say.PositionSetpoint(x, y, z, yaw):
-                firmware.low_level(cf.PositionCommand(x, y, z, math.degrees(yaw)))
-            case say.RawThrust(thrust):
-                firmware.low_level(cf.RawSetpoint(0.0, 0.0, 0.0, thrust))
-            case say.TakeOff(height, duration):
-                firmware.high_level(cf.HlTakeoff(height, duration))
-            case say.Land(height, duration):
-                firmware.notify_setpoint_stop()
-                firmware.high_level(cf.HlLand(height, duration))
-            case say.StopMotors():
-                firmware.low_level(cf.StopCommand())
-                firmware.notify_setpoint_stop()
-            case say.EmergencyStop():
-                firmware.emergency_stop()
+        self._hand_over(encode(command))
 
     def problem(self, now_s: float) -> str | None:
         return None
@@ -86,6 +73,10 @@ class MockLink:
         end_s = self.now_s + 6.0
         while self.vehicle.firmware.supervisor_info & FLYING and self.now_s < end_s:
             self.advance_to(self.now_s + 0.1)
+
+    def _hand_over(self, packets: Iterable[Packet]) -> None:
+        for packet in packets:
+            self._service.handle(packet)
 
     def _sample(self) -> Telemetry:
         firmware = self.vehicle.firmware

@@ -1,4 +1,4 @@
-"""The mission's table as text for docs/architecture.md: a diagram of the phases, a list of the rows.
+"""The mission's table as text for docs/architecture.md: a diagram of the phases, all rows.
 
 ``python -m perchctl.mission.diagram`` prints both; a test holds the page to them.
 """

@@ -1,4 +1,4 @@
-"""Commands as bytes: those of an unmodified cflib, for the same calls."""
+"""Commands as bytes: those of an unmodified cflib, on the real link and in lockstep alike."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from hypothesis import strategies as st
 from perchctl.errors import InvalidValue
 from perchctl.link.connection import send_packets
 from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
+from perchctl.link.mock import MockLink
 from perchctl.sim.crtp.codec import MAX_DATA, Packet
+from perchctl.sim.crtp.commands import CommandService
+from perchctl.sim.firmware.commands import HlLand, HlTakeoff, PositionCommand, RawSetpoint
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -99,6 +102,23 @@ def datagrams(packets: tuple[Packet, ...]) -> list[bytes]:
     return [packet.encode() for packet in packets]
 
 
+class Calls:
+    """A firmware that records what a decoder calls."""
+
+    def __init__(self) -> None:
+        self.made: list[tuple[str, tuple[Any, ...]]] = []
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda *arguments: self.made.append((name, arguments))
+
+
+def in_lockstep(command: Command) -> list[tuple[str, tuple[Any, ...]]]:
+    """What the lockstep link makes the firmware do."""
+    firmware = Calls()
+    MockLink(SimpleNamespace(firmware=firmware)).send(command)  # type: ignore[arg-type]
+    return firmware.made
+
+
 # --- Bytes ------------------------------------------------------------------------------------
 
 
@@ -130,7 +150,7 @@ def test_a_number_that_does_not_fit_is_refused(command: Command) -> None:
         encode(command)
 
 
-# --- The real link ----------------------------------------------------------------------------
+# --- Both links -------------------------------------------------------------------------------
 
 
 @given(commands(st.floats(width=32)))
@@ -138,3 +158,40 @@ def test_the_real_link_sends_these_packets(command: Command) -> None:
     recorder = Recorder()
     send_packets(recorder, encode(command))
     assert recorder.datagrams == by_cflib(command)
+
+
+@given(commands(st.floats(width=32, allow_nan=False)))
+def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None:
+    firmware = Calls()
+    server = CommandService(firmware, PROTOCOL)  # type: ignore[arg-type]
+    for datagram in by_cflib(command):
+        packet = Packet.decode(datagram)
+        assert packet is not None
+        server.handle(packet)
+    assert in_lockstep(command) == firmware.made
+
+
+@pytest.mark.parametrize(
+    ("command", "calls"),
+    [
+        (Idle(), []),
+        (
+            PositionSetpoint(0.25, -0.5, 1.5, math.pi / 2),
+            [("low_level", (PositionCommand(0.25, -0.5, 1.5, 90.0),))],
+        ),
+        (RawThrust(40000), [("low_level", (RawSetpoint(0.0, 0.0, 0.0, 40000),))]),
+        (TakeOff(0.5, 2.0), [("high_level", (HlTakeoff(0.5, 2.0, None),))]),
+        (
+            Land(-0.25, 3.0),
+            [("notify_setpoint_stop", (0.0,)), ("high_level", (HlLand(-0.25, 3.0, None),))],
+        ),
+        (EmergencyStop(), [("emergency_stop", ())]),
+    ],
+)
+def test_the_lockstep_vehicle_flies_the_command(command: Command, calls: list[Any]) -> None:
+    """Values that a float of four bytes holds exactly."""
+    assert in_lockstep(command) == calls
+
+
+def test_a_setpoint_that_is_no_number_does_not_reach_the_firmware() -> None:
+    assert in_lockstep(PositionSetpoint(math.nan, 0.0, 1.0, 0.0)) == []

@@ -1,6 +1,6 @@
 """A Crazyflie's commands as values; units and signs as cflib's calls have them.
 
-Both doors build these: the CRTP server by decoding packets, the mock link directly.
+Built by decoding packets (`perchctl.sim.crtp.commands`).
 """
 
 from __future__ import annotations
