@@ -59,7 +59,9 @@ def _packets(command: Command) -> tuple[Packet, ...]:
         case TakeOff(height, duration):
             return (_vertical(_TAKEOFF_2, height, duration),)
         case Land(height, duration):
-            return _NOTIFY, _vertical(_LAND_2, height, duration)
+            # The order first. The notify alone cuts the motors at once; with it lost, the
+            # setpoint watchdog still leaves 2 s in which the pair is repeated.
+            return _vertical(_LAND_2, height, duration), _NOTIFY
         case StopMotors():
             stop = Packet(Port.COMMANDER_GENERIC, _SETPOINT, bytes((_STOP,)))
             return stop, _NOTIFY

@@ -40,6 +40,7 @@ Acted = tuple[PlannerState, Command]
 REPEAT_ORDER_S = 0.5
 """An order that shows no effect in the telemetry is given again after this time."""
 MAX_ORDERS = 4
+STOPS, STOP_PERIOD_S = 5, 0.1
 
 
 def act(c: Context) -> Acted:
@@ -184,14 +185,19 @@ def _complete(c: Context) -> Acted:
 
 
 def _stop_motors(c: Context) -> Acted:
-    """Stop and notify, again while the telemetry still shows thrust: a lost packet must
-    not leave the motors running, and the pair is harmless twice."""
-    state = c.state
-    if state.ordered_s is not None and c.obs.t_s - state.ordered_s < REPEAT_ORDER_S:
+    """Stop and notify, several times whatever the telemetry shows, and again while it shows
+    thrust: one lost notify locks a vehicle that hangs well, one lost stop leaves the motors
+    running, and the pair is harmless twice (docs/firmware.md, "Repeated stop")."""
+    state, now_s = c.state, c.obs.t_s
+    if not state.motors_stopped or state.ordered_s is None:
+        return replace(state, motors_stopped=True, ordered_s=now_s, orders=1), StopMotors()
+    waited_s = now_s - state.ordered_s
+    repeated = state.orders >= STOPS
+    if waited_s < (REPEAT_ORDER_S if repeated else STOP_PERIOD_S):
         return state, Idle()
-    if state.ordered_s is not None and c.obs.telemetry.thrust < 1:
+    if repeated and c.obs.telemetry.thrust < 1:
         return state, Idle()
-    return replace(state, motors_stopped=True, ordered_s=c.obs.t_s), StopMotors()
+    return replace(state, ordered_s=now_s, orders=state.orders + 1), StopMotors()
 
 
 def _recover(c: Context) -> Acted:

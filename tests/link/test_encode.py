@@ -83,8 +83,8 @@ class Recorder:
             case TakeOff(height, duration):
                 self.high_level.takeoff(height, duration, yaw=None)  # keeps the heading
             case Land(height, duration):
-                self.commander.send_notify_setpoint_stop()
                 self.high_level.land(height, duration, yaw=None)
+                self.commander.send_notify_setpoint_stop()
             case StopMotors():
                 self.commander.send_stop_setpoint()
                 self.commander.send_notify_setpoint_stop()
@@ -183,7 +183,7 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
         (TakeOff(0.5, 2.0), [("high_level", (HlTakeoff(0.5, 2.0, None),))]),
         (
             Land(-0.25, 3.0),
-            [("notify_setpoint_stop", (0.0,)), ("high_level", (HlLand(-0.25, 3.0, None),))],
+            [("high_level", (HlLand(-0.25, 3.0, None),)), ("notify_setpoint_stop", (0.0,))],
         ),
         (EmergencyStop(), [("emergency_stop", ())]),
     ],

@@ -246,3 +246,33 @@ def test_the_perch_ends_by_itself(mode: str) -> None:
     kind = RawThrust if mode == "raw" else PositionSetpoint
     assert all(isinstance(c, kind) for c in sent)
     assert math.isclose(len(sent) * 0.02, PROFILE.planner.perch.timeout_s, abs_tol=0.1)
+
+
+def test_the_stop_is_sent_several_times() -> None:
+    """One lost notify would lock a vehicle that hangs well, one lost stop let it fly on."""
+    z_m = CEILING_M - PROFILE.vehicle.gear_body_m[2]
+    state = replace(state_in(Phase.COMPLETE, z_m=z_m), hover_thrust=56000.0)
+    sent: list[float] = []
+    for i in range(1, 120):
+        t_s = 10.0 + 0.02 * i
+        thrust = 0.0 if sent else 20000.0
+        obs = observation(t_s, telemetry=telemetry(t_s, z_m, thrust=thrust))
+        state, command = planner.step(state, obs, PROFILE)
+        assert state.phase is Phase.COMPLETE
+        if isinstance(command, StopMotors):
+            sent.append(t_s)
+    assert len(sent) == 5
+    assert sent[-1] - sent[0] < 0.6  # well within the supervisor's 2 s
+
+
+def test_a_stop_without_effect_is_repeated() -> None:
+    z_m = CEILING_M - PROFILE.vehicle.gear_body_m[2]
+    state = state_in(Phase.COMPLETE, z_m=z_m)
+    sent = 0
+    for i in range(1, 150):
+        obs = observation(
+            10.0 + 0.02 * i, telemetry=telemetry(10.0 + 0.02 * i, z_m, thrust=20000.0)
+        )
+        state, command = planner.step(state, obs, PROFILE)
+        sent += isinstance(command, StopMotors)
+    assert sent > 7
