@@ -40,15 +40,7 @@ class Telemetry:
 
 @dataclass(frozen=True)
 class Idle:
-    """Send nothing (on the ground, or while a high-level command runs)."""
-
-
-@dataclass(frozen=True)
-class TakeOff:
-    """High-level take-off to an absolute height; the vehicle flies it alone."""
-
-    height_m: float
-    duration_s: float
+    """Send nothing (on the ground, or while the vehicle lands by itself)."""
 
 
 @dataclass(frozen=True)
@@ -86,4 +78,4 @@ class EmergencyStop:
     """Cut the motors now and lock: the user's second Ctrl-C, or a useless attitude."""
 
 
-Command = Idle | TakeOff | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop
+Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop

@@ -44,11 +44,13 @@ def fly(parts: FlightParts) -> FlightReport:
     """
     senses = Senses(parts.link, parts.source, parts.pipeline, parts.profile)
     _wait_until_ready(parts, senses)  # nothing is started before it returns
+    if senses.history.newest is not None:
+        senses.ground_z_m = senses.history.newest.position_m[2]
     try:
         return _mission(parts, senses)
     except BaseException:
-        landing = parts.profile.planner.landing
-        rescue(parts.link, parts.clock, landing, parts.operator, senses.history.newest)
+        landing, newest = parts.profile.planner.landing, senses.history.newest
+        rescue(parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m)
         raise
 
 

@@ -32,6 +32,7 @@ class Senses:
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
     frames: int = 0
+    ground_z_m: float = 0.0  # of the estimate, where the flight begins
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
 

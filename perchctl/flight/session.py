@@ -6,6 +6,7 @@ import contextlib
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -119,13 +120,13 @@ def _true_miss_m(simulated: SimProcess | None) -> float | None:
 
 
 def _simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
-    try:
-        from perchctl.sim.draw import draw_scenario
-        from perchctl.sim.process.handle import SimProcess
-    except ImportError as error:
+    if find_spec("mujoco") is None:
         raise UsageError(
-            f"sim:// needs the simulator, which is not installed ({error.name} is missing); "
+            f"sim:// needs the simulator, which is not installed (mujoco is missing); "
             f"install it with: {sys.executable} -m pip install 'perchctl[sim]'"
-        ) from None
+        )
+    from perchctl.sim.draw import draw_scenario
+    from perchctl.sim.process.handle import SimProcess
+
     scenario = draw_scenario(options.profile, options.seed)
     return SimProcess.start(scenario, camera=camera, target=options.profile.target)

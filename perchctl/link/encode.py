@@ -21,7 +21,6 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     StopMotors,
-    TakeOff,
 )
 
 # Port 7: the channels, then the setpoints' types.
@@ -29,7 +28,7 @@ _SETPOINT, _META = 0, 1
 _STOP, _POSITION = 0, 7
 _NOTIFY_SETPOINT_STOP = 0
 # Port 8.
-_TAKEOFF_2, _LAND_2 = 7, 8
+_LAND_2 = 8
 _ALL_GROUPS = 0
 # Port 9, channel 1.
 _REQUEST = 1
@@ -56,8 +55,6 @@ def _packets(command: Command) -> tuple[Packet, ...]:
             return (Packet(Port.COMMANDER_GENERIC, _SETPOINT, data),)
         case RawThrust(thrust):
             return (_raw(thrust),)
-        case TakeOff(height, duration):
-            return (_vertical(_TAKEOFF_2, height, duration),)
         case Land(height, duration):
             # The order first. The notify alone cuts the motors at once; with it lost, the
             # setpoint watchdog still leaves 2 s in which the pair is repeated.

@@ -20,7 +20,6 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     StopMotors,
-    TakeOff,
     Telemetry,
 )
 from perchctl.vision.types import MARKERS, MarkerPose, PipelineOutput, TargetEstimate
@@ -90,13 +89,13 @@ FIELDS: dict[str, str] = {
     "tz_m": "target in the world of the state estimate",
     "tyaw_rad": "heading of the target in the world of the state estimate",
     # what was sent
-    "cmd": "idle, takeoff, position, thrust, stop, land or emergency",
+    "cmd": "idle, position, thrust, stop, land or emergency",
     "cmd_x_m": "position setpoint, world of the state estimate",
     "cmd_y_m": "position setpoint, world of the state estimate",
-    "cmd_z_m": "position setpoint, or the height of a take-off or landing",
+    "cmd_z_m": "position setpoint, or the height of a landing",
     "cmd_yaw_rad": "setpoint's heading",
     "cmd_thrust": "raw thrust 0..65535",
-    "cmd_duration_s": "duration of a take-off or landing",
+    "cmd_duration_s": "duration of a landing",
     "late_s": "how late this tick began",
     # simulation only
     "true_x_m": "true position of the body, simulation only",
@@ -251,8 +250,6 @@ def _command_values(command: Command | None) -> Mapping[str, Any]:
             return {}
         case Idle():
             return {"cmd": "idle"}
-        case TakeOff(height_m, duration_s):
-            return {"cmd": "takeoff", "cmd_z_m": height_m, "cmd_duration_s": duration_s}
         case PositionSetpoint(x_m, y_m, z_m, yaw_rad):
             return {"cmd": "position", **_xyz("cmd_", (x_m, y_m, z_m)), "cmd_yaw_rad": yaw_rad}
         case RawThrust(thrust):

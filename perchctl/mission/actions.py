@@ -1,10 +1,8 @@
 """What each phase sends: one small function a phase, (view) -> (state, command).
 
 Before each command ask: what if it is the last packet? A position setpoint left
-alone levels out after 0.5 s and is cut after 2 s (docs/firmware.md,
-"Silence"), so anything
-that ends a flight is handed to the vehicle's own high-level commander, which
-needs no further packet.
+alone levels out after 0.5 s and is cut after 2 s (docs/firmware.md, "When setpoints
+stop"). `perchctl.mission.release` holds what stops the motors, `landing` the way down.
 """
 
 from __future__ import annotations
@@ -13,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from perchctl.mission.context import HANGING_S, Context
+from perchctl.mission.context import Context
 from perchctl.mission.guidance import (
     FREE_SPEED_MPS,
     corrected,
@@ -23,24 +21,21 @@ from perchctl.mission.guidance import (
     under_target_xy,
     walk,
 )
-from perchctl.mission.state import Condition, MotorStop, Phase, PlannerState
+from perchctl.mission.landing import landing
+from perchctl.mission.release import Acted, catch, let_go, lower, stop_motors
+from perchctl.mission.state import Condition, MotorStop, Phase
 from perchctl.vehicle import (
-    Command,
     EmergencyStop,
     Idle,
-    Land,
     PositionSetpoint,
     RawThrust,
     StopMotors,
-    TakeOff,
 )
 
-Acted = tuple[PlannerState, Command]
-
-REPEAT_ORDER_S = 0.5
-"""An order that shows no effect in the telemetry is given again after this time."""
-MAX_ORDERS = 4
-STOPS, STOP_PERIOD_S = 5, 0.1
+BLOCKED_ROOM_M = 0.1
+"""How far a search keeps from what it once was pressed against."""
+LIFTED_M = 0.1
+"""Below it a vehicle may still stand, and its height is not to be corrected."""
 
 
 def act(c: Context) -> Acted:
@@ -91,23 +86,18 @@ def _target_goal(c: Context, z_m: float) -> PositionSetpoint:
 
 
 def _approach(c: Context) -> Acted:
+    """Rise from the ground on position setpoints. A stream that falls silent, at whatever
+    moment, ends in level-out and cut, never in a hover of the vehicle's own."""
     planner, state = c.profile.planner, c.state
     assert state.ground_m is not None
-    height = state.ground_m[2] + planner.takeoff_height_m
-    if state.setpoint is not None:
-        x, y = planner.approach_xy_m or (state.ground_m[0], state.ground_m[1])
-        goal = PositionSetpoint(x, y, height, state.entry_yaw_rad)
-        return _walk_to(c, goal)
-    waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
-    unseen = not c.high_level_active and not c.flying
-    if waited > 2 * REPEAT_ORDER_S and unseen and state.orders < MAX_ORDERS:
-        order = TakeOff(height, planner.takeoff_duration_s)
-        return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1), order
-    if waited >= planner.takeoff_duration_s and c.flying:
-        # "Finished" is by the clock: the position setpoint takes over at the same height.
-        start = PositionSetpoint(state.ground_m[0], state.ground_m[1], height, state.entry_yaw_rad)
-        return _fly_to(c, start)
-    return state, Idle()
+    x, y, z = state.ground_m
+    start = state.setpoint or PositionSetpoint(x, y, z, state.entry_yaw_rad)
+    if planner.approach_xy_m is not None and c.height_m > 0.7 * planner.takeoff_height_m:
+        x, y = planner.approach_xy_m
+    goal = PositionSetpoint(x, y, z + planner.takeoff_height_m, state.entry_yaw_rad)
+    c = Context(replace(state, setpoint=start), c.obs, c.profile)
+    setpoint = _walked(c, goal, planner.takeoff_speed_mps, 0.4)
+    return _fly_to(c, setpoint, lift=c.height_m > LIFTED_M)
 
 
 def _search(c: Context) -> Acted:
@@ -124,6 +114,8 @@ def _search(c: Context) -> Acted:
         height = min(z, c.contact_goal_z_m - c.profile.planner.ascend.near_m)
     else:
         top = max(z, ground_m[2] + search.max_height_m)
+        if state.blocked_z_m is not None:
+            top = min(top, state.blocked_z_m - BLOCKED_ROOM_M)
         height = min(z + search.step_m * state.searches, top)
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
     up_mps = c.profile.planner.ascend.speed_mps
@@ -164,46 +156,22 @@ def _perch(c: Context) -> Acted:
 
 
 def _complete(c: Context) -> Acted:
-    """Release in steps; stop the motors once the magnet is proven to hold; watch."""
-    complete, state = c.profile.planner.complete, c.state
-    if state.motors_stopped:
-        return _stop_motors(c)
-    if c.held(Condition.MAGNET_HOLDS) >= complete.hold_dwell_s:
-        return _stop_motors(c)
-    step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
-    part = step / complete.steps
-    if c.profile.planner.perch.mode == "raw":
-        # The lowest step stays below what could carry the vehicle, above the idle cut.
-        lowest = 0.9 * complete.hold_ratio * state.hover_thrust
-        thrust = c.profile.planner.perch.thrust
-        return state, RawThrust(int(thrust + part * (lowest - thrust)))
-    setpoint = state.setpoint or hold_here(c)
-    assert state.contact_z_m is not None
-    top = state.entry_m[2] + c.profile.planner.perch.press_m
-    low = state.contact_z_m - complete.release_drop_m
-    return _fly_to(c, replace(setpoint, z_m=top + part * (low - top)), lift=False)
-
-
-def _stop_motors(c: Context) -> Acted:
-    """Stop and notify, several times whatever the telemetry shows, and again while it shows
-    thrust: one lost notify locks a vehicle that hangs well, one lost stop leaves the motors
-    running, and the pair is harmless twice (docs/firmware.md, "Repeated stop")."""
-    state, now_s = c.state, c.obs.t_s
-    if not state.motors_stopped or state.ordered_s is None:
-        return replace(state, motors_stopped=True, ordered_s=now_s, orders=1), StopMotors()
-    waited_s = now_s - state.ordered_s
-    repeated = state.orders >= STOPS
-    if waited_s < (REPEAT_ORDER_S if repeated else STOP_PERIOD_S):
-        return state, Idle()
-    if repeated and c.obs.telemetry.thrust < 1:
-        return state, Idle()
-    return replace(state, ordered_s=now_s, orders=state.orders + 1), StopMotors()
+    """Release in two stages; stop the motors once the whole weight hangs; watch."""
+    if c.state.stopped_s is not None:
+        return stop_motors(c)
+    holds = c.held(Condition.MAGNET_HOLDS) >= c.profile.planner.complete.hold_dwell_s
+    return let_go(c) if holds or c.state.released_s is not None else lower(c)
 
 
 def _recover(c: Context) -> Acted:
     """Hold in the air `descend_m` below where the attempt ended. Position mode all
     along, so no controller is reset; the setpoint is below at once."""
+    if (caught := catch(c)) is not None:
+        return caught
     recover, state = c.profile.planner.recover, c.state
+    if not state.caught:
+        x, y, z = c.obs.telemetry.position_m  # from where it sinks no more
+        state = replace(state, caught=True, setpoint=None, entry_m=(x, y, z + recover.descend_m))
     z = state.entry_m[2] - recover.descend_m
     setpoint = state.setpoint or hold_here(c)
     if setpoint.z_m > z:
@@ -215,28 +183,6 @@ def _recover(c: Context) -> Acted:
         goal = replace(setpoint, z_m=z)
     c = Context(replace(state, setpoint=setpoint), c.obs, c.profile)
     return _walk_to(c, goal, up_mps=0.0, down_mps=FREE_SPEED_MPS)
-
-
-def _landing(c: Context) -> Acted:
-    """One high-level landing; given again only while it shows no effect. When the motors
-    are off already (on the ground, or hanging), nothing is started again."""
-    landing, state = c.profile.planner.landing, c.state
-    if state.motors_stopped or c.held(Condition.HANGING) >= HANGING_S:
-        return _stop_motors(c)
-    if c.obs.telemetry.thrust < 1 and (state.orders or not c.flying):
-        return state, Idle()  # on the floor: another order would spin the motors up again
-    ground_z = state.ground_m[2] if state.ground_m else 0.0
-    floor = ground_z - landing.undershoot_m
-    waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
-    near_floor = c.obs.telemetry.position_m[2] < ground_z + 0.15
-    if state.orders and near_floor and c.held(Condition.RESTING) > 1.0 and waited > 2.0:
-        return _stop_motors(c)
-    ignored = not c.high_level_active and waited > REPEAT_ORDER_S
-    if state.orders == 0 or (ignored and state.orders < MAX_ORDERS):
-        height = max(0.0, c.obs.telemetry.position_m[2] - floor)
-        order = Land(floor, max(1.0, height / landing.speed_mps))
-        return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
-    return state, Idle()
 
 
 def _terminal(c: Context) -> Acted:
@@ -266,7 +212,7 @@ ACTIONS: dict[Phase, Callable[[Context], Acted]] = {
     Phase.PERCH: _perch,
     Phase.COMPLETE: _complete,
     Phase.RECOVER: _recover,
-    Phase.LANDING: _landing,
+    Phase.LANDING: landing,
     Phase.PERCHED: _terminal,
     Phase.LANDED: _terminal,
     Phase.ABORTED: _aborted,

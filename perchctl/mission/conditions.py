@@ -12,6 +12,10 @@ from collections.abc import Callable
 from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
 
+FULL_THRUST = 65535
+STILL_MOTORS_THRUST = 5000
+"""At and below it the motors stand still (docs/firmware.md, "Raw thrust")."""
+
 
 def _aligned(c: Context) -> bool:
     align = c.profile.planner.align
@@ -64,27 +68,52 @@ def _magnet_holds(c: Context) -> bool:
 
 
 def _slipping(c: Context) -> bool:
-    """Falling away from the proven contact, by position or by acceleration."""
+    """Falling away from the proven contact, by position or by acceleration.
+
+    With the motors still, at the first sign: a fall is caught at the cost of the height it
+    has made by then (docs/firmware.md, "Catching a slip")."""
     complete, tel = c.profile.planner.complete, c.obs.telemetry
     if c.state.contact_z_m is None:
         return False
-    below = c.state.contact_z_m - tel.position_m[2] > complete.slip_m
+    below_m = c.state.contact_z_m - tel.position_m[2]
+    if c.state.released_s is not None and below_m > 0.008 and tel.velocity_mps[2] < -0.12:
+        return True
     sinking = tel.velocity_mps[2] < -0.15
-    return (below and sinking) or (sinking and tel.acc_z_g < complete.slip_acc_g)
+    return sinking and (below_m > complete.slip_m or tel.acc_z_g < complete.slip_acc_g)
+
+
+def _still(c: Context) -> bool:
+    """Not moving, and carried by something: the accelerometer reads one g."""
+    tel = c.obs.telemetry
+    at_rest = abs(tel.acc_z_g - 1.0) <= c.profile.planner.perch.contact_acc_g
+    return at_rest and abs(tel.velocity_mps[2]) < 0.05
+
+
+def _weight_hangs(c: Context) -> bool:
+    """The motors stand still, and the vehicle hangs where it made contact."""
+    return (
+        c.state.released_s is not None
+        and c.obs.telemetry.thrust <= STILL_MOTORS_THRUST
+        and _still(c)
+        and not _slipping(c)
+    )
 
 
 def _hanging(c: Context) -> bool:
     """Held up by the magnet, wherever the mission is: still, at the target's height, on
     a thrust that could not carry the vehicle."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
+    at_contact = (
+        c.state.contact_z_m is not None
+        and abs(tel.position_m[2] - c.state.contact_z_m) <= complete.slip_m
+    )
+    at_target = c.obs.target is not None and abs(c.error_z_m) <= 0.15
     return (
         c.state.hover_thrust > 0
         and tel.thrust <= complete.hold_ratio * c.state.hover_thrust
         and c.height_m > 0.3
-        and c.obs.target is not None
-        and abs(c.error_z_m) <= 0.15
-        and abs(tel.velocity_mps[2]) < 0.05
-        and abs(tel.acc_z_g - 1.0) <= c.profile.planner.perch.contact_acc_g
+        and (at_contact or at_target)
+        and _still(c)
     )
 
 
@@ -113,10 +142,28 @@ def _down(c: Context) -> bool:
     return c.obs.telemetry.thrust < 1 and not c.flying
 
 
-def _resting(c: Context) -> bool:
-    """On the floor, or hung up: not moving although a lower height is asked for."""
-    tel = c.obs.telemetry
-    return abs(tel.velocity_mps[2]) < 0.05 and abs(tel.acc_z_g - 1.0) < 0.1
+def _on_floor(c: Context) -> bool:
+    """Low, not moving, and on a thrust that could not carry the vehicle."""
+    complete = c.profile.planner.complete
+    carried = c.state.hover_thrust > 0 and (
+        c.obs.telemetry.thrust <= complete.hold_ratio * c.state.hover_thrust
+    )
+    near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
+    low = c.height_m < c.profile.planner.landing.handover_m
+    return carried and low and not near_target and _still(c)
+
+
+def _blocked(c: Context) -> bool:
+    """Pressed against something: the setpoint is above, the thrust at its limit or above
+    what hovering takes, and nothing moves."""
+    setpoint, tel, safety = c.state.setpoint, c.obs.telemetry, c.profile.safety
+    if setpoint is None or setpoint.z_m - tel.position_m[2] < 0.08:
+        return False
+    hover = c.state.hover_thrust
+    pressing = tel.thrust >= 0.98 * FULL_THRUST or (
+        hover > 0 and tel.thrust >= safety.blocked_thrust_ratio * hover
+    )
+    return pressing and c.height_m > 0.15 and _still(c)
 
 
 CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
@@ -133,18 +180,37 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.STEADY: _steady,
     Condition.TILTED: _tilted,
     Condition.DOWN: _down,
-    Condition.RESTING: _resting,
+    Condition.ON_FLOOR: _on_floor,
+    Condition.WEIGHT_HANGS: _weight_hangs,
+    Condition.BLOCKED: _blocked,
     Condition.BATTERY_LOW: lambda c: c.battery_is_low,
 }
 KEPT_OVER_A_CHANGE = (Condition.BATTERY_LOW, Condition.TILTED)
 """The vehicle's own, whatever the phase, and however it is held."""
 
 
+PROOFS = frozenset(
+    {
+        Condition.CONTACT,
+        Condition.MAGNET_HOLDS,
+        Condition.HANGING,
+        Condition.WEIGHT_HANGS,
+        Condition.DOWN,
+        Condition.ON_FLOOR,
+    }
+)
+"""What may stop the motors or end a flight: it counts over fresh telemetry only."""
+
+
 def conditions_since(c: Context) -> dict[Condition, float]:
     """`PlannerState.since` of this tick. A condition seen while the vehicle is held
-    in place for a fault, or in stale telemetry, does not count."""
+    in place for a fault does not count, a proof in old telemetry neither."""
     old = c.state.since
-    return {name: old.get(name, c.obs.t_s) for name, holds in CONDITIONS.items() if holds(c)}
+    return {
+        name: old.get(name, c.obs.t_s)
+        for name, holds in CONDITIONS.items()
+        if (c.proves or name not in PROOFS) and holds(c)
+    }
 
 
 def hold_reason(c: Context) -> str:

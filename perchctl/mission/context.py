@@ -49,6 +49,11 @@ class Context:
         return self.obs.t_s - self.obs.telemetry.t_s
 
     @property
+    def proves(self) -> bool:
+        """Whether the telemetry is new enough to prove anything. What is old is unknown."""
+        return self.telemetry_age_s <= self.profile.safety.proof_age_s
+
+    @property
     def flying(self) -> bool:
         return self.obs.telemetry.has(FLYING)
 

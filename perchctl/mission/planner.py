@@ -131,9 +131,18 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
     """What a phase starts with, beyond the clock."""
     match new.phase:
         case Phase.COMPLETE:
-            return replace(new, contact_z_m=obs.telemetry.position_m[2])
+            return replace(new, contact_z_m=obs.telemetry.position_m[2], released_s=None)
         case Phase.RECOVER:
-            return replace(new, motors_stopped=False, contact_z_m=None)
+            slipped = old.phase is Phase.COMPLETE
+            blocked_z_m = obs.telemetry.position_m[2] if new.row == "blocked" else old.blocked_z_m
+            return replace(
+                new,
+                stopped_s=None,
+                contact_z_m=None,
+                released_s=None,
+                caught=not slipped,
+                blocked_z_m=blocked_z_m,
+            )
         case Phase.ASCEND:
             return replace(new, searches=0)
         case Phase.SEARCH if old.setpoint is not None:

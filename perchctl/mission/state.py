@@ -77,7 +77,9 @@ class Condition(Enum):
     STEADY = "steady"
     TILTED = "tilted"
     DOWN = "down"
-    RESTING = "resting"
+    ON_FLOOR = "on the floor"
+    WEIGHT_HANGS = "the whole weight hangs"
+    BLOCKED = "blocked"
     BATTERY_LOW = "battery low"
 
 
@@ -155,9 +157,12 @@ class PlannerState:
     setpoint: PositionSetpoint | None = None
     integral_m: tuple[float, float] = (0.0, 0.0)
     hover_thrust: float = 0.0
-    contact_z_m: float | None = None
-    ordered_s: float | None = None  # last order of a take-off, landing or motor stop
+    contact_z_m: float | None = None  # height of the body while it is held by the magnet
+    released_s: float | None = None  # begin of the release by raw thrust
+    caught: bool = True  # False after a slip, until the fall is stopped
+    blocked_z_m: float | None = None  # something solid is above
+    ordered_s: float | None = None  # last order of a landing or motor stop
     orders: int = 0
-    motors_stopped: bool = False
+    stopped_s: float | None = None  # first order to stop the motors
     jump_s: float | None = None
     hold: str = ""  # why the vehicle is held in place, empty when it is not

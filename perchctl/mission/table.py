@@ -75,8 +75,20 @@ def _attempts_used(c: Context) -> bool:
     return c.state.attempts >= c.profile.planner.attempts
 
 
-def _is_high(c: Context) -> bool:
-    return c.height_m > 0.3 and abs(c.error_z_m) < 0.15
+def _is_blocked(c: Context) -> bool:
+    return c.held(C.BLOCKED) >= c.profile.safety.blocked_s
+
+
+def _stopped_for_s(c: Context) -> float:
+    return -1.0 if c.state.stopped_s is None else c.obs.t_s - c.state.stopped_s
+
+
+def _hangs_stopped(c: Context) -> bool:
+    """The motors were stopped where it hung, and there it still is."""
+    state, tel = c.state, c.obs.telemetry
+    if state.stopped_s is None or state.contact_z_m is None or not c.proves:
+        return False
+    return state.contact_z_m - tel.position_m[2] <= c.profile.planner.complete.slip_m
 
 
 def _settling_too_long(c: Context) -> bool:
@@ -90,6 +102,12 @@ TABLE: tuple[Row, ...] = (
         "operator-stop", AIR, lambda c: c.obs.operator >= Operator.STOP, P.ABORTED,
         "second Ctrl-C: emergency stop", S.STOP, O.EMERGENCY,
         motor_stop=MotorStop.EMERGENCY,
+    ),
+    Row(
+        "hung-but-locked", _only(P.COMPLETE, P.LANDING),
+        lambda c: c.obs.telemetry.has(LOCKED) and _hangs_stopped(c), P.PERCHED,
+        "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
+        outcome=O.PERCHED,
     ),
     Row(
         "locked", AIR, lambda c: c.obs.telemetry.has(LOCKED), P.ABORTED,
@@ -109,7 +127,7 @@ TABLE: tuple[Row, ...] = (
     Row(
         "tilted", AIR,
         lambda c: c.held(C.TILTED) >= c.profile.safety.tilt_debounce_s
-        and not c.state.motors_stopped,
+        and c.state.stopped_s is None,
         P.ABORTED, "tilted beyond the limit: motors cut", S.STOP, O.SAFETY,
         motor_stop=MotorStop.EMERGENCY,
     ),
@@ -182,6 +200,18 @@ TABLE: tuple[Row, ...] = (
         "caught", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
         lambda c: c.held(C.HANGING) >= HANGING_S, P.COMPLETE,
         "hanging on the magnet already",
+    ),
+    # --- something is in the way -----------------------------------------------
+    Row(
+        "cannot-rise", _only(P.APPROACH), _is_blocked, P.LANDING,
+        lambda c: f"pressed at {c.height_m:.2f} m: something is above, or the thrust is weak",
+        S.LAND, O.SAFETY,
+    ),
+    Row(
+        "blocked", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER), _is_blocked,
+        P.RECOVER,
+        lambda c: f"pressed against something at {c.height_m:.2f} m", S.BACK_OFF,
+        counts_attempt=True,
     ),
     # --- phase 1: approach ---------------------------------------------------
     Row(
@@ -266,20 +296,19 @@ TABLE: tuple[Row, ...] = (
     # --- phase 7: completion -------------------------------------------------
     Row(
         "slipped", _only(P.COMPLETE), lambda c: c.held(C.SLIPPING) >= 0.03, P.RECOVER,
-        lambda c: "slipped while hanging" if c.state.motors_stopped else "the magnet does not hold",
+        lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
         S.BACK_OFF, counts_attempt=True,
     ),
     Row(
         "not-released", _only(P.COMPLETE),
-        lambda c: not c.state.motors_stopped
+        lambda c: c.state.stopped_s is None
         and c.in_phase_s > c.profile.planner.complete.release_timeout_s,
         P.RECOVER, "the thrust could not be released", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
         "perched", _only(P.COMPLETE),
-        lambda c: c.state.motors_stopped
-        and c.held(C.DOWN) >= 0.1
-        and c.in_phase_s >= c.profile.planner.complete.watch_s,
+        lambda c: _stopped_for_s(c) >= c.profile.planner.complete.watch_s
+        and c.held(C.DOWN) >= 0.1,
         P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
     ),
     # --- the failed attempt --------------------------------------------------
@@ -301,8 +330,11 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- landing ---------------------------------------------------------------
     Row(
-        "landed", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1, P.LANDED,
-        lambda c: "motors off, hanging on the magnet" if _is_high(c) else "motors off",
+        "hung", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1 and _hangs_stopped(c), P.PERCHED,
+        "the magnet holds: hanging with the motors off",
+    ),
+    Row(
+        "landed", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1, P.LANDED, "motors off",
     ),
     Row(
         "landing-timeout", _only(P.LANDING),

@@ -81,18 +81,25 @@ class PerchConfig(Section):
 
 
 class CompleteConfig(Section):
-    """Phase 7. Thrust is released in `steps` over `release_s`; the magnet must hold
-    with the thrust below `hold_ratio` of the hover thrust before the motors stop."""
+    """Phase 7. The thrust is released in two stages, before the motors stop.
+
+    By position setpoints in `steps` over `release_s`, as far as the onboard controller
+    goes: the magnet must hold for `hold_dwell_s` with the thrust below `hold_ratio` of the
+    hover thrust. Then by raw thrust over `ramp_s` down to where the motors stand still with
+    the stream alive: the whole weight must hang for `hang_s`. `watch_s` after the stop.
+    """
 
     steps: int = Field(5, ge=1, le=50)
     release_s: float = Field(0.8, gt=0, le=10)
     release_drop_m: float = Field(0.25, gt=0, le=1)
     hold_ratio: float = Field(0.6, gt=0, lt=1)
     hold_dwell_s: float = Field(0.3, ge=0, le=5)
-    release_timeout_s: float = Field(4.0, gt=0, le=30)
+    ramp_s: float = Field(0.5, gt=0, le=10)
+    hang_s: float = Field(1.0, ge=0.3, le=10)
+    release_timeout_s: float = Field(8.0, gt=0, le=30)
     slip_m: float = Field(0.03, gt=0, le=0.3)
     slip_acc_g: float = Field(0.5, gt=0, lt=1)
-    watch_s: float = Field(2.5, gt=0, le=60)
+    watch_s: float = Field(1.5, gt=0, le=60)
 
 
 class RecoverConfig(Section):
@@ -105,17 +112,19 @@ class RecoverConfig(Section):
 
 
 class LandingConfig(Section):
-    """`undershoot_m` below the ground of the estimate, so that a drifted height still
-    ends on the floor."""
+    """Down by position setpoints at `speed_mps` to `handover_m`, the rest by the vehicle's
+    own landing, which goes to `undershoot_m` below the ground of the estimate, so that a
+    drifted height still ends on the floor."""
 
-    speed_mps: float = Field(0.35, gt=0, le=1)
+    speed_mps: float = Field(0.3, gt=0, le=1)
+    handover_m: float = Field(0.3, ge=0.1, le=2)
     undershoot_m: float = Field(0.05, ge=0, le=1)
-    timeout_s: float = Field(20.0, gt=0, le=120)
+    timeout_s: float = Field(30.0, gt=0, le=120)
 
 
 class PlannerConfig(Section):
     takeoff_height_m: float = Field(0.5, ge=0.2, le=5)
-    takeoff_duration_s: float = Field(2.5, gt=0.5, le=20)
+    takeoff_speed_mps: float = Field(0.3, gt=0, le=1)  # of the setpoint
     approach_xy_m: tuple[float, float] | None = None  # fly here after take-off
     approach_timeout_s: float = Field(15.0, gt=0, le=120)
     search: SearchConfig = SearchConfig()
@@ -141,6 +150,7 @@ class SafetyConfig(Section):
     battery_stale_s: float = Field(90.0, gt=0, le=600)  # grace for a reading that stands still
     telemetry_hold_s: float = Field(0.3, gt=0, le=5)
     telemetry_land_s: float = Field(1.0, gt=0, le=10)
+    proof_age_s: float = Field(0.1, gt=0, le=0.5)  # older telemetry proves nothing
     camera_hold_s: float = Field(0.5, gt=0, le=10)
     camera_land_s: float = Field(3.0, gt=0, le=60)
     max_frame_age_s: float = Field(0.4, gt=0, le=5)
@@ -154,4 +164,6 @@ class SafetyConfig(Section):
     loop_late_land_s: float = Field(1.0, gt=0, le=10)
     estimator_wait_s: float = Field(10.0, gt=0, le=60)
     estimator_variance_m2: float = Field(0.01, gt=0, le=10)
+    blocked_s: float = Field(0.7, gt=0, le=5)  # pressed and not moving for so long
+    blocked_thrust_ratio: float = Field(1.1, gt=1, le=2)  # of the hover thrust
     land_on_log_error: bool = False

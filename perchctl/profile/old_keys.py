@@ -11,7 +11,11 @@ RENAMED: dict[str, str] = {
     "planner.trim_limit_m": "integral_limit_m",
 }
 """Dotted path -> the key's present name, in the same section."""
-UNUSED: tuple[str, ...] = ("merge.z1_m", "planner.recover.speed_mps")
+UNUSED: tuple[str, ...] = (
+    "merge.z1_m",
+    "planner.recover.speed_mps",
+    "planner.takeoff_duration_s",
+)
 """Nothing depends on them any more: left out."""
 
 

@@ -30,8 +30,8 @@ from perchctl.vehicle import (
     EmergencyStop,
     Idle,
     Land,
+    PositionSetpoint,
     StopMotors,
-    TakeOff,
     Telemetry,
 )
 from perchctl.vision.types import CameraModel, Frame
@@ -65,7 +65,9 @@ class Vehicle(ScriptedLink):
         self._samples: list[Telemetry] = []
         self.z_m = 0.0
         self._goal_m: float | None = None
+        self.by_itself = False
         self.motors = False
+        self.by_itself = False
         self._off_s = -math.inf
 
     def advance_to(self, t_s: float) -> None:
@@ -82,8 +84,10 @@ class Vehicle(ScriptedLink):
     def send(self, command: Command) -> None:
         super().send(command)
         match command:
-            case TakeOff(height, _) | Land(height, _):
-                self._goal_m, self.motors = height, True
+            case PositionSetpoint(z_m=height):
+                self._goal_m, self.motors, self.by_itself = height, True, False
+            case Land(height, _):
+                self._goal_m, self.motors, self.by_itself = height, True, True
             case StopMotors():
                 self._stop()
 
@@ -91,12 +95,12 @@ class Vehicle(ScriptedLink):
         if self._goal_m is not None and self.motors:
             way = self._goal_m - self.z_m
             self.z_m += max(-SINK_MPS * dt_s, min(CLIMB_MPS * dt_s, way))
-            if self.z_m <= 0.0 and self._goal_m <= 0.0:
+            if self.by_itself and self.z_m <= 0.0 and self._goal_m <= 0.0:
                 self.z_m = 0.0
                 self._stop()
         in_air = self.motors or self.now_s - self._off_s < 2.0
         bits = AIRBORNE if in_air else READY
-        if self.motors and self._goal_m is not None:
+        if self.motors and self.by_itself:
             bits |= HL_ACTIVE
         sample = telemetry(
             self.now_s,
@@ -258,9 +262,9 @@ def _later(real: Callable[..., Any], calls: int) -> Callable[..., Any]:
 def landed_after_a_break(rig: Rig) -> None:
     with pytest.raises(Broken):
         rig.fly()
-    assert rig.link.said(TakeOff)
+    assert rig.link.said(PositionSetpoint)
     (order_s,) = rig.link.said(Land)
-    assert order_s > rig.link.said(TakeOff)[0]
+    assert order_s > rig.link.said(PositionSetpoint)[0]
     land = next(c for _, c in rig.link.sent if isinstance(c, Land))
     assert land.height_m < 0.0
     assert land.duration_s >= 1.0
@@ -320,7 +324,7 @@ def test_a_failure_right_after_the_take_off_order_lands(after_s: float) -> None:
     rig = Rig(Vehicle(delay_s=0.15))
 
     def leave(tick: Tick) -> None:
-        orders = rig.link.said(TakeOff)
+        orders = rig.link.said(PositionSetpoint)
         if orders and tick.t_s >= orders[0] + after_s - 1e-9:
             raise Broken
 
@@ -420,10 +424,10 @@ def test_what_does_not_come_in_time_is_refused(
 def test_an_estimate_that_settles_is_waited_for() -> None:
     rig = Rig(
         Vehicle(lambda s: replace(s, position_variance_m2=0.5 if s.t_s < 3.0 else 1e-4)),
-        operator=lambda: Operator.LAND if rig.link.said(TakeOff) else Operator.NONE,
+        operator=lambda: Operator.LAND if rig.link.said(PositionSetpoint) else Operator.NONE,
     )
     rig.fly()
-    assert 3.0 <= rig.link.said(TakeOff)[0] < 3.2
+    assert 3.0 <= rig.link.said(PositionSetpoint)[0] < 3.2
 
 
 def test_pictures_of_another_size_are_refused() -> None:
@@ -555,7 +559,7 @@ def test_a_suspended_computer_lands_and_does_not_catch_up() -> None:
     assert rig.link.said(Land)[0] == times[gap + 1]  # at once
     first = rig.watcher.ticks[gap + 1]
     assert first.loop_late_s > 29.0
-    assert not [t for t in rig.link.said(TakeOff) if t > times[gap]]
+    assert not [t for t in rig.link.said(PositionSetpoint) if t > times[gap]]
 
 
 def test_a_short_hiccup_is_one_late_turn() -> None:

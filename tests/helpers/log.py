@@ -18,7 +18,6 @@ from perchctl.vehicle import (
     Land,
     PositionSetpoint,
     StopMotors,
-    TakeOff,
     Telemetry,
 )
 from perchctl.vision.types import (
@@ -152,7 +151,7 @@ def ticks(seed: int = 7) -> Iterator[dict[str, Any]]:
 def _command(phase: str, z_m: float) -> Command:
     match phase:
         case "APPROACH":
-            return TakeOff(0.5, 2.5)
+            return PositionSetpoint(0.3, -0.2, 0.5, 0.5)
         case "COMPLETE":
             return StopMotors()
         case "PERCHED":

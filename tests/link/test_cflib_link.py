@@ -32,7 +32,6 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     StopMotors,
-    TakeOff,
     Telemetry,
 )
 
@@ -126,7 +125,7 @@ def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
 
 
 def take_off(link: CflibLink, sim: SimProcess) -> None:
-    link.send(TakeOff(0.4, 1.5))
+    cf(link).high_level_commander.takeoff(0.4, 1.5)
     until(lambda: sim.truth()["position_m"][2] > 0.3)
 
 

@@ -21,7 +21,7 @@ from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
 from perchctl.link.mock import MockLink
 from perchctl.sim.crtp.codec import MAX_DATA, Packet
 from perchctl.sim.crtp.commands import CommandService
-from perchctl.sim.firmware.commands import HlLand, HlTakeoff, PositionCommand, RawSetpoint
+from perchctl.sim.firmware.commands import HlLand, PositionCommand, RawSetpoint
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -30,7 +30,6 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     StopMotors,
-    TakeOff,
 )
 
 PROTOCOL = 12
@@ -43,7 +42,6 @@ def commands(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[Command]:
         st.just(Idle()),
         st.builds(PositionSetpoint, numbers, numbers, numbers, st.floats(-1e3, 1e3)),
         st.builds(RawThrust, st.integers(0, THRUST_MAX)),
-        st.builds(TakeOff, numbers, numbers),
         st.builds(Land, numbers, numbers),
         st.just(StopMotors()),
         st.just(EmergencyStop()),
@@ -80,10 +78,8 @@ class Recorder:
                 self.commander.send_position_setpoint(x, y, z, math.degrees(yaw))
             case RawThrust(thrust):
                 self.commander.send_setpoint(0.0, 0.0, 0.0, thrust)
-            case TakeOff(height, duration):
-                self.high_level.takeoff(height, duration, yaw=None)  # keeps the heading
             case Land(height, duration):
-                self.high_level.land(height, duration, yaw=None)
+                self.high_level.land(height, duration, yaw=None)  # keeps the heading
                 self.commander.send_notify_setpoint_stop()
             case StopMotors():
                 self.commander.send_stop_setpoint()
@@ -180,7 +176,6 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
             [("low_level", (PositionCommand(0.25, -0.5, 1.5, 90.0),))],
         ),
         (RawThrust(40000), [("low_level", (RawSetpoint(0.0, 0.0, 0.0, 40000),))]),
-        (TakeOff(0.5, 2.0), [("high_level", (HlTakeoff(0.5, 2.0, None),))]),
         (
             Land(-0.25, 3.0),
             [("high_level", (HlLand(-0.25, 3.0, None),)), ("notify_setpoint_stop", (0.0,))],

@@ -27,7 +27,6 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     StopMotors,
-    TakeOff,
 )
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held, note
@@ -125,7 +124,7 @@ def test_commands_and_telemetry_in_a_record() -> None:
 
     assert of(PositionSetpoint(1.0, 2.0, 3.0, 0.5))["cmd_z_m"] == 3.0
     assert of(RawThrust(60000))["cmd_thrust"] == 60000
-    assert of(TakeOff(0.5, 2.5))["cmd_duration_s"] == 2.5
+    assert of(Land(-0.05, 2.5))["cmd_duration_s"] == 2.5
     assert of(Land(-0.05, 2.0))["cmd_z_m"] == -0.05
     names = [of(c)["cmd"] for c in (Idle(), StopMotors(), EmergencyStop(), None)]
     assert names == ["idle", "stop", "emergency", None]
@@ -142,7 +141,7 @@ def test_every_field_is_filled_by_something() -> None:
     seen: set[str] = set()
     frame = synthetic.output(3, pose, rng)
     frame.poses["joint"] = frame.poses["large"]
-    commands = (TakeOff(0.5, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.1), RawThrust(1))
+    commands = (Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.1), RawThrust(1))
     for command in commands:
         record = tick_record(
             t_s=1.0,

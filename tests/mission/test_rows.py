@@ -30,6 +30,7 @@ from perchctl.vehicle import (
     Command,
     EmergencyStop,
     Idle,
+    PositionSetpoint,
     StopMotors,
 )
 from tests.helpers.mission import (
@@ -126,17 +127,27 @@ def old(look: Look, since_s: float) -> Look:
     return aged
 
 
+def blind(look: Look) -> Look:
+    """Without any target."""
+    return lambda t_s: replace(look(t_s), target=None)
+
+
 LAND_ON_LOG = PROFILE.model_copy(
     update={"safety": PROFILE.safety.model_copy(update={"land_on_log_error": True})}
 )
 QUIET = HOVER_THRUST * 0.5
-PRESSED = HOVER_THRUST * 1.1
+PRESSED = HOVER_THRUST * 1.12
+FULL = 65535.0
 OFF = {"thrust": 0.0, "supervisor": READY}
 
 # row of the table: its case
 CASES: dict[str, Case] = {
     "operator-stop": Case(
         P.ALIGN, P.ABORTED, seen(operator=Operator.STOP), 0.1, O.EMERGENCY, EmergencyStop
+    ),
+    "hung-but-locked": Case(
+        P.COMPLETE, P.PERCHED, flown(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED), 0.1,
+        O.PERCHED, state={"stopped_s": START_S, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
     ),
     "locked": Case(P.ALIGN, P.ABORTED, flown(supervisor=AIRBORNE | LOCKED), 0.1, O.SAFETY,
                    StopMotors),
@@ -165,6 +176,14 @@ CASES: dict[str, Case] = {
         P.ALIGN, P.LANDING, seen(), 0.1, O.ATTEMPTS_USED_UP, state={"started_s": -1000.0}
     ),
     "caught": Case(P.PERCH, P.COMPLETE, flown(2.1, thrust=QUIET), 1.2, z_m=2.1),
+    "cannot-rise": Case(
+        P.APPROACH, P.LANDING, flown(0.3, thrust=FULL), 0.9, O.SAFETY,
+        state={"setpoint": PositionSetpoint(0.0, 0.0, 0.5, 0.0)}, z_m=0.3,
+    ),
+    "blocked": Case(
+        P.SEARCH, P.RECOVER, blind(flown(1.0, thrust=PRESSED)), 0.9,
+        state={"setpoint": PositionSetpoint(0.0, 0.0, 1.3, 0.0), "entry_m": (0.0, 0.0, 1.3)},
+    ),
     "approached": Case(P.APPROACH, P.SEARCH, seen(0.5), 0.4, z_m=0.5),
     "approach-timeout": Case(
         P.APPROACH, P.LANDING, seen(0.1), 0.1, O.SAFETY, state={"entered_s": -20.0}, z_m=0.1
@@ -196,7 +215,7 @@ CASES: dict[str, Case] = {
     ),
     "perched": Case(
         P.COMPLETE, P.PERCHED, flown(CONTACT_Z_M, **OFF), 0.3, O.PERCHED,
-        state={"entered_s": 0.0, "motors_stopped": True}, z_m=CONTACT_Z_M,
+        state={"stopped_s": START_S - 3.0, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
     ),
     "attempts-used": Case(
         P.RECOVER, P.LANDING, seen(), 0.7, O.ATTEMPTS_USED_UP,
@@ -207,13 +226,18 @@ CASES: dict[str, Case] = {
         P.RECOVER, P.LANDING, flown(velocity_mps=(0.5, 0.0, 0.0)), 0.1, O.SAFETY,
         state={"entered_s": 0.0},
     ),
+    "hung": Case(
+        P.LANDING, P.PERCHED, flown(CONTACT_Z_M, **OFF), 0.3, O.OPERATOR,
+        state={"outcome": O.OPERATOR, "stopped_s": START_S, "contact_z_m": CONTACT_Z_M},
+        z_m=CONTACT_Z_M,
+    ),
     "landed": Case(
         P.LANDING, P.LANDED, flown(0.02, **OFF), 0.3, O.OPERATOR,
         state={"outcome": O.OPERATOR, "orders": 1}, z_m=0.02,
     ),
     "landing-timeout": Case(
         P.LANDING, P.ABORTED, seen(), 0.1, O.SAFETY, Idle,
-        state={"entered_s": -20.0, "orders": 1, "ordered_s": START_S},
+        state={"entered_s": -40.0, "orders": 1, "ordered_s": START_S},
     ),
 }  # fmt: skip
 

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -23,8 +24,8 @@ import pytest
 import perchctl
 from perchctl.calibration.files import load_calibration
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link.encode import encode
 from perchctl.profile.places import data_file
+from perchctl.sim.crtp.codec import Packet, Port
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.child import main
 from perchctl.sim.process.control import HostSetup
@@ -33,7 +34,6 @@ from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.process.mjpeg import MjpegServer
 from perchctl.sim.process.runner import MAX_LAG_S, Runner
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.vehicle import TakeOff
 from perchctl.vision.types import CameraModel
 from tests.helpers.crtp_rig import Client
 
@@ -124,8 +124,8 @@ def test_the_same_scenario_gives_the_same_flight(stepped: SimProcess) -> None:
     def flight(sim: SimProcess) -> dict[str, object]:
         sim.advance(1.0)
         with wired(sim.uri) as mine:
-            for packet in encode(TakeOff(0.5, 2.0)):
-                mine.send(packet.encode())
+            data = struct.pack("<BBff?f", 7, 0, 0.5, 0.0, True, 2.0)  # takeoff_2
+            mine.send(Packet(Port.HIGH_LEVEL, 0, data).encode())
             sim.advance(4.0)
         truth = sim.truth()
         assert truth["position_m"][2] > 0.3

@@ -1,0 +1,119 @@
+"""The way down: by position setpoints as long as height and link can be trusted, the rest by
+the vehicle's own landing, which needs no further packet.
+
+What hangs on the magnet is first peeled off: the setpoint goes down and the thrust with it.
+Where the magnet holds all the same, a landing would drop the vehicle when its trajectory
+ends; then the whole weight is put on the magnet instead, and watched.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from perchctl.mission.context import HANGING_S, Context
+from perchctl.mission.guidance import hold_here, limited, walk
+from perchctl.mission.release import Acted, catch, let_go, stop_motors
+from perchctl.mission.state import Condition
+from perchctl.vehicle import Idle, Land
+
+REPEAT_ORDER_S = 0.5
+"""An order that shows no effect in the telemetry is given again after this time."""
+MAX_ORDERS = 6
+TOUCHDOWN_MPS = 0.35
+PEELED_M = 0.1
+"""Below the contact by so much, the magnet has let go."""
+_PEAK_OF_MEAN = 1.875
+"""Of a quintic from rest to rest: its largest speed over its mean."""
+
+
+def landing_time_s(height_m: float) -> float:
+    """For the vehicle's own landing: a quintic that is nowhere faster than a soft touchdown."""
+    return max(1.0, _PEAK_OF_MEAN * height_m / TOUCHDOWN_MPS)
+
+
+def landing(c: Context) -> Acted:
+    state = c.state
+    if state.stopped_s is not None:
+        return _hang_on(c) if state.contact_z_m is not None else stop_motors(c)
+    if not state.caught and (caught := catch(c)) is not None:
+        return caught
+    if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
+        return stop_motors(c)
+    if state.released_s is not None:
+        return _hang_on(c)
+    if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
+        return let_go(c)
+    if state.orders or _doubtful(c) or c.height_m <= c.profile.planner.landing.handover_m:
+        return _by_itself(c)
+    return _by_setpoints(c)
+
+
+def _hang_on(c: Context) -> Acted:
+    """Released or stopped at the ceiling; a slip is caught, and the landing goes on below."""
+    if c.held(Condition.SLIPPING) >= 0.03:
+        tel = c.obs.telemetry
+        state = replace(
+            c.state, released_s=None, stopped_s=None, contact_z_m=None, caught=False,
+            setpoint=None, ordered_s=None, orders=0,
+            entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
+        )  # fmt: skip
+        c = Context(state, c.obs, c.profile)
+        return catch(c) or _by_setpoints(c)
+    return let_go(c) if c.state.stopped_s is None else stop_motors(c)
+
+
+def _doubtful(c: Context) -> bool:
+    """Whether the height, the stream or this loop cannot be relied on."""
+    safety = c.profile.safety
+    return (
+        c.obs.link_problem is not None
+        or c.telemetry_age_s > safety.telemetry_hold_s
+        or c.state.jump_s is not None
+        or c.obs.loop_late_s > safety.loop_late_hold_s
+    )
+
+
+def _by_setpoints(c: Context) -> Acted:
+    """Straight down at the landing's speed, where it was when the landing began."""
+    landing_config, state = c.profile.planner.landing, c.state
+    here = hold_here(c)
+    start = state.setpoint if state.caught and state.setpoint is not None else here
+    # A setpoint far above (the press, a search step) must not be walked down slowly.
+    start = replace(start, z_m=min(start.z_m, here.z_m))
+    x, y, _ = state.entry_m
+    ground_z = state.ground_m[2] if state.ground_m else 0.0
+    goal = replace(start, x_m=x, y_m=y, z_m=ground_z + 0.5 * landing_config.handover_m)
+    setpoint = walk(
+        start,
+        goal,
+        c.obs.t_s - state.t_s,
+        xy_mps=c.profile.planner.align.speed_mps,
+        up_mps=0.0,
+        down_mps=landing_config.speed_mps,
+        yaw_rate_radps=0.0,
+    )
+    # A vehicle that does not follow is not pulled by a setpoint that runs away from it,
+    # beyond what takes the thrust down to its least.
+    setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - 0.35))
+    hung_at_m = state.contact_z_m
+    if hung_at_m is not None and here.z_m < hung_at_m - PEELED_M:
+        hung_at_m = None
+    state = replace(state, setpoint=setpoint, caught=True, contact_z_m=hung_at_m)
+    return state, limited(c, setpoint)
+
+
+def _by_itself(c: Context) -> Acted:
+    """The vehicle's own landing, given again while it shows no effect."""
+    landing_config, state = c.profile.planner.landing, c.state
+    if c.proves and c.obs.telemetry.thrust < 1 and (state.orders or not c.flying):
+        return state, Idle()  # on the floor: another order would spin the motors up again
+    ground_z = state.ground_m[2] if state.ground_m else 0.0
+    floor = ground_z - landing_config.undershoot_m
+    waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
+    ignored = not (c.proves and c.high_level_active) and waited > REPEAT_ORDER_S
+    if state.orders == 0 or (ignored and state.orders < MAX_ORDERS):
+        height = max(0.0, c.obs.telemetry.position_m[2] - floor)
+        order = Land(floor, landing_time_s(height))
+        return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
+    return state, Idle()

@@ -1,0 +1,87 @@
+"""From pressed against the ceiling to hanging with the motors off, and back when it slips.
+
+In position mode the onboard controller never goes below `thrustMin`, so a magnet that
+carries half of the weight would pass for one that holds. Raw thrust goes on to where the
+motors stand still while the stream lives and everything is ready to spin again
+(docs/firmware.md, "Release in raw mode"): the whole weight is put on the magnet
+and watched, and only then the motors are stopped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from perchctl.mission.context import Context
+from perchctl.mission.guidance import corrected, hold_here, limited
+from perchctl.mission.state import Condition, PlannerState
+from perchctl.vehicle import Command, Idle, PositionSetpoint, RawThrust, StopMotors
+
+Acted = tuple[PlannerState, Command]
+
+STILL_THRUST = 1000
+"""Raw thrust at which the motors stand still and the stream lives (5000 and less)."""
+THRUST_MIN = 20000
+"""What position mode leaves."""
+STOPS, STOP_PERIOD_S, STOP_AGAIN_S = 5, 0.1, 0.5
+CATCH_ABOVE_M = 1.0
+CATCH_LIMIT_S = 2.0
+
+
+def lower(c: Context) -> Acted:
+    """Stage one: the setpoint goes down in steps, or the raw thrust where it pressed."""
+    complete, perch, state = c.profile.planner.complete, c.profile.planner.perch, c.state
+    step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
+    part = step / complete.steps
+    if perch.mode == "raw":
+        # The lowest step stays below what could carry the vehicle, above the idle cut.
+        lowest = 0.9 * complete.hold_ratio * state.hover_thrust
+        return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
+    setpoint = state.setpoint or hold_here(c)
+    assert state.contact_z_m is not None
+    top = state.entry_m[2] + perch.press_m
+    low = state.contact_z_m - complete.release_drop_m
+    setpoint = replace(setpoint, z_m=top + part * (low - top))
+    sent = limited(c, corrected(c, setpoint, lift=False))
+    return replace(state, setpoint=setpoint), sent
+
+
+def let_go(c: Context) -> Acted:
+    """Stage two, begun once: raw thrust down to still motors, and the stop when the whole
+    weight has hung long enough."""
+    complete, state = c.profile.planner.complete, c.state
+    if state.released_s is None:
+        z_m = c.obs.telemetry.position_m[2]
+        state = replace(state, released_s=c.obs.t_s, contact_z_m=state.contact_z_m or z_m)
+    assert state.released_s is not None
+    if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s:
+        return stop_motors(c)
+    part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
+    start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
+    start = min(start, THRUST_MIN)
+    return state, RawThrust(int(start + part * (STILL_THRUST - start)))
+
+
+def stop_motors(c: Context) -> Acted:
+    """Stop and notify, several times whatever the telemetry shows: one lost notify locks a
+    vehicle that hangs well, and the pair is harmless twice. Again while there is thrust."""
+    state, now_s = c.state, c.obs.t_s
+    if state.stopped_s is None:
+        return replace(state, stopped_s=now_s, ordered_s=now_s, orders=1), StopMotors()
+    waited_s = now_s - (state.ordered_s if state.ordered_s is not None else state.stopped_s)
+    still_to_send = state.orders < STOPS and waited_s >= STOP_PERIOD_S
+    if still_to_send or (c.obs.telemetry.thrust >= 1 and waited_s >= STOP_AGAIN_S):
+        return replace(state, ordered_s=now_s, orders=state.orders + 1), StopMotors()
+    return state, Idle()
+
+
+def catch(c: Context) -> Acted | None:
+    """After a slip: far above until it sinks no more, then held where it is; None when it
+    is caught. (A setpoint below would cost the change of mode its height.)"""
+    state, tel = c.state, c.obs.telemetry
+    if state.caught:
+        return None
+    if tel.velocity_mps[2] < 0.0 and c.in_phase_s < CATCH_LIMIT_S:
+        x, y, _ = state.entry_m
+        setpoint = PositionSetpoint(x, y, tel.position_m[2] + CATCH_ABOVE_M, state.entry_yaw_rad)
+        return replace(state, setpoint=setpoint), limited(c, setpoint)
+    return None
