@@ -133,7 +133,9 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
         case Phase.COMPLETE:
             return replace(new, contact_z_m=obs.telemetry.position_m[2], released_s=None)
         case Phase.RECOVER:
-            slipped = old.phase is Phase.COMPLETE
+            # From still motors the fall is caught from above. In position mode, with half of
+            # the thrust left, that would only press it to the ceiling again, beside the place.
+            slipped = old.released_s is not None or old.stopped_s is not None
             blocked_z_m = obs.telemetry.position_m[2] if new.row == "blocked" else old.blocked_z_m
             return replace(
                 new,

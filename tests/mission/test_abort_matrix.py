@@ -349,6 +349,18 @@ def test_a_slip_is_caught_from_above_then_held_where_it_is() -> None:
     assert command.z_m < HANG_Z_M - 0.1
 
 
+def test_a_slip_with_half_of_the_thrust_left_goes_down_at_once() -> None:
+    """Caught from above it would stick to the ceiling again, beside the target's centre."""
+    state = replace(hanging(), released_s=None)
+    for i in range(1, 4):
+        t_s = 10.0 + 0.02 * i
+        tel = telemetry(t_s, HANG_Z_M - 0.04, velocity_mps=(0.0, 0.0, -0.3), thrust=30000.0)
+        state, command = planner.step(state, observation(t_s, telemetry=tel), PROFILE)
+    assert state.phase is Phase.RECOVER
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m < HANG_Z_M - 0.1
+
+
 @pytest.mark.parametrize("stopped_s", [None, 9.5])
 def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped_s: float | None) -> None:
     """Released, or with the motors stopped already: they spin again, and then it goes down."""
