@@ -157,7 +157,7 @@ MEANINGS = {
     "planner.complete.release_timeout_s": "then the attempt counts as failed",
     "planner.complete.slip_m": "a slip: so far below the contact, and sinking",
     "planner.complete.slip_acc_g": "a slip: sinking with less than this",
-    "planner.complete.watch_s": "in COMPLETE before it counts as perched",
+    "planner.complete.watch_s": "after the motor stop, before it counts as perched",
     "planner.recover.descend_m": "below where the attempt ended",
     "planner.recover.dwell_s": "for which it must be steady",
     "planner.recover.steady_mps": "steady: speed",

@@ -5,11 +5,20 @@ The diagram and the table of docs/architecture.md are drawn from `TABLE`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.mission.context import HANGING_S, Context
+from perchctl.mission.guards import (
+    attempts_used,
+    fence_broken,
+    hangs_stopped,
+    is_blocked,
+    left_jump_hold,
+    searched_out,
+    settling_too_long,
+    stopped_for_s,
+)
 from perchctl.mission.state import (
     FLYING_PHASES,
     Condition,
@@ -54,48 +63,6 @@ def _only(*phases: Phase) -> frozenset[Phase]:
     return frozenset(phases)
 
 
-def _left_jump_hold(c: Context) -> bool:
-    jump = c.state.jump_s
-    return jump is not None and c.obs.t_s - jump >= c.profile.safety.jump_hold_s
-
-
-def _fence_broken(c: Context) -> bool:
-    if c.state.ground_m is None:
-        return False
-    x, y, _ = c.obs.telemetry.position_m
-    dx, dy = x - c.state.ground_m[0], y - c.state.ground_m[1]
-    return math.hypot(dx, dy) > c.profile.safety.fence_radius_m
-
-
-def _searched_out(c: Context) -> bool:
-    return c.state.searches >= c.profile.planner.search.attempts
-
-
-def _attempts_used(c: Context) -> bool:
-    return c.state.attempts >= c.profile.planner.attempts
-
-
-def _is_blocked(c: Context) -> bool:
-    return c.held(C.BLOCKED) >= c.profile.safety.blocked_s
-
-
-def _stopped_for_s(c: Context) -> float:
-    return -1.0 if c.state.stopped_s is None else c.obs.t_s - c.state.stopped_s
-
-
-def _hangs_stopped(c: Context) -> bool:
-    """The motors were stopped where it hung, and there it still is."""
-    state, tel = c.state, c.obs.telemetry
-    if state.stopped_s is None or state.contact_z_m is None or not c.proves:
-        return False
-    return state.contact_z_m - tel.position_m[2] <= c.profile.planner.complete.slip_m
-
-
-def _settling_too_long(c: Context) -> bool:
-    ascend = c.profile.planner.ascend
-    return c.held(C.NEAR_STANDOFF) > ascend.settle_timeout_s
-
-
 TABLE: tuple[Row, ...] = (
     # --- safety, gravest first -------------------------------------------
     Row(
@@ -105,7 +72,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "hung-but-locked", _only(P.COMPLETE, P.LANDING),
-        lambda c: c.obs.telemetry.has(LOCKED) and _hangs_stopped(c), P.PERCHED,
+        lambda c: c.obs.telemetry.has(LOCKED) and hangs_stopped(c), P.PERCHED,
         "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
         outcome=O.PERCHED,
     ),
@@ -145,7 +112,7 @@ TABLE: tuple[Row, ...] = (
         lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
     ),
     Row(
-        "estimator-jump", FLYING_PHASES, _left_jump_hold, P.LANDING,
+        "estimator-jump", FLYING_PHASES, left_jump_hold, P.LANDING,
         "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
     ),
     Row(
@@ -164,7 +131,7 @@ TABLE: tuple[Row, ...] = (
         lambda c: f"height {c.height_m:.2f} m is above the limit", S.LAND, O.SAFETY,
     ),
     Row(
-        "fence", BEFORE_CONTACT, _fence_broken, P.LANDING,
+        "fence", BEFORE_CONTACT, fence_broken, P.LANDING,
         "outside the fence", S.LAND, O.SAFETY,
     ),
     Row(
@@ -203,12 +170,12 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- something is in the way -----------------------------------------------
     Row(
-        "cannot-rise", _only(P.APPROACH), _is_blocked, P.LANDING,
+        "cannot-rise", _only(P.APPROACH), is_blocked, P.LANDING,
         lambda c: f"pressed at {c.height_m:.2f} m: something is above, or the thrust is weak",
         S.LAND, O.SAFETY,
     ),
     Row(
-        "blocked", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER), _is_blocked,
+        "blocked", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER), is_blocked,
         P.RECOVER,
         lambda c: f"pressed against something at {c.height_m:.2f} m", S.BACK_OFF,
         counts_attempt=True,
@@ -230,7 +197,7 @@ TABLE: tuple[Row, ...] = (
         "target seen",
     ),
     Row(
-        "searched-out", _only(P.SEARCH), _searched_out, P.LANDING,
+        "searched-out", _only(P.SEARCH), searched_out, P.LANDING,
         lambda c: "target not found in the allowed attempts"
         + (f" ({c.obs.camera_problem})" if c.obs.camera_problem else ""),
         S.LAND, O.TARGET_NOT_FOUND,
@@ -274,7 +241,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "ascend-timeout", _only(P.ASCEND),
-        lambda c: c.in_phase_s > c.profile.planner.ascend.timeout_s or _settling_too_long(c),
+        lambda c: c.in_phase_s > c.profile.planner.ascend.timeout_s or settling_too_long(c),
         P.RECOVER, "does not settle under the target", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
@@ -307,14 +274,14 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "perched", _only(P.COMPLETE),
-        lambda c: _stopped_for_s(c) >= c.profile.planner.complete.watch_s
+        lambda c: stopped_for_s(c) >= c.profile.planner.complete.watch_s
         and c.held(C.DOWN) >= 0.1,
         P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
     ),
     # --- the failed attempt --------------------------------------------------
     Row(
         "attempts-used", _only(P.RECOVER),
-        lambda c: _attempts_used(c) and c.in_phase_s > 0.5, P.LANDING,
+        lambda c: attempts_used(c) and c.in_phase_s > 0.5, P.LANDING,
         "all perching attempts are used up", S.LAND, O.ATTEMPTS_USED_UP,
     ),
     Row(
@@ -330,7 +297,7 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- landing ---------------------------------------------------------------
     Row(
-        "hung", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1 and _hangs_stopped(c), P.PERCHED,
+        "hung", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1 and hangs_stopped(c), P.PERCHED,
         "the magnet holds: hanging with the motors off",
     ),
     Row(

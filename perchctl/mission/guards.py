@@ -1,0 +1,50 @@
+"""What several rows of the mission's table ask, each with a name."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.context import Context
+from perchctl.mission.state import Condition
+
+
+def left_jump_hold(c: Context) -> bool:
+    jump = c.state.jump_s
+    return jump is not None and c.obs.t_s - jump >= c.profile.safety.jump_hold_s
+
+
+def fence_broken(c: Context) -> bool:
+    if c.state.ground_m is None:
+        return False
+    x, y, _ = c.obs.telemetry.position_m
+    dx, dy = x - c.state.ground_m[0], y - c.state.ground_m[1]
+    return math.hypot(dx, dy) > c.profile.safety.fence_radius_m
+
+
+def searched_out(c: Context) -> bool:
+    return c.state.searches >= c.profile.planner.search.attempts
+
+
+def attempts_used(c: Context) -> bool:
+    return c.state.attempts >= c.profile.planner.attempts
+
+
+def is_blocked(c: Context) -> bool:
+    return c.held(Condition.BLOCKED) >= c.profile.safety.blocked_s
+
+
+def stopped_for_s(c: Context) -> float:
+    return -1.0 if c.state.stopped_s is None else c.obs.t_s - c.state.stopped_s
+
+
+def hangs_stopped(c: Context) -> bool:
+    """The motors were stopped where it hung, and there it still is."""
+    state, tel = c.state, c.obs.telemetry
+    if state.stopped_s is None or state.contact_z_m is None or not c.proves:
+        return False
+    return state.contact_z_m - tel.position_m[2] <= c.profile.planner.complete.slip_m
+
+
+def settling_too_long(c: Context) -> bool:
+    ascend = c.profile.planner.ascend
+    return c.held(Condition.NEAR_STANDOFF) > ascend.settle_timeout_s
