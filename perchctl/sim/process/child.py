@@ -58,6 +58,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         port=options.port,
         http_port=options.http_port,
     )
+    # A shell starts what runs in its background with Ctrl-C ignored, and children inherit that.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         host = VehicleHost(setup, live=True)
     except PerchError as error:
