@@ -144,7 +144,7 @@ class PlannerConfig(Section):
 class SafetyConfig(Section):
     """Limits and reaction times; `*_hold_s` stays where it is, `*_land_s` lands."""
 
-    min_rest_v: float = Field(3.6, ge=0, le=5)
+    min_rest_v: float = Field(3.8, ge=0, le=5)
     min_load_v: float = Field(3.0, ge=0, le=5)
     battery_debounce_s: float = Field(1.5, ge=0, le=30)
     battery_stale_s: float = Field(90.0, gt=0, le=600)  # grace for a reading that stands still

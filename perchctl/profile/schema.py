@@ -40,7 +40,7 @@ class SimulationConfig(Section):
     target_yaw_deg: Range = (-180.0, 180.0)
     ceiling_z_m: Range = (1.8, 2.6)
     mass_kg: Range = (0.038, 0.042)
-    battery_rest_v: Range = (3.7, 4.2)
+    battery_rest_v: Range = (3.85, 4.2)
     camera_latency_s: Range = (0.03, 0.12)
     camera_jitter_s: float = Field(0.008, ge=0, le=0.2)
     camera_rate_hz: float = Field(30.0, gt=0, le=200)

@@ -5,7 +5,8 @@ origin on the floor under the start. One `World.step` is one `CONTROL_PERIOD_S`.
 
 Assumptions of the model, each with its source:
 
-- Thrust and battery: `perchctl.sim.powertrain`.
+- Motors and battery: `perchctl.sim.powertrain`; the curve between a motor's voltage and
+  its thrust: `perchctl.sim.thrust_curve`.
 - Drag is linear in the airspeed. Of a Crazyflie's four rotors 9.2e-7 N/(m/s) level and
   10.3e-7 vertically a rad/s of their summed speed have been identified (Foerster, ETH
   Zurich, 2015); lifting 42 g they turn at 7600 rad/s together (2.9e-8 N/(rad/s)^2
@@ -110,10 +111,10 @@ class World:
     def battery_rest_v(self, rest_v: float) -> None:
         self._powertrain.rest_v = rest_v
 
-    def step(self, motors: tuple[float, float, float, float]) -> None:
-        """Advance by `CONTROL_PERIOD_S` under four motor commands 0..65535."""
+    def step(self, pwm: tuple[float, float, float, float]) -> None:
+        """Advance by `CONTROL_PERIOD_S` under four duty cycles 0..65535."""
         self._steps += 1
-        f1, f2, f3, f4 = self._powertrain.step(motors)
+        f1, f2, f3, f4 = self._powertrain.step(pwm)
         if self._held:
             self._set_specific_force(0.0, 0.0, 0.0)
             return

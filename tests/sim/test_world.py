@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_rpy
 from perchctl.sim.body import GEAR_RADIUS_M, REST_HEIGHT_M
-from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, MOTOR_LAG_S
+from perchctl.sim.powertrain import MOTOR_COAST_S, MOTOR_LAG_S
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.thrust_curve import (
+    FULL_COMMAND,
+    MOTOR_FORCE_N,
+    STANDSTILL_V,
+    motor_v,
+    thrust_n,
+)
 from perchctl.sim.world import DRAG_LEVEL_NSPM, DRAG_VERTICAL_NSPM, World
 
 OFF = (0.0, 0.0, 0.0, 0.0)
@@ -28,6 +35,17 @@ def make(**conditions: Any) -> World:
 def run(world: World, seconds: float, motors: tuple[float, float, float, float] = OFF) -> None:
     for _ in range(round(seconds / CONTROL_PERIOD_S)):
         world.step(motors)
+
+
+def drive(world: World, seconds: float, command: float) -> None:
+    """Four equal thrust commands, each turned into the duty cycle that gives its thrust."""
+    volts = motor_v(command / FULL_COMMAND * MOTOR_FORCE_N)
+    for _ in range(round(seconds / CONTROL_PERIOD_S)):
+        world.step((min(FULL_COMMAND, FULL_COMMAND * volts / world.battery_v),) * 4)
+
+
+def lift_n(world: World, mass_kg: float) -> float:
+    return float(world.state().specific_force_mps2[2]) * mass_kg
 
 
 def hang(world: World, offset_m: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -64,18 +82,36 @@ def test_hovers_at_the_weight_over_full_thrust(mass_kg: float) -> None:
     world = make(mass_kg=mass_kg)
     command = mass_kg * GRAVITY_MPS2 / (4 * MOTOR_FORCE_N) * FULL_COMMAND
     world.set_pose((0.0, 0.0, 1.0), hold=True)
-    run(world, 1.0, (command,) * 4)  # past the motors' lag
+    drive(world, 1.0, command)  # past the motors' lag
     world.let_go()
-    run(world, 0.5, (command,) * 4)
+    drive(world, 0.5, command)
     assert world.vz_mps == pytest.approx(0.0, abs=0.005)
 
 
-def test_thrust_follows_its_command_with_the_motors_lag() -> None:
+def test_motors_run_up_with_their_lag_and_down_more_slowly() -> None:
+    world = make(mass_kg=0.048, ceiling_z_m=9.0)
+    world.set_pose((0.0, 0.0, 5.0), hold=True)
+    drive(world, 1.0, 40000.0)
+    steady_n = 40000.0 / FULL_COMMAND * MOTOR_FORCE_N
+    world.let_go()
+    run(world, MOTOR_COAST_S)
+    left_n = 4 * thrust_n(motor_v(steady_n) * math.exp(-1.0))
+    drag_n = -DRAG_VERTICAL_NSPM * world.vz_mps
+    assert lift_n(world, 0.048) == pytest.approx(left_n + drag_n, abs=0.003)
     world = make(mass_kg=0.048, ceiling_z_m=9.0)
     world.set_pose((0.0, 0.0, 5.0))
-    run(world, MOTOR_LAG_S, (FULL_COMMAND,) * 4)
-    thrust_n = world.state().specific_force_mps2[2] * 0.048
-    assert thrust_n == pytest.approx(4 * MOTOR_FORCE_N * (1.0 - math.exp(-1.0)), rel=0.03)
+    drive(world, MOTOR_LAG_S, 40000.0)
+    reached_n = 4 * thrust_n(motor_v(steady_n) * (1.0 - math.exp(-1.0)))
+    assert lift_n(world, 0.048) == pytest.approx(reached_n, abs=0.006)
+    assert MOTOR_COAST_S > MOTOR_LAG_S
+
+
+def test_a_motor_stands_still_below_the_dead_band() -> None:
+    world = make(mass_kg=0.048, ceiling_z_m=9.0)
+    world.set_pose((0.0, 0.0, 5.0))
+    run(world, 0.3, (0.98 * STANDSTILL_V / 4.2 * FULL_COMMAND,) * 4)
+    assert lift_n(world, 0.048) == pytest.approx(0.0, abs=0.03)  # drag
+    assert world.battery_v == 4.2
 
 
 def test_drag_is_that_of_rotors_lifting_42_g_and_a_little_more() -> None:
@@ -89,15 +125,16 @@ def test_hover_command_of_42_g_is_the_measured_one() -> None:
     assert command == pytest.approx(56200, abs=100)
 
 
-@pytest.mark.parametrize(("rest_v", "share"), [(4.2, 1.0), (3.7, 0.95)])
-def test_thrust_at_full_command_follows_the_resting_voltage(rest_v: float, share: float) -> None:
+@pytest.mark.parametrize(("rest_v", "share"), [(4.2, 1.0), (3.8, 1.0), (3.5, 0.89)])
+def test_full_thrust_is_the_same_until_the_battery_cannot_give_it(
+    rest_v: float, share: float
+) -> None:
     world = make(mass_kg=0.048, battery_rest_v=rest_v, ceiling_z_m=4.0)
     world.set_pose((0.0, 0.0, 1.0), hold=True)
-    run(world, 0.6, (FULL_COMMAND,) * 4)
+    drive(world, 0.6, FULL_COMMAND)
     world.let_go()
-    run(world, 0.02, (FULL_COMMAND,) * 4)
-    thrust_n = world.state().specific_force_mps2[2] * 0.048
-    assert thrust_n == pytest.approx(0.48 * share, rel=0.005)
+    drive(world, 0.02, FULL_COMMAND)
+    assert lift_n(world, 0.048) == pytest.approx(0.48 * share, rel=0.01)
 
 
 def test_battery_sags_under_load_discharges_and_recovers() -> None:
@@ -263,9 +300,9 @@ def test_a_weak_first_contact_breaks_and_the_second_holds() -> None:
 def test_the_gear_touches_before_the_frame() -> None:
     world = make(no_target=True)
     world.set_pose((0.0, 0.0, 2.1), hold=True)
-    run(world, 0.5, (65000.0,) * 4)  # past the motors' lag
+    drive(world, 0.5, 65000.0)  # past the motors' lag
     world.let_go()
-    run(world, 1.0, (65000.0,) * 4)
+    drive(world, 1.0, 65000.0)
     state = world.state()
     assert state.ceiling_force_n > 0.02
     assert world.gear_tip_m()[2] == pytest.approx(CEILING_M, abs=1e-3)

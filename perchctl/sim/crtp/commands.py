@@ -185,7 +185,8 @@ def _high_level(data: bytes) -> HighLevelCommand | None:
         return HlStop()
     if command in (HL_TAKEOFF, HL_LAND):
         height, duration = struct.unpack_from("<ff", data, 2)
-        return (HlTakeoff if command == HL_TAKEOFF else HlLand)(height, duration, None)
+        # The first generation always turns to yaw 0 (source).
+        return (HlTakeoff if command == HL_TAKEOFF else HlLand)(height, duration, 0.0)
     if command in (HL_TAKEOFF_2, HL_LAND_2):
         height, yaw, keep_yaw, duration = struct.unpack_from("<ff?f", data, 2)
         cls = HlTakeoff if command == HL_TAKEOFF_2 else HlLand

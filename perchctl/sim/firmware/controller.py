@@ -3,13 +3,15 @@
 Gains and limits are the firmware's defaults for the Crazyflie 2.x; they can be changed
 through the parameters of the same names. Angles in degrees, pitch nose up, as inside
 the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
-"Setpoint modes"), so the thrust starts again from `thrustBase`.
+"Setpoint modes"), so the thrust starts again from `thrustBase`. What comes out are thrust
+requests; `perchctl.sim.firmware.motors` turns them into duty cycles.
 """
 
 from __future__ import annotations
 
 import math
 
+from perchctl.sim.firmware.motors import MOTORS_OFF, Motors
 from perchctl.sim.firmware.setpoint import ABSOLUTE, DISABLED, MODE_OFF, VELOCITY, Mode, Setpoint
 
 ATTITUDE_DT_S = 0.002
@@ -110,12 +112,8 @@ class Estimate:
         self.gyro_x_dps = self.gyro_y_dps = self.gyro_z_dps = 0.0
 
 
-Motors = tuple[float, float, float, float]
-MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
-
-
 class Controller:
-    """Setpoint and estimate in, four motor commands 0..65535 out."""
+    """Setpoint and estimate in, four thrust requests out, in units of the thrust command."""
 
     def __init__(self) -> None:
         dt, pt = ATTITUDE_DT_S, POSITION_DT_S
@@ -236,15 +234,5 @@ class Controller:
 
 
 def _distribute(thrust: float, r: float, p: float, y: float) -> Motors:
-    m1, m2 = thrust - r + p + y, thrust - r - p - y
-    m3, m4 = thrust + r - p + y, thrust + r + p - y
-    excess = max(m1, m2, m3, m4) - UINT16_MAX
-    if excess > 0.0:
-        # Attitude comes before thrust: all four give way together.
-        m1, m2, m3, m4 = m1 - excess, m2 - excess, m3 - excess, m4 - excess
-    return (
-        m1 if m1 > 0.0 else 0.0,
-        m2 if m2 > 0.0 else 0.0,
-        m3 if m3 > 0.0 else 0.0,
-        m4 if m4 > 0.0 else 0.0,
-    )
+    """Thrust requests of M1..M4; neither bounded above nor below (see `MotorDriver`)."""
+    return (thrust - r + p + y, thrust - r - p - y, thrust + r - p + y, thrust + r + p - y)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from perchctl.sim.firmware.controller import Controller
 from perchctl.sim.firmware.estimator import Estimator
+from perchctl.sim.firmware.motors import MotorDriver
 from perchctl.sim.firmware.power import PowerMonitor
 from perchctl.sim.firmware.setpoint import Setpoint
 from perchctl.sim.firmware.supervisor import Supervisor
@@ -28,6 +29,7 @@ class Logged(Protocol):
     controller: Controller
     supervisor: Supervisor
     power: PowerMonitor
+    driver: MotorDriver
     flown_setpoint: Setpoint
 
     @property
@@ -144,8 +146,13 @@ def _rotation(firmware: Logged) -> dict[str, Getter]:
 
 
 def _motors(firmware: Logged) -> dict[str, Getter]:
+    """Duty cycles, after and before the cap."""
+
     def motor(i: int) -> Getter:
         return lambda: float(int(firmware.motors[i]))
 
-    names = [f"motor.m{i + 1}{kind}" for i in range(4) for kind in ("", "req")]
-    return {name: motor(int(name[7]) - 1) for name in names}
+    def request(i: int) -> Getter:
+        return lambda: float(int(firmware.driver.requested[i]))
+
+    getters = {f"motor.m{i + 1}": motor(i) for i in range(4)}
+    return getters | {f"motor.m{i + 1}req": request(i) for i in range(4)}

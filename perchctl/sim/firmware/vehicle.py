@@ -7,9 +7,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar
 
 from perchctl.sim.firmware.commands import HighLevelCommand, LowLevelCommand
-from perchctl.sim.firmware.controller import MOTORS_OFF, Controller
+from perchctl.sim.firmware.controller import Controller
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.logs import log_getters
+from perchctl.sim.firmware.motors import MOTORS_OFF, MotorDriver
 from perchctl.sim.firmware.parameters import apply_parameter
 from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.firmware.power import PowerMonitor
@@ -60,6 +61,7 @@ class Firmware:
         self.planner = Planner()
         self.supervisor = Supervisor()
         self.controller = Controller()
+        self.driver = MotorDriver()
         self.power = PowerMonitor(self.world.battery_v)
         self._getters: dict[str, Callable[[], float]] = log_getters(self)
         self._external_positions = True
@@ -109,9 +111,10 @@ class Firmware:
             setpoint = self._levelled
         elif state not in _MOTORS_STATES:
             setpoint = self._null
-        motors = self.controller.update(setpoint, self.estimator.now)
+        requests = self.controller.update(setpoint, self.estimator.now)
         if not supervisor.motors_allowed:
-            motors = MOTORS_OFF
+            requests = MOTORS_OFF
+        motors = self.driver.pwm(requests, self.world.battery_v)
         if motors is not MOTORS_OFF:
             self._flown = True
         self.motors = motors
