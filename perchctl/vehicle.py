@@ -18,7 +18,8 @@ class Telemetry:
     """The vehicle's newest state, SI and right-handed (see `perchctl.geometry`).
 
     `t_s` is on the loop's clock; `thrust` is the commanded 0..65535;
-    `acc_z_g` is the specific force along body z (+1 at rest on the ground).
+    `acc_z_g` is the specific force along body z (+1 at rest on the ground). `behind_s`: by how
+    much position and velocity, which come by a packet of their own, are older than `t_s`.
     """
 
     t_s: float
@@ -33,6 +34,7 @@ class Telemetry:
     supervisor: int
     battery_state: int = 0  # pm.state; 3 = low power
     position_variance_m2: float | None = None  # largest of the estimator's three
+    behind_s: float = 0.0
 
     def has(self, bit: int) -> bool:
         return bool(self.supervisor & bit)

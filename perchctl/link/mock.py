@@ -6,14 +6,16 @@ telemetry and records the commands.
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import math
 from collections import deque
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
+from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
 from perchctl.link.encode import UNLOCK_THRUST, encode
-from perchctl.link.telemetry import NEEDED, OPTIONAL, telemetry_from
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
@@ -26,29 +28,54 @@ TELEMETRY_DELAY_S = 0.01
 SETTLE_S = 1.0
 
 
+class Radio:
+    """What becomes of the packets of both directions; this one loses none."""
+
+    def up(self, packet: Packet, now_s: float) -> bool:
+        """Whether it arrives at the vehicle."""
+        return True
+
+    def down(self, block: str, now_s: float) -> float | None:
+        """After how many seconds a log block's packet arrives; None when it is lost."""
+        return TELEMETRY_DELAY_S
+
+
 class MockLink:
     """The simulated vehicle in lockstep; `advance_to` is the flight's clock.
 
-    Commands reach it as bytes, through the decoder of the simulated link's server.
+    Commands reach it as bytes, through the decoder of the simulated link's server, and its
+    telemetry comes in the same log blocks, through the same assembler, as by radio.
     """
 
-    def __init__(self, vehicle: SimulatedVehicle, telemetry_period_s: float = 0.01) -> None:
+    def __init__(
+        self,
+        vehicle: SimulatedVehicle,
+        telemetry_period_s: float = 0.01,
+        radio: Radio | None = None,
+    ) -> None:
         self.vehicle = vehicle
+        self.radio = radio or Radio()
         self._service = CommandService(vehicle.firmware, PROTOCOL_VERSION)
-        self._period_s = telemetry_period_s
-        self._samples: deque[Telemetry] = deque()
-        self._next_sample_s = 0.0
+        self._assembler = Assembler()
+        self._periods_s = {
+            name: telemetry_period_s if name in FAST_BLOCKS else SLOW_PERIOD_S for name in BLOCKS
+        }
+        self._due_s = dict.fromkeys(BLOCKS, 0.0)
+        self._under_way: list[tuple[float, int, str, float, dict[str, float]]] = []
+        self._count = itertools.count()
 
     @property
     def now_s(self) -> float:
         return self.vehicle.firmware.t_s
 
     def advance_to(self, t_s: float) -> None:
-        """Step the vehicle until `t_s`, sampling its telemetry on the way."""
-        while self._next_sample_s <= t_s:
-            self.vehicle.advance_to(self._next_sample_s)
-            self._samples.append(self._sample())
-            self._next_sample_s += self._period_s
+        """Step the vehicle until `t_s`, sending its telemetry on the way."""
+        while (due_s := min(self._due_s.values())) <= t_s:
+            self.vehicle.advance_to(due_s)
+            for name, block_due_s in self._due_s.items():
+                if block_due_s <= due_s + 1e-9:
+                    self._send_down(name)
+                    self._due_s[name] = block_due_s + self._periods_s[name]
         self.vehicle.advance_to(t_s)
 
     def connect(self) -> None:
@@ -57,10 +84,13 @@ class MockLink:
         self.advance_to(self.now_s + 0.1)
 
     def telemetry(self) -> list[Telemetry]:
-        arrived = []
-        while self._samples and self._samples[0].t_s <= self.now_s - TELEMETRY_DELAY_S + 1e-9:
-            arrived.append(self._samples.popleft())
-        return arrived
+        samples = []
+        while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
+            _, _, block, stamp_s, values = heapq.heappop(self._under_way)
+            sample = self._assembler.accept(block, values, stamp_s)
+            if sample is not None:
+                samples.append(sample)
+        return samples
 
     def send(self, command: Command) -> None:
         self._hand_over(encode(command))
@@ -76,12 +106,16 @@ class MockLink:
 
     def _hand_over(self, packets: Iterable[Packet]) -> None:
         for packet in packets:
-            self._service.handle(packet)
+            if self.radio.up(packet, self.now_s):
+                self._service.handle(packet)
 
-    def _sample(self) -> Telemetry:
+    def _send_down(self, block: str) -> None:
         firmware = self.vehicle.firmware
-        values = {name: firmware.log_value(name) for name in (*NEEDED, *OPTIONAL)}
-        return telemetry_from(values, firmware.t_s)
+        delay_s = self.radio.down(block, self.now_s)
+        if delay_s is not None:
+            values = {name: firmware.log_value(name) for name in BLOCKS[block]}
+            packet = (self.now_s + delay_s, next(self._count), block, firmware.t_s, values)
+            heapq.heappush(self._under_way, packet)
 
 
 class ScriptedLink:

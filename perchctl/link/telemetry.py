@@ -42,7 +42,6 @@ VARIANCE_BLOCK: dict[str, str] = {
 """Only where the Kalman estimator runs; a firmware without it is not refused."""
 
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
-OPTIONAL = (*BATTERY_BLOCK, *VARIANCE_BLOCK)
 
 
 def telemetry_from(values: Mapping[str, float], t_s: float) -> Telemetry:

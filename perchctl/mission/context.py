@@ -46,7 +46,9 @@ class Context:
 
     @property
     def telemetry_age_s(self) -> float:
-        return self.obs.t_s - self.obs.telemetry.t_s
+        """Of the oldest part: position and velocity come by a packet of their own."""
+        tel = self.obs.telemetry
+        return self.obs.t_s - tel.t_s + tel.behind_s
 
     @property
     def proves(self) -> bool:

@@ -4,7 +4,7 @@
   with a first-order lag, and its thrust is the curve at the voltage that belongs to the
   speed (`perchctl.sim.thrust_curve`): a motor that stands still takes longer to give
   thrust than one that turns already. The lag of 0.05 s is that of the caught slips in
-  docs/firmware.md, "Hand-over, take-off and release".
+  docs/firmware.md, "Catching a slip".
 - Nothing brakes a brushed motor, so it runs down more slowly than it runs up.
   `MOTOR_COAST_S` is the value with which the fall after a lone notify, the landing, the
   take-offs and the attitude steps of that page come out nearest to what was measured,

@@ -384,7 +384,7 @@ def test_ctrl_c_twice_stops_a_rescue_too() -> None:
         ({"supervisor": READY | DECK_FAULT}, "deck"),
         ({"supervisor": READY | FLYING}, "flying already"),
         ({"supervisor": READY | 1 << 13}, "unknown bits .0x200E"),
-        ({"battery_v": 3.4}, r"3\.40 V.*3\.60 V.*charge"),
+        ({"battery_v": 3.4}, r"3\.40 V.*3\.80 V.*charge"),
     ],
     ids=["locked", "crashed", "tumbled", "deck", "flying", "unknown", "battery"],
 )

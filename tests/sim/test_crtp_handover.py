@@ -1,4 +1,4 @@
-"""docs/firmware.md, "Hand-over, take-off and release", row by row through cflib's `udp://` driver.
+"""docs/firmware.md, "Setpoint modes" and "Contact, tumble, crash", row by row through `udp://`.
 
 Each docstring quotes its row; a number in it that is not the one asserted was measured
 on the real firmware, and the tolerance is what the model misses it by at most.

@@ -1,6 +1,6 @@
 """Thrust command to duty cycle: the curve, the battery, the cap.
 
-docs/firmware.md, "Hand-over, take-off and release", row "Thrust command -> PWM".
+docs/firmware.md, "Thrust to PWM".
 """
 
 from __future__ import annotations

@@ -124,7 +124,7 @@ def test_battery_reading_follows_the_load() -> None:
     assert rig.firmware.log_value("pm.vbat") == pytest.approx(4.1, abs=0.02)
     assert rig.firmware.log_value("pm.batteryLevel") == 90
     rig.take_off()
-    # Firmware facts, "Hand-over, take-off and release": 3.55 V under 56,200, 4.02 V under 10,000.
+    # docs/firmware.md, "Thrust to PWM": 3.55 V under 56,200, 4.02 V under 10,000.
     assert rig.firmware.log_value("pm.vbat") == pytest.approx(3.55, abs=0.03)
     assert rig.firmware.log_value("pm.state") == 0
 

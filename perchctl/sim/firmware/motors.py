@@ -4,7 +4,7 @@ In the firmware's order (source: power distribution, motor driver and stabiliser
 release 2026.08): the battery's voltage is compensated by the inverted thrust curve
 first, then what exceeds the full duty cycle is taken off all four. More than 0.12 N may
 so be requested of one motor, and is given while the battery suffices: a yaw step at hover
-costs no height (docs/firmware.md, "Hand-over, take-off and release").
+costs no height (docs/firmware.md, "Yaw step").
 """
 
 from __future__ import annotations
