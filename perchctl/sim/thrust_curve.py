@@ -3,8 +3,8 @@
 The curve is the firmware's own for the propellers of the Crazyflie 2.1+ (its platform
 defaults, release 2026.08, from a thrust stand): a cubic in the motor's mean voltage,
 which is the duty cycle times the battery's voltage. Below `STANDSTILL_V` the cubic is
-negative: the motor stands still. The duty cycles that docs/firmware.md, "Hand-over,
-take-off and release", has for seven thrust commands follow from it within half a per cent.
+negative: the motor stands still. The duty cycles of docs/firmware.md, "Thrust to PWM",
+for seven thrust commands follow from it within half a per cent.
 """
 
 from __future__ import annotations
