@@ -178,6 +178,7 @@ class FaultyFlight:
             time_s=end_s,
             miss_m=self._vehicle.world.gear_miss_m() if perched else None,
             drop_m=verdict.drop_m,
+            slip_ratio=verdict.slip_ratio,
             wall_s=wall_s,
             way=() if report is None else tuple(e.phase.value for e in report.history if e.phase),
         )

@@ -4,8 +4,8 @@ The oracle is given samples of the true vehicle (`Sample`) while the flight and 
 after it pass, is told when the program ended and what it claimed, and raises flags:
 
 - *fell*: motors off, or free fall, above 0.1 m while the weight does not hang; a
-  touchdown above 0.8 m/s; let go by the magnet and not caught within what physics needs
-  (`drop_limit_m`), or not before the floor;
+  touchdown above 0.8 m/s. A vehicle that the magnet lets go of with its motors still is
+  judged by how deep it falls until it is caught (`drop_limit_m`); the floor is too deep;
 - *flies_on*: motors turning off the ground, or in the air, 5 s after the program's end;
 - *pressed*: full thrust against ceiling or floor for more than 4 s;
 - *strayed*: truly beyond fence or height limit by more than 0.3 m. What a fault adds to the
@@ -31,6 +31,7 @@ LOW_M = 0.1
 OFF_S = 0.1
 FREE_FALL_G, FREE_FALL_S = 0.2, 0.15
 TOUCHDOWN_MPS = 0.8
+UNPOWERED_G = 0.5
 FAST_MPS = 0.45
 """Sinking faster than any order: falling, until slower again."""
 CAUGHT_MPS, SLOW_AGAIN_S = 0.05, 0.3
@@ -71,10 +72,12 @@ class Limits:
 
 @dataclass(frozen=True)
 class Verdict:
-    """`flags` with when each was first raised; `drop_m` the deepest fall until caught."""
+    """`flags` with when each was first raised; `drop_m` the deepest fall until caught, and
+    `slip_ratio` the magnet's hold over the weight where that was a slip from the magnet."""
 
     flags: dict[Flag, float]
     drop_m: float
+    slip_ratio: float | None
 
 
 def drop_limit_m(hold_ratio: float) -> float:
@@ -91,6 +94,7 @@ class Oracle:
         self._limits = limits
         self.flags: dict[Flag, float] = {}
         self.drop_m = 0.0
+        self._slip_ratio: float | None = None
         self.newest: Sample | None = None
         self._hung: Sample | None = None  # last sample that hung
         self._off_s: float | None = None
@@ -98,6 +102,7 @@ class Oracle:
         self._pressed_s: float | None = None
         self._calm_height_m = 0.0  # where it last did not sink fast
         self._fall: _Fall | None = None
+        self._weak_s: float | None = None  # when it was last without the thrust to slow down
         self._sink_mps = 0.0
         self._was_down = True
         self._may_lock = False
@@ -116,7 +121,7 @@ class Oracle:
 
     def verdict(self) -> Verdict:
         """After the last sample."""
-        return Verdict(dict(self.flags), self.drop_m)
+        return Verdict(dict(self.flags), self.drop_m, self._slip_ratio)
 
     def see(self, s: Sample) -> None:
         self.newest = s
@@ -151,6 +156,8 @@ class Oracle:
 
     def _watch_fall(self, s: Sample) -> None:
         """A fall begins where it sinks faster than ordered, and ends caught or on the floor."""
+        if _airborne(s) and not s.hanging and (not s.motors_on or s.acc_g < UNPOWERED_G):
+            self._weak_s = s.t_s
         sinking = -s.vz_mps
         if self._fall is None:
             if sinking <= FAST_MPS or not _airborne(s):
@@ -158,12 +165,14 @@ class Oracle:
                 return
             hung = self._hung if self._from_hanging(s) else None
             top_m = self._calm_height_m if hung is None else hung.height_m
-            self._fall = _Fall(top_m, None if hung is None else drop_limit_m(hung.hold_ratio))
+            self._fall = _Fall(top_m, None if hung is None else hung.hold_ratio)
         fall = self._fall
-        self.drop_m = max(self.drop_m, fall.top_m - s.height_m)
-        if fall.limit_m is not None and fall.top_m - s.height_m > fall.limit_m:
-            self._raise("fell", s.t_s)
-        if s.floor and fall.limit_m is not None:
+        drop_m = fall.top_m - s.height_m
+        if drop_m > self.drop_m:
+            self.drop_m, self._slip_ratio = drop_m, fall.slip_ratio
+        unpowered = self._weak_s is not None and s.t_s - self._weak_s <= FROM_HANGING_S
+        too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
+        if unpowered and (too_deep or s.floor):
             self._raise("fell", s.t_s)
         fall.slow_s = _since(fall.slow_s, sinking < FAST_MPS, s.t_s)
         caught = sinking < CAUGHT_MPS or _lasts(fall.slow_s, SLOW_AGAIN_S, s.t_s)
@@ -208,10 +217,10 @@ class Oracle:
 
 @dataclass
 class _Fall:
-    """`limit_m` is None for what is no slip."""
+    """`slip_ratio`: the magnet's hold over the weight; None for what is no slip."""
 
     top_m: float
-    limit_m: float | None
+    slip_ratio: float | None
     slow_s: float | None = None
 
 

@@ -20,7 +20,8 @@ class FaultResult:
         counted: the flags that no excuse takes away.
         unavoidable: the excuse's reason, None where none holds.
         begin_s: when the fault began; None when the flight was over before.
-        drop_m: the deepest fall until caught, in the simulation's truth.
+        drop_m: the deepest fall until caught, in the simulation's truth; `slip_ratio`: the
+            magnet's hold over the weight, where that was a slip from the magnet.
     """
 
     seed: int
@@ -38,6 +39,7 @@ class FaultResult:
     time_s: float
     miss_m: float | None
     drop_m: float
+    slip_ratio: float | None = None
     wall_s: float = 0.0
     way: tuple[str, ...] = field(default=())
 
