@@ -76,7 +76,7 @@ def _slipping(c: Context) -> bool:
     if c.state.contact_z_m is None:
         return False
     below_m = c.state.contact_z_m - tel.position_m[2]
-    if c.state.released_s is not None and below_m > 0.008 and tel.velocity_mps[2] < -0.12:
+    if below_m > -0.02 and tel.velocity_mps[2] < -0.12:
         return True
     sinking = tel.velocity_mps[2] < -0.15
     return sinking and (below_m > complete.slip_m or tel.acc_z_g < complete.slip_acc_g)

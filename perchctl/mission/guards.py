@@ -7,6 +7,9 @@ import math
 from perchctl.mission.context import Context
 from perchctl.mission.state import Condition
 
+SLIP_DWELL_S = 0.03
+FALLING_MPS = -0.05
+
 
 def left_jump_hold(c: Context) -> bool:
     jump = c.state.jump_s
@@ -48,3 +51,13 @@ def hangs_stopped(c: Context) -> bool:
 def settling_too_long(c: Context) -> bool:
     ascend = c.profile.planner.ascend
     return c.held(Condition.NEAR_STANDOFF) > ascend.settle_timeout_s
+
+
+def has_slipped(c: Context) -> bool:
+    """Debounced; in free fall at once, since each 10 ms cost what full thrust takes 80 ms to
+    give back."""
+    tel, complete = c.obs.telemetry, c.profile.planner.complete
+    falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
+    if falls and c.proves and tel.velocity_mps[2] < FALLING_MPS:
+        return True
+    return c.held(Condition.SLIPPING) >= SLIP_DWELL_S

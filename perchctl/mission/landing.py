@@ -12,15 +12,19 @@ import math
 from dataclasses import replace
 
 from perchctl.mission.context import HANGING_S, Context
+from perchctl.mission.guards import has_slipped
 from perchctl.mission.guidance import hold_here, limited, walk
-from perchctl.mission.release import Acted, catch, let_go, stop_motors
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, Acted, catch, let_go, stop_motors
 from perchctl.mission.state import Condition
 from perchctl.vehicle import Idle, Land
 
 REPEAT_ORDER_S = 0.5
 """An order that shows no effect in the telemetry is given again after this time."""
 MAX_ORDERS = 6
-TOUCHDOWN_MPS = 0.35
+PLANNED_MPS, SETTLING_S = 0.4, 1.8
+"""The quintic's largest speed, and time added for the begin: the change to the vehicle's own
+trajectory resets its controller, and what it then catches up with must be slow. Touchdown
+comes out at 0.35 m/s at most."""
 PEELED_M = 0.1
 """Below the contact by so much, the magnet has let go."""
 _PEAK_OF_MEAN = 1.875
@@ -28,8 +32,8 @@ _PEAK_OF_MEAN = 1.875
 
 
 def landing_time_s(height_m: float) -> float:
-    """For the vehicle's own landing: a quintic that is nowhere faster than a soft touchdown."""
-    return max(1.0, _PEAK_OF_MEAN * height_m / TOUCHDOWN_MPS)
+    """For the vehicle's own landing, which follows a quintic from rest to rest."""
+    return SETTLING_S + _PEAK_OF_MEAN * height_m / PLANNED_MPS
 
 
 def landing(c: Context) -> Acted:
@@ -51,10 +55,11 @@ def landing(c: Context) -> Acted:
 
 def _hang_on(c: Context) -> Acted:
     """Released or stopped at the ceiling; a slip is caught, and the landing goes on below."""
-    if c.held(Condition.SLIPPING) >= 0.03:
+    if has_slipped(c):
         tel = c.obs.telemetry
         state = replace(
             c.state, released_s=None, stopped_s=None, contact_z_m=None, caught=False,
+            catch_above_m=CATCH_STILL_ABOVE_M,
             setpoint=None, ordered_s=None, orders=0,
             entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
         )  # fmt: skip

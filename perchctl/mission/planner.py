@@ -13,6 +13,7 @@ import numpy as np
 from perchctl.mission.actions import act
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason
 from perchctl.mission.context import Context
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M
 from perchctl.mission.state import (
     TERMINALS,
     Condition,
@@ -133,16 +134,15 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
         case Phase.COMPLETE:
             return replace(new, contact_z_m=obs.telemetry.position_m[2], released_s=None)
         case Phase.RECOVER:
-            # From still motors the fall is caught from above. In position mode, with half of
-            # the thrust left, that would only press it to the ceiling again, beside the place.
-            slipped = old.released_s is not None or old.stopped_s is not None
+            still = old.released_s is not None or old.stopped_s is not None
             blocked_z_m = obs.telemetry.position_m[2] if new.row == "blocked" else old.blocked_z_m
             return replace(
                 new,
                 stopped_s=None,
                 contact_z_m=None,
                 released_s=None,
-                caught=not slipped,
+                caught=new.row != "slipped",
+                catch_above_m=CATCH_STILL_ABOVE_M if still else CATCH_TURNING_ABOVE_M,
                 blocked_z_m=blocked_z_m,
             )
         case Phase.ASCEND:

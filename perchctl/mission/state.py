@@ -160,6 +160,7 @@ class PlannerState:
     contact_z_m: float | None = None  # height of the body while it is held by the magnet
     released_s: float | None = None  # begin of the release by raw thrust
     caught: bool = True  # False after a slip, until the fall is stopped
+    catch_above_m: float = 0.0  # how far above it the setpoint is that stops the fall
     blocked_z_m: float | None = None  # something solid is above
     ordered_s: float | None = None  # last order of a landing or motor stop
     orders: int = 0

@@ -13,6 +13,7 @@ from perchctl.mission.guards import (
     attempts_used,
     fence_broken,
     hangs_stopped,
+    has_slipped,
     is_blocked,
     left_jump_hold,
     searched_out,
@@ -262,7 +263,7 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- phase 7: completion -------------------------------------------------
     Row(
-        "slipped", _only(P.COMPLETE), lambda c: c.held(C.SLIPPING) >= 0.03, P.RECOVER,
+        "slipped", _only(P.COMPLETE), has_slipped, P.RECOVER,
         lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
         S.BACK_OFF, counts_attempt=True,
     ),
