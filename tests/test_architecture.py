@@ -48,7 +48,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.sim",),
     ("perchctl.link", "perchctl.log"),
     ("perchctl.flight",),
-    ("perchctl.weights",),
+    ("perchctl.weights", "perchctl.faults"),
     ("perchctl.display",),
     ("perchctl.track",),
     ("perchctl.commands",),

@@ -18,8 +18,19 @@ def simulate(
         int | None, typer.Option("--only", min=0, help="Repeat the one flight of this seed.")
     ] = None,
     profile: ProfileOption = "sim",
+    faults: Annotated[
+        str | None,
+        typer.Option(
+            "--faults",
+            metavar="all|list|NAME,NAME",
+            help="Lay a fault into each flight, and judge by the world's truth.",
+        ),
+    ] = None,
+    heat_map: Annotated[
+        Path | None, typer.Option("--heat-map", help="PNG of faults against phases.")
+    ] = None,
     log_dir: Annotated[
-        Path | None, typer.Option("--log-dir", help="Folder for the log of an --only flight.")
+        Path | None, typer.Option("--log-dir", help="Folder for the flights' logs.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -35,5 +46,7 @@ def simulate(
             only=only,
             log_dir=log_dir,
             as_json=as_json,
+            faults=faults,
+            heat_map=heat_map,
         )
         raise typer.Exit(run(request))

@@ -6,7 +6,7 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, TextIO
+from typing import Any, Protocol, TextIO
 
 from rich.console import Console
 from rich.progress import (
@@ -18,21 +18,26 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from perchctl.flight.results import FlightResult
-
 _REFRESH_HZ = 4
+
+
+class Ended(Protocol):
+    """A flight's result, of whatever campaign."""
+
+    @property
+    def outcome(self) -> str: ...
 
 
 @contextlib.contextmanager
 def progress_bar(
     total: int, stream: TextIO | None = None
-) -> Iterator[Callable[[FlightResult], None]]:
+) -> Iterator[Callable[[Ended], None]]:
     """Yields the function to call with each finished flight."""
     ends: dict[str, int] = {}
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
     with _bar("flights", *columns, total=total, stream=stream) as update:
 
-        def advance(result: FlightResult) -> None:
+        def advance(result: Ended) -> None:
             ends[result.outcome] = ends.get(result.outcome, 0) + 1
             text = ", ".join(f"{n} {end}" for end, n in ends.items())
             update(advance=1, description=text)

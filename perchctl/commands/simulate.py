@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import ExitStack
+import contextlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
+from typing import TypeVar
 
-from perchctl.commands.output import print_record
+from perchctl.commands.interrupt import signals_to
+from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import progress_bar
-from perchctl.errors import UsageError
+from perchctl.errors import Interrupted, UsageError
 from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
 from perchctl.profile import load_profile
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,14 @@ class SimulateRequest:
     only: int | None = None
     log_dir: Path | None = None
     as_json: bool = False
+    faults: str | None = None
+    heat_map: Path | None = None
+
+    @property
+    def seeds(self) -> list[int]:
+        if self.only is not None:
+            return [self.only]
+        return list(range(self.seed, self.seed + self.flights))
 
 
 def run(request: SimulateRequest) -> int:
@@ -34,33 +46,73 @@ def run(request: SimulateRequest) -> int:
 
     Errors: NotFound, InvalidValue, UsageError.
     """
-    profile = load_profile(request.profile)
     try:
-        from perchctl.flight.campaign import fly_seed, run_campaign
+        from perchctl.flight.campaign import run_campaign
     except ImportError as error:
         raise UsageError(
             f"the simulator is not installed ({error.name} is missing): pip install 'perchctl[sim]'"
         ) from None
-    only, folder = request.only, request.log_dir
-    seeds = (
-        [only] if only is not None else list(range(request.seed, request.seed + request.flights))
-    )
-    with ExitStack() as stack:
-        advance: Callable[[FlightResult], None] = stack.enter_context(progress_bar(len(seeds)))
-        if only is not None and folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            results = [fly_seed(profile, only, folder / f"flight_seed{only}.jsonl")]
-            advance(results[0])
-        else:
-            executor: Executor | None = None
-            if request.jobs > 1 and len(seeds) > 1:
-                context = multiprocessing.get_context("spawn")
-                executor = stack.enter_context(
-                    ProcessPoolExecutor(min(request.jobs, len(seeds)), mp_context=context)
-                )
-            results = run_campaign(profile, seeds, executor, advance)
+    if request.faults is not None:
+        from perchctl.commands.simulate_faults import run_faults
+
+        return run_faults(request)
+    if request.heat_map is not None:
+        raise UsageError("--heat-map is drawn of faults: name them with --faults")
+    profile, seeds = load_profile(request.profile), request.seeds
+    results: list[FlightResult] = []
+    with progress_bar(len(seeds)) as advance, flying(len(seeds), request.jobs) as executor:
+        on_result = noting(results, advance)
+        run_campaign(profile, seeds, executor, on_result, request.log_dir)
+    results.sort(key=lambda result: result.seed)
     if request.as_json:
         print_record(campaign_summary(results))
     else:
         print(campaign_table(results))
-    return 0
+    return exit_code(len(results), len(seeds))
+
+
+def noting(results: list[R], advance: Callable[[R], None]) -> Callable[[R], None]:
+    """Keeps each result as it comes, and moves the bar."""
+
+    def note(result: R) -> None:
+        results.append(result)
+        advance(result)
+
+    return note
+
+
+@contextlib.contextmanager
+def flying(flights: int, jobs: int) -> Iterator[Executor | None]:
+    """Yields the executor of more than one flight. Ctrl-C and SIGTERM end the block early,
+    and nothing else: what was flown by then is there.
+
+    More than one flight is always flown by processes of their own, which are ended where
+    they are; a flight of this process would be landed first.
+    """
+    from perchctl.flight.campaign import job_processes
+
+    with signals_to(_stop()), contextlib.suppress(KeyboardInterrupt):
+        if flights == 1:
+            yield None
+        else:
+            with job_processes(min(jobs, flights)) as executor:
+                yield executor
+
+
+def _stop() -> Callable[[int, FrameType | None], None]:
+    """The first signal ends the flights; while they are ended, further ones do nothing."""
+    pressed: list[int] = []
+
+    def press(number: int, _frame: FrameType | None) -> None:
+        pressed.append(number)
+        if len(pressed) == 1:
+            raise KeyboardInterrupt
+
+    return press
+
+
+def exit_code(flown: int, wanted: int) -> int:
+    if flown == wanted:
+        return 0
+    say(f"stopped: {flown} of {wanted} flights were flown")
+    return Interrupted.exit_code

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
+import signal
 import time
-from collections.abc import Callable, Iterable
-from concurrent.futures import Executor, as_completed
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 
@@ -13,6 +18,8 @@ from perchctl.flight.lockstep import fly_lockstep
 from perchctl.flight.results import FlightEnd, FlightResult
 from perchctl.mission.state import Phase
 from perchctl.profile import Profile
+
+R = TypeVar("R")
 
 OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.PERCHED: "perched",
@@ -46,20 +53,71 @@ def run_campaign(
     seeds: Iterable[int],
     executor: Executor | None = None,
     on_result: Callable[[FlightResult], None] = lambda result: None,
+    log_dir: Path | None = None,
 ) -> list[FlightResult]:
     """Fly all seeds; results in the order of the seeds. With an executor (any of
     `concurrent.futures`' kind) the flights are handed to it, otherwise flown here."""
+    return fly_all(partial(_fly_logged, profile, log_dir), seeds, executor, on_result)
+
+
+def _fly_logged(profile: Profile, log_dir: Path | None, seed: int) -> FlightResult:
+    return fly_seed(profile, seed, log_of(seed, log_dir))
+
+
+def log_of(seed: int, log_dir: Path | None) -> Path | None:
+    """The file for a seed's log, in a folder that is made where it is missing."""
+    if log_dir is None:
+        return None
+    log_dir.mkdir(parents=True, exist_ok=True)
+    return log_dir / f"flight_seed{seed}.jsonl"
+
+
+def fly_all(
+    fly: Callable[[int], R],
+    seeds: Iterable[int],
+    executor: Executor | None = None,
+    on_result: Callable[[R], None] = lambda result: None,
+) -> list[R]:
+    """`fly` of each seed, in the order of the seeds; `on_result` as they are done."""
     seeds = list(seeds)
     if executor is None:
         results = []
         for seed in seeds:
-            results.append(fly_seed(profile, seed))
+            results.append(fly(seed))
             on_result(results[-1])
         return results
-    futures = {executor.submit(fly_seed, profile, seed): seed for seed in seeds}
+    with uninterrupted():  # the executor starts its processes as flights are handed to it
+        futures = {executor.submit(fly, seed): seed for seed in seeds}
     by_seed = {}
     for future in as_completed(futures):
-        result = future.result()
-        by_seed[result.seed] = result
+        by_seed[futures[future]] = result = future.result()
         on_result(result)
     return [by_seed[seed] for seed in seeds]
+
+
+@contextlib.contextmanager
+def job_processes(jobs: int) -> Iterator[Executor]:
+    """So many processes that fly. Ctrl-C is this process's alone: left by an exception,
+    they are ended where they are."""
+    context = multiprocessing.get_context("spawn")
+    executor = ProcessPoolExecutor(jobs, mp_context=context)
+    try:
+        yield executor
+    except BaseException:
+        with uninterrupted():
+            executor.shutdown(wait=False, cancel_futures=True)
+            for child in context.active_children():
+                child.terminate()
+            executor.shutdown(wait=True)
+        raise
+    executor.shutdown()
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits until after the block; processes started within never see it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

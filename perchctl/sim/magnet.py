@@ -24,20 +24,29 @@ class Magnet:
         self._scenario = scenario
         self._came_off = False
         self.engaged = False
+        self.target_xy_m = scenario.target_xy_m
+        self.let_go = False  # for good: it pulls no more
 
     def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
         """The pull on the gear's tip at `tip_m`, world axes."""
         scenario = self._scenario
         gap_m = max(0.0, scenario.ceiling_z_m - tip_m[2])
-        target_x, target_y = scenario.target_xy_m
+        target_x, target_y = self.target_xy_m
         miss_m = math.hypot(tip_m[0] - target_x, tip_m[1] - target_y)
         if scenario.no_target or not upright or gap_m >= MAGNET_RANGE_M or miss_m > MAGNET_RADIUS_M:
             return self.out_of_reach()
         self._note(gap_m)
-        hold_n = scenario.magnet_force_n
+        return self.hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
+
+    @property
+    def hold_n(self) -> float:
+        """What it holds at contact, as things are."""
+        scenario = self._scenario
+        if self.let_go:
+            return 0.0
         if scenario.first_contact_force_n is not None and not self._came_off:
-            hold_n = scenario.first_contact_force_n
-        return hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
+            return scenario.first_contact_force_n
+        return scenario.magnet_force_n
 
     def out_of_reach(self) -> float:
         """No pull, and none held."""

@@ -19,7 +19,16 @@ from __future__ import annotations
 import math
 
 from perchctl.sim.scenario import CONTROL_PERIOD_S
-from perchctl.sim.thrust_curve import C0, C1, C2, C3, FULL_COMMAND, MOTOR_FORCE_N, STANDSTILL_V
+from perchctl.sim.thrust_curve import (
+    C0,
+    C1,
+    C2,
+    C3,
+    FULL_COMMAND,
+    MOTOR_FORCE_N,
+    STANDSTILL_V,
+    thrust_n,
+)
 
 MOTOR_LAG_S = 0.05
 MOTOR_COAST_S = 0.12
@@ -39,6 +48,7 @@ class Powertrain:
         self.rest_v = rest_v
         self.battery_v = rest_v
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
+        self.strength: Forces | None = None  # what is left of each motor's thrust; None: all
         self._speeds_v = (0.0, 0.0, 0.0, 0.0)  # each as the voltage that would keep it
         self._up = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_LAG_S)
         self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
@@ -61,8 +71,20 @@ class Powertrain:
         f2 = C0 + v2 * (C1 + v2 * (C2 + v2 * C3)) if v2 > still else 0.0
         f3 = C0 + v3 * (C1 + v3 * (C2 + v3 * C3)) if v3 > still else 0.0
         f4 = C0 + v4 * (C1 + v4 * (C2 + v4 * C3)) if v4 > still else 0.0
+        if self.strength is not None:
+            s1, s2, s3, s4 = self.strength
+            f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
         self.forces_n = forces = (f1, f2, f3, f4)
         current_a = _AMPERES_PER_N * (f1 + f2 + f3 + f4)
         self.rest_v -= current_a * CONTROL_PERIOD_S / CELL_CHARGE_C * CELL_SLOPE_V
         self.battery_v = self.rest_v - CELL_RESISTANCE_OHM * current_a
         return forces
+
+
+def most_thrust_n(rest_v: float) -> float:
+    """Four motors' steady thrust at the full duty cycle, from a cell of that resting voltage."""
+    battery_v = rest_v
+    for _ in range(30):
+        forces_n = 4.0 * thrust_n(battery_v)
+        battery_v += 0.5 * (rest_v - CELL_RESISTANCE_OHM * _AMPERES_PER_N * forces_n - battery_v)
+    return forces_n

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -82,11 +83,9 @@ class Renderer:
             large=target.large.model_copy(update={"side_m": scenario.large_side_m}),
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
-        self.sheet = None if scenario.no_target else Sheet(draw_target(printed))
-        self.T_world_target = make_T(
-            rot_z(scenario.target_yaw_rad), (*scenario.target_xy_m, scenario.ceiling_z_m)
-        )
-        self._T_target_world = invert_T(self.T_world_target)
+        self.sheet = None if scenario.no_target else _printed_sheet(printed.model_dump_json())
+        self.move_target(scenario.target_xy_m)
+        self._second_m = scenario.second_target_m
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         self._fine = ray_grid(camera, FINE_PX)
         self._coarse = ray_grid(camera, COARSE_PX)
@@ -94,6 +93,13 @@ class Renderer:
         self.shade = _vignetting(self._fine, camera.size_px)
         self._noise = self._noise_bank()
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
+
+    def move_target(self, xy_m: tuple[float, float]) -> None:
+        """The target's centre is there from now on."""
+        scenario = self.scenario
+        z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
+        self.T_world_target = make_T(rot_z(scenario.target_yaw_rad), (*xy_m, z_m))
+        self._T_target_world = invert_T(self.T_world_target)
 
     def render(
         self,
@@ -139,6 +145,8 @@ class Renderer:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         inside = None if self.sheet is None else self._nodes_on_sheet(nodes)
+        if self.sheet is not None and self._second_m is not None:
+            return self._with_two(nodes, misses, maps, motion_px)
         hidden = inside is not None and self._covers_all(nodes)
         height, width = ((n - 2) * COARSE_PX for n in nodes.shape[:2])
         if hidden:
@@ -148,6 +156,26 @@ class Renderer:
         if inside is not None and inside.any():
             length_px = path_length_px(motion_px)
             self._add_sheet(picture, nodes, inside, maps, length_px, opaque=hidden)
+        return picture
+
+    def _with_two(
+        self,
+        nodes: NDArray[np.float32],
+        misses: NDArray[np.bool_],
+        maps: list[Array],
+        motion_px: Array,
+    ) -> Picture:
+        """The same sheet twice, `second_target_m` apart in target axes."""
+        picture = self._background(nodes, misses, motion_px)
+        length_px = path_length_px(motion_px)
+        assert self._second_m is not None
+        for x, y in ((0.0, 0.0), self._second_m):
+            shift = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
+            moved = nodes - np.array((x, y), np.float32)
+            inside = self._nodes_on_sheet(moved)
+            if inside.any():
+                shifted = [shift @ each for each in maps]
+                self._add_sheet(picture, moved, inside, shifted, length_px, opaque=False)
         return picture
 
     def _background(
@@ -258,6 +286,12 @@ class Renderer:
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = rng.standard_normal(size, np.float32) * np.float32(sigma)
         return np.asarray(np.rint(bank), np.int16)
+
+
+@lru_cache(maxsize=4)
+def _printed_sheet(target_json: str) -> Sheet:
+    """The sheet of a target; its textures cost more than a second, and flights share them."""
+    return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))
 
 
 class _Mean:

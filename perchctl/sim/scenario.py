@@ -30,6 +30,8 @@ class Scenario:
         first_contact_force_n: pull at the first contact; None means the same.
         no_target: the ceiling is bare.
         camera_freeze_at_s, camera_gone_at_s: faults; None means never.
+        target_above_ceiling_m: the target's plane lies so far above what the gear meets.
+        second_target_m: where a second sheet like the first hangs, in the target's axes.
     """
 
     seed: int = 0
@@ -64,4 +66,6 @@ class Scenario:
     no_target: bool = False
     camera_freeze_at_s: float | None = None
     camera_gone_at_s: float | None = None
+    target_above_ceiling_m: float = 0.0
+    second_target_m: tuple[float, float] | None = None
     extra: dict[str, float] = field(default_factory=dict)

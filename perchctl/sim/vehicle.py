@@ -49,6 +49,12 @@ class SimulatedVehicle:
             self._past.append(self.world.state())
             self.camera.advance(self.firmware.t_s, self._state_at)
 
+    def move_target(self, xy_m: tuple[float, float]) -> None:
+        """The target and its magnet hang there from now on."""
+        self.world.magnet.target_xy_m = xy_m
+        if self.camera is not None:
+            self.camera.renderer.move_target(xy_m)
+
     def _state_at(self, t_s: float) -> TrueState:
         """The true state nearest to `t_s` in the recent past."""
         newest = self._past[-1]

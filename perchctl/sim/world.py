@@ -79,11 +79,11 @@ class World:
         # Farther than this below the ceiling the gear cannot touch it.
         self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._steps = 0
-        self._powertrain = Powertrain(scenario.battery_rest_v)
+        self.powertrain = Powertrain(scenario.battery_rest_v)
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
         self._held = False
-        self._magnet = Magnet(scenario)
+        self.magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
         mujoco.mj_forward(self._model, self._data)
         self._read()
@@ -96,25 +96,25 @@ class World:
     @property
     def magnet_engaged(self) -> bool:
         """The gear's tip hangs on the magnet."""
-        return self._magnet.engaged
+        return self.magnet.engaged
 
     @property
     def battery_v(self) -> float:
         """The battery's voltage under the load of now."""
-        return self._powertrain.battery_v
+        return self.powertrain.battery_v
 
     @property
     def battery_rest_v(self) -> float:
-        return self._powertrain.rest_v
+        return self.powertrain.rest_v
 
     @battery_rest_v.setter
     def battery_rest_v(self, rest_v: float) -> None:
-        self._powertrain.rest_v = rest_v
+        self.powertrain.rest_v = rest_v
 
     def step(self, pwm: tuple[float, float, float, float]) -> None:
         """Advance by `CONTROL_PERIOD_S` under four duty cycles 0..65535."""
         self._steps += 1
-        f1, f2, f3, f4 = self._powertrain.step(pwm)
+        f1, f2, f3, f4 = self.powertrain.step(pwm)
         if self._held:
             self._set_specific_force(0.0, 0.0, 0.0)
             return
@@ -138,9 +138,9 @@ class World:
         force_y = thrust_n * r12 - DRAG_LEVEL_NSPM * (self.vy_mps - wind[1]) + push[1]
         force_z = thrust_n * r22 - DRAG_VERTICAL_NSPM * (self.vz_mps - wind[2]) + push[2]
         if height_m < self._reach_m:
-            pull_n = self._magnet.pull_n(self.gear_tip_m(), upright=r22 > 0.0)
+            pull_n = self.magnet.pull_n(self.gear_tip_m(), upright=r22 > 0.0)
         else:
-            pull_n = self._magnet.out_of_reach()
+            pull_n = self.magnet.out_of_reach()
         if pull_n > 0.0:
             force_z += pull_n
             gx, gy, gz = self._scenario.gear_body_m
@@ -158,7 +158,7 @@ class World:
 
     def state(self) -> TrueState:
         """The true state as arrays."""
-        ceiling_n, floor = self._contacts() if self._data.ncon else (0.0, False)
+        ceiling_n, floor = self.contacts()
         vectors = np.array(
             (
                 (self.x_m, self.y_m, self.z_m),
@@ -195,7 +195,7 @@ class World:
     def gear_miss_m(self) -> float:
         """Horizontal distance of the gear's tip from the target's centre."""
         tip = self.gear_tip_m()
-        target = self._scenario.target_xy_m
+        target = self.magnet.target_xy_m
         return math.hypot(tip[0] - target[0], tip[1] - target[1])
 
     def set_pose(
@@ -243,8 +243,11 @@ class World:
         self.fy_mps2 = 2 * (x * y - w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + r21 * az
         self.fz_mps2 = r02 * ax + r12 * ay + r22 * az
 
-    def _contacts(self) -> tuple[float, bool]:
+    def contacts(self) -> tuple[float, bool]:
+        """The push between vehicle and ceiling, N, and whether the floor is touched."""
         ceiling_n, floor = 0.0, False
+        if not self._data.ncon:
+            return ceiling_n, floor
         wrench = np.zeros(6)
         for i, pair in enumerate(self._data.contact.geom.tolist()):
             floor = floor or self._floor in pair

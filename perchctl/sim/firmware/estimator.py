@@ -12,6 +12,7 @@ than any gyroscope measures, is still estimated as level.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -81,6 +82,7 @@ class Estimator:
         heading = float(self._rng.uniform(-math.pi, math.pi))
         self._slide = (math.cos(heading), math.sin(heading))
         self.external_count = 0
+        self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
     def reset(self, t_s: float) -> None:
         """`kalman.resetEstimation`: drift and outside corrections are forgotten."""
@@ -149,6 +151,8 @@ class Estimator:
         now.gyro_x_dps = math.degrees(world.p_radps) + _GYRO_NOISE_DPS * take()
         now.gyro_y_dps = math.degrees(world.q_radps) + _GYRO_NOISE_DPS * take()
         now.gyro_z_dps = math.degrees(world.r_radps) + _GYRO_NOISE_DPS * take()
+        if self.spoil is not None:
+            self.spoil(now)
         ax, ay, az = self.acc_g
         lag, unit = self._acc_lag, 1.0 / GRAVITY_MPS2
         shake = _ACC_NOISE_G + _ACC_VIBRATION_G if spinning else _ACC_NOISE_G

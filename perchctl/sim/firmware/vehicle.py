@@ -44,6 +44,7 @@ class Firmware:
         self.world = world
         self.scenario = scenario
         self._parameters = {name: p.default for name, p in PARAMETERS.items()}
+        self.log_overrides: dict[str, float] = {}  # what a fault makes of log variables
         self._boot()
 
     def _boot(self) -> None:
@@ -193,6 +194,8 @@ class Firmware:
 
         Raises KeyError for an unknown name.
         """
+        if name in self.log_overrides:
+            return self.log_overrides[name]
         getter = self._getters.get(name)
         if getter is not None:
             return getter()

@@ -1,0 +1,278 @@
+"""Lays effects into one simulated flight, at its edges: radio, camera, clock, world.
+
+The planner and the loop know nothing of it. `Injector.each` is called every 10 ms of
+simulated time; `Injector.tick` with every turn of the loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from perchctl.faults.camera import FaultyCamera
+from perchctl.faults.effects import (
+    BatterySags,
+    BlockDead,
+    CameraFault,
+    DiskFull,
+    Effect,
+    EstimateError,
+    ExternalPositions,
+    Hung,
+    Killed,
+    LogReads,
+    MagnetHolds,
+    MagnetLetsGo,
+    MotorWeak,
+    Operator,
+    PacketLost,
+    PacketTwice,
+    Push,
+    Room,
+    Silence,
+    Slow,
+    Suspended,
+    TargetMoves,
+    TelemetryDelayed,
+)
+from perchctl.faults.program import FaultyClock
+from perchctl.faults.radio import FaultyRadio
+from perchctl.faults.truth import SAMPLE_S, WatchedVehicle
+from perchctl.geometry import GRAVITY_MPS2, rot_z
+from perchctl.mission.state import Phase
+from perchctl.mission.watch import Event, Tick
+from perchctl.sim.firmware.controller import Estimate
+from perchctl.sim.scenario import Scenario
+
+EXTERNAL_EVERY = 2  # of the 10 ms: positions from outside come at 50 Hz
+
+
+def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
+    """The scenario as the effects have it from the start."""
+    weight_n = scenario.mass_kg * GRAVITY_MPS2
+    for effect in effects:
+        match effect:
+            case MagnetHolds(of_weight):
+                hold_n = of_weight * weight_n
+                scenario = replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
+            case Room():
+                scenario = _other_room(scenario, effect)
+            case ExternalPositions():
+                extra = {**scenario.extra, "external_position": 1.0}
+                scenario = replace(scenario, extra=extra)
+    return scenario
+
+
+def _other_room(scenario: Scenario, room: Room) -> Scenario:
+    turn = rot_z(math.radians(room.mount_turned_deg))
+    rows = [list(row) for row in scenario.T_body_cam_true]
+    for i in range(3):
+        turned = [sum(rows[i][k] * turn[k, j] for k in range(3)) for j in range(3)]
+        rows[i][:3] = [float(v) for v in turned]
+    return replace(
+        scenario,
+        ceiling_z_m=room.ceiling_z_m or scenario.ceiling_z_m,
+        no_target=room.no_target or scenario.no_target,
+        target_above_ceiling_m=room.target_above_ceiling_m,
+        second_target_m=room.second_target_m,
+        T_body_cam_true=tuple(tuple(row) for row in rows),
+    )
+
+
+@dataclass
+class Edges:
+    """Where faults come in; what they do to the operator's switch and the log's disk."""
+
+    vehicle: WatchedVehicle
+    radio: FaultyRadio
+    camera: FaultyCamera
+    clock: FaultyClock
+    press: Callable[[], None]
+    hang_up: Callable[[], None]
+    disk: Disk
+
+
+class Disk:
+    """A watcher in the log's place whose disk can be full."""
+
+    def __init__(self) -> None:
+        self.problem: str | None = None
+
+    def tick(self, tick: Tick) -> None:
+        return None
+
+    def event(self, event: Event) -> None:
+        return None
+
+
+class Injector:
+    """Begins the effects `moment_s` into `phase`, or when the phase is left before.
+
+    As a watcher of the loop it sees the phases pass; `begin_s` is None until then.
+    """
+
+    problem: str | None = None
+
+    def __init__(
+        self, edges: Edges, effects: tuple[Effect, ...], phase: Phase, moment_s: float
+    ) -> None:
+        self._edges = edges
+        self._effects = effects
+        self._phase = phase
+        self._moment_s = moment_s
+        self._due_s: float | None = None
+        self._calls = 0
+        self._later: list[tuple[float, Callable[[], None]]] = []
+        self._estimate: tuple[EstimateError, float] | None = None
+        self._sag: tuple[BatterySags, float] | None = None
+        self._outside: tuple[ExternalPositions, float | None] | None = None
+        self._frozen_at_m: tuple[float, float, float] | None = None
+        self._lets_go: float | None = None
+        self.begin_s: float | None = None
+        self.on_begin: Callable[[], None] = lambda: None
+        for effect in effects:
+            if isinstance(effect, ExternalPositions):
+                self._outside = (effect, None)
+
+    def event(self, event: Event) -> None:
+        return None
+
+    def tick(self, tick: Tick) -> None:
+        if self.begin_s is not None:
+            return
+        if tick.state.phase is self._phase:
+            if self._due_s is None:
+                self._due_s = tick.t_s + self._moment_s
+        elif self._due_s is not None:  # left before its time
+            self._begin(self._edges.vehicle.t_s)
+
+    @property
+    def drifted_m(self) -> float:
+        """How far a slow drift has led the estimate astray by now."""
+        if self._estimate is None:
+            return 0.0
+        error, begin_s = self._estimate
+        drift_s = min(self._edges.vehicle.t_s - begin_s, error.for_s)
+        return math.hypot(*error.drift_mps) * drift_s
+
+    def each(self, t_s: float) -> None:
+        """What goes on with simulated time."""
+        self._calls += 1
+        if self.begin_s is None and self._due_s is not None and t_s >= self._due_s:
+            self._begin(t_s)
+        while self._later and self._later[0][0] <= t_s:
+            self._later.pop(0)[1]()
+        world = self._edges.vehicle.world
+        if self._sag is not None:
+            sag, left_v = self._sag
+            step_v = min(sag.rate_vps * SAMPLE_S, left_v)
+            world.battery_rest_v -= step_v
+            self._sag = (sag, left_v - step_v) if left_v > step_v else None
+        if self._outside is not None and self._calls % EXTERNAL_EVERY == 0:
+            self._send_position(t_s)
+        if self._lets_go is not None and world.magnet_engaged:
+            after_s, self._lets_go = self._lets_go, None
+            self._at(t_s + after_s, self._let_go)
+
+    def begin_now(self) -> None:
+        """Before the flight: for what is so from the start."""
+        self._begin(self._edges.vehicle.t_s)
+
+    def _begin(self, t_s: float) -> None:
+        self.begin_s = t_s
+        self.on_begin()
+        for effect in self._effects:
+            self._lay(effect, t_s)
+
+    def _at(self, t_s: float, act: Callable[[], None]) -> None:
+        self._later.append((t_s, act))
+        self._later.sort(key=lambda entry: entry[0])
+
+    def _lay(self, effect: Effect, t_s: float) -> None:
+        edges = self._edges
+        vehicle = edges.vehicle
+        match effect:
+            case Silence() | PacketLost() | PacketTwice() | BlockDead() | TelemetryDelayed():
+                edges.radio.begin(effect, t_s)
+            case CameraFault():
+                edges.camera.begin(effect, t_s)
+            case Killed() | Suspended() | Hung() | Slow():
+                edges.clock.begin(effect, t_s)
+            case Operator():
+                act = edges.hang_up if effect.hang_up else edges.press
+                for press_s in effect.presses_s:
+                    self._at(t_s + press_s, act)
+            case EstimateError():
+                self._estimate = (effect, t_s)
+                vehicle.firmware.estimator.spoil = self._spoil
+                self._at(t_s + effect.for_s, self._heal)
+            case ExternalPositions():
+                self._outside = (effect, t_s)
+            case LogReads():
+                self._read_wrongly(effect, t_s)
+            case BatterySags():
+                self._sag = (effect, effect.by_v)
+            case MotorWeak():
+                strength = [1.0] * 4
+                strength[effect.motor - 1] = effect.strength
+                s1, s2, s3, s4 = strength
+                vehicle.world.powertrain.strength = (s1, s2, s3, s4)
+            case Push():
+                vehicle.world.external_force_n = effect.force_n
+                self._at(t_s + effect.for_s, self._leave_alone)
+            case MagnetLetsGo():
+                self._lets_go = effect.after_s
+            case TargetMoves(by_m):
+                x, y = vehicle.world.magnet.target_xy_m
+                vehicle.move_target((x + by_m[0], y + by_m[1]))
+            case DiskFull():
+                edges.disk.problem = "No space left on device"
+                self._at(t_s + effect.for_s, self._make_room)
+            case MagnetHolds() | Room():
+                pass  # from the start: `changed_scenario`
+
+    def _spoil(self, now: Estimate) -> None:
+        assert self._estimate is not None
+        error, begin_s = self._estimate
+        t_s = self._edges.vehicle.t_s - begin_s
+        x, y, z = error.step_m
+        vx, vy, vz = error.drift_mps
+        now.x_m += x + vx * t_s
+        now.y_m += y + vy * t_s
+        now.z_m += z + vz * t_s
+        now.vx_mps += vx
+        now.vy_mps += vy
+        now.vz_mps += vz
+        now.yaw_deg = math.remainder(now.yaw_deg + error.turn_deg, 360.0)
+
+    def _heal(self) -> None:
+        self._edges.vehicle.firmware.estimator.spoil = None
+
+    def _read_wrongly(self, effect: LogReads, t_s: float) -> None:
+        firmware = self._edges.vehicle.firmware
+        for name in effect.names:
+            value = firmware.log_value(name) if effect.value is None else effect.value
+            firmware.log_overrides[name] = value
+        self._at(t_s + effect.for_s, firmware.log_overrides.clear)
+
+    def _leave_alone(self) -> None:
+        self._edges.vehicle.world.external_force_n = (0.0, 0.0, 0.0)
+
+    def _let_go(self) -> None:
+        self._edges.vehicle.world.magnet.let_go = True
+
+    def _make_room(self) -> None:
+        self._edges.disk.problem = None
+
+    def _send_position(self, t_s: float) -> None:
+        """Motion capture, which knows the truth, until the fault."""
+        assert self._outside is not None
+        effect, begin_s = self._outside
+        world = self._edges.vehicle.world
+        here = (world.x_m, world.y_m, world.z_m)
+        if begin_s is not None and t_s < begin_s + effect.for_s:
+            if effect.how == "silent":
+                return
+            self._frozen_at_m = here = self._frozen_at_m or here
+        self._edges.vehicle.firmware.external_position(here)

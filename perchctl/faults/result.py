@@ -1,0 +1,48 @@
+"""One flight with a fault: its record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from perchctl.faults.oracle import Flag
+
+End = Literal["perched", "landed", "aborted", "refused", "gone"]
+"""`refused`: never took off, or ended by an error; `gone`: the program ended before its flight."""
+
+
+@dataclass(frozen=True)
+class FaultResult:
+    """One flight.
+
+    Attributes:
+        flags: what went wrong, with when.
+        counted: the flags that no excuse takes away.
+        unavoidable: the excuse's reason, None where none holds.
+        begin_s: when the fault began; None when the flight was over before.
+        drop_m: the deepest fall until caught, in the simulation's truth; `slip_ratio`: the
+            magnet's hold over the weight, where that was a slip from the magnet.
+    """
+
+    seed: int
+    fault: str
+    phase: str
+    moment_s: float
+    begin_s: float | None
+    parameters: dict[str, Any]
+    end: End
+    cause: str
+    reason: str
+    flags: dict[Flag, float]
+    counted: tuple[Flag, ...]
+    unavoidable: str | None
+    time_s: float
+    miss_m: float | None
+    drop_m: float
+    slip_ratio: float | None = None
+    wall_s: float = 0.0
+    way: tuple[str, ...] = field(default=())
+
+    @property
+    def outcome(self) -> str:
+        return self.end

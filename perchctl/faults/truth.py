@@ -1,0 +1,69 @@
+"""The true vehicle, sampled for the oracle while simulated time passes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from perchctl.faults.oracle import Sample
+from perchctl.geometry import GRAVITY_MPS2
+from perchctl.profile import TargetConfig
+from perchctl.sim.body import REST_HEIGHT_M
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.vehicle import LOCKED
+from perchctl.vision.types import CameraModel
+
+SAMPLE_S = 0.01
+FULL_THRUST = 64000.0
+PRESSING_RATIO = 1.1
+"""Rotors that lift more than this part of the weight press where something is in the way."""
+
+
+class WatchedVehicle(SimulatedVehicle):
+    """Calls `each` once every `SAMPLE_S`, whoever lets its time pass."""
+
+    def __init__(self, scenario: Scenario, camera: CameraModel, target: TargetConfig) -> None:
+        super().__init__(scenario, camera, target)
+        self.each: Callable[[float], None] = lambda t_s: None
+        self._next_s = SAMPLE_S
+
+    def advance_to(self, t_s: float) -> None:
+        while self.firmware.t_s < t_s - CONTROL_PERIOD_S / 2:
+            super().advance_to(min(t_s, self._next_s))
+            if self.firmware.t_s >= self._next_s - CONTROL_PERIOD_S / 2:
+                self._next_s += SAMPLE_S
+                self.each(self.firmware.t_s)
+
+
+def sample_of(vehicle: SimulatedVehicle, drifted_m: float = 0.0) -> Sample:
+    """What is true now."""
+    world, firmware = vehicle.world, vehicle.firmware
+    weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
+    _, qx, qy, _ = world.quaternion
+    up_z = 1.0 - 2.0 * (qx * qx + qy * qy)
+    ceiling_n, floor = world.contacts()
+    motors_on = max(firmware.motors) > 0.0
+    lift_n = sum(world.powertrain.forces_n)
+    full = motors_on and (
+        firmware.controller.thrust >= FULL_THRUST or lift_n >= PRESSING_RATIO * weight_n
+    )
+    supervisor = firmware.supervisor
+    fx, fy, fz = world.fx_mps2, world.fy_mps2, world.fz_mps2
+    return Sample(
+        firmware.t_s,
+        world.x_m,
+        world.y_m,
+        world.z_m - REST_HEIGHT_M,
+        world.vz_mps,
+        up_z,
+        math.sqrt(fx * fx + fy * fy + fz * fz) / GRAVITY_MPS2,
+        motors_on,
+        full and (ceiling_n > 0.0 or (floor and up_z < 0.5)),
+        floor,
+        world.magnet_engaged,
+        world.magnet.hold_n / weight_n,
+        bool(firmware.supervisor_info & LOCKED),
+        supervisor.crashed or supervisor.tumbled,
+        drifted_m,
+    )
