@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import load_calibration
-from perchctl.commands.interrupt import signals_to
+from perchctl.commands.interrupt import signals_to_operator
 from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
 from perchctl.display.page.flight import FlightPage, flight_page
@@ -203,9 +203,9 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
 
 
 def _session(options: FlyOptions, watchers: tuple[Watcher, ...], port: int | None) -> SessionResult:
-    """The session with Ctrl-C on its switch, and with the live page where there is a port."""
+    """The session with the signals on its switch, and with the live page where there is a port."""
     switch = OperatorSwitch()
-    with signals_to(switch.press), live_page(options, port, switch) as page:
+    with signals_to_operator(switch, say), live_page(options, port, switch) as page:
         if page is None:
             return fly_session(options, watchers, switch)
         return fly_session(options, (*watchers, page), switch, page.watched)
