@@ -117,8 +117,6 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
         senses.take_in(now_s, look=not _is_blind(state))
         now_s = _present(parts, senses, now_s)
         late_s = max(0.0, now_s - due_s)
-        if state is not None and state.phase in FLYING_PHASES:
-            late_s = max(late_s, watchdog.overruled_s)  # it has landed for this loop
         obs = _observe(parts, senses, now_s, late_s)
         before = state
         new, command = planner.step(before or planner.start(obs), obs, parts.profile)
@@ -161,6 +159,8 @@ def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:
     before = senses.history
     after = extended(before, parts.link.telemetry(), parts.profile.safety)
     senses.history = replace(after, jumped=before.jumped or after.jumped)
+    if senses.last_good_frame_s == began_s:
+        senses.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
     return now_s
 
 
