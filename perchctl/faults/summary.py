@@ -40,7 +40,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     """The figures, faults against phases, and the worst flights, as plain text."""
     figures = fault_summary(results)
     flown = {r.fault for r in results}
-    cells = [("fault", *HEADS)]
+    cells: list[tuple[str, ...]] = [("fault", *HEADS)]
     cells += [
         (fault.name, *(_cell(results, fault.name, phase) for phase in PHASES))
         for fault in FAULTS

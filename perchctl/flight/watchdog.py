@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 from perchctl.link.evidence import is_cut, is_known, motors_may_run
 from perchctl.mission.landing import PEELED_M, landing_time_s
-from perchctl.mission.release import CATCH_ABOVE_M, CATCH_LIMIT_S, THRUST_MIN
+from perchctl.mission.release import CATCH_LIMIT_S, CATCH_STILL_ABOVE_M, THRUST_MIN
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.profile import LandingConfig, Profile
 from perchctl.vehicle import (
@@ -222,7 +222,7 @@ class Watchdog:
                 self._held = PositionSetpoint(x, y, z, known.yaw_rad)
             return None
         top_m = turn.ground_z_m + self._top_m
-        return PositionSetpoint(x, y, min(z + CATCH_ABOVE_M, top_m), known.yaw_rad)
+        return PositionSetpoint(x, y, min(z + CATCH_STILL_ABOVE_M, top_m), known.yaw_rad)
 
 
 def _held_place(turn: Turn, known: Telemetry | None) -> PositionSetpoint:
