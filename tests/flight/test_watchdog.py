@@ -16,7 +16,7 @@ from perchctl.flight.watchdog import (
     REPEAT_AFTER_S,
     Watchdog,
 )
-from perchctl.mission.release import CATCH_ABOVE_M, STILL_THRUST
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, STILL_THRUST
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -131,7 +131,7 @@ def test_a_slip_while_the_loop_is_silent_is_caught_then_held_then_landed() -> No
     rig.z_m = CEILING_M - 0.05
     falls = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0}
     caught = rig.after(0.35, **falls)
-    assert caught == PositionSetpoint(0.0, 0.0, min(rig.z_m + CATCH_ABOVE_M, 3.0), 0.0)
+    assert caught == PositionSetpoint(0.0, 0.0, min(rig.z_m + CATCH_STILL_ABOVE_M, 3.0), 0.0)
     rig.z_m = CEILING_M - 0.4
     assert isinstance(rig.after(0.6, **falls), PositionSetpoint)
     assert rig.after(0.7) == PositionSetpoint(0.0, 0.0, rig.z_m, 0.0)
