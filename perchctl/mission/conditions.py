@@ -14,7 +14,7 @@ from perchctl.mission.state import Condition, Phase
 
 FULL_THRUST = 65535
 STILL_MOTORS_THRUST = 5000
-"""At and below it the motors stand still (docs/firmware.md, "Raw thrust")."""
+"""At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
 
 def _aligned(c: Context) -> bool:
