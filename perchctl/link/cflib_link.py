@@ -51,7 +51,7 @@ class CflibLink:
         self._blocks = LogBlocks(clock)
         self._sender: Sender | None = None
         self._guard: Guard | None = None
-        self._reopening = False
+        self._reopener: threading.Thread | None = None
         self.connection: Connection | None = None
 
     def connect(self) -> None:
@@ -150,19 +150,21 @@ class CflibLink:
     def _reopen(self, connection: Connection, order: Command) -> None:
         """Once in a flight, beside the loop and the sender: what has to come down is worth one
         more try. The order goes out again as soon as there is a link."""
-        if self._reopening:
+        if self._reopener is not None:
             return
-        self._reopening = True
 
         def run() -> None:
             if connection.reopen():
                 self.send(order)
 
-        threading.Thread(target=run, name="perchctl-reconnect", daemon=True).start()
+        self._reopener = threading.Thread(target=run, name="perchctl-reconnect", daemon=True)
+        self._reopener.start()
 
     def _may_hear_more(self) -> bool:
-        connection = self.connection
-        return connection is not None and (connection.lost is None or self._reopening)
+        connection, reopener = self.connection, self._reopener
+        if connection is None:
+            return False
+        return connection.lost is None or (reopener is not None and reopener.is_alive())
 
     def _may_say_farewell(self) -> bool:
         """Only where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""
