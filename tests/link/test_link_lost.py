@@ -40,7 +40,7 @@ def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
         yield process
 
 
-# --- evidence ------------------------------------------------------------------------------------
+# --- evidence --------------------------------------------------------------------------------
 
 OLD_S = evidence.FRESH_S + 0.01
 
@@ -64,7 +64,7 @@ def test_motors_off_for_less_than_two_seconds_is_no_flight_but_no_farewell_eithe
     assert evidence.motors_may_run(telemetry(10.0, supervisor=READY | HL_ACTIVE, thrust=0.0), 10.0)
 
 
-# --- leaving ---------------------------------------------------------------------------------------
+# --- leaving ---------------------------------------------------------------------------------
 
 
 def test_closing_sends_no_zero_setpoint_when_nothing_is_known_any_more(sim: SimProcess) -> None:
@@ -94,7 +94,7 @@ def test_a_failed_look_at_the_estimate_commands_nothing(sim: SimProcess) -> None
     assert sent == [[]]
 
 
-# --- lost in flight ----------------------------------------------------------------------------------
+# --- lost in flight --------------------------------------------------------------------------
 
 
 def test_a_radio_is_not_given_up_after_a_tenth_of_a_second(sim: SimProcess) -> None:
