@@ -48,7 +48,7 @@ USUAL_S: dict[Phase, float] = {
     P.PERCH: 1.0,
     P.COMPLETE: 5.2,
     P.RECOVER: 1.5,
-    P.LANDING: 8.0,
+    P.LANDING: 5.0,
 }
 """For how long a phase usually lasts: a fault begins somewhere within."""
 LANDED_FROM = (P.SEARCH, P.ALIGN, P.ASCEND, P.PERCH, P.COMPLETE)

@@ -37,11 +37,9 @@ class Facts:
 
     effects: tuple[Effect, ...]
     begin_s: float | None
-    end_s: float
     report_s: float | None
     let_go_s: float | None
     own_landing: bool
-    in_the_air: bool
     lift_ratio: float
     hung_m: float | None
 

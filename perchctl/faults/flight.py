@@ -85,7 +85,7 @@ class FaultyFlight:
         )
         safety = profile.safety
         self._oracle = Oracle(Limits(safety.fence_radius_m, safety.max_height_m))
-        self._own_landing = self._aloft = False
+        self._own_landing = False
         self._lift_ratio = float("inf")
         self._hung_m: float | None = None
         self._let_go_s: float | None = None
@@ -94,9 +94,9 @@ class FaultyFlight:
         began_s = time.perf_counter()
         self._vehicle.each = self._each
         ended = self._program()
+        self._vehicle.camera = None
         end_s = self._link.now_s
         self._oracle.ended(end_s)
-        self._vehicle.camera = None  # nobody looks any more
         self._vehicle.advance_to(end_s + AFTER_S)
         if self._oracle.in_the_air:
             self._vehicle.advance_to(end_s + AFTER_IN_THE_AIR_S)
@@ -121,6 +121,7 @@ class FaultyFlight:
             return _Ended(error=str(error))
         except Exception as error:
             return _Ended(error=f"unforeseen {type(error).__name__}: {error}")
+        self._vehicle.camera = None  # nobody looks any more
         self._oracle.claims(claim_of(report), self._link.now_s)
         return _Ended(report, report_s=self._link.now_s)
 
@@ -131,6 +132,9 @@ class FaultyFlight:
         self._oracle.see(sample)
         if sample.hanging:
             self._hung_m = sample.height_m
+        landing = self._injector.flown is Phase.LANDING
+        if landing and sample.floor and not sample.motors_on:
+            self._vehicle.camera = None  # most of the time would go into pictures of the wait
         world = self._vehicle.world
         if world.magnet.let_go and self._let_go_s is None:
             self._let_go_s = t_s
@@ -142,7 +146,6 @@ class FaultyFlight:
 
     def _note_beginning(self) -> None:
         self._own_landing = self._vehicle.firmware.planner.active
-        self._aloft = self._oracle.in_the_air
 
     def _result(self, ended: _Ended, end_s: float, wall_s: float) -> FaultResult:
         case, report = self._case, ended.report
@@ -150,11 +153,9 @@ class FaultyFlight:
         facts = Facts(
             effects=case.effects,
             begin_s=self._injector.begin_s,
-            end_s=end_s,
             report_s=ended.report_s,
             let_go_s=self._let_go_s,
             own_landing=self._own_landing,
-            in_the_air=self._aloft,
             lift_ratio=self._lift_ratio,
             hung_m=self._hung_m,
         )

@@ -130,6 +130,7 @@ class Injector:
         self._frozen_at_m: tuple[float, float, float] | None = None
         self._lets_go: float | None = None
         self.begin_s: float | None = None
+        self.flown: Phase | None = None  # the phase of the newest turn
         self.on_begin: Callable[[], None] = lambda: None
         for effect in effects:
             if isinstance(effect, ExternalPositions):
@@ -139,6 +140,7 @@ class Injector:
         return None
 
     def tick(self, tick: Tick) -> None:
+        self.flown = tick.state.phase
         if self.begin_s is not None:
             return
         if tick.state.phase is self._phase:

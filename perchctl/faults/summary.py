@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, get_args
@@ -14,20 +15,29 @@ from perchctl.flight.results import aligned
 ENDS: tuple[End, ...] = get_args(End)
 WORST = 20
 PHASES = tuple(phase.value for phase in AIR)
+SLIPS = {"to 0.3": (0.0, 0.3), "to 0.75": (0.3, 0.75), "above": (0.75, math.inf)}
+"""What the magnet held, over the weight, where it let go."""
 HEADS = ("appr", "srch", "est", "align", "asc", "perch", "compl", "recov", "land")
 """The phases' heads, as narrow as their columns."""
 
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     """Ready for JSON. The flags are counted outside the unavoidable; `unavoidable` is the
-    number of flights in which one was excused."""
+    number of flights in which one was excused, `drop_m` the deepest slips from a magnet that
+    held up to so much of the weight."""
     return {
         "flights": len(results),
         **{end: sum(r.end == end for r in results) for end in ENDS},
         **{flag: sum(flag in r.counted for r in results) for flag in FLAGS},
         "unavoidable": sum(_is_excused(r) for r in results),
+        "drop_m": {name: _deepest_m(results, *bounds) for name, bounds in SLIPS.items()},
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
+
+
+def _deepest_m(results: Iterable[FaultResult], above: float, to: float) -> float | None:
+    slips = [r.drop_m for r in results if r.slip_ratio is not None and above < r.slip_ratio <= to]
+    return round(max(slips), 3) if slips else None
 
 
 def worst_first(results: Iterable[FaultResult]) -> list[FaultResult]:
@@ -53,6 +63,9 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     lines += [f"{flag.replace('_', ' '):<18} {figures[flag]}" for flag in FLAGS]
     lines.append(f"unavoidable        {figures['unavoidable']}")
     lines += [f"  {count} x {reason}" for reason, count in reasons(results).items()]
+    drops = ", ".join(f"{d:.2f} m {n}" for n, d in figures["drop_m"].items() if d is not None)
+    if drops:
+        lines.append(f"deepest slip       {drops} of the weight")
     worst = worst_first(results)[:WORST]
     if worst:
         lines += ["", "worst flights"]

@@ -36,14 +36,12 @@ class Magnet:
         if scenario.no_target or not upright or gap_m >= MAGNET_RANGE_M or miss_m > MAGNET_RADIUS_M:
             return self.out_of_reach()
         self._note(gap_m)
-        return self.hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
+        return 0.0 if self.let_go else self.hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
 
     @property
     def hold_n(self) -> float:
-        """What it holds at contact, as things are."""
+        """What it holds at contact, unless it has let go."""
         scenario = self._scenario
-        if self.let_go:
-            return 0.0
         if scenario.first_contact_force_n is not None and not self._came_off:
             return scenario.first_contact_force_n
         return scenario.magnet_force_n
