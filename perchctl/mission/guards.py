@@ -61,3 +61,12 @@ def has_slipped(c: Context) -> bool:
     if falls and c.proves and tel.velocity_mps[2] < FALLING_MPS:
         return True
     return c.held(Condition.SLIPPING) >= SLIP_DWELL_S
+
+
+def why_not_found(c: Context) -> str:
+    text = "target not found in the allowed attempts"
+    if c.obs.camera_problem:
+        return f"{text} ({c.obs.camera_problem})"
+    if c.target_m is not None and c.state.mount.open:
+        return f"{text}, though it was seen before: does camera.mount fit the camera?"
+    return text

@@ -13,6 +13,7 @@ import numpy as np
 from perchctl.mission.actions import act
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason
 from perchctl.mission.context import Context
+from perchctl.mission.mounting import MountWatch, Sight, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M
 from perchctl.mission.state import (
     TERMINALS,
@@ -21,7 +22,7 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import TABLE, Row, first_match, risen
+from perchctl.mission.table import TABLE, WATCHED, Row, first_match, risen
 from perchctl.profile import Profile
 from perchctl.vehicle import Command
 
@@ -68,7 +69,7 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
         since = _kept(since)  # a held vehicle proves nothing: the dwell times begin anew
     if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and context.speed_mps < 0.3:
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    return replace(state, since=since)
+    return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -88,6 +89,18 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
         target_spread_m=spread_m,
         confirmed=state.confirmed + 1,
     )
+
+
+def _mount_watched(c: Context) -> MountWatch:
+    """With this tick's frame, where it measured the target and the telemetry is fresh."""
+    mount, target = c.state.mount, c.obs.target
+    if c.state.phase not in WATCHED or c.state.hold or not (c.obs.new_frame and c.proves):
+        return mount
+    if target is None or not target.measured or target.world_m is None:
+        return mount
+    x, y, _ = c.obs.telemetry.position_m
+    place = complex(float(target.world_m[0]), float(target.world_m[1]))
+    return watched(mount, Sight(c.obs.t_s, complex(x, y), place))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
+from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
 from perchctl.vision.types import TargetEstimate
 
@@ -151,6 +152,7 @@ class PlannerState:
     confirmed: int = 0
     target_m: Array | None = None  # in the world, at the last frame that measured it
     target_spread_m: float = 0.0  # by which successive frames' targets differ
+    mount: MountWatch = field(default_factory=MountWatch)  # does the target stand still
     ground_m: tuple[float, float, float] | None = None
     entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entry_yaw_rad: float = 0.0

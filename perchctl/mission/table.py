@@ -19,7 +19,9 @@ from perchctl.mission.guards import (
     searched_out,
     settling_too_long,
     stopped_for_s,
+    why_not_found,
 )
+from perchctl.mission.mounting import explained
 from perchctl.mission.state import (
     FLYING_PHASES,
     Condition,
@@ -36,6 +38,7 @@ P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of
 
 AIR = FLYING_PHASES | {P.LANDING}
 BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
+WATCHED = BY_CAMERA | {P.APPROACH}
 BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
 
 
@@ -127,6 +130,10 @@ TABLE: tuple[Row, ...] = (
         "the battery's reading stands still", S.LAND, O.SAFETY,
     ),
     Row(
+        "mounting", WATCHED, lambda c: c.state.mount.wrong, P.LANDING,
+        lambda c: explained(c.state.mount), S.LAND, O.SAFETY,
+    ),
+    Row(
         "height-limit", BEFORE_CONTACT,
         lambda c: c.height_m > c.profile.safety.max_height_m, P.LANDING,
         lambda c: f"height {c.height_m:.2f} m is above the limit", S.LAND, O.SAFETY,
@@ -199,8 +206,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "searched-out", _only(P.SEARCH), searched_out, P.LANDING,
-        lambda c: "target not found in the allowed attempts"
-        + (f" ({c.obs.camera_problem})" if c.obs.camera_problem else ""),
+        why_not_found,
         S.LAND, O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
