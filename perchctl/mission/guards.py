@@ -9,6 +9,7 @@ from perchctl.mission.state import Condition
 
 SLIP_DWELL_S = 0.03
 FALLING_MPS = -0.05
+HUNG_WITHIN_M = 0.3
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -42,10 +43,16 @@ def stopped_for_s(c: Context) -> float:
 
 def hangs_stopped(c: Context) -> bool:
     """The motors were stopped where it hung, and there it still is."""
-    state, tel = c.state, c.obs.telemetry
-    if state.stopped_s is None or state.contact_z_m is None or not c.proves:
+    return c.state.stopped_s is not None and still_at_contact(c)
+
+
+def still_at_contact(c: Context) -> bool:
+    """Where the magnet has it: a slip ends the contact at once, and what the estimate drifts
+    while it hangs blind is less than this."""
+    contact_z_m = c.state.contact_z_m
+    if contact_z_m is None or not c.proves:
         return False
-    return state.contact_z_m - tel.position_m[2] <= c.profile.planner.complete.slip_m
+    return contact_z_m - c.obs.telemetry.position_m[2] <= HUNG_WITHIN_M
 
 
 def settling_too_long(c: Context) -> bool:

@@ -25,6 +25,7 @@ PLANNED_MPS, SETTLING_S = 0.4, 1.8
 """The quintic's largest speed, and time added for the begin: the change to the vehicle's own
 trajectory resets its controller, and what it then catches up with must be slow. Touchdown
 comes out at 0.35 m/s at most."""
+PEEL_BLIND_S = 4.0
 PEELED_M = 0.1
 """Below the contact by so much, the magnet has let go."""
 _PEAK_OF_MEAN = 1.875
@@ -48,7 +49,8 @@ def landing(c: Context) -> Acted:
         return _hang_on(c)
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
-    if state.orders or _doubtful(c) or c.height_m <= c.profile.planner.landing.handover_m:
+    low = c.height_m <= c.profile.planner.landing.handover_m
+    if state.orders or (not _is_peeling(c) and (low or _doubtful(c))):
         return _by_itself(c)
     return _by_setpoints(c)
 
@@ -66,6 +68,15 @@ def _hang_on(c: Context) -> Acted:
         c = Context(state, c.obs, c.profile)
         return catch(c) or _by_setpoints(c)
     return let_go(c) if c.state.stopped_s is None else stop_motors(c)
+
+
+def _is_peeling(c: Context) -> bool:
+    """At the ceiling, a landing of the vehicle's own would run by its clock and end with the
+    motors off up there: first setpoints below, for a while also blindly."""
+    if c.state.contact_z_m is None:
+        return False
+    seen = c.obs.link_problem is None and c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+    return seen or c.in_phase_s < PEEL_BLIND_S
 
 
 def _doubtful(c: Context) -> bool:

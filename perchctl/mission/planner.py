@@ -24,7 +24,7 @@ from perchctl.mission.state import (
 )
 from perchctl.mission.table import TABLE, WATCHED, Row, first_match, risen
 from perchctl.profile import Profile
-from perchctl.vehicle import Command
+from perchctl.vehicle import Command, PositionSetpoint
 
 
 def start(obs: Observation) -> PlannerState:
@@ -60,8 +60,8 @@ def is_over(state: PlannerState) -> bool:
 
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     state = _with_target(state, obs)
-    if obs.jumped and state.jump_s is None:
-        state = replace(state, jump_s=obs.t_s)
+    if obs.jumped:
+        state = _jumped(state, obs)
     context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)
@@ -70,6 +70,20 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and context.speed_mps < 0.3:
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
+
+
+def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
+    """The estimate's world has moved. What is held by the magnet has not: its references are
+    where the estimate has it now."""
+    if state.contact_z_m is not None:
+        tel = obs.telemetry
+        x, y, z = tel.position_m
+        setpoint = state.setpoint
+        if setpoint is not None:
+            below_m = setpoint.z_m - state.contact_z_m
+            setpoint = PositionSetpoint(x, y, z + below_m, tel.yaw_rad)
+        state = replace(state, contact_z_m=z, entry_m=(x, y, z), setpoint=setpoint)
+    return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -158,6 +172,9 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
                 catch_above_m=CATCH_STILL_ABOVE_M if still else CATCH_TURNING_ABOVE_M,
                 blocked_z_m=blocked_z_m,
             )
+        case Phase.LANDING if old.phase is Phase.PERCH:
+            # It may be in the magnet's reach: it has to be seen below before it counts as free.
+            return replace(new, contact_z_m=obs.telemetry.position_m[2])
         case Phase.ASCEND:
             return replace(new, searches=0)
         case Phase.SEARCH if old.setpoint is not None:

@@ -26,6 +26,7 @@ STOPS, STOP_PERIOD_S, STOP_AGAIN_S = 5, 0.1, 0.5
 CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
 """Motors that stand still need all the thrust there is. Those that turn with most of it
 would carry the vehicle back to the ceiling, beside the target's centre."""
+UNSEEN_S = 3.0
 CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
 CAUGHT_MPS = -0.1
 """By then the thrust is above the weight, and goes on rising until the setpoint is below."""
@@ -59,6 +60,8 @@ def let_go(c: Context) -> Acted:
     assert state.released_s is not None
     if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s:
         return stop_motors(c)
+    if c.telemetry_age_s > UNSEEN_S and c.obs.t_s - state.released_s > complete.ramp_s + UNSEEN_S:
+        return stop_motors(c)  # still for seconds by order: the pair only keeps it from locking
     part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
     start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
     start = min(start, THRUST_MIN)

@@ -18,6 +18,7 @@ from perchctl.mission.guards import (
     left_jump_hold,
     searched_out,
     settling_too_long,
+    still_at_contact,
     stopped_for_s,
     why_not_found,
 )
@@ -116,7 +117,7 @@ TABLE: tuple[Row, ...] = (
         lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
     ),
     Row(
-        "estimator-jump", FLYING_PHASES, left_jump_hold, P.LANDING,
+        "estimator-jump", BEFORE_CONTACT, left_jump_hold, P.LANDING,
         "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
     ),
     Row(
@@ -304,7 +305,8 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- landing ---------------------------------------------------------------
     Row(
-        "hung", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1 and hangs_stopped(c), P.PERCHED,
+        "hung", _only(P.LANDING),
+        lambda c: c.held(C.DOWN) >= 0.1 and still_at_contact(c), P.PERCHED,
         "the magnet holds: hanging with the motors off",
     ),
     Row(
