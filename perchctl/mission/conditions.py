@@ -13,6 +13,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
 
 FULL_THRUST = 65535
+DESCENDED_M = 0.1
 STILL_MOTORS_THRUST = 5000
 """At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
@@ -143,13 +144,18 @@ def _down(c: Context) -> bool:
 
 
 def _on_floor(c: Context) -> bool:
-    """Low, not moving, and on a thrust that could not carry the vehicle."""
+    """Low, or come down from where the landing began, since a drifting estimate has the floor
+    anywhere; not moving, and on a thrust that could not carry the vehicle."""
     complete = c.profile.planner.complete
     carried = c.state.hover_thrust > 0 and (
         c.obs.telemetry.thrust <= complete.hold_ratio * c.state.hover_thrust
     )
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
-    low = c.height_m < c.profile.planner.landing.handover_m
+    came_down_m = c.state.entry_m[2] - c.obs.telemetry.position_m[2]
+    came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
+    low = c.height_m < c.profile.planner.landing.handover_m or (
+        came_down and c.state.contact_z_m is None
+    )
     return carried and low and not near_target and _still(c)
 
 

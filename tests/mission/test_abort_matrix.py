@@ -412,3 +412,16 @@ def test_unknown_is_not_on_the_ground() -> None:
         assert state.phase in (Phase.APPROACH, Phase.LANDING)
     assert state.phase is Phase.LANDING
     assert orders >= 1
+
+
+def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
+    """After a minute of drift the estimate has it at 0.4 m: come down, carried by something
+    that is not the ceiling, and still."""
+    state = state_in(Phase.LANDING, z_m=1.5)
+    for i in range(1, 60):
+        t_s = 10.0 + 0.02 * i
+        tel = telemetry(t_s, 0.4, thrust=20000.0)
+        state, command = planner.step(state, observation(t_s, telemetry=tel), PROFILE)
+        if isinstance(command, StopMotors):
+            break
+    assert 0.5 <= t_s - 10.0 < 0.7
