@@ -60,6 +60,11 @@ class EmergencyStopped(PerchError):
     meaning = "emergency stop, motors cut"
 
 
+class LogIncomplete(PerchError):
+    exit_code = 60
+    meaning = "perched, but the flight log is incomplete"
+
+
 class Interrupted(PerchError):
     exit_code = 130
     meaning = "Ctrl-C, landed (in the air) or left (on the ground)"
@@ -80,6 +85,7 @@ ERROR_CLASSES: tuple[type[PerchError], ...] = (
     AttemptsUsedUp,
     SafetyAbort,
     EmergencyStopped,
+    LogIncomplete,
     Interrupted,
 )
 

@@ -106,7 +106,8 @@ def _profile_notes() -> Iterator[None]:
 
 
 def _complain(sentence: str) -> None:
-    print(f"perchctl: {sentence}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # a terminal that is closed keeps the exit code
+        print(f"perchctl: {sentence}", file=sys.stderr, flush=True)
 
 
 def _print_version(wanted: bool) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import load_calibration
-from perchctl.commands.interrupt import signals_to
-from perchctl.commands.output import print_record, say
+from perchctl.commands.interrupt import signals_to_operator
+from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port
 from perchctl.display.page.flight import FlightPage, flight_page
 from perchctl.display.panel import make_reporter
@@ -20,6 +20,7 @@ from perchctl.errors import (
     AttemptsUsedUp,
     EmergencyStopped,
     Interrupted,
+    LogIncomplete,
     SafetyAbort,
     TargetNotFound,
     UsageError,
@@ -27,7 +28,7 @@ from perchctl.errors import (
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.session import FlyOptions, SessionResult, check_options, fly_session
 from perchctl.log.read import read_log
-from perchctl.log.summary import summary_text
+from perchctl.log.summary import FlightSummary, summary_text
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import Event, EventKind, Watcher
@@ -195,17 +196,24 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
     summary = log.close(result.report, result.miss_m if perched else None)
     assert summary is not None
     plot = _plot(log.path, options.profile)
-    print(summary_text(summary, log.path, plot), file=sys.stderr)
-    code = EXIT_CODE_OF[result.report.outcome]
+    tell(summary_text(summary, log.path, plot))
+    code = exit_code(result.report.outcome, summary)
     if as_json:
-        print_record(summary.as_record() | {"exit_code": code, "log": str(log.path)})
+        lost = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
+        print_record(summary.as_record() | lost | {"exit_code": code, "log": str(log.path)})
     return code
 
 
+def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
+    """Of the flight; of its log where the flight was good and the log is not."""
+    code = EXIT_CODE_OF[outcome]
+    return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
+
+
 def _session(options: FlyOptions, watchers: tuple[Watcher, ...], port: int | None) -> SessionResult:
-    """The session with Ctrl-C on its switch, and with the live page where there is a port."""
+    """The session with the signals on its switch, and with the live page where there is a port."""
     switch = OperatorSwitch()
-    with signals_to(switch.press), live_page(options, port, switch) as page:
+    with signals_to_operator(switch, say), live_page(options, port, switch) as page:
         if page is None:
             return fly_session(options, watchers, switch)
         return fly_session(options, (*watchers, page), switch, page.watched)

@@ -1,15 +1,31 @@
-"""Ctrl-C and SIGTERM in the commands that run for a while."""
+"""Signals: Ctrl-C and SIGTERM in the commands that run for a while, and all that may ask a
+flight to end."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from perchctl.flight.operator import OperatorSwitch
+
 Handler = Callable[[int, FrameType | None], None]
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def _known(*names: str) -> tuple[signal.Signals, ...]:
+    """Those that the operating system has."""
+    return tuple(signal.Signals[name] for name in names if name in signal.Signals.__members__)
+
+
+LANDING_SIGNALS = _known("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+"""End or suspend a program elsewhere; a flight they land."""
+_MUTED = _known("SIGTTOU", "SIGTTIN")  # would suspend a flight in a shell's background
+_SUSPENDING = _known("SIGTSTP")
+_NO_SUSPENDING = "Ctrl-Z does not suspend a flight: landing"
 
 
 @contextlib.contextmanager
@@ -24,6 +40,57 @@ def signals_to(handler: Handler) -> Iterator[None]:
     finally:
         for name, before in old.items():
             signal.signal(name, before)
+
+
+@contextlib.contextmanager
+def signals_to_operator(switch: OperatorSwitch, report: Callable[[str], None]) -> Iterator[None]:
+    """For a flight: Ctrl-C presses the switch, `LANDING_SIGNALS` land (main thread only).
+
+    A thread of its own reads the signals from a socket that the interpreter writes to at
+    once, so they count while the main thread hangs in a library. A hang-up that is ignored
+    already (nohup) stays ignored. `report` prints a line.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handler(_signal: int, _frame: FrameType | None) -> None:
+        switch.leave()
+
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    listener = threading.Thread(
+        target=_listen, args=(reader, switch, report), name="perchctl-signals", daemon=True
+    )
+    listener.start()
+    fd_before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
+    before = {}
+    try:
+        for name in (signal.SIGINT, *LANDING_SIGNALS):
+            if name == signal.SIGINT or signal.getsignal(name) is not signal.SIG_IGN:
+                before[name] = signal.signal(name, handler)
+        for name in _MUTED:
+            before[name] = signal.signal(name, signal.SIG_IGN)
+        yield
+    finally:
+        for name, old in before.items():
+            signal.signal(name, old)
+        signal.set_wakeup_fd(fd_before)
+        writer.close()
+        listener.join(1.0)
+        reader.close()
+
+
+def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str], None]) -> None:
+    while numbers := reader.recv(64):
+        for number in numbers:
+            if number == signal.SIGINT:
+                switch.press()
+            elif number in LANDING_SIGNALS:
+                switch.land()
+        if switch.listening and any(number in _SUSPENDING for number in numbers):
+            # Not from this thread: a terminal that stands still would hold up the signals.
+            threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
 
 
 class Stopper:

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sys
 from collections.abc import Mapping
 from typing import Any
 
 
 def say(sentence: str) -> None:
-    """One sentence on stderr, as stdout is for the result."""
-    print(f"perchctl: {sentence}", file=sys.stderr)
+    """One sentence on stderr, as stdout is for the result. Never raises."""
+    tell(f"perchctl: {sentence}")
+
+
+def tell(text: str) -> None:
+    """Lines on stderr, where there still is one: a terminal may be closed, a pipe's other end
+    gone, and that is no reason to fail."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except (OSError, ValueError):
+        with contextlib.suppress(OSError, ValueError):
+            # What is left in the buffer must not fail at the program's end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
 def print_record(record: Mapping[str, Any]) -> None:

@@ -6,22 +6,37 @@ lockstep with a simulated vehicle.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
+from perchctl.flight.history import extended
 from perchctl.flight.preflight import refuse, still_waiting_for
 from perchctl.flight.rescue import rescue
 from perchctl.flight.senses import Senses
+from perchctl.flight.watchdog import Watchdog
+from perchctl.link.evidence import FRESH_S
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
-from perchctl.mission.state import Observation, Operator, Outcome, Phase, PlannerState, Severity
+from perchctl.mission.state import (
+    FLYING_PHASES,
+    Observation,
+    Operator,
+    Outcome,
+    Phase,
+    PlannerState,
+    Severity,
+)
 from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
-from perchctl.vehicle import LOCKED, NO_BATTERY_READING_V, Idle, Telemetry
+from perchctl.vehicle import LOCKED, NO_BATTERY_READING_V, Command, Idle
+
+HUNG_S = 0.25
+"""A turn that takes longer was hung up somewhere: what it knew of the vehicle is old."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +61,26 @@ def fly(parts: FlightParts) -> FlightReport:
     _wait_until_ready(parts, senses)  # nothing is started before it returns
     if senses.history.newest is not None:
         senses.ground_z_m = senses.history.newest.position_m[2]
+    watchdog = Watchdog(parts.profile, parts.operator)
+    parts.link.guard(watchdog)
     try:
-        return _mission(parts, senses)
-    except BaseException:
+        return _mission(parts, senses, watchdog)
+    except BaseException as error:
+        watchdog.rescuing()
         landing, newest = parts.profile.planner.landing, senses.history.newest
-        rescue(parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m)
+        safe = rescue(parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m)
+        _tell_rescue(parts, error, safe)
         raise
+
+
+def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
+    what = "landed, the motors are off"
+    if not safe:
+        what = "a landing was ordered, but could not be confirmed: keep away from the vehicle"
+    text = f"{type(error).__name__} in flight: {what}"
+    for watcher in parts.watchers:
+        with contextlib.suppress(Exception):  # it may be the one that failed
+            watcher.event(Event(parts.clock.now(), EventKind.NOTE, text))
 
 
 def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
@@ -59,7 +88,7 @@ def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
-            raise Interrupted("Ctrl-C before take-off: nothing was started")
+            raise Interrupted("interrupted before take-off: nothing was started")
         senses.take_in(now_s)
         newest = senses.history.newest
         refuse(newest, parts.profile)
@@ -76,45 +105,77 @@ def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 
 
-def _mission(parts: FlightParts, senses: Senses) -> FlightReport:
+def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightReport:
     period_s = 1.0 / parts.profile.link.loop_hz
     clock = parts.clock
     due_s = clock.now()
     state: PlannerState | None = None
     passed: list[Event] = []
+    redone = log_noted = False
     while True:
         now_s = clock.now()
-        late_s = max(0.0, now_s - due_s)
         senses.take_in(now_s, look=not _is_blind(state))
+        now_s = _present(parts, senses, now_s)
+        late_s = max(0.0, now_s - due_s)
         obs = _observe(parts, senses, now_s, late_s)
         before = state
-        state, command = planner.step(before or planner.start(obs), obs, parts.profile)
+        new, command = planner.step(before or planner.start(obs), obs, parts.profile)
+        overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
+        if not redone and (overruled or clock.now() - now_s > HUNG_S):
+            redone = True  # nothing that was decided before a hang is sent after it
+            continue
+        state, redone = new, False
         if not isinstance(command, Idle):
             parts.link.send(command)
-        for event in _events(before, state, obs, parts.profile):
+        watchdog.turn(now_s, max(due_s, now_s) + period_s, state, command, obs.telemetry)
+        events = _events(before, state, obs, parts.profile)
+        if obs.log_problem is not None and not log_noted:
+            log_noted = True
+            text = f"the log of this flight is incomplete: {obs.log_problem}"
+            events.append(Event(now_s, EventKind.NOTE, text, state.phase))
+        for event in events:
             if event.kind is EventKind.PHASE:
                 passed.append(event)
             for watcher in parts.watchers:
                 watcher.event(event)
-        tick = Tick(
-            now_s,
-            obs.telemetry,
-            senses.output,
-            obs.target,
-            state,
-            command,
-            late_s,
-            obs.camera_age_s,
-            now_s - obs.telemetry.t_s,
-        )
+        tick = _tick(senses, state, command, obs)
         for watcher in parts.watchers:
             watcher.tick(tick)
         if planner.is_over(state):
-            return _report(state, now_s, obs.telemetry, tuple(passed))
+            watchdog.end(motors_off=state.phase is not Phase.ABORTED)
+            return _report(state, obs, tuple(passed))
         due_s += period_s
         if due_s < now_s:
             due_s = now_s + period_s  # never try to catch up with a burst of old ticks
         clock.wait_until(due_s)
+
+
+def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:
+    """The turn's time. Where camera or vision hung, it is the present, with what has arrived
+    meanwhile: a setpoint for the time before the hang would be a stale one."""
+    now_s = parts.clock.now()
+    if now_s - began_s <= HUNG_S:
+        return began_s
+    before = senses.history
+    after = extended(before, parts.link.telemetry(), parts.profile.safety)
+    senses.history = replace(after, jumped=before.jumped or after.jumped)
+    if senses.last_good_frame_s == began_s:
+        senses.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
+    return now_s
+
+
+def _tick(senses: Senses, state: PlannerState, command: Command, obs: Observation) -> Tick:
+    return Tick(
+        obs.t_s,
+        obs.telemetry,
+        senses.output,
+        obs.target,
+        state,
+        command,
+        obs.loop_late_s,
+        obs.camera_age_s,
+        obs.t_s - obs.telemetry.t_s,
+    )
 
 
 def _is_blind(state: PlannerState | None) -> bool:
@@ -168,19 +229,28 @@ def _events(
     return events
 
 
-def _report(
-    state: PlannerState, now_s: float, telemetry: Telemetry, passed: tuple[Event, ...]
-) -> FlightReport:
-    reason = state.reason
-    if state.phase is Phase.LANDED:
-        why = next((e.reason for e in reversed(passed) if e.phase is Phase.LANDING), "")
-        reason = f"{why}; {state.reason}" if why else state.reason
+def _report(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) -> FlightReport:
     return FlightReport(
         phase=state.phase,
         outcome=state.outcome or Outcome.SAFETY,
-        reason=reason,
+        reason=_reason(state, obs, passed),
         attempts=state.attempts + int(state.phase is Phase.PERCHED),
-        duration_s=now_s - state.started_s,
-        locked=telemetry.has(LOCKED),
+        duration_s=obs.t_s - state.started_s,
+        locked=obs.telemetry.has(LOCKED),
         history=passed,
     )
+
+
+def _reason(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) -> str:
+    """Why it ended so, with what led to the landing where there was one."""
+    why = next((e.reason for e in reversed(passed) if e.phase is Phase.LANDING), "")
+    if state.phase is Phase.LANDED:
+        return f"{why}; {state.reason}" if why else state.reason
+    if state.row != "landing-timeout":
+        return state.reason
+    age_s = obs.t_s - obs.telemetry.t_s
+    cause = "by its telemetry the vehicle still flies"
+    if age_s > FRESH_S:
+        cause = f"nothing was heard from the vehicle for {age_s:.1f} s"
+    text = f"the landing was ordered but could not be confirmed: {cause}"
+    return f"{why}; {text}" if why else text

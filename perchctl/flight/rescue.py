@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from perchctl.flight.clock import Clock
+from perchctl.flight.watchdog import landing_order
+from perchctl.link.evidence import is_known, motors_may_run
 from perchctl.link.protocol import Link
-from perchctl.mission.landing import landing_time_s
 from perchctl.mission.state import Operator
 from perchctl.profile import LandingConfig
-from perchctl.vehicle import FLYING, HL_ACTIVE, EmergencyStop, Land, Telemetry
+from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Telemetry
 
 LOOK_S = 0.5
 """For so long a vehicle must be seen with its motors off before a rescue leaves it."""
-FRESH_S = 0.3
-"""What is older says nothing of the motors: unknown counts as flying."""
 REPEAT_S, MAX_ORDERS = 1.0, 5
 PERIOD_S = 0.1
 
@@ -26,9 +25,9 @@ def rescue(
     operator: Callable[[], Operator],
     known: Telemetry | None,
     ground_z_m: float = 0.0,
-) -> None:
-    """Order a landing and wait for it, bounded. The landing needs no further packet once
-    it is under way.
+) -> bool:
+    """Order a landing and wait for it, bounded; whether the motors were seen off at the end.
+    The landing needs no further packet once it is under way.
 
     `known` is the newest telemetry the loop has taken in, `ground_z_m` the height of the
     ground in the estimate. On the ground it is looked at again for `LOOK_S`: a take-off just
@@ -40,31 +39,18 @@ def rescue(
     while clock.now() < start_s + landing.timeout_s:
         now_s = clock.now()
         if operator() is Operator.STOP:
-            link.send(EmergencyStop())
-            return
+            link.send(EmergencyStop())  # the link's guard repeats it
+            return False
         samples = link.telemetry()
         newest = samples[-1] if samples else newest
-        unknown = newest is None or now_s - newest.t_s > FRESH_S
-        if unknown or newest is None or _motors_run(newest):
+        if motors_may_run(newest, now_s):
             off_since_s = now_s
-            under_way = not unknown and newest is not None and newest.has(HL_ACTIVE)
+            under_way = newest is not None and is_known(newest, now_s) and newest.has(HL_ACTIVE)
             due = orders == 0 or (not under_way and now_s - ordered_s > REPEAT_S)
             if due and orders < MAX_ORDERS:
                 link.send(landing_order(landing, ground_z_m, newest))
                 ordered_s, orders = now_s, orders + 1
         elif now_s - off_since_s >= LOOK_S:
-            return
+            return True
         clock.wait_until(now_s + PERIOD_S)
-
-
-def landing_order(landing: LandingConfig, ground_z_m: float, newest: Telemetry | None) -> Land:
-    """To below the ground, slow enough at touchdown."""
-    floor_m = ground_z_m - landing.undershoot_m
-    height_m = 1.0 if newest is None else max(0.0, newest.position_m[2] - floor_m)
-    return Land(floor_m, landing_time_s(height_m))
-
-
-def _motors_run(telemetry: Telemetry) -> bool:
-    """In the air, or about to be. The flying bit alone outlives the motors by 2 s, and a
-    vehicle that hangs with its motors off shall not start them again."""
-    return telemetry.has(HL_ACTIVE) or (telemetry.has(FLYING) and telemetry.thrust >= 1)
+    return False

@@ -18,6 +18,7 @@ from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError
 from perchctl.flight.clock import WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight.pace import PaceWatcher, judged
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.uri import check_uri
 from perchctl.mission.watch import FlightReport, Watcher
@@ -102,12 +103,24 @@ def fly_session(
         try:
             link.connect()
             switch.listening = True
-            parts = FlightParts(link, source, clock, profile, pipeline, watchers, switch.read)
+            pace, lag_s = PaceWatcher(), _lag_s(simulated, clock)
+            watched = (*watchers, pace)
+            parts = FlightParts(link, source, clock, profile, pipeline, watched, switch.read)
             report = fly(parts)
+            if simulated is not None:
+                report = judged(report, pace, _lag_s(simulated, clock) - lag_s)
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
         return SessionResult(report, miss_m=_true_miss_m(simulated))
+
+
+def _lag_s(simulated: SimProcess | None, clock: WallClock) -> float:
+    """The wall's clock less the simulator's; only its change means something."""
+    if simulated is not None:
+        with contextlib.suppress(ConnectionFailed, TimedOut):
+            return clock.now() - float(simulated.truth()["t_s"])
+    return 0.0
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:

@@ -7,18 +7,21 @@ zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints s
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.connection import Connection, open_connection, send_packets
 from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
+from perchctl.link.evidence import is_known, may_fly
 from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.prepare import check_firmware, set_parameters
+from perchctl.link.protocol import Guard
 from perchctl.link.sender import Sender
 from perchctl.link.uri import check_uri
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import ARMED, FLYING, Command, Idle, Telemetry
+from perchctl.vehicle import ARMED, FLYING, Command, EmergencyStop, Idle, Land, Telemetry
 
 SILENCE_S = 1.5
 SENDER_STUCK_S = 0.5
@@ -47,6 +50,8 @@ class CflibLink:
         self._landing_wait_s = landing_wait_s
         self._blocks = LogBlocks(clock)
         self._sender: Sender | None = None
+        self._guard: Guard | None = None
+        self._reopener: threading.Thread | None = None
         self.connection: Connection | None = None
 
     def connect(self) -> None:
@@ -55,8 +60,7 @@ class CflibLink:
             self._prepare(self.connection)
         except BaseException:
             # As long as nothing is known of the vehicle, it may be flying for another.
-            known = self._blocks.newest is not None
-            self._leave(farewell=known and not self._still_flying())
+            self._leave(farewell=self._may_say_farewell())
             raise
 
     def telemetry(self) -> list[Telemetry]:
@@ -65,6 +69,9 @@ class CflibLink:
     def send(self, command: Command) -> None:
         if self._sender is not None and not isinstance(command, Idle):
             self._sender.put(command)
+
+    def guard(self, guard: Guard) -> None:
+        self._guard = guard
 
     def problem(self, now_s: float) -> str | None:
         if self.connection is not None and self.connection.lost is not None:
@@ -82,15 +89,15 @@ class CflibLink:
     def close(self) -> None:
         """Close when nothing flies; otherwise leave the link without its farewell packet.
 
-        A vehicle whose supervisor still reports flying after the wait is better off
-        with its own landing or level-out than with a zero setpoint.
+        A vehicle that still reports flying after the wait, or of which nothing is known any
+        more, is better off with its own landing or level-out than with a zero setpoint.
         """
         if self._sender is not None:
             self._sender.drain(DRAIN_S)
         end_s = self._clock() + self._landing_wait_s
-        while self._still_flying() and self._clock() < end_s:
+        while self._may_hear_more() and not self._may_say_farewell() and self._clock() < end_s:
             time.sleep(0.05)
-        farewell = not self._still_flying()
+        farewell = self._may_say_farewell()
         if self._sender is not None:
             self._sender.stop()
         self._leave(farewell=farewell)
@@ -102,7 +109,7 @@ class CflibLink:
         self._start_logging(connection)
         self._arm_if_needed(connection)
         self._unlock_thrust(connection)
-        self._sender = Sender(self._hand_over)
+        self._sender = Sender(self._hand_over, self._ask_guard, self._clock)
 
     def _start_logging(self, connection: Connection) -> None:
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
@@ -116,20 +123,52 @@ class CflibLink:
 
     def _unlock_thrust(self, connection: Connection) -> None:
         """On the ground only: its zero thrust cuts the motors."""
-        if self._still_flying():
+        newest, now_s = self._blocks.newest, self._clock()
+        if not is_known(newest, now_s):
+            raise ConnectionFailed(f"the telemetry of {self._uri} has stopped: not taken over")
+        if newest is not None and newest.has(FLYING):
             raise ConnectionFailed(
                 f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
             )
         send_packets(connection.cf, UNLOCK_THRUST)
 
+    def _ask_guard(self) -> Command | None:
+        """In the sender's thread."""
+        if self._guard is None:
+            return None
+        return self._guard.poll(self._clock(), self._blocks.newest)
+
     def _hand_over(self, command: Command) -> None:
         """In the sender's thread."""
-        if self.connection is not None:
-            send_packets(self.connection.cf, encode(command))
+        connection = self.connection
+        if connection is None:
+            return
+        if connection.lost is not None and isinstance(command, (Land, EmergencyStop)):
+            self._reopen(connection, command)
+        send_packets(connection.cf, encode(command))
 
-    def _still_flying(self) -> bool:
-        newest = self._blocks.newest
-        return self.connection is not None and newest is not None and newest.has(FLYING)
+    def _reopen(self, connection: Connection, order: Command) -> None:
+        """Once in a flight, beside the loop and the sender: what has to come down is worth one
+        more try. The order goes out again as soon as there is a link."""
+        if self._reopener is not None:
+            return
+
+        def run() -> None:
+            if connection.reopen():
+                self.send(order)
+
+        self._reopener = threading.Thread(target=run, name="perchctl-reconnect", daemon=True)
+        self._reopener.start()
+
+    def _may_hear_more(self) -> bool:
+        connection, reopener = self.connection, self._reopener
+        if connection is None:
+            return False
+        return connection.lost is None or (reopener is not None and reopener.is_alive())
+
+    def _may_say_farewell(self) -> bool:
+        """Only where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""
+        return not may_fly(self._blocks.newest, self._clock())
 
     def _leave(self, *, farewell: bool) -> None:
         """`farewell`: let cflib send its zero setpoint, which drops a flying vehicle."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -15,6 +17,11 @@ from perchctl.sim.crtp.codec import Packet
 
 CONNECT_TRIES = 2
 CLOSE_TIMEOUT_S = 3.0
+RADIO_RETRIES = 100_000
+"""Lost packets in a row after which cflib gives a radio up. Its own 100 are over in about
+0.2 s, and then nothing can be ordered any more; the age of the telemetry ends a flight long
+before these."""
+REOPEN_TIMEOUT_S, REOPEN_PAUSE_S = 3.0, 0.2
 
 
 class Connection:
@@ -30,6 +37,7 @@ class Connection:
         cache.mkdir(parents=True, exist_ok=True)
         self.cf: Any = Crazyflie(rw_cache=str(cache))
         self.lost: str | None = None
+        self._left = False
         self._settled = threading.Event()  # connected, or failed
         self.cf.fully_connected.add_callback(lambda _uri: self._settled.set())
         self.cf.connection_failed.add_callback(self._on_lost)
@@ -42,15 +50,58 @@ class Connection:
         opener.start()
         return self._settled.wait(timeout_s)
 
+    def reopen(self) -> bool:
+        """A new driver under the same tables and log blocks, after the link was lost in
+        flight; whether one could be opened. Blocks for `REOPEN_TIMEOUT_S` at most.
+
+        cflib's own `open_link` would reset the vehicle's log blocks and read every table and
+        parameter before it is connected; the driver alone is up in milliseconds, and the
+        blocks, which know nothing of it, go on arriving.
+        """
+        import cflib.crtp
+
+        opened = threading.Event()
+
+        def run() -> None:
+            end_s = time.monotonic() + REOPEN_TIMEOUT_S
+            while time.monotonic() < end_s and not self._left:
+                try:
+                    driver = cflib.crtp.get_link_driver(
+                        self.cf.link_uri,
+                        self.cf.link_statistics.radio_link_statistics_callback,
+                        self._on_reopened_lost,
+                    )
+                except Exception:  # whatever the driver raises: not there, not yet
+                    time.sleep(REOPEN_PAUSE_S)
+                    continue
+                if driver is None or self._left:
+                    if driver is not None:
+                        driver.close()
+                    return
+                self.cf.link, self.lost = driver, None
+                opened.set()
+                return
+
+        threading.Thread(target=run, name="perchctl-reopen", daemon=True).start()
+        return opened.wait(REOPEN_TIMEOUT_S)
+
     def close(self) -> None:
         """Close with cflib's farewell, a zero setpoint: only when nothing flies."""
+        self._left = True
         _run_bounded([self.cf.close_link])
 
     def abandon(self) -> None:
         """Release the driver and clean up, sending nothing more."""
+        self._left = True
         # Without its driver, close_link has nowhere to send the zero setpoint.
         driver, self.cf.link = self.cf.link, None
         _run_bounded([self.cf.close_link] if driver is None else [driver.close, self.cf.close_link])
+
+    def _on_reopened_lost(self, message: str) -> None:
+        driver, self.cf.link = self.cf.link, None
+        if driver is not None:
+            driver.close()
+        self.lost = plain_cause(message)
 
     def _on_lost(self, _uri: str, message: str) -> None:
         self.lost = plain_cause(message)
@@ -68,6 +119,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
     _hush_cflib()
     if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
         cflib.crtp.init_drivers()
+    _keep_radio_patient()
     share_s = timeout_s / CONNECT_TRIES
     for _ in range(CONNECT_TRIES):
         connection = Connection()
@@ -121,6 +173,14 @@ def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
     closer = threading.Thread(target=run, daemon=True)
     closer.start()
     closer.join(CLOSE_TIMEOUT_S)
+
+
+def _keep_radio_patient() -> None:
+    """Where this cflib can: a radio is not given up after the first lost packets."""
+    with contextlib.suppress(ImportError, AttributeError):
+        from cflib.crtp import radiodriver
+
+        radiodriver.set_retries_before_disconnect(RADIO_RETRIES)
 
 
 def _hush_cflib() -> None:

@@ -72,7 +72,7 @@ def _raw(thrust: int) -> Packet:
 
 
 def _vertical(kind: int, height_m: float, duration_s: float) -> Packet:
-    """A take-off or landing that keeps the heading: cflib's `yaw=None`.
+    """A landing that keeps the heading: cflib's `yaw=None`.
 
     With a yaw of its own, 0 by default, the vehicle turns to it on the way.
     """
@@ -86,5 +86,5 @@ _NOTIFY = Packet(Port.COMMANDER_GENERIC, _META, struct.pack("<BI", _NOTIFY_SETPO
 ARM = (Packet(Port.SUPERVISOR, _REQUEST, bytes((_ARM, True))),)
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
 """One zero-thrust packet since boot, on the ground, then the priority back: without the
-first a raw thrust stays 0, without the second a take-off is not flown (docs/firmware.md,
-"Raw thrust")."""
+first a raw thrust stays 0, without the second the vehicle's own landing is not flown
+(docs/firmware.md, "Raw thrust")."""

@@ -14,6 +14,9 @@ class EstimateLink(CflibLink):
         """Leave at once and without cflib's farewell: the vehicle may fly for another."""
         self._leave(farewell=False)
 
+    def _may_say_farewell(self) -> bool:
+        return False  # neither when connecting fails half-way
+
     def _prepare(self, connection: Connection) -> None:
         check_firmware(connection.cf, self._uri)
         self._start_logging(connection)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from perchctl.errors import ConnectionFailed
 from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
 from perchctl.link.encode import UNLOCK_THRUST, encode
+from perchctl.link.protocol import Guard
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 TELEMETRY_DELAY_S = 0.01
 SETTLE_S = 1.0
+WATCH_PERIOD_S = 0.05
 
 
 class Radio:
@@ -63,6 +65,10 @@ class MockLink:
         self._due_s = dict.fromkeys(BLOCKS, 0.0)
         self._under_way: list[tuple[float, int, str, float, dict[str, float]]] = []
         self._count = itertools.count()
+        self._arrived: list[Telemetry] = []
+        self._newest: Telemetry | None = None
+        self._guard: Guard | None = None
+        self._watched_s = -math.inf
 
     @property
     def now_s(self) -> float:
@@ -76,6 +82,7 @@ class MockLink:
                 if block_due_s <= due_s + 1e-9:
                     self._send_down(name)
                     self._due_s[name] = block_due_s + self._periods_s[name]
+            self._ask_guard()
         self.vehicle.advance_to(t_s)
 
     def connect(self) -> None:
@@ -84,13 +91,29 @@ class MockLink:
         self.advance_to(self.now_s + 0.1)
 
     def telemetry(self) -> list[Telemetry]:
-        samples = []
+        self._collect()
+        samples, self._arrived = self._arrived, []
+        return samples
+
+    def guard(self, guard: Guard) -> None:
+        self._guard = guard
+
+    def _ask_guard(self) -> None:
+        if self._guard is None or self.now_s < self._watched_s + WATCH_PERIOD_S - 1e-9:
+            return
+        self._watched_s = self.now_s
+        self._collect()
+        command = self._guard.poll(self.now_s, self._newest)
+        if command is not None:
+            self.send(command)
+
+    def _collect(self) -> None:
         while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
             _, _, block, stamp_s, values = heapq.heappop(self._under_way)
             sample = self._assembler.accept(block, values, stamp_s)
             if sample is not None:
-                samples.append(sample)
-        return samples
+                self._newest = sample
+                self._arrived.append(sample)
 
     def send(self, command: Command) -> None:
         self._hand_over(encode(command))
@@ -149,6 +172,9 @@ class ScriptedLink:
 
     def problem(self, now_s: float) -> str | None:
         return "the script ended the link" if now_s >= self._dies_at_s else None
+
+    def guard(self, guard: Guard) -> None:
+        self.watchdog = guard
 
     def close(self) -> None:
         self.closed = True

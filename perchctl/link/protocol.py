@@ -7,6 +7,16 @@ from typing import Protocol
 from perchctl.vehicle import Command, Telemetry
 
 
+class Guard(Protocol):
+    """Who looks after the vehicle while the flight loop is silent."""
+
+    def poll(self, now_s: float, newest: Telemetry | None) -> Command | None:
+        """What the link has to send now of itself, None almost always.
+
+        Called about every 50 ms, in the link's own thread where it has one; `newest` is the
+        newest telemetry that has arrived."""
+
+
 class Link(Protocol):
     """A vehicle: simulated in lockstep, or behind cflib.
 
@@ -25,6 +35,9 @@ class Link(Protocol):
 
     def problem(self, now_s: float) -> str | None:
         """None while the link works, otherwise one sentence with the cause."""
+
+    def guard(self, guard: Guard) -> None:
+        """From now on ask `guard` regularly, until the link is closed."""
 
     def close(self) -> None:
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""

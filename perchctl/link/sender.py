@@ -1,7 +1,8 @@
 """A thread that hands commands to a blocking library, so the flight loop never blocks.
 
-Setpoints coalesce (only the newest counts); orders keep their place. `stuck_s`
-is the heartbeat: for how long the present hand-over has been hanging.
+Setpoints coalesce (only the newest counts), and one that has waited too long is dropped;
+orders keep their place. `stuck_s` is the heartbeat: for how long the present hand-over has
+been hanging. In between the thread asks its `guard` what has to be sent while the loop hangs.
 """
 
 from __future__ import annotations
@@ -14,12 +15,25 @@ from collections.abc import Callable
 from perchctl.vehicle import Command, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
+STALE_S = 0.25
+"""A setpoint that has waited longer, behind a command that hung, is for another moment."""
+GUARD_PERIOD_S = 0.05
 
 
 class Sender:
-    def __init__(self, hand_over: Callable[[Command], None]) -> None:
+    """`guard` gives the command to send of itself, None almost always; asked in the thread,
+    every `GUARD_PERIOD_S` and after each command."""
+
+    def __init__(
+        self,
+        hand_over: Callable[[Command], None],
+        guard: Callable[[], Command | None] = lambda: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._hand_over = hand_over
-        self._queue: deque[Command] = deque()
+        self._guard = guard
+        self._clock = clock
+        self._queue: deque[tuple[float, Command]] = deque()
         self._ready = threading.Condition()
         self._busy_since_s: float | None = None
         self._running = True
@@ -29,15 +43,15 @@ class Sender:
 
     def put(self, command: Command) -> None:
         with self._ready:
-            if self._queue and isinstance(self._queue[-1], _STREAMED):
+            if self._queue and isinstance(self._queue[-1][1], _STREAMED):
                 self._queue.pop()
-            self._queue.append(command)
+            self._queue.append((self._clock(), command))
             self._ready.notify()
 
     def stuck_s(self) -> float:
         """Seconds for which one command has been in the library's hands; 0 when idle."""
         since = self._busy_since_s
-        return 0.0 if since is None else time.monotonic() - since
+        return 0.0 if since is None else self._clock() - since
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until everything is handed over; False when that takes too long."""
@@ -57,18 +71,37 @@ class Sender:
         self._thread.join(timeout=1.0)
 
     def _run(self) -> None:
+        asked_s = self._clock()
         while True:
             with self._ready:
-                while self._running and not self._queue:
-                    self._ready.wait()
+                if self._running and not self._queue:
+                    self._ready.wait(GUARD_PERIOD_S)
                 if not self._running:
                     return
-                command = self._queue.popleft()
-                self._busy_since_s = time.monotonic()
+                command = self._next()
             try:
-                self._hand_over(command)
+                if command is not None:
+                    self._hand_over(command)
+                if self._clock() - asked_s >= GUARD_PERIOD_S:
+                    asked_s = self._clock()
+                    self._send_for_guard()
             except Exception as error:  # the library's, whatever it is: reported by `problem`
                 self.problem = f"a command could not be sent: {error}"
             with self._ready:
                 self._busy_since_s = None
                 self._ready.notify_all()
+
+    def _next(self) -> Command | None:
+        while self._queue:
+            put_s, command = self._queue.popleft()
+            if isinstance(command, _STREAMED) and self._clock() - put_s > STALE_S:
+                continue
+            self._busy_since_s = self._clock()
+            return command
+        return None
+
+    def _send_for_guard(self) -> None:
+        command = self._guard()
+        if command is not None:
+            self._busy_since_s = self._clock()
+            self._hand_over(command)

@@ -22,6 +22,7 @@ class FlightSummary:
             that ends without its summary.
         cause: what decided it, such as ``target not found``.
         miss_m: None where no truth is known.
+        lost_records, log_problem: what the log lacks, and why; 0 and None for a whole one.
     """
 
     outcome: str
@@ -34,9 +35,12 @@ class FlightSummary:
     locked: bool = False
     fell: bool = False
     phases: tuple[PhaseSpan, ...] = ()
+    lost_records: int = 0
+    log_problem: str | None = None
 
     def as_record(self) -> dict[str, Any]:
-        """For `FlightLogWriter.close`; the phases are in the ticks already."""
+        """For `FlightLogWriter.close`; the phases are in the ticks already, and what the log
+        lacks is the writer's to say."""
         return {
             "outcome": self.outcome,
             "cause": self.cause or None,
@@ -72,6 +76,8 @@ def summary_of(log: FlightLog) -> FlightSummary:
         locked=bool(end.get("locked", False)),
         fell=bool(end.get("fell", False)),
         phases=phases,
+        lost_records=int(end.get("lost_records") or 0),
+        log_problem=end.get("problem"),
     )
 
 
@@ -81,8 +87,13 @@ def summary_text(
     """A few lines, no colour, no line break at the end."""
     faults = []
     if isinstance(flight, FlightLog):
-        faults = _log_faults(flight)
+        if flight.ignored_bytes:
+            faults.append(f"log lost:  its tail, {flight.ignored_bytes} unreadable bytes")
         flight = summary_of(flight)
+    if flight.lost_records:
+        faults.insert(0, f"log lost:  {flight.lost_records} records ({flight.log_problem})")
+    elif flight.log_problem is not None:
+        faults.insert(0, f"log lost:  perhaps its last records ({flight.log_problem})")
     lines = [f"{flight.outcome.upper()}: {flight.reason}".rstrip(": ")]
     if flight.cause and flight.cause != flight.outcome:
         lines[0] += f" [{flight.cause}]"
@@ -103,17 +114,6 @@ def summary_text(
     if plot_path is not None:
         lines.append(f"plot:      {plot_path}")
     return "\n".join(lines)
-
-
-def _log_faults(log: FlightLog) -> list[str]:
-    """What the log has lost, if anything."""
-    faults = []
-    lost = (log.summary or {}).get("lost_records", 0)
-    if lost:
-        faults.append(f"log lost:  {lost} records ({(log.summary or {}).get('problem')})")
-    if log.ignored_bytes:
-        faults.append(f"log lost:  its tail, {log.ignored_bytes} unreadable bytes")
-    return faults
 
 
 def phases_text(phases: Sequence[PhaseSpan]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -41,13 +42,13 @@ class LogWatcher:
     def real_time(
         cls, directory: Path, profile: Profile, uri: str, source: str, seed: int | None = None
     ) -> LogWatcher:
-        """A new file in `directory`, brought to the disk as the flight goes on.
+        """A new file in `directory`, written behind the flight.
 
         Errors: InvalidValue."""
         started = datetime.now(UTC)
         header = make_header(profile, uri=uri, source=source, seed=seed, started=started)
         path = log_path(directory, profile.name, started)
-        return cls(FlightLogWriter.open(path, header, fsync=True))
+        return cls(FlightLogWriter.open(path, header, live=True))
 
     @property
     def path(self) -> Path:
@@ -84,7 +85,8 @@ class LogWatcher:
             phases=spans_of(report),
         )
         self.writer.close(summary.as_record())
-        return summary
+        lost, problem = self.writer.lost_records, self.writer.problem
+        return replace(summary, lost_records=lost, log_problem=problem)
 
     def abandon(self, reason: str) -> None:
         """Close the log of a flight that failed. One that never began leaves no file."""

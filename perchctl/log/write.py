@@ -2,7 +2,8 @@
 
 Line 1 is the header; then one `tick` record a turn of the loop, `event` records
 between them, and one `summary` at the end. A flight is never troubled by its
-log: a write that fails is remembered in `FlightLogWriter.problem`.
+log: in real time a thread of its own writes it, and a write that fails is remembered
+in `FlightLogWriter.problem`.
 """
 
 from __future__ import annotations
@@ -10,16 +11,17 @@ from __future__ import annotations
 import errno
 import os
 import re
-import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
 
 import perchctl
 from perchctl.errors import InvalidValue
+from perchctl.log.behind import Behind
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
 from perchctl.log.jsonl import encode
 from perchctl.mission.watch import Event
@@ -29,7 +31,9 @@ FORMAT = "perchctl-flight-log"
 SCHEMA_VERSION = 2
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
-CLOSE_TIMEOUT_S = 2.0
+CLOSE_TIMEOUT_S = 3.0
+MOST_BEHIND = 1500
+"""Records that may wait for the disk, half a minute of a flight; more are dropped."""
 
 
 def make_header(
@@ -76,25 +80,30 @@ class FlightLogWriter:
         lost_records: how many could not be written.
     """
 
-    def __init__(self, path: Path, fd: int, fsync: bool) -> None:
+    def __init__(self, path: Path, fd: int, behind: Behind | None) -> None:
         self.path = path
         self.problem: str | None = None
-        self.lost_records = 0
         self._fd = fd
-        self._fsync = fsync
+        self._behind = behind
         self._closed = False
+        self._dropped = 0  # by the loop's thread
+        # Below: of the thread that writes.
+        self._failed = 0
         self._good_bytes = 0
         self._synced_s: float | None = None
         self._failed_s: float | None = None
-        self._sync_thread: threading.Thread | None = None
+
+    @property
+    def lost_records(self) -> int:
+        return self._dropped + self._failed
 
     @classmethod
-    def open(cls, path: Path, header: Mapping[str, Any], fsync: bool = False) -> FlightLogWriter:
+    def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> FlightLogWriter:
         """Create the file and its folder and write the header.
 
-        `fsync` (for flights in real time) brings the records to the disk about
-        once a second of the loop's time, on a thread beside the loop.
-        Raises InvalidValue when the file cannot be created: that is before the
+        `live` (for flights in real time): a thread of its own writes, and brings the records
+        to the disk about once a second of the loop's time; otherwise each record is in the
+        file at once. Raises InvalidValue when the file cannot be created: that is before the
         flight, where refusing costs nothing.
         """
         try:
@@ -102,7 +111,8 @@ class FlightLogWriter:
             free, fd = _create(path)
         except OSError as error:
             raise InvalidValue(_cannot_start(path, error)) from None
-        writer = cls(free, fd, fsync)
+        behind = Behind(MOST_BEHIND, "perchctl-log") if live else None
+        writer = cls(free, fd, behind)
         try:
             writer._append(encode(header))
         except OSError as error:
@@ -120,38 +130,52 @@ class FlightLogWriter:
         self._put({"kind": "event", **event_record(event)}, event.t_s)
 
     def close(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Append the summary, if there is one, and close. Never raises; twice is once."""
+        """Append the summary, if there is one, and close. Never raises; twice is once.
+
+        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most."""
         if self._closed:
             return
+        self._closed = True
+        if self._behind is None:
+            self._end(summary)
+            return
+        left = self._behind.finish(partial(self._end, summary), CLOSE_TIMEOUT_S)
+        if left:
+            self._dropped += left
+            self._remember("the disk does not answer: the flight log lacks its end")
+
+    def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
             lost = {"lost_records": self.lost_records, "problem": self.problem}
             self._failed_s = None  # one last try, whatever happened before
-            self._put({"kind": "summary", **summary, **lost}, None)
-        self._closed = True
-        if self._sync_thread is not None:
-            self._sync_thread.join(CLOSE_TIMEOUT_S)
-            if self._sync_thread.is_alive():
-                # The disk hangs: the records are with the kernel, more cannot be done.
-                self._remember("the disk does not answer")
-                return
-        if self._fsync:
+            self._store({"kind": "summary", **summary, **lost}, None)
+        if self._behind is not None:
             self._sync_to_disk()
         with suppress(OSError):
             os.close(self._fd)
 
     def _put(self, record: Mapping[str, Any], t_s: float | None) -> None:
-        if self._closed or self._is_waiting(t_s):
-            self.lost_records += 1
+        if self._closed:
+            self._dropped += 1
+        elif self._behind is None:
+            self._store(record, t_s)
+        elif not self._behind.put(partial(self._store, record, t_s)):
+            self._dropped += 1
+            self._remember("the disk does not keep up with the flight log: records are dropped")
+
+    def _store(self, record: Mapping[str, Any], t_s: float | None) -> None:
+        if self._is_waiting(t_s):
+            self._failed += 1
             return
         try:
             self._append(encode(record))
         except (OSError, TypeError, ValueError, RecursionError) as error:
-            self.lost_records += 1
+            self._failed += 1
             self._failed_s = t_s
             self._remember(_explain(error))
             return
         self._failed_s = None
-        if self._fsync and t_s is not None:
+        if self._behind is not None and t_s is not None:
             self._sync_sometimes(t_s)
 
     def _is_waiting(self, t_s: float | None) -> bool:
@@ -176,13 +200,9 @@ class FlightLogWriter:
     def _sync_sometimes(self, t_s: float) -> None:
         if self._synced_s is None:
             self._synced_s = t_s
-        busy = self._sync_thread is not None and self._sync_thread.is_alive()
-        if busy or t_s - self._synced_s < FSYNC_PERIOD_S:
-            return
-        self._synced_s = t_s
-        # A slow disk may take longer than the loop can wait.
-        self._sync_thread = threading.Thread(target=self._sync_to_disk, daemon=True)
-        self._sync_thread.start()
+        if t_s - self._synced_s >= FSYNC_PERIOD_S:
+            self._synced_s = t_s
+            self._sync_to_disk()
 
     def _sync_to_disk(self) -> None:
         try:

@@ -34,6 +34,8 @@ from perchctl.vehicle import (
 
 BLOCKED_ROOM_M = 0.1
 """How far a search keeps from what it once was pressed against."""
+WARY_MPS, WARY_M = 0.25, 0.2
+"""Sideways, as long as nothing tells whether the camera's mounting is right."""
 LIFTED_M = 0.1
 """Below it a vehicle may still stand, and its height is not to be corrected."""
 
@@ -59,11 +61,14 @@ def _walk_to(
 
 def _walked(c: Context, goal: PositionSetpoint, up_mps: float, down_mps: float) -> PositionSetpoint:
     align = c.profile.planner.align
+    xy_mps = align.speed_mps
+    if c.state.phase in (Phase.ALIGN, Phase.ASCEND) and c.state.mount.open:
+        xy_mps = min(xy_mps, WARY_MPS) if c.fresh else 0.0
     return walk(
         c.state.setpoint or hold_here(c),
         goal,
         c.obs.t_s - c.state.t_s,
-        xy_mps=align.speed_mps,
+        xy_mps=xy_mps,
         up_mps=up_mps,
         down_mps=down_mps,
         yaw_rate_radps=math.radians(align.yaw_rate_dps),
@@ -102,7 +107,8 @@ def _approach(c: Context) -> Acted:
 
 def _search(c: Context) -> Acted:
     """Wait, climb a step, turn a step, wait again; never above the limit. A target that
-    was seen before is looked for from under it, not climbed to."""
+    was seen before is looked for from under it, not climbed to; as long as nothing speaks
+    for the camera's mounting, only a little nearer than where it was seen last."""
     search, state, ground_m = c.profile.planner.search, c.state, c.state.ground_m
     assert ground_m is not None
     if c.obs.t_s - state.search_step_s > search.wait_s:
@@ -110,7 +116,8 @@ def _search(c: Context) -> Acted:
         c = Context(state, c.obs, c.profile)
     x, y, z = state.entry_m
     if c.target_m is not None:
-        x, y = under_target_xy(c, state.entry_yaw_rad)
+        there = under_target_xy(c, state.entry_yaw_rad)
+        x, y = _not_far(state.mount.last_from or (x, y), there) if state.mount.open else there
         height = min(z, c.contact_goal_z_m - c.profile.planner.ascend.near_m)
     else:
         top = max(z, ground_m[2] + search.max_height_m)
@@ -120,6 +127,13 @@ def _search(c: Context) -> Acted:
     yaw = state.entry_yaw_rad + math.radians(search.yaw_step_deg) * state.searches
     up_mps = c.profile.planner.ascend.speed_mps
     return _walk_to(c, PositionSetpoint(x, y, height, yaw), up_mps=up_mps)
+
+
+def _not_far(start: tuple[float, float], goal: tuple[float, float]) -> tuple[float, float]:
+    """The goal, or as far towards it as a wrong mounting may lead."""
+    dx, dy = goal[0] - start[0], goal[1] - start[1]
+    part = min(1.0, WARY_M / max(math.hypot(dx, dy), 1e-6))
+    return start[0] + part * dx, start[1] + part * dy
 
 
 def _estimate(c: Context) -> Acted:

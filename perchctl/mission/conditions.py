@@ -13,8 +13,9 @@ from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
 
 FULL_THRUST = 65535
+DESCENDED_M = 0.1
 STILL_MOTORS_THRUST = 5000
-"""At and below it the motors stand still (docs/firmware.md, "Raw thrust")."""
+"""At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
 
 def _aligned(c: Context) -> bool:
@@ -76,7 +77,7 @@ def _slipping(c: Context) -> bool:
     if c.state.contact_z_m is None:
         return False
     below_m = c.state.contact_z_m - tel.position_m[2]
-    if c.state.released_s is not None and below_m > 0.008 and tel.velocity_mps[2] < -0.12:
+    if below_m > -0.02 and tel.velocity_mps[2] < -0.12:
         return True
     sinking = tel.velocity_mps[2] < -0.15
     return sinking and (below_m > complete.slip_m or tel.acc_z_g < complete.slip_acc_g)
@@ -143,13 +144,18 @@ def _down(c: Context) -> bool:
 
 
 def _on_floor(c: Context) -> bool:
-    """Low, not moving, and on a thrust that could not carry the vehicle."""
+    """Low, or come down from where the landing began, since a drifting estimate has the floor
+    anywhere; not moving, and on a thrust that could not carry the vehicle."""
     complete = c.profile.planner.complete
     carried = c.state.hover_thrust > 0 and (
         c.obs.telemetry.thrust <= complete.hold_ratio * c.state.hover_thrust
     )
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
-    low = c.height_m < c.profile.planner.landing.handover_m
+    came_down_m = c.state.entry_m[2] - c.obs.telemetry.position_m[2]
+    came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
+    low = c.height_m < c.profile.planner.landing.handover_m or (
+        came_down and c.state.contact_z_m is None
+    )
     return carried and low and not near_target and _still(c)
 
 

@@ -7,6 +7,10 @@ import math
 from perchctl.mission.context import Context
 from perchctl.mission.state import Condition
 
+SLIP_DWELL_S = 0.03
+FALLING_MPS = -0.05
+HUNG_WITHIN_M = 0.3
+
 
 def left_jump_hold(c: Context) -> bool:
     jump = c.state.jump_s
@@ -39,12 +43,37 @@ def stopped_for_s(c: Context) -> float:
 
 def hangs_stopped(c: Context) -> bool:
     """The motors were stopped where it hung, and there it still is."""
-    state, tel = c.state, c.obs.telemetry
-    if state.stopped_s is None or state.contact_z_m is None or not c.proves:
+    return c.state.stopped_s is not None and still_at_contact(c)
+
+
+def still_at_contact(c: Context) -> bool:
+    """Where the magnet has it: a slip ends the contact at once, and what the estimate drifts
+    while it hangs blind is less than this."""
+    contact_z_m = c.state.contact_z_m
+    if contact_z_m is None or not c.proves:
         return False
-    return state.contact_z_m - tel.position_m[2] <= c.profile.planner.complete.slip_m
+    return contact_z_m - c.obs.telemetry.position_m[2] <= HUNG_WITHIN_M
 
 
 def settling_too_long(c: Context) -> bool:
     ascend = c.profile.planner.ascend
     return c.held(Condition.NEAR_STANDOFF) > ascend.settle_timeout_s
+
+
+def has_slipped(c: Context) -> bool:
+    """Debounced; in free fall at once, since each 10 ms cost what full thrust takes 80 ms to
+    give back."""
+    tel, complete = c.obs.telemetry, c.profile.planner.complete
+    falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
+    if falls and c.proves and tel.velocity_mps[2] < FALLING_MPS:
+        return True
+    return c.held(Condition.SLIPPING) >= SLIP_DWELL_S
+
+
+def why_not_found(c: Context) -> str:
+    text = "target not found in the allowed attempts"
+    if c.obs.camera_problem:
+        return f"{text} ({c.obs.camera_problem})"
+    if c.target_m is not None and c.state.mount.open:
+        return f"{text}, though it was seen before: does camera.mount fit the camera?"
+    return text

@@ -12,15 +12,20 @@ import math
 from dataclasses import replace
 
 from perchctl.mission.context import HANGING_S, Context
+from perchctl.mission.guards import has_slipped
 from perchctl.mission.guidance import hold_here, limited, walk
-from perchctl.mission.release import Acted, catch, let_go, stop_motors
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, Acted, catch, let_go, stop_motors
 from perchctl.mission.state import Condition
 from perchctl.vehicle import Idle, Land
 
 REPEAT_ORDER_S = 0.5
 """An order that shows no effect in the telemetry is given again after this time."""
 MAX_ORDERS = 6
-TOUCHDOWN_MPS = 0.35
+PLANNED_MPS, SETTLING_S = 0.4, 1.8
+"""The quintic's largest speed, and time added for the begin: the change to the vehicle's own
+trajectory resets its controller, and what it then catches up with must be slow. Touchdown
+comes out at 0.35 m/s at most."""
+PEEL_BLIND_S = 4.0
 PEELED_M = 0.1
 """Below the contact by so much, the magnet has let go."""
 _PEAK_OF_MEAN = 1.875
@@ -28,8 +33,8 @@ _PEAK_OF_MEAN = 1.875
 
 
 def landing_time_s(height_m: float) -> float:
-    """For the vehicle's own landing: a quintic that is nowhere faster than a soft touchdown."""
-    return max(1.0, _PEAK_OF_MEAN * height_m / TOUCHDOWN_MPS)
+    """For the vehicle's own landing, which follows a quintic from rest to rest."""
+    return SETTLING_S + _PEAK_OF_MEAN * height_m / PLANNED_MPS
 
 
 def landing(c: Context) -> Acted:
@@ -44,23 +49,34 @@ def landing(c: Context) -> Acted:
         return _hang_on(c)
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
-    if state.orders or _doubtful(c) or c.height_m <= c.profile.planner.landing.handover_m:
+    low = c.height_m <= c.profile.planner.landing.handover_m
+    if state.orders or (not _is_peeling(c) and (low or _doubtful(c))):
         return _by_itself(c)
     return _by_setpoints(c)
 
 
 def _hang_on(c: Context) -> Acted:
     """Released or stopped at the ceiling; a slip is caught, and the landing goes on below."""
-    if c.held(Condition.SLIPPING) >= 0.03:
+    if has_slipped(c):
         tel = c.obs.telemetry
         state = replace(
             c.state, released_s=None, stopped_s=None, contact_z_m=None, caught=False,
+            catch_above_m=CATCH_STILL_ABOVE_M,
             setpoint=None, ordered_s=None, orders=0,
             entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
         )  # fmt: skip
         c = Context(state, c.obs, c.profile)
         return catch(c) or _by_setpoints(c)
     return let_go(c) if c.state.stopped_s is None else stop_motors(c)
+
+
+def _is_peeling(c: Context) -> bool:
+    """At the ceiling, a landing of the vehicle's own would run by its clock and end with the
+    motors off up there: first setpoints below, for a while also blindly."""
+    if c.state.contact_z_m is None:
+        return False
+    seen = c.obs.link_problem is None and c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+    return seen or c.in_phase_s < PEEL_BLIND_S
 
 
 def _doubtful(c: Context) -> bool:

@@ -13,6 +13,8 @@ import numpy as np
 from perchctl.mission.actions import act
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason
 from perchctl.mission.context import Context
+from perchctl.mission.mounting import MountWatch, Sight, watched
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M
 from perchctl.mission.state import (
     TERMINALS,
     Condition,
@@ -20,9 +22,9 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import TABLE, Row, first_match, risen
+from perchctl.mission.table import TABLE, WATCHED, Row, first_match, risen
 from perchctl.profile import Profile
-from perchctl.vehicle import Command
+from perchctl.vehicle import Command, PositionSetpoint
 
 
 def start(obs: Observation) -> PlannerState:
@@ -58,8 +60,8 @@ def is_over(state: PlannerState) -> bool:
 
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     state = _with_target(state, obs)
-    if obs.jumped and state.jump_s is None:
-        state = replace(state, jump_s=obs.t_s)
+    if obs.jumped:
+        state = _jumped(state, obs)
     context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)
@@ -67,7 +69,21 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
         since = _kept(since)  # a held vehicle proves nothing: the dwell times begin anew
     if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and context.speed_mps < 0.3:
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    return replace(state, since=since)
+    return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
+
+
+def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
+    """The estimate's world has moved. What is held by the magnet has not: its references are
+    where the estimate has it now."""
+    if state.contact_z_m is not None:
+        tel = obs.telemetry
+        x, y, z = tel.position_m
+        setpoint = state.setpoint
+        if setpoint is not None:
+            below_m = setpoint.z_m - state.contact_z_m
+            setpoint = PositionSetpoint(x, y, z + below_m, tel.yaw_rad)
+        state = replace(state, contact_z_m=z, entry_m=(x, y, z), setpoint=setpoint)
+    return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -87,6 +103,18 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
         target_spread_m=spread_m,
         confirmed=state.confirmed + 1,
     )
+
+
+def _mount_watched(c: Context) -> MountWatch:
+    """With this tick's frame, where it measured the target and the telemetry is fresh."""
+    mount, target = c.state.mount, c.obs.target
+    if c.state.phase not in WATCHED or c.state.hold or not (c.obs.new_frame and c.proves):
+        return mount
+    if target is None or not target.measured or target.world_m is None:
+        return mount
+    x, y, _ = c.obs.telemetry.position_m
+    place = complex(float(target.world_m[0]), float(target.world_m[1]))
+    return watched(mount, Sight(c.obs.t_s, complex(x, y), place))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
@@ -133,18 +161,20 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
         case Phase.COMPLETE:
             return replace(new, contact_z_m=obs.telemetry.position_m[2], released_s=None)
         case Phase.RECOVER:
-            # From still motors the fall is caught from above. In position mode, with half of
-            # the thrust left, that would only press it to the ceiling again, beside the place.
-            slipped = old.released_s is not None or old.stopped_s is not None
+            still = old.released_s is not None or old.stopped_s is not None
             blocked_z_m = obs.telemetry.position_m[2] if new.row == "blocked" else old.blocked_z_m
             return replace(
                 new,
                 stopped_s=None,
                 contact_z_m=None,
                 released_s=None,
-                caught=not slipped,
+                caught=new.row != "slipped",
+                catch_above_m=CATCH_STILL_ABOVE_M if still else CATCH_TURNING_ABOVE_M,
                 blocked_z_m=blocked_z_m,
             )
+        case Phase.LANDING if old.phase is Phase.PERCH:
+            # It may be in the magnet's reach: it has to be seen below before it counts as free.
+            return replace(new, contact_z_m=obs.telemetry.position_m[2])
         case Phase.ASCEND:
             return replace(new, searches=0)
         case Phase.SEARCH if old.setpoint is not None:

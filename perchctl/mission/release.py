@@ -23,8 +23,13 @@ STILL_THRUST = 1000
 THRUST_MIN = 20000
 """What position mode leaves."""
 STOPS, STOP_PERIOD_S, STOP_AGAIN_S = 5, 0.1, 0.5
-CATCH_ABOVE_M = 1.0
-CATCH_LIMIT_S = 2.0
+CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
+"""Motors that stand still need all the thrust there is. Those that turn with most of it
+would carry the vehicle back to the ceiling, beside the target's centre."""
+UNSEEN_S = 3.0
+CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
+CAUGHT_MPS = -0.1
+"""By then the thrust is above the weight, and goes on rising until the setpoint is below."""
 
 
 def lower(c: Context) -> Acted:
@@ -55,6 +60,8 @@ def let_go(c: Context) -> Acted:
     assert state.released_s is not None
     if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s:
         return stop_motors(c)
+    if c.telemetry_age_s > UNSEEN_S and c.obs.t_s - state.released_s > complete.ramp_s + UNSEEN_S:
+        return stop_motors(c)  # still for seconds by order: the pair only keeps it from locking
     part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
     start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
     start = min(start, THRUST_MIN)
@@ -75,13 +82,16 @@ def stop_motors(c: Context) -> Acted:
 
 
 def catch(c: Context) -> Acted | None:
-    """After a slip: far above until it sinks no more, then held where it is; None when it
+    """After a slip: far above until it hardly sinks, then held where it is; None when it
     is caught. (A setpoint below would cost the change of mode its height.)"""
     state, tel = c.state, c.obs.telemetry
     if state.caught:
         return None
-    if tel.velocity_mps[2] < 0.0 and c.in_phase_s < CATCH_LIMIT_S:
+    begun = c.in_phase_s < CATCH_LEAST_S
+    if begun or (tel.velocity_mps[2] < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
         x, y, _ = state.entry_m
-        setpoint = PositionSetpoint(x, y, tel.position_m[2] + CATCH_ABOVE_M, state.entry_yaw_rad)
+        setpoint = PositionSetpoint(
+            x, y, tel.position_m[2] + state.catch_above_m, state.entry_yaw_rad
+        )
         return replace(state, setpoint=setpoint), limited(c, setpoint)
     return None

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
+from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
 from perchctl.vision.types import TargetEstimate
 
@@ -151,6 +152,7 @@ class PlannerState:
     confirmed: int = 0
     target_m: Array | None = None  # in the world, at the last frame that measured it
     target_spread_m: float = 0.0  # by which successive frames' targets differ
+    mount: MountWatch = field(default_factory=MountWatch)  # does the target stand still
     ground_m: tuple[float, float, float] | None = None
     entry_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entry_yaw_rad: float = 0.0
@@ -160,6 +162,7 @@ class PlannerState:
     contact_z_m: float | None = None  # height of the body while it is held by the magnet
     released_s: float | None = None  # begin of the release by raw thrust
     caught: bool = True  # False after a slip, until the fall is stopped
+    catch_above_m: float = 0.0  # how far above it the setpoint is that stops the fall
     blocked_z_m: float | None = None  # something solid is above
     ordered_s: float | None = None  # last order of a landing or motor stop
     orders: int = 0

@@ -13,12 +13,16 @@ from perchctl.mission.guards import (
     attempts_used,
     fence_broken,
     hangs_stopped,
+    has_slipped,
     is_blocked,
     left_jump_hold,
     searched_out,
     settling_too_long,
+    still_at_contact,
     stopped_for_s,
+    why_not_found,
 )
+from perchctl.mission.mounting import explained
 from perchctl.mission.state import (
     FLYING_PHASES,
     Condition,
@@ -35,6 +39,7 @@ P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of
 
 AIR = FLYING_PHASES | {P.LANDING}
 BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
+WATCHED = BY_CAMERA | {P.APPROACH}
 BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
 
 
@@ -112,7 +117,7 @@ TABLE: tuple[Row, ...] = (
         lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
     ),
     Row(
-        "estimator-jump", FLYING_PHASES, left_jump_hold, P.LANDING,
+        "estimator-jump", BEFORE_CONTACT, left_jump_hold, P.LANDING,
         "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
     ),
     Row(
@@ -124,6 +129,10 @@ TABLE: tuple[Row, ...] = (
         "battery-unknown", BEFORE_CONTACT,
         lambda c: c.obs.battery_age_s > c.profile.safety.battery_stale_s, P.LANDING,
         "the battery's reading stands still", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "mounting", WATCHED, lambda c: c.state.mount.wrong, P.LANDING,
+        lambda c: explained(c.state.mount), S.LAND, O.SAFETY,
     ),
     Row(
         "height-limit", BEFORE_CONTACT,
@@ -198,8 +207,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "searched-out", _only(P.SEARCH), searched_out, P.LANDING,
-        lambda c: "target not found in the allowed attempts"
-        + (f" ({c.obs.camera_problem})" if c.obs.camera_problem else ""),
+        why_not_found,
         S.LAND, O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
@@ -262,7 +270,7 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- phase 7: completion -------------------------------------------------
     Row(
-        "slipped", _only(P.COMPLETE), lambda c: c.held(C.SLIPPING) >= 0.03, P.RECOVER,
+        "slipped", _only(P.COMPLETE), has_slipped, P.RECOVER,
         lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
         S.BACK_OFF, counts_attempt=True,
     ),
@@ -297,7 +305,8 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- landing ---------------------------------------------------------------
     Row(
-        "hung", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1 and hangs_stopped(c), P.PERCHED,
+        "hung", _only(P.LANDING),
+        lambda c: c.held(C.DOWN) >= 0.1 and still_at_contact(c), P.PERCHED,
         "the magnet holds: hanging with the motors off",
     ),
     Row(

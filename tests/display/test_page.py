@@ -23,7 +23,7 @@ from perchctl.display.page.live import LivePage
 from perchctl.display.page.server import MAX_STREAMS, TOKEN_HEADER, is_loopback
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import InvalidValue
-from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight.operator import AGAIN_S, HELD_S, OperatorSwitch
 from perchctl.flight.session import FlyOptions
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.mission.watch import Tick
@@ -316,7 +316,8 @@ OPTIONS = FlyOptions(load_profile("sim"), Path("sim.yaml"), "sim://", "sim:")
 
 
 def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) -> None:
-    switch = OperatorSwitch(listening=True)
+    now_s = [100.0]
+    switch = OperatorSwitch(listening=True, clock=lambda: now_s[0])
     with live_page(OPTIONS, 0, switch) as flight:
         assert flight is not None
         assert flight.page.url in capsys.readouterr().err
@@ -328,7 +329,9 @@ def test_stop_is_one_ctrl_c_and_never_two(capsys: pytest.CaptureFixture[str]) ->
             assert switch.read() is Operator.LAND
         switch.press()
         assert switch.read() is Operator.LAND  # the first Ctrl-C repeats STOP
+        now_s[0] += AGAIN_S
         switch.press()
+        now_s[0] += HELD_S
         assert switch.read() is Operator.STOP
 
 

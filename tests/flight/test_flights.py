@@ -12,6 +12,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.flight.campaign import fly_seed, run_campaign
 from perchctl.flight.results import FlightResult, campaign_summary
+from perchctl.geometry import rot_z
 from perchctl.log.read import FlightLog, read_log
 from perchctl.mission.state import SEVEN, Operator, Outcome, Phase
 from perchctl.profile import load_profile
@@ -197,6 +198,18 @@ def test_a_nearly_empty_battery_lands() -> None:
     assert is_landed(flown, Outcome.SAFETY), flown
     assert "battery" in flown.report.reason
     assert "PERCH" not in flown.way
+
+
+@pytest.mark.parametrize("deg", [90, 180])
+def test_a_turned_mounting_is_named_within_three_decimetres(deg: int) -> None:
+    """Unnoticed, such a flight goes the wrong way until it meets the fence."""
+    drawn = draw_scenario(load_profile(SHORT), SEED)
+    turned = np.array(drawn.T_body_cam_true)
+    turned[:3, :3] = rot_z(np.radians(deg)) @ turned[:3, :3]
+    flown = fly_short(T_body_cam_true=tuple(map(tuple, turned.tolist())), target_xy_m=(0.25, 0.1))
+    assert is_landed(flown, Outcome.SAFETY), flown
+    assert f"camera.mount is turned by about {deg} deg" in flown.report.reason
+    assert flown.farthest_m < 0.3
 
 
 # --- The operator ---------------------------------------------------------------------

@@ -6,12 +6,15 @@ What the machine's load can spoil is tried once more; nothing passes without fly
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import pty
 import re
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -247,3 +250,65 @@ def test_kill_9_in_flight_leaves_a_log_and_a_vehicle_that_ends_by_itself(tmp_pat
     assert locked_s == pytest.approx(cut_s, abs=0.1)
     held = [t["position_m"][2] for t in past if after_s < t["t_s"] < before_s + 1.7]
     assert min(held) > 0.2  # until then it hovers
+
+
+def test_a_terminal_that_is_closed_in_flight_lands(tmp_path: Path) -> None:
+    """A hang-up, and from then on each write to the terminal fails."""
+    with vehicle(tmp_path) as own:
+        where = ("--uri", own.sim.uri, "--source", own.sim.stream_url)
+        command, environment = say_fly(*where, "--yes", "--log-dir", str(tmp_path))
+        terminal, its_end = pty.openpty()
+        process = subprocess.Popen(
+            command,
+            env=environment | {"TERM": "xterm"},
+            stdin=its_end,
+            stdout=its_end,
+            stderr=its_end,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
+        guard = threading.Timer(FLIGHT_LIMIT_S, process.kill)
+        guard.start()
+        try:
+            os.close(its_end)
+            seen = b""
+            while b"SEARCH:" not in seen:
+                seen += os.read(terminal, 4096)
+            own.wait_for(lambda t: bool(t["position_m"][2] > 0.3), 5.0)
+            os.close(terminal)
+            assert process.wait(FLIGHT_LIMIT_S) == 130
+        finally:
+            guard.cancel()
+            process.kill()
+        truth = own.sim.truth()
+    assert truth["floor_contact"]
+    assert max(truth["motors"]) == 0
+    assert not truth["supervisor_info"] & (LOCKED | FLYING)
+    log = read_log(the_log(tmp_path))
+    assert log.summary is not None
+    assert log.summary["outcome"] == "landed"
+    assert log.summary["cause"] == "operator"
+
+
+def test_a_simulator_that_is_starved_is_named_for_the_abort(tmp_path: Path) -> None:
+    """As on a busy computer: its process gets no time for a while."""
+    command, environment = say_fly("--seed", str(SEED), "--log-dir", str(tmp_path))
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        guard = threading.Timer(FLIGHT_LIMIT_S, process.kill)
+        guard.start()
+        try:
+            assert process.stderr is not None
+            while "] SEARCH:" not in process.stderr.readline():
+                assert process.poll() is None
+            children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
+            (simulator,) = (int(pid) for pid in children.split())
+            os.kill(simulator, signal.SIGSTOP)
+            threading.Event().wait(2.5)
+            os.kill(simulator, signal.SIGCONT)
+            rest = process.stderr.read()
+            assert process.wait(FLIGHT_LIMIT_S) == 52, rest
+        finally:
+            guard.cancel()
+            process.kill()
+    (end,) = [line for line in rest.splitlines() if "this computer is too slow" in line]
+    assert re.search(r"simulator \d\.\d s behind", end)

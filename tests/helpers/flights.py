@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,10 +29,11 @@ SEED = 3
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight's end, and the true height of its last tick."""
+    """A flight's end, the true height of its last tick, and how far aside it ever was."""
 
     flight: LockstepFlight
     z_m: float
+    farthest_m: float = 0.0
 
     @property
     def report(self) -> FlightReport:
@@ -48,11 +50,12 @@ class _Heights(LogWatcher):
 
     def __init__(self) -> None:
         self.truth: Callable[[], Truth] | None = None
-        self.z_m = 0.0
+        self.z_m = self.farthest_m = 0.0
 
     def tick(self, tick: Tick) -> None:
         assert self.truth is not None
-        self.z_m = self.truth()[0][2]
+        x_m, y_m, self.z_m = self.truth()[0]
+        self.farthest_m = max(self.farthest_m, math.hypot(x_m, y_m))
 
     def event(self, event: Event) -> None:
         return None
@@ -89,4 +92,4 @@ def fly_short(
     drawn = replace(draw_scenario(profile, seed), **scenario)
     heights = _Heights()
     flight = fly_lockstep(profile, log=heights, scenario=drawn, operator_at=operator_at)
-    return Flown(flight, heights.z_m)
+    return Flown(flight, heights.z_m, heights.farthest_m)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
-from perchctl.link.sender import Sender
+from perchctl.link.sender import STALE_S, Sender
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
     BATTERY_BLOCK,
@@ -20,7 +20,7 @@ from perchctl.link.telemetry import (
 )
 from perchctl.link.timebase import WRAP_MS, Timebase
 from perchctl.link.uri import UDEV_HELP, check_uri
-from perchctl.vehicle import Command, PositionSetpoint, StopMotors
+from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, StopMotors
 
 SIZES = {"float": 4, "uint16_t": 2, "int8_t": 1}
 
@@ -126,3 +126,40 @@ def test_udev_lines_name_all_three_devices() -> None:
     """Conventions: radio, bootloader, Crazyflie over USB."""
     for ids in (("1915", "7777"), ("1915", "0101"), ("0483", "5740")):
         assert any(all(i in line for i in ids) for line in UDEV_HELP.splitlines())
+
+
+def test_a_setpoint_that_waited_behind_a_hang_is_dropped_an_order_is_not() -> None:
+    gate, begun = threading.Event(), threading.Event()
+    sent: list[Command] = []
+    now_s = [10.0]
+
+    def hand_over(command: Command) -> None:
+        begun.set()
+        gate.wait(5.0)
+        sent.append(command)
+
+    sender = Sender(hand_over, clock=lambda: now_s[0])
+    sender.put(StopMotors())
+    assert begun.wait(5.0)
+    sender.put(Land(-0.05, 2.0))
+    sender.put(PositionSetpoint(0.0, 0.0, 1.0, 0.0))
+    now_s[0] += STALE_S + 0.01
+    gate.set()
+    assert sender.drain(5.0)
+    sender.stop()
+    assert sent == [StopMotors(), Land(-0.05, 2.0)]
+
+
+def test_the_senders_thread_asks_its_guard_by_itself() -> None:
+    sent: list[Command] = []
+    stopped = threading.Event()
+
+    def hand_over(command: Command) -> None:
+        sent.append(command)
+        if len(sent) == 3:
+            stopped.set()
+
+    sender = Sender(hand_over, guard=EmergencyStop)
+    assert stopped.wait(5.0)
+    sender.stop()
+    assert set(sent) == {EmergencyStop()}

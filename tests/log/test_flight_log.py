@@ -257,7 +257,7 @@ def test_fsync_about_once_a_second_and_its_failure(
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(os, "fsync", failing)
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), fsync=True)
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
     for i in range(251):
         writer.write({"t_s": 100.0 + 0.02 * i})
     writer.close()
@@ -320,9 +320,10 @@ def test_a_killed_writer_leaves_a_readable_log(tmp_path: Path) -> None:
         "from perchctl.log.write import FlightLogWriter\n"
         "from tests.helpers import log as synthetic\n"
         "from tests.helpers.mission import note\n"
-        "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header(), fsync=True)\n"
+        "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header(), live=True)\n"
         "for n, record in enumerate(synthetic.ticks()):\n"
         "    w.write(record)\n"
+        "    while n == 150 and Path(sys.argv[1]).read_bytes().count(b'\\n') < 152: pass\n"
         "    if n == 150: os.kill(os.getpid(), 9)\n"
     )
     done = _python(code, path)

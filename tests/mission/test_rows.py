@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
+from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.state import (
     FLYING_PHASES,
     TERMINALS,
@@ -162,6 +163,10 @@ CASES: dict[str, Case] = {
     "estimator-jump": Case(P.ALIGN, P.LANDING, seen(jumped=True), 0.8, O.SAFETY),
     "battery-low": Case(P.ALIGN, P.LANDING, flown(battery_v=2.8), 1.8, O.SAFETY),
     "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
+    "mounting": Case(
+        P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
+        state={"mount": MountWatch(against=SIGHTS_IN_A_ROW)},
+    ),
     "height-limit": Case(P.SEARCH, P.LANDING, unseen(3.4), 0.1, O.SAFETY, z_m=3.4),
     "fence": Case(P.ALIGN, P.LANDING, aside(2.5), 0.1, O.SAFETY),
     "camera-gone": Case(

@@ -1,0 +1,243 @@
+"""What is sent when the flight loop falls silent, and the operator's stop: decided here, sent
+by the link (`Link.guard`) from where the loop's hanging does not reach.
+
+What is safe to send again, by the last command (silence: since that command):
+
+- a position setpoint, from `REPEAT_AFTER_S` on: the same place, but never above where the
+  vehicle is, so it neither climbs nor presses. While it sinks, a setpoint above stays: it
+  brakes.
+- raw thrust of the release: the same, as long as fresh telemetry shows it hanging still; what
+  slips is caught as the planner catches it. It is never landed while it hangs: a landing ends
+  with the motors off, whatever the magnet carries, and still motors under a living stream can
+  spin again at once. Without fresh telemetry it is held where it was last seen: that also
+  catches.
+- raw thrust of the press: the same while it stands still in contact (a change of mode costs
+  more height than the second until the landing), else held.
+- nothing after the motors were stopped for good, or while the vehicle lands by itself.
+
+From `safety.loop_late_land_s` on, or when the operator asks for it, a landing. From the
+ceiling it first peels off by a setpoint below; where the magnet holds all the same, the
+vehicle goes on hanging there with its motors ready.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from perchctl.link.evidence import is_cut, is_known, motors_may_run
+from perchctl.mission.landing import PEELED_M, landing_time_s
+from perchctl.mission.release import CATCH_LIMIT_S, CATCH_STILL_ABOVE_M, THRUST_MIN
+from perchctl.mission.state import Operator, Phase, PlannerState
+from perchctl.profile import LandingConfig, Profile
+from perchctl.vehicle import (
+    HL_ACTIVE,
+    Command,
+    EmergencyStop,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    Telemetry,
+)
+
+REPEAT_AFTER_S = 0.3
+"""The vehicle levels out by itself at 0.5 s (docs/firmware.md, "When setpoints stop")."""
+STOP_AFTER_S = 0.1
+"""For so long the operator's stop is left to the loop, whose row records it."""
+ORDER_PERIOD_S, MAX_ORDERS = 0.3, 6
+CUT_PERIOD_S, MAX_CUTS = 0.1, 50
+SINKING_MPS = -0.1
+SLIP_M, SLIP_MPS = 0.008, -0.12
+STILL_MPS = 0.06
+PEEL_BELOW_M = 0.35
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The last turn of the loop that sent its command, and what it knew.
+
+    Attributes:
+        due_s: when the next turn is due; the loop measures its lateness from there.
+        held_m: height of the body where the ceiling holds it, None away from the ceiling.
+    """
+
+    t_s: float
+    due_s: float
+    command: Command
+    telemetry: Telemetry
+    ground_z_m: float
+    held_m: float | None
+    stopped: bool
+    by_itself: bool
+
+
+class Watchdog:
+    """A `perchctl.link.protocol.Guard`. `turn`, `rescuing` and `end` are called by the loop's
+    thread, `poll` by the link's; each writes its own fields.
+
+    `overruled_s` is how late the loop was when a landing was decided for it, else 0.
+    """
+
+    def __init__(self, profile: Profile, operator: Callable[[], Operator]) -> None:
+        self._landing = profile.planner.landing
+        self._land_s = profile.safety.loop_late_land_s
+        self._top_m = profile.safety.max_height_m
+        self._operator = operator
+        self._turn: Turn | None = None
+        self._closing = False
+        self._motors_off = False
+        self.overruled_s = 0.0
+        self._cut_ordered = False
+        self._cut_s, self._cuts = -CUT_PERIOD_S, 0
+        self._streamed: Command | None = None
+        self._revived()
+
+    # --- the loop's side ---------------------------------------------------------------
+
+    def turn(
+        self, now_s: float, due_s: float, state: PlannerState, command: Command, newest: Telemetry
+    ) -> None:
+        """A turn of the loop is done, its command on its way."""
+        if isinstance(command, (PositionSetpoint, RawThrust)):
+            self._streamed = command
+        if isinstance(command, EmergencyStop):
+            self._cut_ordered = True
+        held_m = state.contact_z_m
+        if held_m is None and state.phase is Phase.PERCH:
+            held_m = newest.position_m[2]
+        self._turn = Turn(
+            now_s,
+            due_s,
+            self._streamed or command,
+            newest,
+            state.ground_m[2] if state.ground_m else 0.0,
+            held_m,
+            state.stopped_s is not None,
+            state.phase is Phase.LANDING and state.orders > 0,
+        )
+
+    def rescuing(self) -> None:
+        """The loop has ended by an error; what is left is the operator's stop."""
+        self._closing = True
+
+    def end(self, *, motors_off: bool) -> None:
+        """The flight is over; `motors_off` where that is proven."""
+        self._closing, self._motors_off = True, motors_off
+
+    # --- the link's side ---------------------------------------------------------------
+
+    def poll(self, now_s: float, newest: Telemetry | None) -> Command | None:
+        """What has to be sent now in the loop's place, if anything."""
+        turn = self._turn
+        if self._cut_ordered:
+            return self._cut(now_s, newest)
+        if turn is None or self._motors_off:
+            return None
+        operator, silent_s = self._operator(), now_s - turn.t_s
+        if operator is Operator.STOP and (self._closing or silent_s > STOP_AFTER_S):
+            self._cut_ordered = True
+            return self._cut(now_s, newest)
+        if self._closing or turn.stopped:
+            return None
+        if silent_s < REPEAT_AFTER_S:
+            self._revived()
+            return None
+        known = newest if is_known(newest, now_s) else None
+        late_s = now_s - turn.due_s
+        if operator is Operator.LAND or late_s > self._land_s:
+            self.overruled_s = max(self.overruled_s, late_s)
+            return self._land(now_s, turn, known)
+        return None if turn.by_itself else self._hold(now_s, turn, known)
+
+    def _revived(self) -> None:
+        self._held: PositionSetpoint | None = None
+        self._peel: PositionSetpoint | None = None
+        self._slipped_s: float | None = None
+        self._ordered_s, self._orders = -ORDER_PERIOD_S, 0
+
+    def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
+        """The emergency stop, until the vehicle is seen to be locked. Bounded."""
+        due = now_s - self._cut_s >= CUT_PERIOD_S - 1e-9
+        if is_cut(newest, now_s) or not due or self._cuts >= MAX_CUTS:
+            return None
+        self._cut_s, self._cuts = now_s, self._cuts + 1
+        return EmergencyStop()
+
+    def _hold(self, now_s: float, turn: Turn, known: Telemetry | None) -> Command | None:
+        """The last safe setpoint."""
+        caught = self._caught(now_s, turn, known)
+        if caught is not None:
+            return caught
+        match turn.command:
+            case RawThrust(thrust) if known is not None and self._held is None:
+                if thrust <= THRUST_MIN or abs(known.velocity_mps[2]) < STILL_MPS:
+                    return turn.command
+            case PositionSetpoint(z_m=z_m) if known is not None and self._held is None:
+                if z_m > known.position_m[2] and known.velocity_mps[2] < SINKING_MPS:
+                    return turn.command
+            case PositionSetpoint() | RawThrust():
+                pass
+            case _:
+                return None
+        if self._held is None:
+            self._held = _held_place(turn, known)
+        return self._held
+
+    def _land(self, now_s: float, turn: Turn, known: Telemetry | None) -> Command | None:
+        """A landing, as soon as the vehicle is away from the ceiling."""
+        caught = self._caught(now_s, turn, known)
+        if caught is not None:
+            return caught
+        free = self._orders > 0 or turn.by_itself or self._slipped_s is not None
+        if not free and known is not None and turn.held_m is not None:
+            if isinstance(turn.command, RawThrust) and turn.command.thrust <= THRUST_MIN:
+                return turn.command
+            if known.position_m[2] > turn.held_m - PEELED_M:
+                if self._peel is None:
+                    x, y, z = known.position_m
+                    self._peel = PositionSetpoint(x, y, z - PEEL_BELOW_M, known.yaw_rad)
+                return self._peel
+        if known is not None and (known.has(HL_ACTIVE) or not motors_may_run(known, now_s)):
+            return None
+        due = now_s - self._ordered_s >= ORDER_PERIOD_S - 1e-9
+        if not due or self._orders >= MAX_ORDERS:
+            return None
+        self._ordered_s, self._orders = now_s, self._orders + 1
+        return landing_order(self._landing, turn.ground_z_m, known or turn.telemetry)
+
+    def _caught(self, now_s: float, turn: Turn, known: Telemetry | None) -> Command | None:
+        """Far above as long as what has slipped off the magnet sinks; None when there is
+        nothing to catch, or no more."""
+        released = isinstance(turn.command, RawThrust) and turn.command.thrust <= THRUST_MIN
+        if known is None or turn.held_m is None or not released or self._orders:
+            return None
+        x, y, z = known.position_m
+        sink_mps = known.velocity_mps[2]
+        if self._slipped_s is None:
+            if turn.held_m - z <= SLIP_M or sink_mps >= SLIP_MPS:
+                return None
+            self._slipped_s = now_s
+        if self._held is not None or sink_mps >= 0.0 or now_s - self._slipped_s > CATCH_LIMIT_S:
+            if self._held is None:
+                self._held = PositionSetpoint(x, y, z, known.yaw_rad)
+            return None
+        top_m = turn.ground_z_m + self._top_m
+        return PositionSetpoint(x, y, min(z + CATCH_STILL_ABOVE_M, top_m), known.yaw_rad)
+
+
+def _held_place(turn: Turn, known: Telemetry | None) -> PositionSetpoint:
+    """The last setpoint's place, or the vehicle's, and not above where the vehicle is."""
+    sample = known or turn.telemetry
+    x, y, z = sample.position_m
+    match turn.command:
+        case PositionSetpoint(sx, sy, sz, yaw):
+            return PositionSetpoint(sx, sy, min(sz, z), yaw)
+        case _:
+            return PositionSetpoint(x, y, z, sample.yaw_rad)
+
+
+def landing_order(landing: LandingConfig, ground_z_m: float, newest: Telemetry | None) -> Land:
+    """To below the ground, slow enough at touchdown."""
+    floor_m = ground_z_m - landing.undershoot_m
+    height_m = 1.0 if newest is None else max(0.0, newest.position_m[2] - floor_m)
+    return Land(floor_m, landing_time_s(height_m))

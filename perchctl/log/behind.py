@@ -1,0 +1,52 @@
+"""Work that may hang, done by a thread of its own: a disk does not hold up the flight loop."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+
+Job = Callable[[], None]
+
+
+class Behind:
+    """A bounded queue of jobs and the thread that does them, in order. A job must not raise."""
+
+    def __init__(self, most: int, name: str) -> None:
+        self._most = most
+        self._jobs: deque[Job] = deque()
+        self._changed = threading.Condition()
+        self._last = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, job: Job) -> bool:
+        """False when the queue is full: the job is not done."""
+        with self._changed:
+            if len(self._jobs) >= self._most or self._last:
+                return False
+            self._jobs.append(job)
+            self._changed.notify()
+        return True
+
+    def finish(self, job: Job, timeout_s: float) -> int:
+        """One last job; waits for it. How many jobs were not done by then: 0 is all done."""
+        with self._changed:
+            self._jobs.append(job)
+            self._last = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+        with self._changed:
+            left = len(self._jobs) + int(self._thread.is_alive())
+            self._jobs.clear()  # what comes too late is not done at all
+        return left
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._jobs:
+                    if self._last:
+                        return
+                    self._changed.wait()
+                job = self._jobs.popleft()
+            job()

@@ -1,0 +1,226 @@
+"""The operator's switch, and the signals on it, also while the main thread hangs."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from perchctl.errors import Interrupted
+from perchctl.flight.operator import AGAIN_S, HELD_S, OperatorSwitch
+from perchctl.mission.state import Operator
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class Pressed:
+    """A switch, and presses at given times."""
+
+    def __init__(self) -> None:
+        self.now_s = 50.0
+        self.switch = OperatorSwitch(listening=True, clock=lambda: self.now_s)
+
+    def press(self, *times_s: float) -> None:
+        for t_s in times_s:
+            self.now_s = 50.0 + t_s
+            self.switch.press()
+
+    def at(self, t_s: float) -> Operator:
+        self.now_s = 50.0 + t_s
+        return self.switch.read()
+
+
+def test_one_press_lands_for_good() -> None:
+    it = Pressed()
+    assert it.at(0.0) is Operator.NONE
+    it.press(0.0)
+    assert it.at(0.0) is Operator.LAND
+    assert it.at(100.0) is Operator.LAND
+
+
+def test_a_second_press_within_half_a_second_does_not_count() -> None:
+    it = Pressed()
+    it.press(0.0, AGAIN_S - 0.01)
+    assert it.at(9.0) is Operator.LAND
+
+
+def test_a_second_press_after_half_a_second_stops() -> None:
+    it = Pressed()
+    it.press(0.0, AGAIN_S)
+    assert it.at(AGAIN_S + HELD_S + 0.001) is Operator.STOP
+    assert it.at(9.0) is Operator.STOP
+
+
+def test_presses_one_after_the_other_stop_after_half_a_second() -> None:
+    it = Pressed()
+    it.press(0.0, 0.2, 0.4, 0.6, 0.8)
+    assert it.at(0.8) is Operator.STOP
+
+
+@pytest.mark.parametrize("delay_s", [0.03, 0.25, 0.5, 0.66])
+@pytest.mark.parametrize("period_s", [0.03, 0.04, 0.092])
+def test_a_key_held_down_is_one_press(delay_s: float, period_s: float) -> None:
+    """However long a keyboard waits before it repeats."""
+    it = Pressed()
+    it.press(0.0, *(delay_s + period_s * i for i in range(60)))
+    assert it.at(delay_s + period_s * 60) is Operator.LAND
+    assert it.at(60.0) is Operator.LAND
+    it.press(61.0)
+    assert it.at(61.2) is Operator.STOP
+
+
+def test_before_the_flight_a_signal_leaves() -> None:
+    with pytest.raises(Interrupted, match="nothing was started"):
+        OperatorSwitch().leave()
+    OperatorSwitch(listening=True).leave()
+
+
+# --- signals, in a process of its own -----------------------------------------------------------
+
+HANGING = """
+import hashlib, sys, time
+from perchctl.commands.interrupt import signals_to_operator
+from perchctl.commands.output import say
+from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight.watchdog import Watchdog
+from perchctl.link.sender import Sender
+from perchctl.mission.state import Phase, PlannerState
+from perchctl.profile import Profile
+from perchctl.vehicle import PositionSetpoint
+from tests.helpers.mission import telemetry
+
+switch = OperatorSwitch(listening=True)
+dog = Watchdog(Profile(), switch.read)
+
+def send(command):
+    print(type(command).__name__, switch.read().name, flush=True)
+
+with signals_to_operator(switch, say):
+    sender = Sender(send, lambda: dog.poll(time.monotonic(), telemetry(time.monotonic())))
+    now = time.monotonic()
+    state = PlannerState(phase=Phase.ALIGN)
+    dog.turn(now, now + float(sys.argv[1]), state, PositionSetpoint(0, 0, 1, 0), telemetry(now))
+    # A call into a library that no signal interrupts; it lets the other threads run.
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 1 << 25)
+print("woke up", flush=True)
+"""
+
+
+class Hanging:
+    """A flight whose main thread hangs in a library, with what its link would send."""
+
+    def __init__(self, patience_s: float) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", HANGING, str(patience_s)],
+            cwd=ROOT,
+            env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self.next()  # the first setpoint that is repeated: the loop hangs
+
+    def next(self) -> list[str]:
+        assert self.process.stdout is not None
+        return self.process.stdout.readline().split()
+
+    def until(self, command: str) -> list[str]:
+        while (said := self.next()) and said[0] != command:
+            assert said[0] != "woke", "nothing was sent while it hung"
+        return said
+
+    def __enter__(self) -> Hanging:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+def test_ctrl_c_works_while_the_main_thread_hangs_in_a_library() -> None:
+    with Hanging(60.0) as flight:
+        flight.process.send_signal(signal.SIGINT)
+        assert flight.until("Land") == ["Land", "LAND"]
+        time.sleep(AGAIN_S)
+        flight.process.send_signal(signal.SIGINT)
+        assert flight.until("EmergencyStop") == ["EmergencyStop", "STOP"]
+        assert flight.process.poll() is None
+
+
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGTERM", "SIGQUIT", "SIGTSTP"])
+def test_signals_that_end_or_suspend_a_program_land(name: str) -> None:
+    with Hanging(60.0) as flight:
+        for _ in range(2):
+            flight.process.send_signal(signal.Signals[name])
+        assert flight.until("Land") == ["Land", "LAND"]
+        assert flight.process.poll() is None
+        state = Path(f"/proc/{flight.process.pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        assert state != "T"
+        if name == "SIGTSTP":
+            assert flight.process.stderr is not None
+            assert "Ctrl-Z does not suspend a flight" in flight.process.stderr.readline()
+
+
+def test_a_hanging_loop_is_landed_without_the_operator() -> None:
+    with Hanging(0.02) as flight:
+        assert flight.until("Land") == ["Land", "NONE"]
+
+
+def test_a_hang_up_that_is_ignored_stays_ignored() -> None:
+    """As under nohup."""
+    code = (
+        "import os, signal\n"
+        "from perchctl.commands.interrupt import signals_to_operator\n"
+        "from perchctl.flight.operator import OperatorSwitch\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "switch = OperatorSwitch(listening=True)\n"
+        "with signals_to_operator(switch, print):\n"
+        "    os.kill(os.getpid(), signal.SIGHUP)\n"
+        "    print(switch.read().name)\n"
+        "print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.split() == ["NONE", "True"], done.stderr
+
+
+def test_before_the_flight_each_signal_leaves_by_one_sentence() -> None:
+    code = (
+        "import os, signal, sys, time\n"
+        "from perchctl.commands.interrupt import signals_to_operator\n"
+        "from perchctl.errors import Interrupted\n"
+        "from perchctl.flight.operator import OperatorSwitch\n"
+        "for name in ('SIGINT', 'SIGTERM', 'SIGHUP', 'SIGTSTP'):\n"
+        "    try:\n"
+        "        with signals_to_operator(OperatorSwitch(), print):\n"
+        "            os.kill(os.getpid(), signal.Signals[name])\n"
+        "            time.sleep(5)\n"
+        "    except Interrupted as error:\n"
+        "        print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.count("nothing was started") == 4, done.stderr
+
+
+def test_a_terminal_that_is_gone_is_no_failure() -> None:
+    """Writes to stderr fail with EIO or EPIPE: nothing is raised, and the exit code stays."""
+    code = (
+        "import os, sys\n"
+        "from perchctl.commands.output import say, tell\n"
+        "from perchctl.display.panel import make_reporter\n"
+        "from perchctl.mission.watch import Event, EventKind\n"
+        "say('one'); reporter = make_reporter(stream=sys.stderr)\n"
+        "reporter.event(Event(0.0, EventKind.NOTE, 'two'))\n"
+        "reporter.close(); tell('three')\n"
+        "sys.exit(7)\n"
+    )
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=write)
+    os.close(write)
+    assert done.returncode == 7

@@ -1,0 +1,287 @@
+"""The watchdog: what is sent while the flight loop is silent. No thread, no clock."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import pytest
+
+from perchctl.flight.watchdog import (
+    CUT_PERIOD_S,
+    MAX_CUTS,
+    MAX_ORDERS,
+    ORDER_PERIOD_S,
+    PEEL_BELOW_M,
+    REPEAT_AFTER_S,
+    Watchdog,
+)
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, STILL_THRUST
+from perchctl.mission.state import Operator, Phase, PlannerState
+from perchctl.profile import Profile
+from perchctl.vehicle import (
+    HL_ACTIVE,
+    LOCKED,
+    Command,
+    EmergencyStop,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+    Telemetry,
+)
+from tests.helpers.mission import READY, telemetry
+
+PROFILE = Profile()
+LAND_S = PROFILE.safety.loop_late_land_s
+PERIOD_S = 0.02
+T_S = 100.0
+HOVER = PositionSetpoint(0.1, 0.2, 0.9, 0.5)
+RELEASED = RawThrust(STILL_THRUST)
+CEILING_M = 2.0
+AT_CEILING = PlannerState(
+    phase=Phase.COMPLETE, ground_m=(0.0, 0.0, 0.0), contact_z_m=CEILING_M, released_s=T_S - 1.0
+)
+IN_AIR = PlannerState(phase=Phase.ALIGN, ground_m=(0.0, 0.0, 0.0))
+SILENT_S = (0.31, 0.5, 0.9)
+
+
+class Rig:
+    """A watchdog whose loop has done one turn at `T_S`."""
+
+    def __init__(
+        self, command: Command = HOVER, state: PlannerState = IN_AIR, z_m: float = 1.0
+    ) -> None:
+        self.operator = Operator.NONE
+        self.dog = Watchdog(PROFILE, lambda: self.operator)
+        self.z_m = z_m
+        self.turn(T_S, command, state)
+
+    def turn(self, t_s: float, command: Command = HOVER, state: PlannerState = IN_AIR) -> None:
+        self.dog.turn(t_s, t_s + PERIOD_S, state, command, telemetry(t_s, self.z_m))
+
+    def after(self, silent_s: float, **changes: object) -> Command | None:
+        """What is sent so long after the turn; telemetry 20 ms old, altered."""
+        newest = telemetry(T_S + silent_s - 0.02, self.z_m)
+        return self.poll(silent_s, replace(newest, **changes))  # type: ignore[arg-type]
+
+    def poll(self, silent_s: float, newest: Telemetry | None) -> Command | None:
+        return self.dog.poll(T_S + silent_s, newest)
+
+
+# --- a loop that lives ----------------------------------------------------------------------
+
+
+def test_before_the_flight_nothing_is_sent() -> None:
+    dog = Watchdog(PROFILE, lambda: Operator.STOP)
+    assert dog.poll(1e6, telemetry(1e6)) is None
+
+
+@pytest.mark.parametrize("silent_s", [0.0, 0.02, 0.1, 0.29])
+def test_a_loop_that_lives_is_left_alone(silent_s: float) -> None:
+    assert Rig().after(silent_s) is None
+
+
+# --- 0.3 s: the last safe setpoint ------------------------------------------------------------
+
+
+def test_the_last_setpoint_is_repeated_from_0_3_s_on_until_the_landing() -> None:
+    rig = Rig()
+    assert [rig.after(s) for s in SILENT_S] == [HOVER] * 3
+
+
+def test_a_setpoint_above_the_vehicle_is_held_at_its_height() -> None:
+    """Neither a climb nor a press goes on, and what is held is not asked anew each time."""
+    rig = Rig(replace(HOVER, z_m=1.8), z_m=1.0)
+    assert rig.after(0.31) == replace(HOVER, z_m=1.0)
+    rig.z_m = 0.7
+    assert rig.after(0.5) == replace(HOVER, z_m=1.0)
+
+
+def test_without_telemetry_it_is_the_height_of_the_last_turn() -> None:
+    rig = Rig(replace(HOVER, z_m=1.8), z_m=1.0)
+    old = telemetry(T_S, 5.0)
+    assert rig.poll(0.35, old) == replace(HOVER, z_m=1.0)
+    assert Rig(replace(HOVER, z_m=1.8), z_m=1.0).poll(0.35, None) == replace(HOVER, z_m=1.0)
+
+
+def test_while_it_sinks_a_setpoint_above_goes_on_braking() -> None:
+    """A catch that the loop has begun."""
+    catching = replace(HOVER, z_m=2.0)
+    rig = Rig(catching, z_m=1.0)
+    assert rig.after(0.31, velocity_mps=(0.0, 0.0, -0.5)) == catching
+    rig.z_m = 0.8
+    assert rig.after(0.5) == replace(HOVER, z_m=0.8)
+
+
+@pytest.mark.parametrize("silent_s", SILENT_S)
+def test_what_hangs_still_in_the_release_keeps_its_raw_thrust(silent_s: float) -> None:
+    assert Rig(RELEASED, AT_CEILING, CEILING_M).after(silent_s, thrust=1000.0) == RELEASED
+
+
+def test_a_release_of_which_nothing_is_known_is_held_where_it_was() -> None:
+    """A slip would be a fall: unknown is never the harmless case."""
+    command = Rig(RELEASED, AT_CEILING, CEILING_M).poll(0.35, None)
+    assert command == PositionSetpoint(0.0, 0.0, CEILING_M, 0.0)
+
+
+def test_a_slip_while_the_loop_is_silent_is_caught_then_held_then_landed() -> None:
+    rig = Rig(RELEASED, AT_CEILING, CEILING_M)
+    rig.z_m = CEILING_M - 0.05
+    falls = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0}
+    caught = rig.after(0.35, **falls)
+    assert caught == PositionSetpoint(0.0, 0.0, min(rig.z_m + CATCH_STILL_ABOVE_M, 3.0), 0.0)
+    rig.z_m = CEILING_M - 0.4
+    assert isinstance(rig.after(0.6, **falls), PositionSetpoint)
+    assert rig.after(0.7) == PositionSetpoint(0.0, 0.0, rig.z_m, 0.0)
+    assert isinstance(rig.after(1.1), Land)
+
+
+def test_a_fall_is_caught_before_it_is_landed() -> None:
+    rig = Rig(RELEASED, AT_CEILING, CEILING_M)
+    rig.z_m = CEILING_M - 0.05
+    falls = {"velocity_mps": (0.0, 0.0, -0.8), "thrust": 1000.0}
+    assert isinstance(rig.after(1.2, **falls), PositionSetpoint)
+    assert isinstance(rig.after(1.5), Land)
+
+
+def test_a_raw_press_goes_on_in_contact_and_becomes_a_hold_in_the_air() -> None:
+    pressing = replace(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
+    assert Rig(RawThrust(60000), pressing, CEILING_M).after(0.31) == RawThrust(60000)
+    rising = Rig(RawThrust(60000), pressing, 1.9)
+    assert rising.after(0.31, velocity_mps=(0.0, 0.0, 0.2)) == PositionSetpoint(0, 0, 1.9, 0.0)
+
+
+# --- 1.0 s: a landing ---------------------------------------------------------------------------
+
+
+def test_a_silence_of_a_second_lands_and_repeats_until_it_shows() -> None:
+    rig = Rig()
+    late_s = LAND_S + PERIOD_S + 0.01
+    order = rig.after(late_s)
+    assert isinstance(order, Land)
+    assert order.height_m < 0.0
+    assert rig.dog.overruled_s > LAND_S
+    assert rig.after(late_s + 0.05) is None
+    assert isinstance(rig.after(late_s + ORDER_PERIOD_S), Land)
+    assert rig.after(late_s + 2 * ORDER_PERIOD_S, supervisor=READY | HL_ACTIVE) is None
+
+
+def test_a_landing_is_ordered_a_limited_number_of_times() -> None:
+    rig = Rig()
+    orders = [rig.poll(1.05 + 0.05 * i, None) for i in range(200)]
+    assert sum(isinstance(c, Land) for c in orders) == MAX_ORDERS
+    assert not [c for c in orders if c is not None and not isinstance(c, Land)]
+
+
+def test_what_stands_with_its_motors_off_is_not_started_again() -> None:
+    rig = Rig(z_m=0.0)
+    assert rig.after(1.2, supervisor=READY, thrust=0.0) is None
+
+
+def test_from_the_ceiling_it_peels_off_before_it_lands() -> None:
+    """A landing that runs by its clock while the magnet holds ends with a fall."""
+    pressing = replace(AT_CEILING, phase=Phase.PERCH, contact_z_m=None, released_s=None)
+    rig = Rig(replace(HOVER, z_m=2.25), pressing, CEILING_M)
+    below = PositionSetpoint(0.0, 0.0, CEILING_M - PEEL_BELOW_M, 0.0)
+    assert [rig.after(1.1 + s) for s in (0.0, 0.05, 2.0)] == [below] * 3
+    rig.z_m = CEILING_M - 0.15
+    assert isinstance(rig.after(3.2), Land)
+
+
+def test_what_hangs_released_is_not_landed_but_watched() -> None:
+    rig = Rig(RELEASED, AT_CEILING, CEILING_M)
+    for silent_s in (1.1, 5.0, 60.0):
+        assert rig.after(silent_s, thrust=1000.0) == RELEASED
+    rig.operator = Operator.LAND
+    assert rig.after(61.0, thrust=1000.0) == RELEASED
+
+
+def test_hanging_of_which_nothing_is_known_is_landed() -> None:
+    assert isinstance(Rig(RELEASED, AT_CEILING, CEILING_M).poll(1.1, None), Land)
+
+
+def test_a_landing_of_the_vehicles_own_is_left_alone() -> None:
+    landing = replace(IN_AIR, phase=Phase.LANDING, orders=1)
+    rig = Rig(Idle(), landing)
+    assert rig.after(0.5) is None
+    assert rig.after(5.0, supervisor=READY | HL_ACTIVE) is None
+
+
+def test_nothing_after_the_motors_were_stopped_for_good() -> None:
+    rig = Rig(StopMotors(), replace(AT_CEILING, stopped_s=T_S), CEILING_M)
+    assert [rig.after(s) for s in (0.5, 1.1, 9.0)] == [None] * 3
+
+
+def test_nothing_after_the_flight() -> None:
+    for motors_off in (True, False):
+        rig = Rig()
+        rig.dog.end(motors_off=motors_off)
+        assert [rig.after(s) for s in (0.5, 1.1, 9.0)] == [None] * 3
+
+
+def test_a_loop_that_revives_is_believed_and_a_second_silence_begins_anew() -> None:
+    rig = Rig(replace(HOVER, z_m=1.8))
+    assert rig.after(0.5) == replace(HOVER, z_m=1.0)
+    rig.turn(T_S + 0.6)
+    assert rig.after(0.65) is None
+    rig.z_m = 0.6
+    assert rig.after(0.6 + REPEAT_AFTER_S + 0.01) == replace(HOVER, z_m=0.6)
+
+
+# --- the operator ---------------------------------------------------------------------------------
+
+
+def test_the_operator_lands_a_silent_loop_at_once() -> None:
+    rig = Rig()
+    rig.operator = Operator.LAND
+    assert rig.after(0.2) is None  # the loop's own, if it lives
+    assert isinstance(rig.after(0.31), Land)
+
+
+def test_the_operators_stop_cuts_while_the_loop_is_silent() -> None:
+    rig = Rig()
+    rig.operator = Operator.STOP
+    assert rig.after(0.02) is None  # the loop's own: its row records it
+    assert rig.after(0.15) == EmergencyStop()
+
+
+@pytest.mark.parametrize("closing", ["rescue", "closing"])
+def test_the_operators_stop_cuts_at_once_after_the_loop(closing: str) -> None:
+    rig = Rig()
+    if closing == "rescue":
+        rig.dog.rescuing()
+    else:
+        rig.dog.end(motors_off=False)
+    assert rig.after(0.01) is None
+    rig.operator = Operator.STOP
+    assert rig.after(0.02) == EmergencyStop()
+
+
+def test_a_perched_vehicle_is_not_locked_by_a_late_stop() -> None:
+    rig = Rig(StopMotors(), replace(AT_CEILING, stopped_s=T_S), CEILING_M)
+    rig.dog.end(motors_off=True)
+    rig.operator = Operator.STOP
+    assert rig.after(1.0) is None
+
+
+@pytest.mark.parametrize("by_planner", [True, False])
+def test_an_emergency_stop_is_repeated_until_it_is_confirmed(by_planner: bool) -> None:
+    rig = Rig(EmergencyStop() if by_planner else HOVER)
+    rig.operator = Operator.STOP
+    times = [0.2 + 0.05 * i for i in range(20)]
+    cuts = [s for s in times if rig.after(s) == EmergencyStop()]
+    assert len(cuts) == 10
+    assert min(b - a for a, b in itertools.pairwise(cuts)) > CUT_PERIOD_S - 1e-6
+    locked = {"supervisor": LOCKED, "thrust": 0.0}
+    assert rig.after(1.5, supervisor=LOCKED) == EmergencyStop()  # its motors still run
+    assert rig.poll(1.7, telemetry(T_S + 0.5, supervisor=LOCKED, thrust=0.0)) == EmergencyStop()
+    assert [rig.after(2.0 + 0.05 * i, **locked) for i in range(20)] == [None] * 20
+
+
+def test_an_emergency_stop_is_repeated_a_limited_number_of_times() -> None:
+    rig = Rig()
+    rig.operator = Operator.STOP
+    cuts = [rig.poll(0.2 + 0.05 * i, None) for i in range(1000)]
+    assert cuts.count(EmergencyStop()) == MAX_CUTS

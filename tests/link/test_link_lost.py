@@ -1,0 +1,144 @@
+"""Leaving a link of which nothing is known any more, and one try to open a lost one again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.errors import ConnectionFailed
+from perchctl.link import evidence
+from perchctl.link.cflib_link import CflibLink
+from perchctl.link.connection import RADIO_RETRIES, Connection
+from perchctl.link.estimate import EstimateLink
+from perchctl.sim.process.handle import SimProcess
+from perchctl.vehicle import FLYING, HL_ACTIVE, LOCKED, EmergencyStop, Land, PositionSetpoint
+from tests.helpers.mission import AIRBORNE, READY, telemetry
+from tests.link.test_cflib_link import (
+    CONFIG,
+    LOW_CEILING,
+    cf,
+    commands_sent,
+    info,
+    let_pass,
+    linked,
+    newest,
+    sent_raw,
+    take_off,
+    until,
+)
+
+
+@pytest.fixture(scope="module")
+def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
+    with pytest.MonkeyPatch.context() as patch, SimProcess.start(LOW_CEILING) as process:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+        yield process
+
+
+# --- evidence --------------------------------------------------------------------------------
+
+OLD_S = evidence.FRESH_S + 0.01
+
+
+def test_what_is_unknown_flies() -> None:
+    standing = telemetry(10.0, 0.0, supervisor=READY, thrust=0.0)
+    for predicate in (evidence.may_fly, evidence.motors_may_run):
+        assert predicate(None, 10.0)
+        assert predicate(standing, 10.0 + OLD_S)
+        assert not predicate(standing, 10.1)
+    assert not evidence.is_cut(None, 10.0)
+    locked = telemetry(10.0, supervisor=LOCKED, thrust=0.0)
+    assert evidence.is_cut(locked, 10.1)
+    assert not evidence.is_cut(locked, 10.0 + OLD_S)
+
+
+def test_motors_off_for_less_than_two_seconds_is_no_flight_but_no_farewell_either() -> None:
+    hanging = telemetry(10.0, 2.0, supervisor=AIRBORNE, thrust=0.0)
+    assert evidence.may_fly(hanging, 10.0)
+    assert not evidence.motors_may_run(hanging, 10.0)
+    assert evidence.motors_may_run(telemetry(10.0, supervisor=READY | HL_ACTIVE, thrust=0.0), 10.0)
+
+
+# --- leaving ---------------------------------------------------------------------------------
+
+
+def test_closing_sends_no_zero_setpoint_when_nothing_is_known_any_more(sim: SimProcess) -> None:
+    """The last sample shows a vehicle on the ground; what it does since then is unknown."""
+    with linked(sim, landing_wait_s=0.5) as link:
+        assert not newest(link).has(FLYING)
+        raw = sent_raw(link, sim)
+        sim.silence(2.5)
+        until(lambda: link.problem(time.monotonic()))
+        link.close()
+        assert raw == []
+    let_pass(sim, 1.0)  # for who comes next
+
+
+def test_a_failed_look_at_the_estimate_commands_nothing(sim: SimProcess) -> None:
+    sent: list[list[int]] = []
+
+    class Failing(EstimateLink):
+        def _prepare(self, connection: Connection) -> None:
+            super()._prepare(connection)
+            sent.append(commands_sent(self))
+            raise ConnectionFailed("by the test")
+
+    link = Failing(sim.uri, CONFIG, time.monotonic)
+    with pytest.raises(ConnectionFailed, match="by the test"):
+        link.connect()
+    assert sent == [[]]
+
+
+# --- lost in flight --------------------------------------------------------------------------
+
+
+def test_a_radio_is_not_given_up_after_a_tenth_of_a_second(sim: SimProcess) -> None:
+    from cflib.crtp import radiodriver
+
+    with linked(sim):
+        assert radiodriver._nr_of_retries == RADIO_RETRIES
+
+
+def lose(link: CflibLink) -> None:
+    """As cflib's radio does after too many lost packets."""
+    cf(link).link.link_error_callback("Too many packets lost")
+    assert link.problem(time.monotonic()) == "Too many packets lost"
+
+
+def test_a_lost_link_is_opened_again_for_the_landing(sim: SimProcess) -> None:
+    with linked(sim) as link:
+        take_off(link, sim)
+        lose(link)
+        link.send(PositionSetpoint(0.0, 0.0, 0.4, 0.0))  # no reason to open it again
+        link.send(Land(-0.05, 1.5))
+        until(lambda: sim.truth()["floor_contact"] and max(sim.truth()["motors"]) == 0)
+        assert not info(sim) & LOCKED
+        until(lambda: link.problem(time.monotonic()) is None)
+        age_s = until(lambda: time.monotonic() - newest(link).t_s < 0.3)  # the blocks go on
+        assert age_s
+        lose(link)
+        link.send(EmergencyStop())  # once is enough
+        let_pass(sim, 0.5)
+        assert link.problem(time.monotonic()) is not None
+
+
+def test_a_link_that_cannot_be_opened_again_holds_up_nobody(
+    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import cflib.crtp
+
+    def gone(*_: Any) -> Any:
+        raise OSError("no dongle")
+
+    with linked(sim) as link:
+        monkeypatch.setattr(cflib.crtp, "get_link_driver", gone)
+        lose(link)
+        began_s = time.monotonic()
+        link.send(Land(-0.05, 1.5))
+        assert time.monotonic() - began_s < 0.2
+        assert link.problem(time.monotonic()) == "Too many packets lost"
