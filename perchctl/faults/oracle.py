@@ -6,7 +6,8 @@ after it pass, is told when the program ended and what it claimed, and raises fl
 - *fell*: motors off, or free fall, above 0.1 m while the weight does not hang; a
   touchdown above 0.8 m/s. A vehicle that the magnet lets go of with its motors still is
   judged by how deep it falls until it is caught (`drop_limit_m`); the floor is too deep;
-- *flies_on*: motors turning off the ground, or in the air, 5 s after the program's end;
+- *flies_on*: off the ground with turning motors 5 s after the program's end (what falls
+  with still motors has fallen);
 - *pressed*: full thrust against ceiling or floor for more than 4 s;
 - *strayed*: truly beyond fence or height limit by more than 0.3 m. What a fault adds to the
   estimate as a slow drift is allowed on top: nothing on board can know it;
@@ -204,7 +205,7 @@ class Oracle:
         elif self._claim_open and s.t_s >= claimed_s + CLAIM_S:
             self._claim_open = False
             self._raise("lied", s.t_s)
-        if s.t_s >= self._end_s + ALONE_S and "flies_on" not in self.flags and self.in_the_air:
+        if s.t_s >= self._end_s + ALONE_S and s.motors_on and _airborne(s):
             self._raise("flies_on", s.t_s)
 
     def _watch_lock(self, s: Sample) -> None:

@@ -221,6 +221,7 @@ def test_a_claim_has_half_a_second_to_become_true() -> None:
         (HANGING, set()),
         (HANGING._replace(motors_on=True), {"flies_on"}),
         (ON_THE_FLOOR, set()),
+        (ON_THE_FLOOR._replace(motors_on=True), set()),
     ],
 )
 def test_flies_on(truth: Sample, flags: set[str]) -> None:
@@ -232,6 +233,13 @@ def test_flies_on(truth: Sample, flags: set[str]) -> None:
 
 def test_a_lock_without_reason_is_needless() -> None:
     assert Script().show(ON_THE_FLOOR, 1.0, locked=True).flags == {"locked_needlessly"}
+
+
+def test_what_falls_after_the_end_does_not_fly() -> None:
+    script = Script().show(HANGING, 1.0)
+    script.oracle.ended(script.t_s)
+    script.show(HANGING, 4.9)
+    assert script.sink(STILL_FALL, falling(G, 2.0)).flags == {"fell"}
 
 
 @pytest.mark.parametrize("changes", [{"ended_by_vehicle": True}, {"up_z": 0.3}])
