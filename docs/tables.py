@@ -165,6 +165,7 @@ MEANINGS = {
     "planner.landing.speed_mps": "of the landing",
     "planner.landing.handover_m": "above the ground: from here the vehicle lands by itself",
     "planner.landing.undershoot_m": "the landing aims so far below the ground",
+    "planner.landing.drift_mps": "of the estimate's height: the aim sinks so fast",
     "planner.landing.timeout_s": "for which a landing is waited for",
     "planner.attempts": "perching attempts in all",
     "planner.perching_time_s": "then it lands",

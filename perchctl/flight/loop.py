@@ -63,12 +63,16 @@ def fly(parts: FlightParts) -> FlightReport:
         senses.ground_z_m = senses.history.newest.position_m[2]
     watchdog = Watchdog(parts.profile, parts.operator)
     parts.link.guard(watchdog)
+    started_s = parts.clock.now()
     try:
         return _mission(parts, senses, watchdog)
     except BaseException as error:
         watchdog.rescuing()
         landing, newest = parts.profile.planner.landing, senses.history.newest
-        safe = rescue(parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m)
+        flown_s = parts.clock.now() - started_s
+        safe = rescue(
+            parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m, flown_s
+        )
         _tell_rescue(parts, error, safe)
         raise
 

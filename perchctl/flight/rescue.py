@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from perchctl.flight.clock import Clock
-from perchctl.flight.watchdog import landing_order
 from perchctl.link.evidence import is_known, motors_may_run
 from perchctl.link.protocol import Link
+from perchctl.mission.landing import own_landing
 from perchctl.mission.state import Operator
 from perchctl.profile import LandingConfig
 from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Telemetry
@@ -25,13 +25,14 @@ def rescue(
     operator: Callable[[], Operator],
     known: Telemetry | None,
     ground_z_m: float = 0.0,
+    flown_s: float = 0.0,
 ) -> bool:
     """Order a landing and wait for it, bounded; whether the motors were seen off at the end.
     The landing needs no further packet once it is under way.
 
     `known` is the newest telemetry the loop has taken in, `ground_z_m` the height of the
-    ground in the estimate. On the ground it is looked at again for `LOOK_S`: a take-off just
-    begun does not show at once.
+    ground in the estimate, `flown_s` for how long it has flown. On
+    the ground it is looked at again for `LOOK_S`: a take-off just begun does not show at once.
     """
     newest = known
     start_s = off_since_s = clock.now()
@@ -48,7 +49,7 @@ def rescue(
             under_way = newest is not None and is_known(newest, now_s) and newest.has(HL_ACTIVE)
             due = orders == 0 or (not under_way and now_s - ordered_s > REPEAT_S)
             if due and orders < MAX_ORDERS:
-                link.send(landing_order(landing, ground_z_m, newest))
+                link.send(own_landing(landing, ground_z_m, flown_s, newest))
                 ordered_s, orders = now_s, orders + 1
         elif now_s - off_since_s >= LOOK_S:
             return True

@@ -26,15 +26,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.link.evidence import is_cut, is_known, motors_may_run
-from perchctl.mission.landing import PEELED_M, landing_time_s
+from perchctl.mission.landing import PEELED_M, own_landing
 from perchctl.mission.release import CATCH_LIMIT_S, CATCH_STILL_ABOVE_M, THRUST_MIN
 from perchctl.mission.state import Operator, Phase, PlannerState
-from perchctl.profile import LandingConfig, Profile
+from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
     Command,
     EmergencyStop,
-    Land,
     PositionSetpoint,
     RawThrust,
     Telemetry,
@@ -66,6 +65,7 @@ class Turn:
     command: Command
     telemetry: Telemetry
     ground_z_m: float
+    started_s: float
     held_m: float | None
     stopped: bool
     by_itself: bool
@@ -111,6 +111,7 @@ class Watchdog:
             self._streamed or command,
             newest,
             state.ground_m[2] if state.ground_m else 0.0,
+            state.started_s,
             held_m,
             state.stopped_s is not None,
             state.phase is Phase.LANDING and state.orders > 0,
@@ -203,7 +204,8 @@ class Watchdog:
         if not due or self._orders >= MAX_ORDERS:
             return None
         self._ordered_s, self._orders = now_s, self._orders + 1
-        return landing_order(self._landing, turn.ground_z_m, known or turn.telemetry)
+        flown_s = now_s - turn.started_s
+        return own_landing(self._landing, turn.ground_z_m, flown_s, known or turn.telemetry)
 
     def _caught(self, now_s: float, turn: Turn, known: Telemetry | None) -> Command | None:
         """Far above as long as what has slipped off the magnet sinks; None when there is
@@ -234,10 +236,3 @@ def _held_place(turn: Turn, known: Telemetry | None) -> PositionSetpoint:
             return PositionSetpoint(sx, sy, min(sz, z), yaw)
         case _:
             return PositionSetpoint(x, y, z, sample.yaw_rad)
-
-
-def landing_order(landing: LandingConfig, ground_z_m: float, newest: Telemetry | None) -> Land:
-    """To below the ground, slow enough at touchdown."""
-    floor_m = ground_z_m - landing.undershoot_m
-    height_m = 1.0 if newest is None else max(0.0, newest.position_m[2] - floor_m)
-    return Land(floor_m, landing_time_s(height_m))

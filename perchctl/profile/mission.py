@@ -113,12 +113,13 @@ class RecoverConfig(Section):
 
 class LandingConfig(Section):
     """Down by position setpoints at `speed_mps` to `handover_m`, the rest by the vehicle's
-    own landing, which goes to `undershoot_m` below the ground of the estimate, so that a
-    drifted height still ends on the floor."""
+    own landing, which goes to `undershoot_m` below the ground of the estimate, and by
+    `drift_mps` of the flight's time lower, so that a drifted height still ends on the floor."""
 
     speed_mps: float = Field(0.3, gt=0, le=1)
     handover_m: float = Field(0.3, ge=0.1, le=2)
     undershoot_m: float = Field(0.05, ge=0, le=1)
+    drift_mps: float = Field(0.012, ge=0, le=0.1)  # of the estimate's height: lower by that
     timeout_s: float = Field(30.0, gt=0, le=120)
 
 
