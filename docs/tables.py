@@ -24,6 +24,8 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from perchctl.errors import EXIT_CODES  # noqa: E402
+from perchctl.faults.catalogue import AIR, FAULTS, FROM_THE_START, Fault  # noqa: E402
+from perchctl.faults.excuses import EXCUSES  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.mission.diagram import diagram, rows_table  # noqa: E402
 from perchctl.profile import Profile  # noqa: E402
@@ -345,6 +347,35 @@ def exit_codes() -> str:
     return "\n".join(["| code | meaning |", "|---|---|", *rows])
 
 
+def fault_catalogue() -> str:
+    head = ["| name | rows | what happens | begins in | excuses |", "|---|---|---|---|---|"]
+    return "\n".join([*head, *map(_fault_row, FAULTS)])
+
+
+def _fault_row(fault: Fault) -> str:
+    rows = ", ".join(map(str, fault.rows))
+    excuses = ", ".join(excuse.name for excuse in fault.excuses)
+    return f"| `{fault.name}` | {rows} | {fault.what} | {_phases(fault)} | {excuses} |"
+
+
+def _phases(fault: Fault) -> str:
+    if fault.phases is FROM_THE_START:
+        return "from the start"
+    missing = [phase.value for phase in AIR if phase not in fault.phases]
+    if len(missing) > 2:
+        return ", ".join(phase.value for phase in fault.phases)
+    return f"any phase but {', '.join(missing)}" if missing else "any phase"
+
+
+def fault_excuses() -> str:
+    rows = [
+        f"| {excuse.name} | {', '.join(sorted(excuse.expected)).replace('_', ' ')} | "
+        f"{excuse.reason} |"
+        for excuse in EXCUSES
+    ]
+    return "\n".join(["| excuse | what is not counted | why |", "|---|---|---|", *rows])
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{diagram()}\n```",
@@ -353,6 +384,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "log-fields": log_fields,
     "event-fields": lambda: log_fields(EVENT_FIELDS),
     "exit-codes": exit_codes,
+    "fault-catalogue": fault_catalogue,
+    "fault-excuses": fault_excuses,
 }
 
 

@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import progress_bar
-from perchctl.commands.simulate import SimulateRequest, exit_code, flying, noting
+from perchctl.commands.simulate_request import SimulateRequest, exit_code, flying, noting
 from perchctl.faults.campaign import run_fault_campaign
 from perchctl.faults.catalogue import FAULTS, selected
 from perchctl.faults.result import FaultResult

@@ -20,6 +20,7 @@ from perchctl.faults.excuses import (
     LETS_GO_LATER,
     NO_LIFT,
     OPERATOR_STOPS,
+    SAGS_TOO_FAST,
     TOO_LOW,
     Excuse,
 )
@@ -118,7 +119,7 @@ FAULTS: tuple[Fault, ...] = (
           draws.external),
     # --- power and motors -----------------------------------------------------------
     Fault("battery-sags", (6,), "loses 0.2 to 0.7 V at 10 to 100 mV/s", AIR, draws.sags,
-          (NO_LIFT,)),
+          (SAGS_TOO_FAST,)),
     Fault("battery-reading-frozen", (7,), "its reading stands still", AIR,
           draws.reading_frozen),
     Fault("battery-low", (6,), "its reading is low", AIR, draws.reading_low),

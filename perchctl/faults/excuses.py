@@ -24,15 +24,20 @@ CUT_S = 1.9
 """Silence for longer ends in the firmware's cut (2.0 s after the last setpoint)."""
 CATCHABLE_M = 1.0
 """Hanging lower than this, a magnet of nearly the weight that lets go cannot be caught."""
+LEAST_LIFT = 1.02
+"""Over the weight: with less nothing is held in the air."""
+NOTICED_S, DOWN_MPS = 1.5, 0.4
+"""How long a low battery takes to be believed, and how fast a landing goes at best."""
 
 
 @dataclass(frozen=True)
 class Facts:
     """What was true in the flight. Times None: never.
 
-    `lift_ratio`: the least lift that battery and motors could give, over the weight, from
-    the fault's beginning on. `own_landing`: the vehicle's own landing ran as the fault
-    began. `hung_m`: height of the last hanging.
+    `own_landing`: the vehicle's own landing ran as the fault began. `weak_s`: when battery
+    and motors could first not lift the weight any more; `low_s`, `low_m`: when the battery
+    was first low under load, and how high the vehicle was then. `hung_m`: height of the
+    last hanging.
     """
 
     effects: tuple[Effect, ...]
@@ -40,7 +45,9 @@ class Facts:
     report_s: float | None
     let_go_s: float | None
     own_landing: bool
-    lift_ratio: float
+    weak_s: float | None
+    low_s: float | None
+    low_m: float
     hung_m: float | None
 
 
@@ -102,6 +109,13 @@ def _too_low_to_catch(facts: Facts) -> bool:
     return weak and facts.hung_m is not None and facts.hung_m < CATCHABLE_M
 
 
+def _sags_too_fast(facts: Facts) -> bool:
+    if facts.weak_s is None:
+        return False
+    down_s = NOTICED_S + facts.low_m / DOWN_MPS
+    return facts.low_s is None or facts.weak_s - facts.low_s < down_s
+
+
 CUT = Excuse(
     "cut by the firmware", _is_cut, _flags("fell", "locked_needlessly"),
     "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
@@ -125,9 +139,14 @@ TOO_LOW = Excuse(
     "a fall from standing motors takes up to 0.8 m to catch; it hung lower than 1 m",
 )  # fmt: skip
 NO_LIFT = Excuse(
-    "too weak to hover", lambda facts: facts.lift_ratio < 1.02, _flags("fell"),
-    "what battery and motors can lift is less than the weight (with one motor weak, four "
-    "times that one: the others may give no more, or it turns over)",
+    "too weak to hover", lambda facts: facts.weak_s is not None, _flags("fell"),
+    "what battery and motors can lift is less than the weight: four times what the weak motor "
+    "gives, for with more of the others it turns over",
+)  # fmt: skip
+SAGS_TOO_FAST = Excuse(
+    "sags too fast", _sags_too_fast, _flags("fell"),
+    "from the voltage at which it lands to the one that does not lift the weight any more it "
+    "has less time than the way down takes",
 )  # fmt: skip
 
-EXCUSES = (CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT)
+EXCUSES = (CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT, SAGS_TOO_FAST)

@@ -15,7 +15,7 @@ from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
 from perchctl.faults.effects import Effect
 from perchctl.faults.effects import Operator as Presses
-from perchctl.faults.excuses import Facts
+from perchctl.faults.excuses import LEAST_LIFT, Facts
 from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
 from perchctl.faults.oracle import Claim, Limits, Oracle
 from perchctl.faults.program import FaultyClock, ProgramKilled
@@ -35,6 +35,7 @@ from perchctl.profile import Profile
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.powertrain import most_thrust_n
 from perchctl.sim.scenario import Scenario
+from perchctl.sim.thrust_curve import MOTOR_FORCE_N
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
 LONGEST_FLIGHT_S = 240.0
@@ -73,7 +74,7 @@ class FaultyFlight:
         self._injector.on_begin = self._note_beginning
         self._injectors = [self._injector]
         if case.landed_from is not None:
-            lands: tuple[Effect, ...] = (Presses((0.0,)),)
+            lands: tuple[Effect, ...] = (Presses((0.0,), hang_up=True),)
             self._injectors.append(Injector(edges, lands, case.landed_from, case.landed_after_s))
         watchers: tuple[Watcher, ...] = (*self._injectors, disk)
         if log is not None:
@@ -86,7 +87,9 @@ class FaultyFlight:
         safety = profile.safety
         self._oracle = Oracle(Limits(safety.fence_radius_m, safety.max_height_m))
         self._own_landing = False
-        self._lift_ratio = float("inf")
+        self._weak_s: float | None = None
+        self._low_s: float | None = None
+        self._low_m = 0.0
         self._hung_m: float | None = None
         self._let_go_s: float | None = None
 
@@ -140,9 +143,12 @@ class FaultyFlight:
             self._let_go_s = t_s
         if self._injector.begin_s is not None:
             weakest = min(world.powertrain.strength or (1.0,))
-            lift_n = weakest * most_thrust_n(world.battery_rest_v)
-            ratio = lift_n / (self._scenario.mass_kg * GRAVITY_MPS2)
-            self._lift_ratio = min(self._lift_ratio, ratio)
+            lift_n = min(4.0 * MOTOR_FORCE_N, weakest * most_thrust_n(world.battery_rest_v))
+            weight_n = self._scenario.mass_kg * GRAVITY_MPS2
+            if self._weak_s is None and lift_n < LEAST_LIFT * weight_n:
+                self._weak_s = t_s
+            if self._low_s is None and world.battery_v < self._profile.safety.min_load_v:
+                self._low_s, self._low_m = t_s, sample.height_m
 
     def _note_beginning(self) -> None:
         self._own_landing = self._vehicle.firmware.planner.active
@@ -156,7 +162,9 @@ class FaultyFlight:
             report_s=ended.report_s,
             let_go_s=self._let_go_s,
             own_landing=self._own_landing,
-            lift_ratio=self._lift_ratio,
+            weak_s=self._weak_s,
+            low_s=self._low_s,
+            low_m=self._low_m,
             hung_m=self._hung_m,
         )
         excuses = [excuse for excuse in case.fault.excuses if excuse.when(facts)]

@@ -127,7 +127,7 @@ class Injector:
         self._estimate: tuple[EstimateError, float] | None = None
         self._sag: tuple[BatterySags, float] | None = None
         self._outside: tuple[ExternalPositions, float | None] | None = None
-        self._frozen_at_m: tuple[float, float, float] | None = None
+        self._frozen_at_m = (0.0, 0.0, 0.0)
         self._lets_go: float | None = None
         self.begin_s: float | None = None
         self.flown: Phase | None = None  # the phase of the newest turn
@@ -211,6 +211,8 @@ class Injector:
                 self._at(t_s + effect.for_s, self._heal)
             case ExternalPositions():
                 self._outside = (effect, t_s)
+                world = vehicle.world
+                self._frozen_at_m = (world.x_m, world.y_m, world.z_m)
             case LogReads():
                 self._read_wrongly(effect, t_s)
             case BatterySags():
@@ -276,5 +278,5 @@ class Injector:
         if begin_s is not None and t_s < begin_s + effect.for_s:
             if effect.how == "silent":
                 return
-            self._frozen_at_m = here = self._frozen_at_m or here
+            here = self._frozen_at_m
         self._edges.vehicle.firmware.external_position(here)

@@ -1,0 +1,180 @@
+"""Whole flights with faults: some in every run, each fault in each phase as a campaign."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+import cv2
+from typer.testing import CliRunner
+
+from perchctl.cli import app
+from perchctl.faults.catalogue import BY_NAME, FAULTS, case_of
+from perchctl.faults.flight import fly_fault_seed, fly_with_fault
+from perchctl.faults.oracle import FLAGS
+from perchctl.faults.plot import plot_heat_map
+from perchctl.faults.result import FaultResult
+from perchctl.faults.summary import fault_summary, fault_table, worst_first
+from perchctl.mission.state import Phase
+from perchctl.profile import Profile, load_profile
+from perchctl.sim.draw import draw_scenario
+from tests.helpers.flights import SEED, SHORT
+
+CELLS = [(fault.name, phase) for fault in FAULTS for phase in fault.phases]
+
+
+@cache
+def profile() -> Profile:
+    return load_profile(SHORT)
+
+
+def flown(name: str, phase: Phase, log: Path | None = None, draw: int = 0) -> FaultResult:
+    cv2.setNumThreads(1)
+    scenario = draw_scenario(profile(), SEED)
+    rng = np.random.default_rng([draw, [f.name for f in FAULTS].index(name)])
+    return fly_with_fault(profile(), case_of(BY_NAME[name], phase, rng, scenario), scenario, log)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(("name", "phase"), CELLS, ids=[f"{n}-{p.value}" for n, p in CELLS])
+def test_nothing_goes_wrong(name: str, phase: Phase) -> None:
+    result = flown(name, phase)
+    assert not result.reason.startswith("unforeseen"), result
+    assert result.counted == (), result
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[FaultResult, Path]:
+    """Killed while it aligns, in the air: nothing can be done about that."""
+    log = tmp_path_factory.mktemp("killed") / "flight.jsonl"
+    return flown("killed", Phase.ALIGN, log), log
+
+
+def test_a_killed_program_is_cut_and_excused(killed: tuple[FaultResult, Path]) -> None:
+    result, _ = killed
+    assert (result.end, result.phase, result.miss_m) == ("gone", "ALIGN", None)
+    assert set(result.flags) == {"fell", "locked_needlessly"}
+    assert result.counted == ()
+    assert result.unavoidable is not None
+    assert "2 s after the last setpoint" in result.unavoidable
+    assert result.begin_s is not None
+    assert result.flags["fell"] == pytest.approx(result.begin_s + 2.0, abs=0.3)
+
+
+def test_the_log_ends_where_the_program_did(killed: tuple[FaultResult, Path]) -> None:
+    result, log = killed
+    lines = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    ticks = [line["t_s"] for line in lines if line["kind"] == "tick"]
+    assert ticks[-1] == pytest.approx(result.time_s, abs=0.05)
+
+
+def test_the_operator_s_word_is_excused() -> None:
+    result = flown("operator-twice", Phase.SEARCH)
+    assert result.end == "aborted"
+    assert result.counted == ()
+
+
+def test_a_fault_that_begins_leaves_its_mark() -> None:
+    result = flown("camera-silent", Phase.SEARCH, draw=1)
+    assert result.begin_s is not None
+    assert result.counted == ()
+    assert result.parameters["CameraFault"]["kind"] == "silent"
+
+
+def test_the_same_seed_is_the_same_flight() -> None:
+    short = profile()
+    one, two = (fly_fault_seed(short, SEED, ("operator-once",)) for _ in range(2))
+    assert {**vars(one), "wall_s": 0.0} == {**vars(two), "wall_s": 0.0}
+
+
+# --- figures, table, picture ----------------------------------------------------------
+
+
+def made(seed: int, name: str, phase: Phase, **changes: Any) -> FaultResult:
+    plain: dict[str, Any] = {
+        "seed": seed, "fault": name, "phase": phase.value, "moment_s": 0.5, "begin_s": 4.0,
+        "parameters": {}, "end": "landed", "cause": "", "reason": "", "flags": {}, "counted": (),
+        "unavoidable": None, "time_s": 20.0, "miss_m": None, "drop_m": 0.0,
+    }  # fmt: skip
+    return FaultResult(**(plain | changes))
+
+
+RESULTS = [
+    made(1, "killed", Phase.ALIGN, end="gone", flags={"fell": 6.0}, unavoidable="it is gone"),
+    made(2, "kick", Phase.ALIGN, end="perched"),
+    made(3, "kick", Phase.ALIGN, flags={"lied": 9.0, "fell": 8.0}, counted=("lied", "fell")),
+    made(4, "weak-magnet", Phase.PERCH, drop_m=0.4, slip_ratio=0.5, flags={"pressed": 9.0},
+         counted=("pressed",)),
+]  # fmt: skip
+
+
+def test_figures() -> None:
+    figures = fault_summary(RESULTS)
+    assert {k: figures[k] for k in ("flights", "perched", "landed", "aborted", "gone")} == {
+        "flights": 4, "perched": 1, "landed": 2, "aborted": 0, "gone": 1,
+    }  # fmt: skip
+    assert {flag: figures[flag] for flag in FLAGS} == {
+        "fell": 1, "flies_on": 0, "pressed": 1, "strayed": 0, "lied": 1, "locked_needlessly": 0,
+    }  # fmt: skip
+    assert figures["unavoidable"] == 1
+    assert figures["worst_seeds"] == [3, 4]
+    assert figures["drop_m"] == {"to 0.3": None, "to 0.75": 0.4, "above": None}
+    assert [r.seed for r in worst_first(RESULTS)] == [3, 4]
+    json.dumps(figures)
+
+
+def test_the_table_fits_the_terminal() -> None:
+    every = [made(i, name, phase) for i, (name, phase) in enumerate(CELLS)]
+    table = fault_table(every)
+    assert max(map(len, table.splitlines())) <= 80
+    lines = fault_table(RESULTS).splitlines()
+    assert re.search(r"^kick +\. +\. +\. +2!1 ", "\n".join(lines), re.MULTILINE)
+    assert re.search(r"^killed +\. +\. +\. +1u ", "\n".join(lines), re.MULTILINE)
+    assert "  1 x it is gone" in lines
+
+
+def test_the_heat_map_is_drawn(tmp_path: Path) -> None:
+    plot_heat_map(RESULTS, tmp_path / "map.png")
+    picture = cv2.imread(str(tmp_path / "map.png"))
+    assert picture is not None
+    assert min(picture.shape[:2]) > 200
+
+
+# --- the command ----------------------------------------------------------------------
+
+
+def simulate(*arguments: str) -> Any:
+    return CliRunner().invoke(app, ["simulate", "-p", SHORT, *arguments])
+
+
+def test_the_command_prints_one_object_and_repeats_a_seed(tmp_path: Path) -> None:
+    options = ["--faults", "low-bare-ceiling,hang-up", "--only", str(SEED)]
+    done = simulate(
+        *options, "--json", "--log-dir", str(tmp_path), "--heat-map", str(tmp_path / "map.png")
+    )
+    assert done.exit_code == 0
+    said = json.loads(done.stdout)
+    assert {"flights", "perched", "landed", "aborted", *FLAGS, "unavoidable", "worst_seeds"} <= set(
+        said
+    )
+    assert said["flights"] == 1
+    assert (tmp_path / "map.png").exists()
+    assert (tmp_path / f"flight_seed{SEED}.jsonl").exists()
+
+
+def test_the_command_lists_and_refuses() -> None:
+    listed = simulate("--faults", "list")
+    assert listed.exit_code == 0
+    assert all(f"{fault.name} " in listed.stdout for fault in FAULTS)
+    refused = simulate("--faults", "hanged")
+    assert refused.exit_code == 2
+    assert "--faults list" in refused.stderr
+    assert simulate("--heat-map", "x.png").exit_code == 2

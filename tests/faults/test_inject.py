@@ -1,0 +1,260 @@
+"""Faults of the world: each is laid into a simulated vehicle at its moment, and seen there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.calibration.files import load_calibration
+from perchctl.faults import effects as e
+from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
+from perchctl.faults.truth import WatchedVehicle, sample_of
+from perchctl.geometry import GRAVITY_MPS2
+from perchctl.mission.state import Phase, PlannerState
+from perchctl.profile import TargetConfig
+from perchctl.sim.powertrain import most_thrust_n
+from perchctl.sim.scenario import Scenario
+
+CAMERA = load_calibration("example_640x480.yaml")
+SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, target_xy_m=(0.1, 0.2))
+
+
+@dataclass
+class Rig:
+    """A vehicle on the floor and an injector whose edges count."""
+
+    effects: tuple[e.Effect, ...]
+    scenario: Scenario = SCENARIO
+    moment_s: float = 0.0
+    presses: int = 0
+    hang_ups: int = 0
+    begun: list[Any] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.vehicle = WatchedVehicle(self.scenario, CAMERA, TargetConfig())
+        self.disk = Disk()
+        edge: Any = self
+        edges = Edges(self.vehicle, edge, edge, edge, self.press, self.hang_up, self.disk)
+        self.injector = Injector(edges, self.effects, Phase.SEARCH, self.moment_s)
+        self.vehicle.each = self.injector.each
+
+    def press(self) -> None:
+        self.presses += 1
+
+    def hang_up(self) -> None:
+        self.hang_ups += 1
+
+    def begin(self, effect: e.Effect, now_s: float) -> None:
+        self.begun.append(effect)
+
+    def wait(self, for_s: float) -> None:
+        self.vehicle.advance_to(self.vehicle.t_s + for_s)
+
+    def turn(self, phase: Phase) -> None:
+        tick: Any = type("Turn", (), {})()
+        tick.t_s, tick.state = self.vehicle.t_s, PlannerState(phase=phase)
+        self.injector.tick(tick)
+
+
+def begun(*effects: e.Effect, **changes: Any) -> Rig:
+    rig = Rig(effects, **changes)
+    rig.wait(0.1)
+    rig.injector.begin_now()
+    return rig
+
+
+def test_it_begins_at_its_moment_in_its_phase() -> None:
+    rig = Rig((e.Push((0.1, 0.0, 0.0), 0.2),), moment_s=0.5)
+    for phase in (Phase.APPROACH, Phase.SEARCH):
+        rig.turn(phase)
+        rig.wait(0.4)
+        assert rig.injector.begin_s is None
+    rig.wait(0.15)
+    assert rig.injector.begin_s == pytest.approx(0.9, abs=0.011)
+
+
+def test_it_begins_when_its_phase_is_left() -> None:
+    rig = Rig((e.Push((0.1, 0.0, 0.0), 0.2),), moment_s=5.0)
+    rig.turn(Phase.SEARCH)
+    rig.wait(0.2)
+    rig.turn(Phase.ESTIMATE)
+    assert rig.injector.begin_s == pytest.approx(0.2)
+
+
+def test_it_never_begins_where_the_phase_never_comes() -> None:
+    rig = Rig((e.Push((0.1, 0.0, 0.0), 0.2),))
+    for phase in (Phase.APPROACH, Phase.LANDING):
+        rig.turn(phase)
+        rig.wait(0.1)
+    assert rig.injector.begin_s is None
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        e.Silence(1.0, True, True), e.PacketLost("land", 1), e.PacketTwice("land"),
+        e.BlockDead("state", 1.0), e.TelemetryDelayed(0.1, 1.0), e.CameraFault("snow", 1.0),
+        e.Killed(), e.Suspended(1.0), e.Hung(1.0), e.Slow(0.1, 1.0),
+    ],
+)  # fmt: skip
+def test_what_the_edges_are_handed(effect: e.Effect) -> None:
+    assert begun(effect).begun == [effect]
+
+
+def test_the_estimate_steps_turns_and_slides() -> None:
+    rig = begun(
+        e.EstimateError((0.5, 0.0, -0.2), 90.0, (0.0, 0.1, 0.0), for_s=1.0),
+        scenario=replace(SCENARIO, estimate_noise_m=0.0),
+    )
+    now = rig.vehicle.firmware.estimator.now
+    rig.wait(0.5)
+    assert now.x_m == pytest.approx(0.5, abs=0.01)
+    assert now.y_m == pytest.approx(0.05, abs=0.01)
+    assert now.vy_mps == pytest.approx(0.1, abs=0.01)
+    assert now.yaw_deg == pytest.approx(90.0, abs=1.0)
+    assert rig.injector.drifted_m == pytest.approx(0.05, abs=0.01)
+    rig.wait(0.7)
+    assert now.x_m == pytest.approx(0.0, abs=0.01)
+    assert rig.injector.drifted_m == pytest.approx(0.1, abs=0.01)  # where it has led the vehicle
+
+
+@pytest.mark.parametrize("how", ["frozen", "silent"])
+def test_positions_from_outside_end(how: str) -> None:
+    effect = e.ExternalPositions(how, 1.0)
+    rig = Rig((effect,), changed_scenario(SCENARIO, (effect,)))
+    estimator = rig.vehicle.firmware.estimator
+    rig.wait(1.0)
+    assert estimator.external_count == pytest.approx(50, abs=2)
+    rig.injector.begin_now()
+    rig.vehicle.world.set_pose((0.4, 0.0, 0.5), hold=True)
+    rig.wait(0.9)
+    if how == "silent":
+        assert estimator.external_count == pytest.approx(50, abs=2)
+    else:
+        assert abs(estimator.now.x_m) < 0.05  # where it was
+    rig.wait(1.0)
+    assert estimator.now.x_m == pytest.approx(0.4, abs=0.05)
+
+
+def test_a_log_variable_reads_wrongly() -> None:
+    rig = begun(e.LogReads(("pm.vbat",), 2.8, 0.5), e.LogReads(("stateEstimate.x",), math.nan, 0.5))
+    firmware = rig.vehicle.firmware
+    rig.wait(0.2)
+    assert firmware.log_value("pm.vbat") == 2.8
+    assert math.isnan(firmware.log_value("stateEstimate.x"))
+    rig.wait(0.5)
+    assert firmware.log_value("pm.vbat") > 4.0
+
+
+def test_a_reading_stands_still() -> None:
+    rig = begun(e.LogReads(("pm.vbat",), None, 5.0), e.BatterySags(0.1, 0.5))
+    before = rig.vehicle.firmware.log_value("pm.vbat")
+    rig.wait(2.0)
+    assert rig.vehicle.firmware.log_value("pm.vbat") == before
+
+
+def test_the_battery_sags_by_so_much() -> None:
+    rig = begun(e.BatterySags(0.1, 0.3))
+    before = rig.vehicle.world.battery_rest_v
+    rig.wait(1.0)
+    assert before - rig.vehicle.world.battery_rest_v == pytest.approx(0.1, abs=0.002)
+    rig.wait(4.0)
+    assert before - rig.vehicle.world.battery_rest_v == pytest.approx(0.3, abs=0.002)
+
+
+def test_a_motor_is_weak() -> None:
+    rig = begun(e.MotorWeak(2, 0.85))
+    world = rig.vehicle.world
+    world.set_pose((0.0, 0.0, 1.0), hold=True)
+    for _ in range(500):
+        world.step((40000.0,) * 4)
+    f1, f2, f3, f4 = world.powertrain.forces_n
+    assert f1 == f3 == f4
+    assert f2 == pytest.approx(0.85 * f1)
+
+
+def test_a_push_ends() -> None:
+    rig = begun(e.Push((0.1, 0.0, 0.0), 0.2))
+    assert rig.vehicle.world.external_force_n == (0.1, 0.0, 0.0)
+    rig.wait(0.3)
+    assert rig.vehicle.world.external_force_n == (0.0, 0.0, 0.0)
+
+
+def test_the_magnet_lets_go_after_the_contact() -> None:
+    rig = begun(e.MagnetLetsGo(0.5))
+    vehicle, scenario = rig.vehicle, rig.scenario
+    top_m = scenario.ceiling_z_m - scenario.gear_body_m[2]
+    rig.wait(1.0)
+    vehicle.world.set_pose((*scenario.target_xy_m, top_m))
+    rig.wait(0.4)
+    assert sample_of(vehicle).hanging
+    rig.wait(0.5)
+    assert not sample_of(vehicle).hanging
+    assert vehicle.world.z_m < top_m - 0.05
+
+
+def test_the_target_moves_with_its_magnet() -> None:
+    rig = begun(e.TargetMoves((0.3, 0.0)))
+    assert rig.vehicle.world.magnet.target_xy_m == pytest.approx((0.4, 0.2))
+    assert rig.vehicle.camera is not None
+    assert rig.vehicle.camera.renderer.T_world_target[0, 3] == pytest.approx(0.4)
+
+
+def test_the_operator_presses() -> None:
+    rig = begun(e.Operator((0.0, 0.5)), e.Operator((0.0,), hang_up=True))
+    rig.wait(0.3)
+    assert (rig.presses, rig.hang_ups) == (1, 1)
+    rig.wait(0.5)
+    assert (rig.presses, rig.hang_ups) == (2, 1)
+
+
+def test_the_disk_is_full_for_a_while() -> None:
+    rig = begun(e.DiskFull(0.5))
+    assert rig.disk.problem
+    rig.wait(0.6)
+    assert rig.disk.problem is None
+
+
+def test_what_is_so_from_the_start() -> None:
+    weight_n = SCENARIO.mass_kg * GRAVITY_MPS2
+    weak = changed_scenario(replace(SCENARIO, first_contact_force_n=0.1), (e.MagnetHolds(0.5),))
+    assert weak.magnet_force_n == pytest.approx(0.5 * weight_n)
+    assert weak.first_contact_force_n is None
+    room = e.Room(1.2, True, 0.1, (0.4, 0.0), 90.0)
+    other = changed_scenario(SCENARIO, (room,))
+    assert (other.ceiling_z_m, other.no_target) == (1.2, True)
+    assert (other.target_above_ceiling_m, other.second_target_m) == (0.1, (0.4, 0.0))
+    turned = np.array(other.T_body_cam_true)[:3, :3] @ (1.0, 0.0, 0.0)
+    assert turned == pytest.approx((0.0, 1.0, 0.0), abs=1e-12)
+    assert changed_scenario(SCENARIO, (e.Killed(),)) == SCENARIO
+
+
+def test_the_truth_of_a_vehicle_on_the_floor() -> None:
+    rig = Rig(())
+    rig.wait(1.0)
+    sample = sample_of(rig.vehicle)
+    assert sample.floor
+    assert abs(sample.height_m) < 0.002
+    assert sample.acc_g == pytest.approx(1.0, abs=0.01)
+    assert True not in (sample.motors_on, sample.hanging, sample.locked, sample.pressing)
+
+
+def test_the_truth_of_a_vehicle_that_presses() -> None:
+    rig = Rig((), replace(SCENARIO, no_target=True))
+    world, scenario = rig.vehicle.world, rig.scenario
+    world.set_pose((0.0, 0.0, scenario.ceiling_z_m - scenario.gear_body_m[2]))
+    rig.vehicle.firmware.motors = (60000.0,) * 4
+    for _ in range(1000):
+        world.step((60000.0,) * 4)
+    assert sample_of(rig.vehicle).pressing
+
+
+def test_the_most_that_a_battery_lifts() -> None:
+    """At 3.47 V under load four motors give about what the firmware asks of them at most."""
+    assert 0.36 < most_thrust_n(3.6) < most_thrust_n(3.9) < most_thrust_n(4.2) < 0.64
