@@ -29,9 +29,7 @@ class Ended(Protocol):
 
 
 @contextlib.contextmanager
-def progress_bar(
-    total: int, stream: TextIO | None = None
-) -> Iterator[Callable[[Ended], None]]:
+def progress_bar(total: int, stream: TextIO | None = None) -> Iterator[Callable[[Ended], None]]:
     """Yields the function to call with each finished flight."""
     ends: dict[str, int] = {}
     columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
