@@ -16,12 +16,13 @@ from perchctl.mission.guards import (
     has_slipped,
     is_blocked,
     left_jump_hold,
+    mounted_wrong,
     searched_out,
     settling_too_long,
     stopped_for_s,
+    why_mounted_wrong,
     why_not_found,
 )
-from perchctl.mission.mounting import explained
 from perchctl.mission.state import (
     FLYING_PHASES,
     Condition,
@@ -130,8 +131,7 @@ TABLE: tuple[Row, ...] = (
         "the battery's reading stands still", S.LAND, O.SAFETY,
     ),
     Row(
-        "mounting", WATCHED, lambda c: c.state.mount.wrong, P.LANDING,
-        lambda c: explained(c.state.mount), S.LAND, O.SAFETY,
+        "mounting", WATCHED, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,
     ),
     Row(
         "height-limit", BEFORE_CONTACT,

@@ -30,13 +30,13 @@ def test_no_setpoint_lies_in_the_ground(z_m: float, phase: Phase) -> None:
 
 
 def test_a_target_that_seems_to_lie_below_is_not_dived_to() -> None:
-    """A recording, a camera that looks down: ASCEND and PERCH go where the target is."""
-    for phase in (Phase.ASCEND, Phase.PERCH):
+    """SEARCH looks for a target that it knows from below it."""
+    for phase in (Phase.SEARCH, Phase.ASCEND, Phase.PERCH):
         state, z_m = state_in(phase), 1.0
         for i in range(1, 400):
             t_s = 10.0 + 0.02 * i
             body_m = (0.0, 0.0, z_m)
-            target = target_at(t_s, (0.0, 0.0, -1.0), body_m)
+            target = target_at(t_s, (0.0, 0.0, -1.0), body_m, tracked=False, measured=False)
             tel = telemetry(t_s, position_m=body_m)
             obs = observation(t_s, telemetry=tel, target=target)
             state, command = planner.step(state, obs, PROFILE)
