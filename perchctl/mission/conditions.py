@@ -14,6 +14,8 @@ from perchctl.mission.state import Condition, Phase
 
 FULL_THRUST = 65535
 DESCENDED_M = 0.1
+BELOW_M = 0.3
+"""A target on the ceiling that seems so far below the vehicle is not there."""
 STILL_MOTORS_THRUST = 5000
 """At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
@@ -189,6 +191,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
+    Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
     Condition.BATTERY_LOW: lambda c: c.battery_is_low,
 }
 KEPT_OVER_A_CHANGE = (Condition.BATTERY_LOW, Condition.TILTED)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 
 from perchctl.mission.context import Context
+from perchctl.mission.mounting import explained
 from perchctl.mission.state import Condition
 
 SLIP_DWELL_S = 0.03
 FALLING_MPS = -0.05
 HUNG_WITHIN_M = 0.3
+BELOW_S = 0.3
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -68,6 +70,20 @@ def has_slipped(c: Context) -> bool:
     if falls and c.proves and tel.velocity_mps[2] < FALLING_MPS:
         return True
     return c.held(Condition.SLIPPING) >= SLIP_DWELL_S
+
+
+def mounted_wrong(c: Context) -> bool:
+    """The target moves with the vehicle, or seems to lie below it."""
+    return c.state.mount.wrong or c.held(Condition.TARGET_BELOW) >= BELOW_S
+
+
+def why_mounted_wrong(c: Context) -> str:
+    if c.state.mount.wrong:
+        return explained(c.state.mount)
+    return (
+        f"the target seems to lie {-c.error_z_m:.1f} m below the vehicle: camera.mount does not "
+        f"look up"
+    )
 
 
 def why_not_found(c: Context) -> str:

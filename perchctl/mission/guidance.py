@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from perchctl.geometry import rot_z, wrap_rad
 from perchctl.mission.context import Context
+from perchctl.mission.state import Phase
 from perchctl.vehicle import PositionSetpoint
 
 HEIGHT_GAIN = 1.5
@@ -17,6 +18,8 @@ VELOCITY_GAIN_S = 0.3
 STIFF_BELOW_M = 0.8
 STIFF_RANGE_M = 0.4
 STIFF_LIMIT_M = 0.1
+FLOOR_M = 0.05
+"""Above the ground, no lower; what is left is the vehicle's own landing."""
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
 
 
@@ -116,17 +119,20 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The setpoint inside the fence and under the height limit (fault 36)."""
+    """The setpoint inside the fence, under the height limit and above the ground (fault 36):
+    wherever a wrong target or a step of the estimate would lead, nothing dives into the floor.
+    Only a take-off begins lower."""
     ground, safety = c.state.ground_m, c.profile.safety
     if ground is None:
         return setpoint
     dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]
     distance = math.hypot(dx, dy)
+    floor_m = ground[2] + (0.0 if c.state.phase is Phase.APPROACH else FLOOR_M)
     if distance > safety.fence_radius_m:
         dx, dy = dx * safety.fence_radius_m / distance, dy * safety.fence_radius_m / distance
     return replace(
         setpoint,
         x_m=ground[0] + dx,
         y_m=ground[1] + dy,
-        z_m=min(setpoint.z_m, ground[2] + safety.max_height_m),
+        z_m=min(max(setpoint.z_m, floor_m), ground[2] + safety.max_height_m),
     )

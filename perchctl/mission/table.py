@@ -16,13 +16,14 @@ from perchctl.mission.guards import (
     has_slipped,
     is_blocked,
     left_jump_hold,
+    mounted_wrong,
     searched_out,
     settling_too_long,
     still_at_contact,
     stopped_for_s,
+    why_mounted_wrong,
     why_not_found,
 )
-from perchctl.mission.mounting import explained
 from perchctl.mission.state import (
     FLYING_PHASES,
     Condition,
@@ -131,8 +132,7 @@ TABLE: tuple[Row, ...] = (
         "the battery's reading stands still", S.LAND, O.SAFETY,
     ),
     Row(
-        "mounting", WATCHED, lambda c: c.state.mount.wrong, P.LANDING,
-        lambda c: explained(c.state.mount), S.LAND, O.SAFETY,
+        "mounting", WATCHED, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,
     ),
     Row(
         "height-limit", BEFORE_CONTACT,
