@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
+from perchctl.vehicle import FULL_THRUST
 
-FULL_THRUST = 65535
 DESCENDED_M = 0.1
 BELOW_M = 0.3
 """A target on the ceiling that seems so far below the vehicle is not there."""

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import has_slipped
-from perchctl.mission.guidance import hold_here, limited, walk
+from perchctl.mission.guidance import hold_here, limited, unpressed, walk
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, Acted, catch, let_go, stop_motors
 from perchctl.mission.state import Condition
 from perchctl.profile import LandingConfig
@@ -60,6 +60,10 @@ def landing(c: Context) -> Acted:
         return _hang_on(c)
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
+    state, away = unpressed(c)
+    if away is not None and not _doubtful(c):
+        return state, away
+    c = Context(state, c.obs, c.profile)
     low = c.height_m <= c.profile.planner.landing.handover_m
     if state.orders or (not _is_peeling(c) and (low or _doubtful(c))):
         return _by_itself(c)

@@ -13,6 +13,7 @@ import numpy as np
 from perchctl.mission.actions import act
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason
 from perchctl.mission.context import Context
+from perchctl.mission.guidance import presses
 from perchctl.mission.mounting import MountWatch, Sight, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M
 from perchctl.mission.state import (
@@ -149,6 +150,7 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         entry_yaw_rad=obs.telemetry.yaw_rad,
         search_step_s=obs.t_s,
         confirmed=0,
+        pressed=row.to in (Phase.RECOVER, Phase.LANDING) and presses(context),
         ordered_s=None,
         orders=0,
     )

@@ -425,3 +425,28 @@ def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
         if isinstance(command, StopMotors):
             break
     assert 0.5 <= t_s - 10.0 < 0.7
+
+
+@pytest.mark.parametrize("phase", [Phase.LANDING, Phase.RECOVER])
+def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: Phase) -> None:
+    """The integrators that a second of full thrust has wound up hold it there for seconds."""
+    state = replace(state_in(phase, z_m=1.0), pressed=True)
+    tel = telemetry(10.02, 1.0, thrust=65535.0)
+    state, command = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m < 0.2
+    away = telemetry(10.5, 0.85, thrust=45000.0, velocity_mps=(0.0, 0.0, -0.1))
+    state, command = planner.step(state, observation(10.5, telemetry=away), PROFILE)
+    assert not state.pressed
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > 0.4
+
+
+def test_what_presses_when_its_way_down_begins_is_remembered() -> None:
+    for thrust, pressed in ((65535.0, True), (42000.0, False)):
+        state = state_in(Phase.SEARCH, z_m=1.0)
+        tel = telemetry(10.02, 1.0, thrust=thrust)
+        obs = observation(10.02, telemetry=tel, operator=Operator.LAND)
+        state, _ = planner.step(state, obs, PROFILE)
+        assert state.phase is Phase.LANDING
+        assert state.pressed is pressed
