@@ -97,8 +97,9 @@ def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
         newest = senses.history.newest
         refuse(newest, parts.profile)
         waiting = still_waiting_for(
-            newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile
-        )
+            newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
+            senses.target(now_s),
+        )  # fmt: skip
         if parts.source.finished:
             raise NotFound(
                 f"{parts.source.describe()} ended before take-off: a flight needs pictures that "
