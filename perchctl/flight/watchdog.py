@@ -26,7 +26,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.link.evidence import is_cut, is_known, motors_may_run
-from perchctl.mission.landing import PEELED_M, own_landing
+from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEELED_M, REPEAT_ORDER_S, own_landing
 from perchctl.mission.release import CATCH_LIMIT_S, CATCH_STILL_ABOVE_M, THRUST_MIN
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.profile import Profile
@@ -43,7 +43,6 @@ REPEAT_AFTER_S = 0.3
 """The vehicle levels out by itself at 0.5 s (docs/firmware.md, "When setpoints stop")."""
 STOP_AFTER_S = 0.1
 """For so long the operator's stop is left to the loop, whose row records it."""
-ORDER_PERIOD_S, MAX_ORDERS = 0.3, 6
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 SINKING_MPS = -0.1
 SLIP_M, SLIP_MPS = 0.008, -0.12
@@ -154,7 +153,7 @@ class Watchdog:
         self._held: PositionSetpoint | None = None
         self._peel: PositionSetpoint | None = None
         self._slipped_s: float | None = None
-        self._ordered_s, self._orders = -ORDER_PERIOD_S, 0
+        self._ordered_s, self._orders = -REPEAT_ORDER_S, 0
 
     def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
         """The emergency stop, until the vehicle is seen to be locked. Bounded."""
@@ -198,9 +197,12 @@ class Watchdog:
                     x, y, z = known.position_m
                     self._peel = PositionSetpoint(x, y, z - PEEL_BELOW_M, known.yaw_rad)
                 return self._peel
-        if known is not None and (known.has(HL_ACTIVE) or not motors_may_run(known, now_s)):
+        if known is not None and not motors_may_run(known, now_s):
             return None
-        due = now_s - self._ordered_s >= ORDER_PERIOD_S - 1e-9
+        enough = turn.by_itself or self._orders >= LEAST_ORDERS
+        if enough and known is not None and known.has(HL_ACTIVE):
+            return None
+        due = now_s - self._ordered_s >= REPEAT_ORDER_S - 1e-9
         if not due or self._orders >= MAX_ORDERS:
             return None
         self._ordered_s, self._orders = now_s, self._orders + 1

@@ -200,9 +200,9 @@ KEPT_OVER_A_CHANGE = (Condition.BATTERY_LOW, Condition.TILTED)
 
 PROOFS = frozenset(
     {
+        Condition.HANGING,
         Condition.CONTACT,
         Condition.MAGNET_HOLDS,
-        Condition.HANGING,
         Condition.WEIGHT_HANGS,
         Condition.DOWN,
         Condition.ON_FLOOR,
@@ -218,8 +218,16 @@ def conditions_since(c: Context) -> dict[Condition, float]:
     return {
         name: old.get(name, c.obs.t_s)
         for name, holds in CONDITIONS.items()
-        if (c.proves or name not in PROOFS) and holds(c)
+        if _counts(c, name) and holds(c)
     }
+
+
+def _counts(c: Context, name: Condition) -> bool:
+    if name is Condition.HANGING and c.state.phase is Phase.LANDING:
+        # It begins a release, which stops nothing and is taken back at the first slip: late
+        # telemetry may do that, where the vehicle would else hang there until it is cut.
+        return c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+    return c.proves or name not in PROOFS
 
 
 def hold_reason(c: Context) -> str:

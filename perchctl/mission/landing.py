@@ -19,9 +19,11 @@ from perchctl.mission.state import Condition
 from perchctl.profile import LandingConfig
 from perchctl.vehicle import Idle, Land, Telemetry
 
-REPEAT_ORDER_S = 0.5
-"""An order that shows no effect in the telemetry is given again after this time."""
-MAX_ORDERS = 6
+REPEAT_ORDER_S = 0.3
+LEAST_ORDERS, MAX_ORDERS = 3, 6
+"""An order without its notify shows *HL active* and is not flown, and 2 s later the vehicle
+is cut (docs/firmware.md, "Order without notify"): no telemetry tells a lost notify, so the
+pair is sent three times, and more often while nothing shows."""
 PLANNED_MPS, SETTLING_S = 0.35, 1.8
 """The quintic's largest speed, and time added for the begin: the change to the vehicle's own
 trajectory resets its controller, and what it then catches up with must be slow. Touchdown
@@ -141,8 +143,8 @@ def _by_itself(c: Context) -> Acted:
         return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0
     waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
-    ignored = not (c.proves and c.high_level_active) and waited > REPEAT_ORDER_S
-    if state.orders == 0 or (ignored and state.orders < MAX_ORDERS):
+    seen = state.orders >= LEAST_ORDERS and c.proves and c.high_level_active
+    if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.obs.t_s - state.started_s
         order = own_landing(landing_config, ground_z, flown_s, c.obs.telemetry)
         return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
