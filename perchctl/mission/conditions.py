@@ -191,10 +191,11 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
+    Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
     Condition.BATTERY_LOW: lambda c: c.battery_is_low,
 }
-KEPT_OVER_A_CHANGE = (Condition.BATTERY_LOW, Condition.TILTED)
+KEPT_OVER_A_CHANGE = (Condition.BATTERY_LOW, Condition.TILTED, Condition.UNSURE)
 """The vehicle's own, whatever the phase, and however it is held."""
 
 
@@ -239,6 +240,8 @@ def hold_reason(c: Context) -> str:
         return f"telemetry is {c.telemetry_age_s:.1f} s old"
     if c.state.jump_s is not None:
         return "the state estimate jumped"
+    if c.variance_m2 > safety.flight_variance_m2:
+        return f"the state estimate is unsure (variance {c.variance_m2:.2g} m^2)"
     if c.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {c.obs.loop_late_s:.1f} s late"
     if c.state.phase in _CAMERA_PHASES and c.obs.camera_age_s > safety.camera_hold_s:

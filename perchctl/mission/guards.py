@@ -72,6 +72,11 @@ def has_slipped(c: Context) -> bool:
     return c.held(Condition.SLIPPING) >= SLIP_DWELL_S
 
 
+def unsure(c: Context) -> str:
+    limit_m2 = c.profile.safety.flight_variance_m2
+    return f"the position's variance is {c.variance_m2:.2g} m^2, at most {limit_m2:g} allowed"
+
+
 def mounted_wrong(c: Context) -> bool:
     """The target moves with the vehicle, or seems to lie below it."""
     return c.state.mount.wrong or c.held(Condition.TARGET_BELOW) >= BELOW_S

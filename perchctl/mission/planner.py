@@ -23,7 +23,7 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import TABLE, WATCHED, Row, first_match, risen
+from perchctl.mission.table import IN_THE_OPEN, TABLE, Row, first_match, risen
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, PositionSetpoint
 
@@ -109,7 +109,7 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 def _mount_watched(c: Context) -> MountWatch:
     """With this tick's frame, where it measured the target and the telemetry is fresh."""
     mount, target = c.state.mount, c.obs.target
-    if c.state.phase not in WATCHED or c.state.hold or not (c.obs.new_frame and c.proves):
+    if c.state.phase not in IN_THE_OPEN or c.state.hold or not (c.obs.new_frame and c.proves):
         return mount
     if target is None or not target.measured or target.world_m is None:
         return mount

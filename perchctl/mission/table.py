@@ -21,6 +21,7 @@ from perchctl.mission.guards import (
     settling_too_long,
     still_at_contact,
     stopped_for_s,
+    unsure,
     why_mounted_wrong,
     why_not_found,
 )
@@ -40,7 +41,7 @@ P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of
 
 AIR = FLYING_PHASES | {P.LANDING}
 BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
-WATCHED = BY_CAMERA | {P.APPROACH}
+IN_THE_OPEN = BY_CAMERA | {P.APPROACH}
 BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
 
 
@@ -122,6 +123,11 @@ TABLE: tuple[Row, ...] = (
         "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
     ),
     Row(
+        "estimate-unsure", IN_THE_OPEN,
+        lambda c: c.held(C.UNSURE) >= c.profile.safety.variance_land_s, P.LANDING,
+        lambda c: f"{unsure(c)}: is the positioning system gone?", S.LAND, O.SAFETY,
+    ),
+    Row(
         "battery-low", BEFORE_CONTACT,
         lambda c: c.held(C.BATTERY_LOW) >= c.profile.safety.battery_debounce_s, P.LANDING,
         lambda c: f"battery at {c.obs.telemetry.battery_v:.2f} V under load", S.LAND, O.SAFETY,
@@ -132,7 +138,7 @@ TABLE: tuple[Row, ...] = (
         "the battery's reading stands still", S.LAND, O.SAFETY,
     ),
     Row(
-        "mounting", WATCHED, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,
+        "mounting", IN_THE_OPEN, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,
     ),
     Row(
         "height-limit", BEFORE_CONTACT,

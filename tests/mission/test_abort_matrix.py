@@ -73,6 +73,10 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         1.5, FLYING_PHASES, LAND, Outcome.SAFETY,
     ),
     "estimator-jump": (_obs(jumped=True), 0.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
+    "estimate-unsure": (
+        _tel(position_variance_m2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
+        Outcome.SAFETY,
+    ),
     "battery-low": (_tel(battery_v=2.8), 1.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
     "battery-low-power": (_tel(battery_state=3), 1.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
     "battery-unknown": (_obs(battery_age_s=99.0), 0.1, BEFORE_CONTACT, LAND, Outcome.SAFETY),
@@ -185,8 +189,9 @@ def test_ctrl_c_once_lands_and_twice_stops(phase: Phase) -> None:
         _obs(camera_age_s=1.0, new_frame=False, target=None),
         _obs(loop_late_s=0.4),
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=o.t_s - 0.5)),
+        _tel(position_variance_m2=0.08),
     ],
-    ids=["camera-silent", "loop-late", "telemetry-late"],
+    ids=["camera-silent", "loop-late", "telemetry-late", "estimate-unsure"],
 )
 def test_a_short_fault_never_climbs(phase: Phase, event: Event) -> None:
     state = state_in(phase)
