@@ -147,7 +147,7 @@ MEANINGS = {
     "planner.perch.contact_z_m": "contact: the gear's distance from the target",
     "planner.perch.contact_speed_mps": "contact: vertical speed",
     "planner.perch.contact_acc_g": "contact: acceleration differs from 1 g by at most this",
-    "planner.perch.contact_thrust_ratio": "contact: thrust over the hover thrust",
+    "planner.perch.contact_thrust_ratio": "contact: thrust over the hover thrust, as far as there is more",
     "planner.perch.timeout_s": "without contact",
     "planner.complete.steps": "of the release",
     "planner.complete.release_s": "over which the thrust is released",

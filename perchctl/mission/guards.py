@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 
+from perchctl.mission.conditions import SATURATED, press_thrust
 from perchctl.mission.context import Context
 from perchctl.mission.mounting import explained
-from perchctl.mission.state import Condition
+from perchctl.mission.state import Condition, Phase
 
 SLIP_DWELL_S = 0.03
 FALLING_MPS = -0.05
 HUNG_WITHIN_M = 0.3
 BELOW_S = 0.3
+WEAK_S = 2.0
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -37,6 +39,14 @@ def attempts_used(c: Context) -> bool:
 
 def is_blocked(c: Context) -> bool:
     return c.held(Condition.BLOCKED) >= c.profile.safety.blocked_s
+
+
+def too_weak(c: Context) -> bool:
+    """No thrust is left to press with: seen at full thrust, or known before the press."""
+    if c.held(Condition.SATURATED) >= WEAK_S:
+        return True
+    near = c.state.phase is Phase.ASCEND and c.held(Condition.NEAR_STANDOFF) >= 0.0
+    return near and c.state.hover_thrust > SATURATED * press_thrust(c)
 
 
 def stopped_for_s(c: Context) -> float:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.mission.actions import act
-from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason
+from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason, hovers
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
 from perchctl.mission.mounting import MountWatch, Sight, watched
@@ -68,7 +68,7 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     since = conditions_since(context)
     if state.hold:
         since = _kept(since)  # a held vehicle proves nothing: the dwell times begin anew
-    if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and context.speed_mps < 0.3:
+    if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
@@ -121,8 +121,6 @@ def _mount_watched(c: Context) -> MountWatch:
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     """Slow mean of the thrust in quiet flight: the reference of the contact proof."""
     thrust = obs.telemetry.thrust
-    if thrust < 1000:
-        return state.hover_thrust
     if state.hover_thrust == 0.0:
         return thrust
     part = min(1.0, (obs.t_s - state.t_s) / 1.5)

@@ -81,6 +81,7 @@ class Condition(Enum):
     ON_FLOOR = "on the floor"
     WEIGHT_HANGS = "the whole weight hangs"
     BLOCKED = "blocked"
+    SATURATED = "saturated"
     UNSURE = "unsure"
     TARGET_BELOW = "target below"
     BATTERY_LOW = "battery low"

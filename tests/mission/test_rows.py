@@ -192,6 +192,10 @@ CASES: dict[str, Case] = {
         P.SEARCH, P.RECOVER, blind(flown(1.0, thrust=PRESSED)), 0.9,
         state={"setpoint": PositionSetpoint(0.0, 0.0, 1.3, 0.0), "entry_m": (0.0, 0.0, 1.3)},
     ),
+    "too-weak": Case(
+        P.SEARCH, P.LANDING, blind(flown(thrust=FULL)), 2.3, O.SAFETY,
+        state={"search_step_s": START_S + 9.0},
+    ),
     "approached": Case(P.APPROACH, P.SEARCH, seen(0.5), 0.4, z_m=0.5),
     "approach-timeout": Case(
         P.APPROACH, P.LANDING, seen(0.1), 0.1, O.SAFETY, state={"entered_s": -20.0}, z_m=0.1
