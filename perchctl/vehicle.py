@@ -9,6 +9,7 @@ CAN_ARM, ARMED, AUTO_ARM, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << i fo
 HL_ACTIVE, HL_FINISHED, HL_DISABLED, DECK_FAULT = (1 << i for i in range(8, 12))
 
 LOW_POWER = 3  # pm.state
+FULL_THRUST = 65535
 NO_BATTERY_READING_V = 1.0
 """Below this nothing is measured: the battery is unknown, not empty (fault 7)."""
 

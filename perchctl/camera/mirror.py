@@ -9,6 +9,10 @@ import numpy as np
 from perchctl.camera.source import SourceAround
 from perchctl.vision.types import Frame
 
+MIRRORED = (
+    "the picture is mirrored: switch that off in the camera, or set camera.mirrored in the profile"
+)
+
 
 class UnmirroredSource(SourceAround):
     """Flips each picture left to right."""

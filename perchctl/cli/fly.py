@@ -43,7 +43,8 @@ def fly(
 ) -> None:
     """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
 
-    Without options it flies the simulated vehicle. Ctrl-C once lands, twice cuts the motors.
+    Without options it flies the simulated vehicle. Ctrl-C once lands, again after half
+    a second cuts the motors.
     """
     with reported():
         from perchctl.commands.fly import FlyRequest, run

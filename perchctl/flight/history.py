@@ -12,6 +12,9 @@ from perchctl.vehicle import Telemetry
 from perchctl.vision.types import Attitude
 
 KEEP_S = 2.0
+SMEARED_S = 0.15
+FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
+"""What a flight does between two samples: 400 deg/s, 2 g."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +41,7 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
         if not _is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
             continue
         if samples:
-            jumped = jumped or _is_jump(samples[-1], sample, safety.jump_m)
+            jumped = jumped or _is_jump(samples, sample, safety)
         if changed is None or sample.battery_v != samples[-1].battery_v:
             changed = sample.t_s
         samples.append(sample)
@@ -89,10 +92,34 @@ def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
     return Attitude(s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z))
 
 
-def _is_jump(a: Telemetry, b: Telemetry, limit_m: float) -> bool:
-    moved = math.dist(a.position_m, b.position_m)
+def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:
+    """Whether the estimate stepped farther than any flight leads: at once, or smeared over a
+    few samples by the vehicle's own filter."""
+    last = before[-1]
+    first = next(s for s in before if s.t_s >= last.t_s - SMEARED_S)
+    dt_s = new.t_s - last.t_s
+    turned = abs(wrap_rad(new.yaw_rad - last.yaw_rad))
+    faster_mps = math.dist(last.velocity_mps, new.velocity_mps)
+    return (
+        _is_moved(last, new, safety)
+        or _is_moved(first, new, safety)
+        or turned > math.radians(safety.jump_deg) + FASTEST_TURN_RADPS * dt_s
+        or faster_mps > safety.jump_mps + FASTEST_MPS2 * _between_s(last, new)
+    )
+
+
+def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
+    """Floor and ceiling are near: a step in height counts sooner."""
+    moved_m = math.dist(a.position_m, b.position_m)
+    rise_m = abs(b.position_m[2] - a.position_m[2])
     fastest = max(math.hypot(*a.velocity_mps), math.hypot(*b.velocity_mps))
-    return moved > limit_m + 1.5 * fastest * (b.t_s - a.t_s)
+    flown_m = 1.5 * fastest * _between_s(a, b)
+    return moved_m > safety.jump_m + flown_m or rise_m > safety.jump_z_m + flown_m
+
+
+def _between_s(a: Telemetry, b: Telemetry) -> float:
+    """Between the two positions, which are as old as their own packets."""
+    return max(b.t_s - a.t_s, b.t_s - b.behind_s - (a.t_s - a.behind_s))
 
 
 def _is_finite(s: Telemetry) -> bool:

@@ -63,12 +63,16 @@ def fly(parts: FlightParts) -> FlightReport:
         senses.ground_z_m = senses.history.newest.position_m[2]
     watchdog = Watchdog(parts.profile, parts.operator)
     parts.link.guard(watchdog)
+    started_s = parts.clock.now()
     try:
         return _mission(parts, senses, watchdog)
     except BaseException as error:
         watchdog.rescuing()
         landing, newest = parts.profile.planner.landing, senses.history.newest
-        safe = rescue(parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m)
+        flown_s = parts.clock.now() - started_s
+        safe = rescue(
+            parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m, flown_s
+        )
         _tell_rescue(parts, error, safe)
         raise
 
@@ -93,8 +97,9 @@ def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
         newest = senses.history.newest
         refuse(newest, parts.profile)
         waiting = still_waiting_for(
-            newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile
-        )
+            newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
+            senses.target(now_s),
+        )  # fmt: skip
         if parts.source.finished:
             raise NotFound(
                 f"{parts.source.describe()} ended before take-off: a flight needs pictures that "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -14,8 +16,13 @@ from perchctl.vehicle import (
     TUMBLED,
     Telemetry,
 )
+from perchctl.vision.types import TargetEstimate
 
 KNOWN_SUPERVISOR_BITS = 0x0FFF
+REST_ACC_G = 0.15
+"""At rest the accelerometer reads 1 g, give or take so much."""
+WITHIN_REACH_M = 0.35
+"""Of the gear. From the ground no target is so near: a take-off needs more height."""
 
 _FORBIDDEN = (
     (LOCKED, "is locked: inspect it and restart it"),
@@ -47,14 +54,40 @@ def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
         )
 
 
+def _refuse_off_the_ground(telemetry: Telemetry, profile: Profile) -> None:
+    """Raises SafetyAbort for a vehicle that hangs, or is held, by the settled estimate."""
+    safety = profile.safety
+    z_m = telemetry.position_m[2]
+    if abs(z_m - safety.ground_z_m) > safety.ground_tolerance_m:
+        raise SafetyAbort(
+            f"the state estimate places the vehicle at {z_m:.2f} m, and the ground is at "
+            f"{safety.ground_z_m:.2f} m: if it hangs, take it down and restart it; if the "
+            f"positioning system's zero is elsewhere, set safety.ground_z_m"
+        )
+
+
+def _refuse_within_reach(target: TargetEstimate | None) -> None:
+    """Raises SafetyAbort for a target that is too near to be seen from the ground."""
+    if target is None or not target.tracked:
+        return
+    away_m = math.hypot(*(float(e) for e in target.e_m))
+    if away_m < WITHIN_REACH_M:
+        raise SafetyAbort(
+            f"the target is only {away_m:.2f} m away, at least {WITHIN_REACH_M:g} m are needed: "
+            f"the vehicle hangs, or stands too close under it; take it down first"
+        )
+
+
 def still_waiting_for(
     telemetry: Telemetry | None,
     has_frame: bool,
     camera_problem: str | None,
     waited_s: float,
     profile: Profile,
+    target: TargetEstimate | None = None,
 ) -> str:
-    """What is missing yet, or empty when ready. Raises TimedOut past the bound."""
+    """What is missing yet, or empty when ready. Errors: TimedOut past the bound, and
+    SafetyAbort off the ground."""
     safety = profile.safety
     if telemetry is None:
         return _bounded("telemetry", waited_s, safety.estimator_wait_s)
@@ -63,6 +96,21 @@ def still_waiting_for(
         return _bounded(
             f"the state estimate to settle (variance {variance:.3g} m^2, at most "
             f"{safety.estimator_variance_m2:g} allowed; is there a positioning system?)",
+            waited_s,
+            safety.estimator_wait_s,
+        )
+    _refuse_off_the_ground(telemetry, profile)
+    tilt_deg = math.degrees(max(abs(telemetry.roll_rad), abs(telemetry.pitch_rad)))
+    if tilt_deg > safety.start_tilt_deg:
+        return _bounded(
+            f"the vehicle to stand level (it is tilted by {tilt_deg:.0f} deg, at most "
+            f"{safety.start_tilt_deg:g} allowed)",
+            waited_s,
+            safety.estimator_wait_s,
+        )
+    if abs(telemetry.acc_z_g - 1.0) > REST_ACC_G:
+        return _bounded(
+            f"the vehicle to stand still (its accelerometer reads {telemetry.acc_z_g:.2f} g)",
             waited_s,
             safety.estimator_wait_s,
         )
@@ -75,6 +123,7 @@ def still_waiting_for(
     if not has_frame:
         what = f"a good picture ({camera_problem or 'none has come'})"
         return _bounded(what, waited_s, profile.camera.start_timeout_s)
+    _refuse_within_reach(target)
     return ""
 
 

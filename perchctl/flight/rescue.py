@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from perchctl.flight.clock import Clock
-from perchctl.flight.watchdog import landing_order
 from perchctl.link.evidence import is_known, motors_may_run
 from perchctl.link.protocol import Link
+from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S, own_landing
 from perchctl.mission.state import Operator
 from perchctl.profile import LandingConfig
 from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Telemetry
 
 LOOK_S = 0.5
 """For so long a vehicle must be seen with its motors off before a rescue leaves it."""
-REPEAT_S, MAX_ORDERS = 1.0, 5
 PERIOD_S = 0.1
 
 
@@ -25,17 +24,18 @@ def rescue(
     operator: Callable[[], Operator],
     known: Telemetry | None,
     ground_z_m: float = 0.0,
+    flown_s: float = 0.0,
 ) -> bool:
     """Order a landing and wait for it, bounded; whether the motors were seen off at the end.
     The landing needs no further packet once it is under way.
 
     `known` is the newest telemetry the loop has taken in, `ground_z_m` the height of the
-    ground in the estimate. On the ground it is looked at again for `LOOK_S`: a take-off just
-    begun does not show at once.
+    ground in the estimate, `flown_s` for how long it has flown. On
+    the ground it is looked at again for `LOOK_S`: a take-off just begun does not show at once.
     """
     newest = known
     start_s = off_since_s = clock.now()
-    ordered_s, orders = -REPEAT_S, 0
+    ordered_s, orders = -REPEAT_ORDER_S, 0
     while clock.now() < start_s + landing.timeout_s:
         now_s = clock.now()
         if operator() is Operator.STOP:
@@ -46,9 +46,10 @@ def rescue(
         if motors_may_run(newest, now_s):
             off_since_s = now_s
             under_way = newest is not None and is_known(newest, now_s) and newest.has(HL_ACTIVE)
-            due = orders == 0 or (not under_way and now_s - ordered_s > REPEAT_S)
+            seen = under_way and orders >= LEAST_ORDERS
+            due = orders == 0 or (not seen and now_s - ordered_s > REPEAT_ORDER_S)
             if due and orders < MAX_ORDERS:
-                link.send(landing_order(landing, ground_z_m, newest))
+                link.send(own_landing(landing, ground_z_m, flown_s, newest))
                 ordered_s, orders = now_s, orders + 1
         elif now_s - off_since_s >= LOOK_S:
             return True

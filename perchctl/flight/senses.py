@@ -6,12 +6,15 @@ import math
 from dataclasses import dataclass, field, replace
 
 from perchctl.camera.health import HealthState, assess
+from perchctl.camera.mirror import MIRRORED
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import History, attitude_at, attitude_of, extended
 from perchctl.link.protocol import Link
 from perchctl.pipeline import Pipeline, estimate, step
 from perchctl.profile import Profile
-from perchctl.vision.types import Frame, PipelineOutput, PipelineState, TargetEstimate
+from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineState, TargetEstimate
+
+MIRRORED_FRAMES = 5
 
 
 @dataclass(eq=False)
@@ -35,6 +38,7 @@ class Senses:
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
+    _mirrored: int = 0
 
     def take_in(self, now_s: float, *, look: bool = True) -> None:
         """Telemetry and at most one frame. Without `look` the frame only counts as a sign
@@ -52,14 +56,17 @@ class Senses:
         if self.frames == 0:
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         rejection = problem or self._rejection(frame, now_s)
-        self.camera_problem = rejection or self._note
         if rejection is not None:
+            self.camera_problem = rejection
             return
         self.last_good_frame_s = now_s
         self.frames += 1
         if look:
             attitude = attitude_at(self.history, frame.t_s)
             self.state, self.output = step(self.state, frame, attitude, self.pipeline)
+            self._mirrored = _mirrored_frames(self._mirrored, self.output.detections)
+        mirrored = self._mirrored >= MIRRORED_FRAMES
+        self.camera_problem = MIRRORED if mirrored else self._note
 
     def target(self, now_s: float) -> TargetEstimate | None:
         """The estimate at the present. The filter coasts by frames: while none are looked
@@ -73,7 +80,11 @@ class Senses:
         return target
 
     def _rejection(self, frame: Frame, now_s: float) -> str | None:
-        """Why this frame is no measurement: frozen, no picture at all, or too old."""
+        """Why this frame is no measurement: of another size, frozen, no picture at all, or too
+        old."""
+        height, width = frame.image.shape[:2]
+        if (width, height) != (size_px := self.pipeline.camera.size_px):
+            return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
         self._health, verdict = assess(self._health, frame, live)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen:
@@ -85,3 +96,10 @@ class Senses:
         if live and age_s > self.profile.safety.max_frame_age_s:
             return f"the picture is {age_s:.1f} s late"
         return None
+
+
+def _mirrored_frames(before: int, found: Detections) -> int:
+    """How many frames have shown the target's mirror image, since one showed the target."""
+    if found.mirrored:
+        return before + 1
+    return 0 if found.large is not None or found.small is not None else before

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from perchctl.sim.process.handle import SimProcess
 
 SOURCE_SCHEMES = ("camera", "video", "images", "http", "https", "sim")
+RECORDED = ("video", "images")
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,11 @@ def check_options(options: FlyOptions) -> None:
         raise UsageError(
             f"source {options.source} belongs to the simulated vehicle, but the URI is "
             f"{options.uri}; name the camera with --source (camera:N, http://...)"
+        )
+    if options.source.partition(":")[0] in RECORDED and not options.simulated:
+        raise UsageError(
+            f"source {options.source} is a recording, and {options.uri} a real vehicle: it would "
+            f"be steered by pictures of another flight; fly sim://, or name a camera with --source"
         )
     if options.seed < 0:
         raise InvalidValue(f"seed {options.seed} is negative; seeds are 0, 1, 2, ...")

@@ -26,15 +26,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.link.evidence import is_cut, is_known, motors_may_run
-from perchctl.mission.landing import PEELED_M, landing_time_s
+from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEELED_M, REPEAT_ORDER_S, own_landing
 from perchctl.mission.release import CATCH_LIMIT_S, CATCH_STILL_ABOVE_M, THRUST_MIN
 from perchctl.mission.state import Operator, Phase, PlannerState
-from perchctl.profile import LandingConfig, Profile
+from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
     Command,
     EmergencyStop,
-    Land,
     PositionSetpoint,
     RawThrust,
     Telemetry,
@@ -44,7 +43,6 @@ REPEAT_AFTER_S = 0.3
 """The vehicle levels out by itself at 0.5 s (docs/firmware.md, "When setpoints stop")."""
 STOP_AFTER_S = 0.1
 """For so long the operator's stop is left to the loop, whose row records it."""
-ORDER_PERIOD_S, MAX_ORDERS = 0.3, 6
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 SINKING_MPS = -0.1
 SLIP_M, SLIP_MPS = 0.008, -0.12
@@ -66,6 +64,7 @@ class Turn:
     command: Command
     telemetry: Telemetry
     ground_z_m: float
+    started_s: float
     held_m: float | None
     stopped: bool
     by_itself: bool
@@ -111,6 +110,7 @@ class Watchdog:
             self._streamed or command,
             newest,
             state.ground_m[2] if state.ground_m else 0.0,
+            state.started_s,
             held_m,
             state.stopped_s is not None,
             state.phase is Phase.LANDING and state.orders > 0,
@@ -153,7 +153,7 @@ class Watchdog:
         self._held: PositionSetpoint | None = None
         self._peel: PositionSetpoint | None = None
         self._slipped_s: float | None = None
-        self._ordered_s, self._orders = -ORDER_PERIOD_S, 0
+        self._ordered_s, self._orders = -REPEAT_ORDER_S, 0
 
     def _cut(self, now_s: float, newest: Telemetry | None) -> Command | None:
         """The emergency stop, until the vehicle is seen to be locked. Bounded."""
@@ -197,13 +197,17 @@ class Watchdog:
                     x, y, z = known.position_m
                     self._peel = PositionSetpoint(x, y, z - PEEL_BELOW_M, known.yaw_rad)
                 return self._peel
-        if known is not None and (known.has(HL_ACTIVE) or not motors_may_run(known, now_s)):
+        if known is not None and not motors_may_run(known, now_s):
             return None
-        due = now_s - self._ordered_s >= ORDER_PERIOD_S - 1e-9
+        enough = turn.by_itself or self._orders >= LEAST_ORDERS
+        if enough and known is not None and known.has(HL_ACTIVE):
+            return None
+        due = now_s - self._ordered_s >= REPEAT_ORDER_S - 1e-9
         if not due or self._orders >= MAX_ORDERS:
             return None
         self._ordered_s, self._orders = now_s, self._orders + 1
-        return landing_order(self._landing, turn.ground_z_m, known or turn.telemetry)
+        flown_s = now_s - turn.started_s
+        return own_landing(self._landing, turn.ground_z_m, flown_s, known or turn.telemetry)
 
     def _caught(self, now_s: float, turn: Turn, known: Telemetry | None) -> Command | None:
         """Far above as long as what has slipped off the magnet sinks; None when there is
@@ -234,10 +238,3 @@ def _held_place(turn: Turn, known: Telemetry | None) -> PositionSetpoint:
             return PositionSetpoint(sx, sy, min(sz, z), yaw)
         case _:
             return PositionSetpoint(x, y, z, sample.yaw_rad)
-
-
-def landing_order(landing: LandingConfig, ground_z_m: float, newest: Telemetry | None) -> Land:
-    """To below the ground, slow enough at touchdown."""
-    floor_m = ground_z_m - landing.undershoot_m
-    height_m = 1.0 if newest is None else max(0.0, newest.position_m[2] - floor_m)
-    return Land(floor_m, landing_time_s(height_m))

@@ -23,6 +23,7 @@ from perchctl.vehicle import (
     StopMotors,
 )
 
+LAND_TIMES = 3
 # Port 7: the channels, then the setpoints' types.
 _SETPOINT, _META = 0, 1
 _STOP, _POSITION = 0, 7
@@ -56,9 +57,10 @@ def _packets(command: Command) -> tuple[Packet, ...]:
         case RawThrust(thrust):
             return (_raw(thrust),)
         case Land(height, duration):
-            # The order first. The notify alone cuts the motors at once; with it lost, the
-            # setpoint watchdog still leaves 2 s in which the pair is repeated.
-            return _vertical(_LAND_2, height, duration), _NOTIFY
+            # The order first, and three times: the notify alone cuts the motors at once
+            # (docs/firmware.md, "Notify alone"), so the order must not be what is lost. With
+            # the notify lost, the setpoint watchdog leaves 2 s in which all is repeated.
+            return (_vertical(_LAND_2, height, duration),) * LAND_TIMES + (_NOTIFY,)
         case StopMotors():
             stop = Packet(Port.COMMANDER_GENERIC, _SETPOINT, bytes((_STOP,)))
             return stop, _NOTIFY

@@ -14,11 +14,13 @@ from dataclasses import replace
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import (
     FREE_SPEED_MPS,
+    LIFTED_M,
     corrected,
     hold_here,
     integrated,
     limited,
     under_target_xy,
+    unpressed,
     walk,
 )
 from perchctl.mission.landing import landing
@@ -36,8 +38,6 @@ BLOCKED_ROOM_M = 0.1
 """How far a search keeps from what it once was pressed against."""
 WARY_MPS, WARY_M = 0.25, 0.2
 """Sideways, as long as nothing tells whether the camera's mounting is right."""
-LIFTED_M = 0.1
-"""Below it a vehicle may still stand, and its height is not to be corrected."""
 
 
 def act(c: Context) -> Acted:
@@ -182,7 +182,10 @@ def _recover(c: Context) -> Acted:
     along, so no controller is reset; the setpoint is below at once."""
     if (caught := catch(c)) is not None:
         return caught
-    recover, state = c.profile.planner.recover, c.state
+    state, away = unpressed(c)
+    if away is not None:
+        return state, away
+    recover = c.profile.planner.recover
     if not state.caught:
         x, y, z = c.obs.telemetry.position_m  # from where it sinks no more
         state = replace(state, caught=True, setpoint=None, entry_m=(x, y, z + recover.descend_m))

@@ -11,9 +11,20 @@ from collections.abc import Callable
 
 from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
+from perchctl.vehicle import FULL_THRUST
 
-FULL_THRUST = 65535
 DESCENDED_M = 0.1
+PRESSED_M = 0.08
+"""A setpoint so far above a vehicle that stands still presses it against something."""
+HARD_CLIMB_MPS = 0.27
+BELOW_M = 0.3
+"""A target on the ceiling that seems so far below the vehicle is not there."""
+SATURATED = 0.98
+"""Of the largest thrust: from here on nothing tells how much more it takes."""
+LITTLE_LEFT = 0.93
+"""A hover thrust above this part of the largest: full thrust is no sign of pressing then."""
+PROVABLE = 0.99
+"""Of the thrust that presses: so much at most is asked of a contact."""
 STILL_MOTORS_THRUST = 5000
 """At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
@@ -58,7 +69,35 @@ def _contact(c: Context) -> bool:
         and abs(tel.velocity_mps[2]) <= perch.contact_speed_mps
         and abs(tel.acc_z_g - 1.0) <= perch.contact_acc_g
         and c.state.hover_thrust > 0
-        and tel.thrust >= perch.contact_thrust_ratio * c.state.hover_thrust
+        and tel.thrust >= contact_thrust(c)
+    )
+
+
+def press_thrust(c: Context) -> float:
+    """The most that a press can have."""
+    perch = c.profile.planner.perch
+    return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
+
+
+def contact_thrust(c: Context) -> float:
+    """What proves a contact: more than hovering takes, as far as there is more."""
+    wanted = c.profile.planner.perch.contact_thrust_ratio * c.state.hover_thrust
+    return min(wanted, PROVABLE * press_thrust(c))
+
+
+def hovers(c: Context) -> bool:
+    """Whether the thrust is what hovering takes: carried by nothing, pressed to nothing, not
+    at its limit, and hardly accelerated."""
+    tel, setpoint = c.obs.telemetry, c.state.setpoint
+    vz = tel.velocity_mps[2]
+    stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < 0.05
+    return (
+        c.proves
+        and 1000 <= tel.thrust < SATURATED * FULL_THRUST
+        and c.speed_mps < 0.3
+        and abs(vz) < HARD_CLIMB_MPS
+        and abs(tel.acc_z_g - 1.0) < 0.1
+        and not stuck
     )
 
 
@@ -161,15 +200,23 @@ def _on_floor(c: Context) -> bool:
 
 def _blocked(c: Context) -> bool:
     """Pressed against something: the setpoint is above, the thrust at its limit or above
-    what hovering takes, and nothing moves."""
+    what hovering takes, and nothing moves. Where hovering takes nearly all there is, the limit
+    tells nothing."""
     setpoint, tel, safety = c.state.setpoint, c.obs.telemetry, c.profile.safety
-    if setpoint is None or setpoint.z_m - tel.position_m[2] < 0.08:
+    if setpoint is None or setpoint.z_m - tel.position_m[2] < PRESSED_M:
         return False
     hover = c.state.hover_thrust
-    pressing = tel.thrust >= 0.98 * FULL_THRUST or (
-        hover > 0 and tel.thrust >= safety.blocked_thrust_ratio * hover
+    pressing = hover < LITTLE_LEFT * FULL_THRUST and (
+        tel.thrust >= SATURATED * FULL_THRUST
+        or (hover > 0 and tel.thrust >= safety.blocked_thrust_ratio * hover)
     )
     return pressing and c.height_m > 0.15 and _still(c)
+
+
+def _saturated(c: Context) -> bool:
+    """All the thrust there is, and it does not rise (nor is it just being caught)."""
+    full = c.obs.telemetry.thrust >= SATURATED * FULL_THRUST
+    return full and c.height_m > 0.15 and -0.15 < c.obs.telemetry.velocity_mps[2] < 0.05
 
 
 CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
@@ -189,20 +236,29 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
+    Condition.SATURATED: _saturated,
+    Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
+    Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
     Condition.BATTERY_LOW: lambda c: c.battery_is_low,
 }
-KEPT_OVER_A_CHANGE = (Condition.BATTERY_LOW, Condition.TILTED)
+KEPT_OVER_A_CHANGE = (
+    Condition.BATTERY_LOW,
+    Condition.TILTED,
+    Condition.UNSURE,
+    Condition.SATURATED,
+)
 """The vehicle's own, whatever the phase, and however it is held."""
 
 
 PROOFS = frozenset(
     {
+        Condition.HANGING,
         Condition.CONTACT,
         Condition.MAGNET_HOLDS,
-        Condition.HANGING,
         Condition.WEIGHT_HANGS,
         Condition.DOWN,
         Condition.ON_FLOOR,
+        Condition.SATURATED,
     }
 )
 """What may stop the motors or end a flight: it counts over fresh telemetry only."""
@@ -215,8 +271,16 @@ def conditions_since(c: Context) -> dict[Condition, float]:
     return {
         name: old.get(name, c.obs.t_s)
         for name, holds in CONDITIONS.items()
-        if (c.proves or name not in PROOFS) and holds(c)
+        if _counts(c, name) and holds(c)
     }
+
+
+def _counts(c: Context, name: Condition) -> bool:
+    if name is Condition.HANGING and c.state.phase is Phase.LANDING:
+        # It begins a release, which stops nothing and is taken back at the first slip: late
+        # telemetry may do that, where the vehicle would else hang there until it is cut.
+        return c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+    return c.proves or name not in PROOFS
 
 
 def hold_reason(c: Context) -> str:
@@ -228,6 +292,8 @@ def hold_reason(c: Context) -> str:
         return f"telemetry is {c.telemetry_age_s:.1f} s old"
     if c.state.jump_s is not None:
         return "the state estimate jumped"
+    if c.variance_m2 > safety.flight_variance_m2:
+        return f"the state estimate is unsure (variance {c.variance_m2:.2g} m^2)"
     if c.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {c.obs.loop_late_s:.1f} s late"
     if c.state.phase in _CAMERA_PHASES and c.obs.camera_age_s > safety.camera_hold_s:

@@ -56,6 +56,11 @@ class Context:
         return self.telemetry_age_s <= self.profile.safety.proof_age_s
 
     @property
+    def variance_m2(self) -> float:
+        """Of the position; 0 where the firmware tells none."""
+        return self.obs.telemetry.position_variance_m2 or 0.0
+
+    @property
     def flying(self) -> bool:
         return self.obs.telemetry.has(FLYING)
 

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 from perchctl.mission.state import FLYING_PHASES, Phase
-from perchctl.mission.table import AIR, BEFORE_CONTACT, BY_CAMERA, TABLE, Row
+from perchctl.mission.table import AIR, BEFORE_CONTACT, BY_CAMERA, IN_THE_OPEN, TABLE, Row
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (AIR, "in the air"),
     (FLYING_PHASES, "before landing"),
     (BEFORE_CONTACT, "before contact"),
     (BY_CAMERA, "by camera"),
+    (IN_THE_OPEN, "in the open"),
 )
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 
+from perchctl.mission.conditions import SATURATED, press_thrust
 from perchctl.mission.context import Context
-from perchctl.mission.state import Condition
+from perchctl.mission.mounting import explained
+from perchctl.mission.state import Condition, Phase
 
 SLIP_DWELL_S = 0.03
 FALLING_MPS = -0.05
 HUNG_WITHIN_M = 0.3
+BELOW_S = 0.3
+WEAK_S = 2.0
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -35,6 +39,14 @@ def attempts_used(c: Context) -> bool:
 
 def is_blocked(c: Context) -> bool:
     return c.held(Condition.BLOCKED) >= c.profile.safety.blocked_s
+
+
+def too_weak(c: Context) -> bool:
+    """No thrust is left to press with: seen at full thrust, or known before the press."""
+    if c.held(Condition.SATURATED) >= WEAK_S:
+        return True
+    near = c.state.phase is Phase.ASCEND and c.held(Condition.NEAR_STANDOFF) >= 0.0
+    return near and c.state.hover_thrust > SATURATED * press_thrust(c)
 
 
 def stopped_for_s(c: Context) -> float:
@@ -68,6 +80,25 @@ def has_slipped(c: Context) -> bool:
     if falls and c.proves and tel.velocity_mps[2] < FALLING_MPS:
         return True
     return c.held(Condition.SLIPPING) >= SLIP_DWELL_S
+
+
+def unsure(c: Context) -> str:
+    limit_m2 = c.profile.safety.flight_variance_m2
+    return f"the position's variance is {c.variance_m2:.2g} m^2, at most {limit_m2:g} allowed"
+
+
+def mounted_wrong(c: Context) -> bool:
+    """The target moves with the vehicle, or seems to lie below it."""
+    return c.state.mount.wrong or c.held(Condition.TARGET_BELOW) >= BELOW_S
+
+
+def why_mounted_wrong(c: Context) -> str:
+    if c.state.mount.wrong:
+        return explained(c.state.mount)
+    return (
+        f"the target seems to lie {-c.error_z_m:.1f} m below the vehicle: camera.mount does not "
+        f"look up"
+    )
 
 
 def why_not_found(c: Context) -> str:

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from perchctl.geometry import rot_z, wrap_rad
 from perchctl.mission.context import Context
-from perchctl.vehicle import PositionSetpoint
+from perchctl.mission.state import Phase, PlannerState
+from perchctl.vehicle import FULL_THRUST, PositionSetpoint
 
 HEIGHT_GAIN = 1.5
 HEIGHT_RATE_S = 0.25
@@ -17,6 +18,13 @@ VELOCITY_GAIN_S = 0.3
 STIFF_BELOW_M = 0.8
 STIFF_RANGE_M = 0.4
 STIFF_LIMIT_M = 0.1
+FLOOR_M = 0.05
+"""Above the ground, no lower; what is left is the vehicle's own landing."""
+PRESSING_PART, PRESSING_RATIO = 0.95, 1.05
+UNPRESSED_MPS, UNPRESSED_M, FALLING_MPS = 0.05, 0.08, -0.3
+UNWIND_M, UNWIND_AWAY_M, UNPRESS_LIMIT_S = 1.0, 0.25, 4.0
+LIFTED_M = 0.1
+"""Below it a vehicle may still stand, and its height is not to be corrected."""
 FREE_SPEED_MPS = 10.0  # a speed limit that limits nothing
 
 
@@ -116,17 +124,56 @@ def _stiffened(c: Context, reference: PositionSetpoint) -> tuple[float, float]:
 
 
 def limited(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
-    """The setpoint inside the fence and under the height limit (fault 36)."""
+    """The setpoint inside the fence, under the height limit and above the ground (fault 36):
+    wherever a wrong target or a step of the estimate would lead, nothing dives into the floor.
+    Only a take-off begins lower."""
     ground, safety = c.state.ground_m, c.profile.safety
     if ground is None:
         return setpoint
     dx, dy = setpoint.x_m - ground[0], setpoint.y_m - ground[1]
     distance = math.hypot(dx, dy)
+    floor_m = ground[2] + (0.0 if c.state.phase is Phase.APPROACH else FLOOR_M)
     if distance > safety.fence_radius_m:
         dx, dy = dx * safety.fence_radius_m / distance, dy * safety.fence_radius_m / distance
     return replace(
         setpoint,
         x_m=ground[0] + dx,
         y_m=ground[1] + dy,
-        z_m=min(setpoint.z_m, ground[2] + safety.max_height_m),
+        z_m=min(max(setpoint.z_m, floor_m), ground[2] + safety.max_height_m),
     )
+
+
+def presses(c: Context) -> bool:
+    """The vehicle is at its thrust's limit, or above what hovering takes, and does not move."""
+    return (
+        _is_strong(c)
+        and abs(c.obs.telemetry.velocity_mps[2]) <= UNPRESSED_MPS
+        and c.height_m >= LIFTED_M
+    )
+
+
+def _is_strong(c: Context) -> bool:
+    thrust, hover = c.obs.telemetry.thrust, c.state.hover_thrust
+    return thrust >= PRESSING_PART * FULL_THRUST or (hover > 0 and thrust >= PRESSING_RATIO * hover)
+
+
+def unpressed(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
+    """Below where the vehicle is, until it is away from what it pressed against and the
+    integrators have come down; None once they have, or where nothing was pressed.
+
+    Pressed for a second at full thrust they take many seconds to come down by a setpoint
+    that is a little below, and the change to the vehicle's own landing does not reset them.
+    """
+    state, tel = c.state, c.obs.telemetry
+    x, y, z = state.entry_m
+    if not state.pressed:
+        return state, None
+    away_m = z - tel.position_m[2]
+    calm = away_m > UNPRESSED_M and not _is_strong(c) and tel.velocity_mps[2] > FALLING_MPS
+    if calm or c.in_phase_s > UNPRESS_LIMIT_S:
+        return replace(state, pressed=False), None
+    below_m = UNWIND_M if away_m < UNPRESSED_M else UNWIND_AWAY_M
+    if tel.velocity_mps[2] < FALLING_MPS:
+        below_m = 0.0
+    setpoint = PositionSetpoint(x, y, tel.position_m[2] - below_m, state.entry_yaw_rad)
+    return state, setpoint

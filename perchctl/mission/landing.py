@@ -13,28 +13,41 @@ from dataclasses import replace
 
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import has_slipped
-from perchctl.mission.guidance import hold_here, limited, walk
+from perchctl.mission.guidance import hold_here, limited, unpressed, walk
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, Acted, catch, let_go, stop_motors
 from perchctl.mission.state import Condition
-from perchctl.vehicle import Idle, Land
+from perchctl.profile import LandingConfig
+from perchctl.vehicle import Idle, Land, Telemetry
 
-REPEAT_ORDER_S = 0.5
-"""An order that shows no effect in the telemetry is given again after this time."""
-MAX_ORDERS = 6
-PLANNED_MPS, SETTLING_S = 0.4, 1.8
+REPEAT_ORDER_S = 0.3
+LEAST_ORDERS, MAX_ORDERS = 3, 6
+"""An order without its notify shows *HL active* and is not flown, and 2 s later the vehicle
+is cut (docs/firmware.md, "Order without notify"): no telemetry tells a lost notify, so the
+pair is sent three times, and more often while nothing shows."""
+PLANNED_MPS, SETTLING_S = 0.35, 1.8
 """The quintic's largest speed, and time added for the begin: the change to the vehicle's own
 trajectory resets its controller, and what it then catches up with must be slow. Touchdown
 comes out at 0.35 m/s at most."""
 PEEL_BLIND_S = 4.0
+MOST_DRIFT_M = 1.0
 PEELED_M = 0.1
 """Below the contact by so much, the magnet has let go."""
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 
 
-def landing_time_s(height_m: float) -> float:
-    """For the vehicle's own landing, which follows a quintic from rest to rest."""
-    return SETTLING_S + _PEAK_OF_MEAN * height_m / PLANNED_MPS
+def own_landing(
+    landing: LandingConfig, ground_z_m: float, flown_s: float, newest: Telemetry | None
+) -> Land:
+    """The order for the vehicle's own landing, which follows a quintic from rest to rest.
+
+    It aims below the ground, and the lower the longer the estimate has had to drift: the
+    motors stop at the trajectory's end, and over a floor that lies lower they would drop it.
+    """
+    below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
+    aim_m = ground_z_m - below_m
+    height_m = 1.0 if newest is None else max(0.0, newest.position_m[2] - aim_m)
+    return Land(aim_m, SETTLING_S + _PEAK_OF_MEAN * height_m / PLANNED_MPS)
 
 
 def landing(c: Context) -> Acted:
@@ -49,6 +62,10 @@ def landing(c: Context) -> Acted:
         return _hang_on(c)
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
+    state, away = unpressed(c)
+    if away is not None and not _doubtful(c):
+        return state, away
+    c = Context(state, c.obs, c.profile)
     low = c.height_m <= c.profile.planner.landing.handover_m
     if state.orders or (not _is_peeling(c) and (low or _doubtful(c))):
         return _by_itself(c)
@@ -125,11 +142,10 @@ def _by_itself(c: Context) -> Acted:
     if c.proves and c.obs.telemetry.thrust < 1 and (state.orders or not c.flying):
         return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0
-    floor = ground_z - landing_config.undershoot_m
     waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
-    ignored = not (c.proves and c.high_level_active) and waited > REPEAT_ORDER_S
-    if state.orders == 0 or (ignored and state.orders < MAX_ORDERS):
-        height = max(0.0, c.obs.telemetry.position_m[2] - floor)
-        order = Land(floor, landing_time_s(height))
+    seen = state.orders >= LEAST_ORDERS and c.proves and c.high_level_active
+    if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
+        flown_s = c.obs.t_s - state.started_s
+        order = own_landing(landing_config, ground_z, flown_s, c.obs.telemetry)
         return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()

@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.mission.actions import act
-from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason
+from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason, hovers
 from perchctl.mission.context import Context
+from perchctl.mission.guidance import presses
 from perchctl.mission.mounting import MountWatch, Sight, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M
 from perchctl.mission.state import (
@@ -22,7 +23,7 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import TABLE, WATCHED, Row, first_match, risen
+from perchctl.mission.table import IN_THE_OPEN, TABLE, Row, first_match, risen
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, PositionSetpoint
 
@@ -67,7 +68,7 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     since = conditions_since(context)
     if state.hold:
         since = _kept(since)  # a held vehicle proves nothing: the dwell times begin anew
-    if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and context.speed_mps < 0.3:
+    if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
@@ -108,7 +109,7 @@ def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
 def _mount_watched(c: Context) -> MountWatch:
     """With this tick's frame, where it measured the target and the telemetry is fresh."""
     mount, target = c.state.mount, c.obs.target
-    if c.state.phase not in WATCHED or c.state.hold or not (c.obs.new_frame and c.proves):
+    if c.state.phase not in IN_THE_OPEN or c.state.hold or not (c.obs.new_frame and c.proves):
         return mount
     if target is None or not target.measured or target.world_m is None:
         return mount
@@ -120,8 +121,6 @@ def _mount_watched(c: Context) -> MountWatch:
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     """Slow mean of the thrust in quiet flight: the reference of the contact proof."""
     thrust = obs.telemetry.thrust
-    if thrust < 1000:
-        return state.hover_thrust
     if state.hover_thrust == 0.0:
         return thrust
     part = min(1.0, (obs.t_s - state.t_s) / 1.5)
@@ -149,6 +148,7 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         entry_yaw_rad=obs.telemetry.yaw_rad,
         search_step_s=obs.t_s,
         confirmed=0,
+        pressed=row.to in (Phase.RECOVER, Phase.LANDING) and presses(context),
         ordered_s=None,
         orders=0,
     )

@@ -60,7 +60,8 @@ def let_go(c: Context) -> Acted:
     assert state.released_s is not None
     if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s:
         return stop_motors(c)
-    if c.telemetry_age_s > UNSEEN_S and c.obs.t_s - state.released_s > complete.ramp_s + UNSEEN_S:
+    least_s = complete.ramp_s + complete.hang_s + UNSEEN_S
+    if not c.proves and c.obs.t_s - state.released_s > least_s:
         return stop_motors(c)  # still for seconds by order: the pair only keeps it from locking
     part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
     start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN

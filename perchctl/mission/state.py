@@ -81,6 +81,9 @@ class Condition(Enum):
     ON_FLOOR = "on the floor"
     WEIGHT_HANGS = "the whole weight hangs"
     BLOCKED = "blocked"
+    SATURATED = "saturated"
+    UNSURE = "unsure"
+    TARGET_BELOW = "target below"
     BATTERY_LOW = "battery low"
 
 
@@ -163,6 +166,7 @@ class PlannerState:
     released_s: float | None = None  # begin of the release by raw thrust
     caught: bool = True  # False after a slip, until the fall is stopped
     catch_above_m: float = 0.0  # how far above it the setpoint is that stops the fall
+    pressed: bool = False  # the way down begins with full thrust against something
     blocked_z_m: float | None = None  # something solid is above
     ordered_s: float | None = None  # last order of a landing or motor stop
     orders: int = 0

@@ -5,9 +5,6 @@ The diagram and the table of docs/architecture.md are drawn from `TABLE`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import (
     attempts_used,
@@ -16,13 +13,17 @@ from perchctl.mission.guards import (
     has_slipped,
     is_blocked,
     left_jump_hold,
+    mounted_wrong,
     searched_out,
     settling_too_long,
     still_at_contact,
     stopped_for_s,
+    too_weak,
+    unsure,
+    why_mounted_wrong,
     why_not_found,
 )
-from perchctl.mission.mounting import explained
+from perchctl.mission.row import Row
 from perchctl.mission.state import (
     FLYING_PHASES,
     Condition,
@@ -34,34 +35,12 @@ from perchctl.mission.state import (
 )
 from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
-Guard = Callable[[Context], bool]
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
 
 AIR = FLYING_PHASES | {P.LANDING}
 BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
-WATCHED = BY_CAMERA | {P.APPROACH}
+IN_THE_OPEN = BY_CAMERA | {P.APPROACH}
 BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
-
-
-@dataclass(frozen=True, eq=False)
-class Row:
-    """From any of `phases`, when `when` holds, to `to`.
-
-    `reason` is shown to the user; `motor_stop` is what a row into ABORTED does to the motors.
-    """
-
-    name: str
-    phases: frozenset[Phase]
-    when: Guard
-    to: Phase
-    reason: str | Callable[[Context], str]
-    severity: Severity = Severity.CONTINUE
-    outcome: Outcome | None = None
-    counts_attempt: bool = False
-    motor_stop: MotorStop = MotorStop.NONE
-
-    def explain(self, c: Context) -> str:
-        return self.reason if isinstance(self.reason, str) else self.reason(c)
 
 
 def _only(*phases: Phase) -> frozenset[Phase]:
@@ -121,6 +100,11 @@ TABLE: tuple[Row, ...] = (
         "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
     ),
     Row(
+        "estimate-unsure", IN_THE_OPEN,
+        lambda c: c.held(C.UNSURE) >= c.profile.safety.variance_land_s, P.LANDING,
+        lambda c: f"{unsure(c)}: is the positioning system gone?", S.LAND, O.SAFETY,
+    ),
+    Row(
         "battery-low", BEFORE_CONTACT,
         lambda c: c.held(C.BATTERY_LOW) >= c.profile.safety.battery_debounce_s, P.LANDING,
         lambda c: f"battery at {c.obs.telemetry.battery_v:.2f} V under load", S.LAND, O.SAFETY,
@@ -131,8 +115,7 @@ TABLE: tuple[Row, ...] = (
         "the battery's reading stands still", S.LAND, O.SAFETY,
     ),
     Row(
-        "mounting", WATCHED, lambda c: c.state.mount.wrong, P.LANDING,
-        lambda c: explained(c.state.mount), S.LAND, O.SAFETY,
+        "mounting", IN_THE_OPEN, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,
     ),
     Row(
         "height-limit", BEFORE_CONTACT,
@@ -186,8 +169,14 @@ TABLE: tuple[Row, ...] = (
     Row(
         "blocked", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER), is_blocked,
         P.RECOVER,
-        lambda c: f"pressed against something at {c.height_m:.2f} m", S.BACK_OFF,
+        lambda c: f"pressed against something at {c.height_m:.2f} m"
+        + ("" if c.state.hover_thrust else ", or the thrust is weak"), S.BACK_OFF,
         counts_attempt=True,
+    ),
+    Row(
+        "too-weak", BY_CAMERA, too_weak, P.LANDING,
+        "hovering takes all the thrust: the vehicle is too heavy, the battery too low, or "
+        "something is above", S.LAND, O.SAFETY,
     ),
     # --- phase 1: approach ---------------------------------------------------
     Row(

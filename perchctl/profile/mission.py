@@ -113,12 +113,13 @@ class RecoverConfig(Section):
 
 class LandingConfig(Section):
     """Down by position setpoints at `speed_mps` to `handover_m`, the rest by the vehicle's
-    own landing, which goes to `undershoot_m` below the ground of the estimate, so that a
-    drifted height still ends on the floor."""
+    own landing, which goes to `undershoot_m` below the ground of the estimate, and by
+    `drift_mps` of the flight's time lower, so that a drifted height still ends on the floor."""
 
     speed_mps: float = Field(0.3, gt=0, le=1)
     handover_m: float = Field(0.3, ge=0.1, le=2)
     undershoot_m: float = Field(0.05, ge=0, le=1)
+    drift_mps: float = Field(0.012, ge=0, le=0.1)  # of the estimate's height: lower by that
     timeout_s: float = Field(30.0, gt=0, le=120)
 
 
@@ -155,6 +156,11 @@ class SafetyConfig(Section):
     camera_land_s: float = Field(3.0, gt=0, le=60)
     max_frame_age_s: float = Field(0.4, gt=0, le=5)
     jump_m: float = Field(0.25, gt=0, le=5)
+    jump_z_m: float = Field(0.15, gt=0, le=5)
+    jump_deg: float = Field(15.0, gt=0, le=180)  # of the heading
+    jump_mps: float = Field(1.0, gt=0, le=10)
+    flight_variance_m2: float = Field(0.05, gt=0, le=10)  # of the position, in flight
+    variance_land_s: float = Field(1.0, ge=0, le=30)
     jump_hold_s: float = Field(0.5, ge=0, le=0.5)
     max_height_m: float = Field(3.0, gt=0, le=20)
     fence_radius_m: float = Field(2.0, gt=0, le=50)
@@ -164,6 +170,9 @@ class SafetyConfig(Section):
     loop_late_land_s: float = Field(1.0, gt=0, le=10)
     estimator_wait_s: float = Field(10.0, gt=0, le=60)
     estimator_variance_m2: float = Field(0.01, gt=0, le=10)
+    ground_z_m: float = Field(0.0, ge=-10, le=10)  # of the estimate, where it takes off
+    ground_tolerance_m: float = Field(0.15, gt=0, le=10)
+    start_tilt_deg: float = Field(10.0, gt=0, le=45)
     blocked_s: float = Field(0.7, gt=0, le=5)  # pressed and not moving for so long
     blocked_thrust_ratio: float = Field(1.1, gt=1, le=2)  # of the hover thrust
     land_on_log_error: bool = False

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from perchctl.camera.health import HealthState, Verdict, assess
+from perchctl.camera.mirror import MIRRORED
 from perchctl.display.page.live import State
 from perchctl.display.page.sketch import Sketch
 from perchctl.pipeline import Pipeline, camera_profile, make_pipeline, step
@@ -27,9 +28,6 @@ FOLD_RATIOS = 500  # frames whose size ratios are kept one by one
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
-_MIRRORED = (
-    "the picture is mirrored: switch that off in the camera, or set camera.mirrored in the profile"
-)
 
 
 def camera_pipeline(profile: Profile, camera: CameraModel, stills: bool = False) -> Pipeline:
@@ -75,7 +73,7 @@ class Tracker:
         self.output = output
         self._last = tracked_of(name, frame.t_s, output, not self.stills, last)
         if output.detections.mirrored:
-            self.notes += (_MIRRORED,)
+            self.notes += (MIRRORED,)
         if output.disagreeing_frames >= (1 if self.stills else self.disagreement_frames):
             self.notes += (_DISAGREE,)
         return self._last

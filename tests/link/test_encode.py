@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
 from perchctl.link.connection import send_packets
-from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
+from perchctl.link.encode import ARM, LAND_TIMES, UNLOCK_THRUST, encode
 from perchctl.link.mock import MockLink
 from perchctl.sim.crtp.codec import MAX_DATA, Packet
 from perchctl.sim.crtp.commands import CommandService
@@ -79,7 +79,8 @@ class Recorder:
             case RawThrust(thrust):
                 self.commander.send_setpoint(0.0, 0.0, 0.0, thrust)
             case Land(height, duration):
-                self.high_level.land(height, duration, yaw=None)  # keeps the heading
+                for _ in range(LAND_TIMES):
+                    self.high_level.land(height, duration, yaw=None)  # keeps the heading
                 self.commander.send_notify_setpoint_stop()
             case StopMotors():
                 self.commander.send_stop_setpoint()
@@ -178,7 +179,8 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
         (RawThrust(40000), [("low_level", (RawSetpoint(0.0, 0.0, 0.0, 40000),))]),
         (
             Land(-0.25, 3.0),
-            [("high_level", (HlLand(-0.25, 3.0, None),)), ("notify_setpoint_stop", (0.0,))],
+            [("high_level", (HlLand(-0.25, 3.0, None),))] * LAND_TIMES
+            + [("notify_setpoint_stop", (0.0,))],
         ),
         (EmergencyStop(), [("emergency_stop", ())]),
     ],

@@ -73,6 +73,10 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         1.5, FLYING_PHASES, LAND, Outcome.SAFETY,
     ),
     "estimator-jump": (_obs(jumped=True), 0.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
+    "estimate-unsure": (
+        _tel(position_variance_m2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
+        Outcome.SAFETY,
+    ),
     "battery-low": (_tel(battery_v=2.8), 1.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
     "battery-low-power": (_tel(battery_state=3), 1.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
     "battery-unknown": (_obs(battery_age_s=99.0), 0.1, BEFORE_CONTACT, LAND, Outcome.SAFETY),
@@ -185,8 +189,9 @@ def test_ctrl_c_once_lands_and_twice_stops(phase: Phase) -> None:
         _obs(camera_age_s=1.0, new_frame=False, target=None),
         _obs(loop_late_s=0.4),
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=o.t_s - 0.5)),
+        _tel(position_variance_m2=0.08),
     ],
-    ids=["camera-silent", "loop-late", "telemetry-late"],
+    ids=["camera-silent", "loop-late", "telemetry-late", "estimate-unsure"],
 )
 def test_a_short_fault_never_climbs(phase: Phase, event: Event) -> None:
     state = state_in(phase)
@@ -425,3 +430,28 @@ def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
         if isinstance(command, StopMotors):
             break
     assert 0.5 <= t_s - 10.0 < 0.7
+
+
+@pytest.mark.parametrize("phase", [Phase.LANDING, Phase.RECOVER])
+def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: Phase) -> None:
+    """The integrators that a second of full thrust has wound up hold it there for seconds."""
+    state = replace(state_in(phase, z_m=1.0), pressed=True)
+    tel = telemetry(10.02, 1.0, thrust=65535.0)
+    state, command = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m < 0.2
+    away = telemetry(10.5, 0.85, thrust=45000.0, velocity_mps=(0.0, 0.0, -0.1))
+    state, command = planner.step(state, observation(10.5, telemetry=away), PROFILE)
+    assert not state.pressed
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > 0.4
+
+
+def test_what_presses_when_its_way_down_begins_is_remembered() -> None:
+    for thrust, pressed in ((65535.0, True), (42000.0, False)):
+        state = state_in(Phase.SEARCH, z_m=1.0)
+        tel = telemetry(10.02, 1.0, thrust=thrust)
+        obs = observation(10.02, telemetry=tel, operator=Operator.LAND)
+        state, _ = planner.step(state, obs, PROFILE)
+        assert state.phase is Phase.LANDING
+        assert state.pressed is pressed

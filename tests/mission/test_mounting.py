@@ -155,3 +155,14 @@ def test_the_first_decimetres_are_flown_slowly() -> None:
         state, _ = planner.step(state, observation(t_s, target=target), PROFILE)
     assert state.setpoint is not None
     assert math.hypot(state.setpoint.x_m, state.setpoint.y_m) <= 0.25 * 0.3 + 1e-9
+
+
+def test_a_target_below_the_vehicle_is_not_believed() -> None:
+    """A mounting that is upside down in the profile: nothing is on the ceiling below."""
+    state = state_in(Phase.ALIGN)
+    for i in range(1, 30):
+        t_s = 10.0 + 0.02 * i
+        target = target_at(t_s, (0.0, 0.0, -0.2))
+        state, _ = planner.step(state, observation(t_s, target=target), PROFILE)
+    assert state.row == "mounting"
+    assert "camera.mount does not look up" in state.reason

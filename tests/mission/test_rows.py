@@ -161,6 +161,9 @@ CASES: dict[str, Case] = {
     "link-lost": Case(P.ALIGN, P.LANDING, seen(link_problem="gone"), 0.1, O.SAFETY),
     "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), START_S), 1.5, O.SAFETY),
     "estimator-jump": Case(P.ALIGN, P.LANDING, seen(jumped=True), 0.8, O.SAFETY),
+    "estimate-unsure": Case(
+        P.ALIGN, P.LANDING, flown(position_variance_m2=0.08), 1.2, O.SAFETY
+    ),
     "battery-low": Case(P.ALIGN, P.LANDING, flown(battery_v=2.8), 1.8, O.SAFETY),
     "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
     "mounting": Case(
@@ -188,6 +191,10 @@ CASES: dict[str, Case] = {
     "blocked": Case(
         P.SEARCH, P.RECOVER, blind(flown(1.0, thrust=PRESSED)), 0.9,
         state={"setpoint": PositionSetpoint(0.0, 0.0, 1.3, 0.0), "entry_m": (0.0, 0.0, 1.3)},
+    ),
+    "too-weak": Case(
+        P.SEARCH, P.LANDING, blind(flown(thrust=FULL)), 2.3, O.SAFETY,
+        state={"search_step_s": START_S + 9.0},
     ),
     "approached": Case(P.APPROACH, P.SEARCH, seen(0.5), 0.4, z_m=0.5),
     "approach-timeout": Case(

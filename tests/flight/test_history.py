@@ -1,0 +1,127 @@
+"""Steps of the state estimate, and what is none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.flight.history import History, extended
+from perchctl.mission.state import Outcome
+from perchctl.vehicle import Telemetry
+from tests.flight.test_loop import PROFILE, Rig, Vehicle
+from tests.helpers.mission import telemetry
+
+SAFETY = PROFILE.safety
+
+
+def jumped(*samples: Telemetry) -> bool:
+    history, found = History(), False
+    for sample in samples:
+        history = extended(history, [sample], SAFETY)
+        found = found or history.jumped
+    return found
+
+
+def step(dt_s: float = 0.01, **changes: Any) -> bool:
+    before = telemetry(1.0)
+    return jumped(before, replace(telemetry(1.0 + dt_s), **changes))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"position_m": (0.3, 0.0, 1.0)},
+        {"position_m": (0.0, 0.0, 1.2)},
+        {"position_m": (0.0, 0.0, 0.8)},
+        {"yaw_rad": math.radians(25.0)},
+        {"yaw_rad": math.radians(-170.0)},
+        {"velocity_mps": (0.0, 1.5, 0.0)},
+        {"velocity_mps": (0.0, 0.0, -1.5)},
+    ],
+    ids=["sideways", "up", "down", "heading", "half a turn", "speed", "sinking"],
+)
+def test_a_step_of_the_estimate_is_a_jump(changes: dict[str, Any]) -> None:
+    assert step(**changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"position_m": (0.2, 0.0, 1.0)},
+        {"position_m": (0.0, 0.0, 1.1)},
+        {"yaw_rad": math.radians(10.0)},
+        {"velocity_mps": (0.0, 0.5, -0.5)},
+    ],
+    ids=["sideways", "height", "heading", "speed"],
+)
+def test_a_small_step_is_none(changes: dict[str, Any]) -> None:
+    assert not step(**changes)
+
+
+def test_the_heading_wraps() -> None:
+    a, b = telemetry(1.0, yaw_rad=math.pi - 0.01), telemetry(1.01, yaw_rad=-math.pi + 0.01)
+    assert not jumped(a, b)
+
+
+def test_a_gap_allows_what_a_flight_does_in_it() -> None:
+    fast = {"velocity_mps": (0.5, 0.0, 0.0)}
+    a = telemetry(1.0, **fast)
+    b = replace(telemetry(1.6, **fast), position_m=(0.35, 0.0, 1.0), yaw_rad=1.5)
+    assert not jumped(a, b)
+
+
+def test_a_position_that_comes_late_is_no_jump() -> None:
+    """Its packet stayed away for a second, the other samples came every 10 ms."""
+    a = telemetry(1.0, velocity_mps=(0.5, 0.0, 0.0))
+    late = [replace(a, t_s=1.0 + 0.01 * i, behind_s=0.01 * i) for i in range(1, 100)]
+    b = replace(a, t_s=2.0, position_m=(0.6, 0.0, 1.0), behind_s=0.0)
+    assert not jumped(a, *late, b)
+
+
+def test_a_smeared_step_is_a_jump() -> None:
+    """0.3 m over five samples, which no velocity explains."""
+    samples = [telemetry(1.0 + 0.01 * i, position_m=(0.06 * min(i, 5), 0.0, 1.0)) for i in range(9)]
+    assert jumped(*samples)
+
+
+@given(
+    st.floats(0, 2 * math.pi), st.floats(0, 2.0), st.floats(-8.0, 8.0), st.sampled_from([1, 2, 5])
+)
+def test_a_flight_is_no_jump(way: float, mps: float, mps2: float, every: int) -> None:
+    """Whatever it does: speeds up, brakes, with telemetry every 10 to 50 ms."""
+    samples = []
+    for i in range(0, 60, every):
+        t_s = 0.01 * i
+        v = max(0.0, mps + mps2 * t_s)
+        stops_s = -mps / mps2 if mps2 < 0 else math.inf
+        far = min(t_s, stops_s)
+        s = mps * far + 0.5 * mps2 * far**2
+        direction = (math.cos(way), 0.0, math.sin(way))
+        samples.append(
+            telemetry(
+                1.0 + t_s,
+                position_m=tuple(s * d for d in direction),
+                velocity_mps=tuple(v * d for d in direction),
+            )
+        )
+    assert not jumped(*samples)
+
+
+def test_a_heading_that_jumps_lands() -> None:
+    rig = Rig(Vehicle(lambda s: replace(s, yaw_rad=1.0 if s.t_s > 1.5 else 0.0)))
+    report = rig.fly()
+    assert report.outcome is Outcome.SAFETY
+    assert "the state estimate jumped" in report.reason
+
+
+def test_an_estimate_that_is_no_number_for_long_is_stale() -> None:
+    nan = (math.nan, 0.0, 0.0)
+    rig = Rig(Vehicle(lambda s: replace(s, velocity_mps=nan) if 1.5 < s.t_s < 4.0 else s))
+    report = rig.fly()
+    assert report.outcome is Outcome.SAFETY
+    assert "no telemetry" in report.reason

@@ -1,0 +1,137 @@
+"""What the thrust proves: the hover thrust that is learned, and what is measured by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from perchctl.mission import planner
+from perchctl.mission.conditions import contact_thrust
+from perchctl.mission.context import Context
+from perchctl.mission.state import Outcome, Phase, PlannerState
+from perchctl.profile import Profile
+from perchctl.vehicle import FULL_THRUST, PositionSetpoint
+from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry
+
+CONTACT_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
+
+
+def flown(
+    state: PlannerState,
+    for_s: float,
+    z_m: float = 1.0,
+    profile: Profile = PROFILE,
+    setpoint_z_m: float | None = None,
+    aside_m: float = 0.0,
+    **tel: Any,
+) -> PlannerState:
+    """For so long in that state of flight, or until the phase changes."""
+    for i in range(1, round(for_s / 0.02) + 1):
+        t_s = 10.0 + 0.02 * i
+        if setpoint_z_m is not None:
+            state = replace(state, setpoint=PositionSetpoint(0.0, 0.0, setpoint_z_m, 0.0))
+        sample = telemetry(t_s, z_m, **tel)
+        target = target_at(t_s, (aside_m, 0.0, CEILING_M), sample.position_m)
+        obs = observation(t_s, telemetry=sample, target=target)
+        new, _ = planner.step(state, obs, profile)
+        if new.phase is not state.phase:
+            return new
+        state = new
+    return state
+
+
+def learned(**how: Any) -> float:
+    """The hover thrust after a second in ESTIMATE."""
+    start = replace(state_in(Phase.ESTIMATE), hover_thrust=0.0, target_spread_m=1.0)
+    return flown(start, 0.3, thrust=50000.0, **how).hover_thrust
+
+
+def test_quiet_flight_teaches_the_hover_thrust() -> None:
+    assert learned() == 50000.0
+    assert learned(velocity_mps=(0.0, 0.0, 0.25)) == 50000.0  # a steady climb takes no more
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"setpoint_z_m": 1.3},
+        {"acc_z_g": 1.2},
+        {"acc_z_g": 0.8},
+        {"velocity_mps": (0.0, 0.0, 0.29)},
+        {"velocity_mps": (0.4, 0.0, 0.0)},
+        {"behind_s": 0.2},
+    ],
+    ids=["pressed", "speeding up", "braking", "climbing hard", "journey", "stale"],
+)
+def test_what_is_no_hover_teaches_nothing(how: dict[str, Any]) -> None:
+    assert learned(**how) == 0.0
+
+
+def test_saturated_thrust_teaches_nothing() -> None:
+    start = replace(state_in(Phase.ALIGN), hover_thrust=60000.0)
+    assert flown(start, 0.3, thrust=float(FULL_THRUST)).hover_thrust == 60000.0
+
+
+def pressing(hover: float, thrust: float, profile: Profile = PROFILE) -> PlannerState:
+    start = replace(state_in(Phase.PERCH, z_m=CONTACT_Z_M), hover_thrust=hover)
+    return flown(start, 0.5, CONTACT_Z_M, profile, thrust=thrust)
+
+
+@pytest.mark.parametrize("hover", [56000.0, 63000.0, 64000.0])
+def test_a_contact_can_be_proven_with_what_thrust_there_is(hover: float) -> None:
+    assert pressing(hover, FULL_THRUST).phase is Phase.COMPLETE
+    assert pressing(hover, hover).phase is Phase.PERCH
+
+
+def raw_profile() -> Profile:
+    perch = PROFILE.planner.perch.model_copy(update={"mode": "raw"})
+    return PROFILE.model_copy(
+        update={"planner": PROFILE.planner.model_copy(update={"perch": perch})}
+    )
+
+
+def test_a_raw_press_is_measured_by_its_own_thrust() -> None:
+    c = Context(replace(state_in(Phase.PERCH), hover_thrust=58500.0), observation(1), raw_profile())
+    assert 58500.0 < contact_thrust(c) < 60000.0
+
+
+@pytest.mark.parametrize(("hover", "presses"), [(57000.0, True), (59500.0, False)])
+def test_a_press_that_could_not_press_is_not_begun(hover: float, presses: bool) -> None:
+    """Raw thrust of 60000 at a hover thrust of 59500: the vehicle would hang in the air."""
+    z_m = CONTACT_Z_M - PROFILE.planner.ascend.standoff_m
+    start = replace(state_in(Phase.ASCEND, z_m=z_m), hover_thrust=hover)
+    state = flown(start, 0.5, z_m, raw_profile(), thrust=hover)
+    assert state.phase is (Phase.PERCH if presses else Phase.LANDING)
+    if not presses:
+        assert state.outcome is Outcome.SAFETY
+        assert "too heavy" in state.reason
+
+
+def test_a_weak_vehicle_at_full_thrust_is_not_called_pressed() -> None:
+    """It hovers below its setpoint on all the thrust there is, as it did before on nearly all."""
+    start = replace(state_in(Phase.ALIGN), hover_thrust=62500.0)
+    state = flown(start, 1.9, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2)
+    assert state.phase is Phase.ALIGN
+    state = flown(start, 2.5, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2)
+    assert state.row == "too-weak"
+    assert "battery too low" in state.reason
+
+
+def test_a_strong_vehicle_at_full_thrust_is_pressed() -> None:
+    state = flown(
+        state_in(Phase.ALIGN), 1.0, thrust=float(FULL_THRUST), setpoint_z_m=1.2, aside_m=0.2
+    )
+    assert state.row == "blocked"
+
+
+def test_a_change_of_phase_does_not_hide_a_weak_vehicle() -> None:
+    state, rows = replace(state_in(Phase.ALIGN), hover_thrust=62500.0), []
+    for i in range(1, 115):
+        t_s = 10.0 + 0.02 * i
+        sample = telemetry(t_s, thrust=float(FULL_THRUST))
+        state, _ = planner.step(state, observation(t_s, telemetry=sample), PROFILE)
+        rows.append(state.row)
+    assert "aligned" in rows
+    assert rows[-1] == "too-weak"
