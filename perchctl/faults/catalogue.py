@@ -22,6 +22,7 @@ from perchctl.faults.excuses import (
     OPERATOR_STOPS,
     SAGS_TOO_FAST,
     TOO_LOW,
+    TURNED,
     Excuse,
 )
 from perchctl.mission.state import Phase
@@ -111,7 +112,7 @@ FAULTS: tuple[Fault, ...] = (
     # --- the state estimate ---------------------------------------------------------
     Fault("estimate-jumps", (9,), "steps sideways by 0.1 to 2 m", AIR, draws.jump_xy),
     Fault("height-jumps", (9,), "steps in height by 0.1 to 1 m", AIR, draws.jump_z),
-    Fault("heading-jumps", (9, 34), "turns by 10 to 180 deg", AIR, draws.jump_yaw),
+    Fault("heading-jumps", (9, 34), "turns by 10 to 180 deg", AIR, draws.jump_yaw, (TURNED,)),
     Fault("estimate-drifts", (9,), "slides by 3 to 30 cm/s", AIR, draws.drift),
     Fault("estimate-nan", (35,), "position and velocity are logged as NaN", AIR,
           draws.not_a_number),
@@ -151,7 +152,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("operator-once", (16,), "Ctrl-C", AIR, draws.pressed_once),
     Fault("operator-twice", (16,), "Ctrl-C, and again 0.6 to 10 s later", AIR,
           draws.pressed_twice, (OPERATOR_STOPS,)),
-    Fault("operator-held", (16,), "Ctrl-C held for up to 0.45 s: it repeats every 30 ms", AIR,
+    Fault("operator-held", (16,), "Ctrl-C held for 0.1 to 3 s: it repeats every 30 ms", AIR,
           draws.held),
     Fault("hang-up", (16,), "the terminal is closed", AIR, draws.hang_up),
     # --- the program ------------------------------------------------------------------

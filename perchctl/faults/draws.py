@@ -206,9 +206,8 @@ def pressed_twice(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 
 def held(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
-    """A key that repeats every 30 ms, for less than the half second after which a second
-    press counts."""
-    times = np.arange(0.0, between(rng, 0.1, 0.45), 0.03)
+    """A key that repeats every 30 ms: one press, however long."""
+    times = np.arange(0.0, log_between(rng, 0.1, 3.0), 0.03)
     return (e.Operator(tuple(round(float(t), 2) for t in times)),)
 
 

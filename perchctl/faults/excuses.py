@@ -20,6 +20,7 @@ from perchctl.faults.effects import (
     Suspended,
 )
 from perchctl.faults.oracle import Flag
+from perchctl.flight.operator import AGAIN_S, HELD_S
 
 CUT_S = 1.9
 """Silence for longer ends in the firmware's cut (2.0 s after the last setpoint)."""
@@ -97,8 +98,10 @@ def _stopped_by_operator(facts: Facts) -> bool:
 
 
 def _is_double(presses_s: tuple[float, ...]) -> bool:
-    """A second press after more than the half second that a held key is given."""
-    return len(presses_s) > 1 and presses_s[-1] - presses_s[0] > 0.5
+    """A second press, later than the repetitions of a key held down."""
+    if len(presses_s) < 2:
+        return False
+    return presses_s[-1] - presses_s[0] > AGAIN_S and presses_s[-1] - presses_s[-2] > HELD_S
 
 
 def _lets_go_later(facts: Facts) -> bool:

@@ -68,7 +68,7 @@ class FaultyFlight:
         inner = LockstepSource(vehicle.camera, profile.camera.latency_s)
         source = FaultyCamera(inner, scenario.seed)
         self._clock = FaultyClock(self._link, lambda: _cut(radio), LONGEST_FLIGHT_S)
-        switch, disk = OperatorSwitch(listening=True), Disk()
+        switch, disk = OperatorSwitch(listening=True, clock=self._clock.now), Disk()
         edges = Edges(vehicle, radio, source, self._clock, switch.press, switch.land, disk)
         self._injector = Injector(edges, case.effects, case.phase, case.moment_s)
         self._injector.on_begin = self._note_beginning
