@@ -22,7 +22,6 @@ from perchctl.faults.excuses import (
     OPERATOR_STOPS,
     SAGS_TOO_FAST,
     TOO_LOW,
-    TURNED,
     Excuse,
 )
 from perchctl.mission.state import Phase
@@ -112,7 +111,7 @@ FAULTS: tuple[Fault, ...] = (
     # --- the state estimate ---------------------------------------------------------
     Fault("estimate-jumps", (9,), "steps sideways by 0.1 to 2 m", AIR, draws.jump_xy),
     Fault("height-jumps", (9,), "steps in height by 0.1 to 1 m", AIR, draws.jump_z),
-    Fault("heading-jumps", (9, 34), "turns by 10 to 180 deg", AIR, draws.jump_yaw, (TURNED,)),
+    Fault("heading-jumps", (9, 34), "turns by 10 to 180 deg", AIR, draws.jump_yaw),
     Fault("estimate-drifts", (9,), "slides by 3 to 30 cm/s", AIR, draws.drift),
     Fault("estimate-nan", (35,), "position and velocity are logged as NaN", AIR,
           draws.not_a_number),

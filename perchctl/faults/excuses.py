@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from perchctl.faults.effects import (
     Effect,
-    EstimateError,
     Killed,
     MagnetHolds,
     MagnetLetsGo,
@@ -28,8 +27,6 @@ CATCHABLE_M = 1.0
 """Hanging lower than this, a magnet of nearly the weight that lets go cannot be caught."""
 LEAST_LIFT = 1.02
 """Over the weight: with less nothing is held in the air."""
-UNSTABLE_DEG, UNSTABLE_S = 60.0, 3.0
-"""A heading wrong by so much, for so long: the simulated vehicle, holding a place, leaves it."""
 NOTICED_S, DOWN_MPS = 1.5, 0.4
 """How long a low battery takes to be believed, and how fast a landing goes at best."""
 
@@ -122,15 +119,6 @@ def _sags_too_fast(facts: Facts) -> bool:
     return facts.low_s is None or facts.weak_s - facts.low_s < down_s
 
 
-def _is_turned_around(facts: Facts) -> bool:
-    return facts.begin_s is not None and any(
-        isinstance(effect, EstimateError)
-        and abs(effect.turn_deg) >= UNSTABLE_DEG
-        and effect.for_s >= UNSTABLE_S
-        for effect in facts.effects
-    )
-
-
 CUT = Excuse(
     "cut by the firmware", _is_cut, _flags("fell", "locked_needlessly"),
     "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
@@ -163,12 +151,7 @@ SAGS_TOO_FAST = Excuse(
     "from the voltage at which it lands to the one that does not lift the weight any more it "
     "has less time than the way down takes",
 )  # fmt: skip
-TURNED = Excuse(
-    "turned around", _is_turned_around, _flags("fell", "strayed"),
-    "with a heading wrong by 60 deg the vehicle's own position loop is unstable: whatever "
-    "position it is to hold, it swings out by 1 m in 5 s and 2 m in 7 s, also in its own landing",
-)  # fmt: skip
 
 EXCUSES = (
-    CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT, SAGS_TOO_FAST, TURNED,
+    CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT, SAGS_TOO_FAST,
 )  # fmt: skip

@@ -23,6 +23,7 @@ class History:
 
     samples: tuple[Telemetry, ...] = ()
     jumped: bool = False
+    turned_rad: float = 0.0
     battery_changed_s: float | None = None
 
     @property
@@ -31,17 +32,19 @@ class History:
 
 
 def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> History:
-    """The history with new samples; `jumped` is about these samples only.
+    """The history with new samples; `jumped` and `turned_rad`, the largest step of the
+    heading, are about these samples only.
 
     Samples with NaN or out of order are left out (fault 35).
     """
     samples = list(history.samples)
-    jumped, changed = False, history.battery_changed_s
+    jumped, turned_rad, changed = False, 0.0, history.battery_changed_s
     for sample in new:
         if not _is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
             continue
         if samples:
             jumped = jumped or _is_jump(samples, sample, safety)
+            turned_rad = max(turned_rad, _turned_rad(samples[-1], sample))
         if changed is None or sample.battery_v != samples[-1].battery_v:
             changed = sample.t_s
         samples.append(sample)
@@ -49,7 +52,7 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
         oldest = samples[-1].t_s - KEEP_S
         first = bisect.bisect_left([s.t_s for s in samples], oldest)
         samples = samples[first:]
-    return History(tuple(samples), jumped, changed)
+    return History(tuple(samples), jumped, turned_rad, changed)
 
 
 def attitude_at(history: History, t_s: float) -> Attitude | None:
@@ -97,15 +100,18 @@ def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> b
     few samples by the vehicle's own filter."""
     last = before[-1]
     first = next(s for s in before if s.t_s >= last.t_s - SMEARED_S)
-    dt_s = new.t_s - last.t_s
-    turned = abs(wrap_rad(new.yaw_rad - last.yaw_rad))
     faster_mps = math.dist(last.velocity_mps, new.velocity_mps)
     return (
         _is_moved(last, new, safety)
         or _is_moved(first, new, safety)
-        or turned > math.radians(safety.jump_deg) + FASTEST_TURN_RADPS * dt_s
+        or _turned_rad(last, new) > math.radians(safety.jump_deg)
         or faster_mps > safety.jump_mps + FASTEST_MPS2 * _between_s(last, new)
     )
+
+
+def _turned_rad(a: Telemetry, b: Telemetry) -> float:
+    """The heading's step beyond what the vehicle can turn in between."""
+    return abs(wrap_rad(b.yaw_rad - a.yaw_rad)) - FASTEST_TURN_RADPS * (b.t_s - a.t_s)
 
 
 def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:

@@ -163,7 +163,8 @@ def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:
         return began_s
     before = senses.history
     after = extended(before, parts.link.telemetry(), parts.profile.safety)
-    senses.history = replace(after, jumped=before.jumped or after.jumped)
+    turned_rad = max(before.turned_rad, after.turned_rad)
+    senses.history = replace(after, jumped=before.jumped or after.jumped, turned_rad=turned_rad)
     if senses.last_good_frame_s == began_s:
         senses.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
     return now_s
@@ -202,6 +203,7 @@ def _observe(parts: FlightParts, senses: Senses, now_s: float, late_s: float) ->
         link_problem=parts.link.problem(now_s),
         battery_age_s=0.0 if changed_s is None else now_s - changed_s,
         jumped=senses.history.jumped,
+        turned_rad=senses.history.turned_rad,
         loop_late_s=late_s,
         disagreeing_frames=senses.state.disagreeing_frames,
         operator=parts.operator(),

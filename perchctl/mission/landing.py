@@ -14,6 +14,7 @@ from dataclasses import replace
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import has_slipped
 from perchctl.mission.guidance import hold_here, limited, unpressed, walk
+from perchctl.mission.level import can_level, level_down
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, Acted, catch, let_go, stop_motors
 from perchctl.mission.state import Condition
 from perchctl.profile import LandingConfig
@@ -62,6 +63,8 @@ def landing(c: Context) -> Acted:
         return _hang_on(c)
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
+    if state.heading_lost and can_level(c):
+        return level_down(_left_contact(c))
     state, away = unpressed(c)
     if away is not None and not _doubtful(c):
         return state, away
@@ -129,11 +132,16 @@ def _by_setpoints(c: Context) -> Acted:
     # A vehicle that does not follow is not pulled by a setpoint that runs away from it,
     # beyond what takes the thrust down to its least.
     setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - 0.35))
-    hung_at_m = state.contact_z_m
-    if hung_at_m is not None and here.z_m < hung_at_m - PEELED_M:
-        hung_at_m = None
-    state = replace(state, setpoint=setpoint, caught=True, contact_z_m=hung_at_m)
+    state = replace(_left_contact(c).state, setpoint=setpoint, caught=True)
     return state, limited(c, setpoint)
+
+
+def _left_contact(c: Context) -> Context:
+    """Seen below the contact, it is free of the magnet."""
+    contact_z_m = c.state.contact_z_m
+    if contact_z_m is None or c.obs.telemetry.position_m[2] >= contact_z_m - PEELED_M:
+        return c
+    return Context(replace(c.state, contact_z_m=None), c.obs, c.profile)
 
 
 def _by_itself(c: Context) -> Acted:

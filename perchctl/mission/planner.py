@@ -6,6 +6,7 @@ One tick: remember what was observed, look up the table, act for the phase.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -63,6 +64,10 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     state = _with_target(state, obs)
     if obs.jumped:
         state = _jumped(state, obs)
+    if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
+        # Where no hover thrust was learned yet, the present one has to do.
+        hover = state.hover_thrust or obs.telemetry.thrust
+        state = replace(state, heading_lost=True, hover_thrust=hover)
     context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)

@@ -114,6 +114,7 @@ class Observation:
         camera_age_s: since the last good frame arrived.
         camera_problem, link_problem: None, or one sentence.
         jumped: the state estimate moved farther than any flight could.
+        turned_rad: the estimated heading's step beyond what a vehicle can turn.
         loop_late_s: how late this tick began.
         disagreeing_frames: frames in a row in which the markers contradicted.
         log_problem: the flight log cannot be written.
@@ -128,6 +129,7 @@ class Observation:
     link_problem: str | None = None
     battery_age_s: float = 0.0
     jumped: bool = False
+    turned_rad: float = 0.0
     loop_late_s: float = 0.0
     disagreeing_frames: int = 0
     operator: Operator = Operator.NONE
@@ -172,4 +174,6 @@ class PlannerState:
     orders: int = 0
     stopped_s: float | None = None  # first order to stop the motors
     jump_s: float | None = None
+    heading_lost: bool = False  # position control would lead away from its setpoint
+    level_thrust: float = 0.0  # raw thrust of a level way down
     hold: str = ""  # why the vehicle is held in place, empty when it is not

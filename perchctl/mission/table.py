@@ -96,6 +96,10 @@ TABLE: tuple[Row, ...] = (
         lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
     ),
     Row(
+        "heading-lost", BEFORE_CONTACT, lambda c: c.state.heading_lost, P.LANDING,
+        "the estimated heading jumped: down level, by thrust alone", S.LAND, O.SAFETY,
+    ),
+    Row(
         "estimator-jump", BEFORE_CONTACT, left_jump_hold, P.LANDING,
         "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
     ),

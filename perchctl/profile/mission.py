@@ -158,6 +158,7 @@ class SafetyConfig(Section):
     jump_m: float = Field(0.25, gt=0, le=5)
     jump_z_m: float = Field(0.15, gt=0, le=5)
     jump_deg: float = Field(15.0, gt=0, le=180)  # of the heading
+    heading_lost_deg: float = Field(40.0, gt=0, le=180)  # a step of the heading: down level
     jump_mps: float = Field(1.0, gt=0, le=10)
     flight_variance_m2: float = Field(0.05, gt=0, le=10)  # of the position, in flight
     variance_land_s: float = Field(1.0, ge=0, le=30)

@@ -113,9 +113,6 @@ def test_what_the_firmware_cuts(effect: e.Effect, changes: dict[str, object], ho
 
 
 def test_who_stops_what() -> None:
-    assert excused("turned around", facts(e.EstimateError(turn_deg=-90.0)))
-    assert not excused("turned around", facts(e.EstimateError(turn_deg=50.0)))
-    assert not excused("turned around", facts(e.EstimateError(turn_deg=90.0, for_s=2.0)))
     assert excused("lands alone", facts(e.Killed(), own_landing=True))
     assert not excused("lands alone", facts(e.Hung(9.0), own_landing=True))
     assert excused("the operator's word", facts(e.Operator((0.0, 0.8))))

@@ -32,6 +32,7 @@ from perchctl.vehicle import (
     EmergencyStop,
     Idle,
     PositionSetpoint,
+    RawThrust,
     StopMotors,
 )
 from tests.helpers.mission import (
@@ -160,6 +161,9 @@ CASES: dict[str, Case] = {
     "operator-land": Case(P.ALIGN, P.LANDING, seen(operator=Operator.LAND), 0.1, O.OPERATOR),
     "link-lost": Case(P.ALIGN, P.LANDING, seen(link_problem="gone"), 0.1, O.SAFETY),
     "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), START_S), 1.5, O.SAFETY),
+    "heading-lost": Case(
+        P.ALIGN, P.LANDING, seen(jumped=True, turned_rad=1.5), 0.1, O.SAFETY, RawThrust
+    ),
     "estimator-jump": Case(P.ALIGN, P.LANDING, seen(jumped=True), 0.8, O.SAFETY),
     "estimate-unsure": Case(
         P.ALIGN, P.LANDING, flown(position_variance_m2=0.08), 1.2, O.SAFETY
