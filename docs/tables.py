@@ -26,6 +26,7 @@ if str(ROOT) not in sys.path:
 from perchctl.errors import EXIT_CODES  # noqa: E402
 from perchctl.faults.catalogue import AIR, FAULTS, FROM_THE_START, Fault  # noqa: E402
 from perchctl.faults.excuses import EXCUSES  # noqa: E402
+from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.mission.diagram import diagram, rows_table  # noqa: E402
 from perchctl.profile import Profile  # noqa: E402
@@ -385,6 +386,11 @@ def fault_excuses() -> str:
     return "\n".join(["| excuse | what is not counted | why |", "|---|---|---|", *rows])
 
 
+def promises() -> str:
+    rows = [f"| {promise.what} | {promise.happens} |" for promise in PROMISES]
+    return "\n".join(["| what | what happens |", "|---|---|", *rows])
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{diagram()}\n```",
@@ -395,6 +401,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "exit-codes": exit_codes,
     "fault-catalogue": fault_catalogue,
     "fault-excuses": fault_excuses,
+    "promises": promises,
 }
 
 

@@ -21,6 +21,7 @@ from perchctl.faults.catalogue import BY_NAME, FAULTS, case_of
 from perchctl.faults.flight import fly_fault_seed, fly_with_fault
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.plot import plot_heat_map
+from perchctl.faults.promises import PROMISE_OF, PROMISES
 from perchctl.faults.result import FaultResult
 from perchctl.faults.summary import fault_summary, fault_table, worst_first
 from perchctl.mission.state import Phase
@@ -47,8 +48,20 @@ def flown(name: str, phase: Phase, log: Path | None = None, draw: int = 0) -> Fa
 @pytest.mark.parametrize(("name", "phase"), CELLS, ids=[f"{n}-{p.value}" for n, p in CELLS])
 def test_nothing_goes_wrong(name: str, phase: Phase) -> None:
     result = flown(name, phase)
-    assert not result.reason.startswith("unforeseen"), result
     assert result.counted == (), result
+    assert PROMISE_OF[name].is_kept(result), result
+
+
+def test_each_fault_stands_under_one_line_of_the_readme() -> None:
+    named = [fault for promise in PROMISES for fault in promise.faults]
+    assert sorted(named) == sorted(BY_NAME)
+
+
+def test_a_broken_promise_is_seen() -> None:
+    once = PROMISE_OF["operator-once"]
+    assert once.is_kept(made(1, "operator-once", Phase.ALIGN))
+    assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, end="aborted"))
+    assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, counted=("fell",)))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,129 @@
+"""What the README promises for when something goes wrong, and whether a flight keeps it.
+
+The README's table is drawn from `PROMISES`; each fault of the catalogue stands under one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from perchctl.faults.result import End, FaultResult
+
+DOWN: frozenset[End] = frozenset({"perched", "landed"})
+CUT: frozenset[End] = frozenset({"perched", "landed", "aborted"})
+UNCONFIRMED = "could not be confirmed"
+
+
+@dataclass(frozen=True)
+class Promise:
+    """`ends`: how a flight with one of the `faults` may end; `unseen`: also aborted, where the
+    landing was ordered and nobody saw it."""
+
+    what: str
+    happens: str
+    faults: tuple[str, ...]
+    ends: frozenset[End] = DOWN
+    unseen: bool = False
+
+    def is_kept(self, result: FaultResult) -> bool:
+        """Whether the flight ended as promised, and nothing avoidable went wrong in it."""
+        if result.counted or result.reason.startswith("unforeseen"):
+            return False
+        if self.unseen and result.end == "aborted" and UNCONFIRMED in result.reason:
+            return True
+        return result.unavoidable is not None or result.end in self.ends
+
+
+PROMISES = (
+    Promise(
+        "camera silent, frozen, snowing, dark, late",
+        "held after 0.5 s, landed after 3 s; in the ascent it backs off down",
+        ("camera-silent", "camera-frozen", "camera-snow", "camera-dark", "camera-late",
+         "camera-out-of-order"),
+    ),
+    Promise(
+        "picture mirrored, camera turned",
+        "landed within three decimetres, and the key of the profile is named",
+        ("camera-mirrored", "camera-turned"),
+    ),
+    Promise(
+        "telemetry old, or a part of it; loop late or hanging",
+        "held after 0.3 s, landed after 1 s; nothing old proves a contact or a landing",
+        ("downlink-silent", "state-block-dead", "attitude-block-dead", "telemetry-delayed",
+         "slow", "hung"),
+        unseen=True,
+    ),
+    Promise(
+        "link lost",
+        "a landing is ordered, for which the link is opened once more; a silent vehicle levels "
+        "out at 0.5 s and cuts at 2 s by itself, except in its own landing",
+        ("uplink-silent", "link-silent"), CUT,
+    ),
+    Promise(
+        "a packet lost or sent twice, at any order",
+        "nothing: what must arrive is sent again until it shows",
+        ("landing-lost", "notify-lost", "stop-lost", "stop-notify-lost", "packet-twice"),
+    ),
+    Promise(
+        "battery low under load for 1.5 s, its reading frozen",
+        "no new attempt, landing; a reading that stands still lands after 90 s",
+        ("battery-low", "battery-sags", "battery-reading-frozen", "battery-block-dead"),
+    ),
+    Promise(
+        "state estimate jumps, drifts, is no number",
+        "held for 0.5 s, then landed where it is; what the magnet holds goes on",
+        ("estimate-jumps", "height-jumps", "estimate-drifts", "estimate-nan",
+         "external-position", "variance-block-dead"),
+        unseen=True,
+    ),
+    Promise(
+        "heading jumps by more than 40 deg",
+        "down at once, level, by thrust alone",
+        ("heading-jumps",),
+    ),
+    Promise(
+        "a blow, a gust, a weak motor",
+        "flown out; back to the alignment when it is beside the target",
+        ("kick", "gust", "motor-weak"),
+    ),
+    Promise(
+        "no magnet, a weak one, a slip",
+        "caught, one attempt less; the motors stop only after a second of the whole weight",
+        ("no-magnet", "weak-magnet", "magnet-lets-go"),
+    ),
+    Promise(
+        "pressed against something for 0.7 s, ceiling bare or elsewhere",
+        "backs off down, or lands when it was the take-off; lands when nothing is found",
+        ("low-bare-ceiling", "bare-ceiling", "ceiling-unusual", "ceiling-beside-its-plane"),
+    ),
+    Promise(
+        "target moved, a second one",
+        "followed, or landed after the attempts",
+        ("target-moves", "second-target"),
+    ),
+    Promise(
+        "Ctrl-C once, held, terminal closed",
+        "landed; where the magnet holds on, left hanging and said so",
+        ("operator-once", "operator-held", "hang-up"),
+    ),
+    Promise(
+        "Ctrl-C twice",
+        "motors cut and locked, repeated until it shows",
+        ("operator-twice", "emergency-stop-lost"), CUT,
+    ),
+    Promise(
+        "disk full, or hanging",
+        "flies on, says so, and exits with 60 where all else went well",
+        ("disk-full",),
+    ),
+    Promise(
+        "perchctl suspended, killed",
+        "in the air the firmware cuts after 2 s and locks, but finishes its own landing; the log "
+        "reads up to its last record",
+        ("suspended", "killed"), CUT | {"gone"},
+    ),
+    Promise("perchctl itself fails", "the vehicle is landed first, whatever was raised", ()),
+    Promise("tumbled, crashed, locked", "stop; the message says to inspect and restart", ()),
+)  # fmt: skip
+
+PROMISE_OF = {fault: promise for promise in PROMISES for fault in promise.faults}
