@@ -14,6 +14,8 @@ from perchctl.mission.state import Condition, Phase
 from perchctl.vehicle import FULL_THRUST
 
 DESCENDED_M = 0.1
+DRIFTED_M = 0.02
+"""So far the estimate may have drifted up from the contact, and a slip counts all the same."""
 PRESSED_M = 0.08
 """A setpoint so far above a vehicle that stands still presses it against something."""
 HARD_CLIMB_MPS = 0.27
@@ -115,11 +117,9 @@ def _slipping(c: Context) -> bool:
     complete, tel = c.profile.planner.complete, c.obs.telemetry
     if c.state.contact_z_m is None:
         return False
-    below_m = c.state.contact_z_m - tel.position_m[2]
-    if below_m > -0.02 and tel.velocity_mps[2] < -0.12:
-        return True
-    sinking = tel.velocity_mps[2] < -0.15
-    return sinking and (below_m > complete.slip_m or tel.acc_z_g < complete.slip_acc_g)
+    above_m = tel.position_m[2] - c.state.contact_z_m
+    sinking = tel.velocity_mps[2] < -complete.slip_mps
+    return sinking and (above_m < DRIFTED_M or tel.acc_z_g < complete.slip_acc_g)
 
 
 def _still(c: Context) -> bool:
@@ -174,7 +174,11 @@ def _estimated(c: Context) -> bool:
 
 
 def _tilted(c: Context) -> bool:
-    return c.tilt_rad > math.radians(c.profile.safety.max_tilt_deg)
+    """By attitudes that are fresh; the position's packet does not matter to it."""
+    safety = c.profile.safety
+    if c.obs.t_s - c.obs.telemetry.t_s > safety.proof_age_s:
+        return False
+    return c.tilt_rad > math.radians(safety.max_tilt_deg)
 
 
 def _down(c: Context) -> bool:

@@ -9,7 +9,6 @@ from perchctl.mission.context import Context
 from perchctl.mission.mounting import explained
 from perchctl.mission.state import Condition, Phase
 
-SLIP_DWELL_S = 0.03
 FALLING_MPS = -0.05
 HUNG_WITHIN_M = 0.3
 BELOW_S = 0.3
@@ -79,7 +78,7 @@ def has_slipped(c: Context) -> bool:
     falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
     if falls and c.proves and tel.velocity_mps[2] < FALLING_MPS:
         return True
-    return c.held(Condition.SLIPPING) >= SLIP_DWELL_S
+    return c.held(Condition.SLIPPING) >= complete.slip_dwell_s
 
 
 def unsure(c: Context) -> str:

@@ -98,6 +98,8 @@ class CompleteConfig(Section):
     hang_s: float = Field(1.0, ge=0.3, le=10)
     release_timeout_s: float = Field(8.0, gt=0, le=30)
     slip_m: float = Field(0.03, gt=0, le=0.3)
+    slip_mps: float = Field(0.12, gt=0, le=1)
+    slip_dwell_s: float = Field(0.03, ge=0, le=0.5)
     slip_acc_g: float = Field(0.5, gt=0, lt=1)
     watch_s: float = Field(1.5, gt=0, le=60)
 

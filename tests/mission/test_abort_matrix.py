@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from perchctl.mission import planner
 from perchctl.mission.state import (
@@ -28,10 +30,12 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     StopMotors,
+    Telemetry,
 )
 from tests.helpers.mission import (
     AIRBORNE,
     CEILING_M,
+    HOVER_THRUST,
     PROFILE,
     READY,
     observation,
@@ -221,7 +225,7 @@ def test_nothing_but_search_ascent_and_perch_climbs() -> None:
 
 def test_no_stop_without_contact_tumble_word_or_attitude() -> None:
     """Motors stop only on proof: nothing else in the table leads to a stop."""
-    for phase in FLYING_PHASES:
+    for phase in ALL:
         state = _begin(phase, "")
         for i in range(1, 300):
             obs = observation(10.0 + 0.02 * i, state.entry_m[2])
@@ -455,3 +459,129 @@ def test_what_presses_when_its_way_down_begins_is_remembered() -> None:
         state, _ = planner.step(state, obs, PROFILE)
         assert state.phase is Phase.LANDING
         assert state.pressed is pressed
+
+
+# --- A landing stops no motor but on the floor's or the ceiling's proof ------------------------
+
+Bit = tuple[int, float, float, float, float, float]
+"""Ticks, and what is observed for them: height, climb, acceleration, thrust, age."""
+
+BITS = st.tuples(
+    st.integers(3, 70),
+    st.sampled_from([0.02, 0.1, 0.25, 0.6, 1.0, HANG_Z_M - 0.05, HANG_Z_M]),
+    st.sampled_from([0.0, 0.0, 0.0, -0.3]),
+    st.sampled_from([1.0, 1.0, 1.0, 0.3]),
+    st.sampled_from([0.0, 0.0, 1000.0, 20000.0, 33000.0, 56000.0]),
+    st.sampled_from([0.01, 0.01, 0.01, 0.15, 0.5]),
+)
+STATES: tuple[dict[str, object], ...] = (
+    {},
+    {"contact_z_m": HANG_Z_M},
+    {"contact_z_m": HANG_Z_M, "released_s": 9.9},
+    {"orders": 2, "ordered_s": 9.9},
+    {"hover_thrust": 0.0},
+)
+
+
+def _was_fresh(seen: list[Observation], for_s: float) -> list[Observation] | None:
+    """What was observed in that time, None unless there was something, all of it fresh."""
+    now_s = seen[-1].t_s
+    recent = [o for o in seen if o.t_s >= now_s - for_s - 1e-6]
+    long_enough = now_s - recent[0].t_s >= for_s - 1e-6
+    fresh = all(o.t_s - o.telemetry.t_s <= PROFILE.safety.proof_age_s + 1e-9 for o in recent)
+    return recent if long_enough and fresh else None
+
+
+def _at_rest(tel: Telemetry) -> bool:
+    return abs(tel.velocity_mps[2]) < 0.05 and abs(tel.acc_z_g - 1.0) <= 0.12
+
+
+def on_the_floor(seen: list[Observation], entry_z_m: float) -> bool:
+    """Half a second at rest, down, away from the target, on what could not carry it."""
+    recent = _was_fresh(seen, 0.5)
+    return recent is not None and all(
+        _at_rest(o.telemetry)
+        and o.telemetry.thrust <= 0.6 * HOVER_THRUST
+        and o.telemetry.position_m[2] < max(0.3, entry_z_m - 0.1)
+        and o.telemetry.position_m[2] < HANG_Z_M - 0.3
+        for o in recent
+    )
+
+
+def on_the_ceiling(seen: list[Observation]) -> bool:
+    """The whole weight for as long as it takes, where the target is or the contact was."""
+    recent = _was_fresh(seen, PROFILE.planner.complete.hang_s)
+    return recent is not None and all(
+        _at_rest(o.telemetry) and o.telemetry.thrust <= 5000.0 for o in recent
+    )
+
+
+@settings(max_examples=400)
+@given(
+    bits=st.lists(BITS, min_size=1, max_size=6),
+    begin=st.sampled_from(STATES),
+    doubt=st.sampled_from([{}, {"jumped": True}, {"link_problem": "gone"}, {"loop_late_s": 0.5}]),
+    flying=st.booleans(),
+)
+def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
+    bits: list[Bit], begin: dict[str, object], doubt: dict[str, object], flying: bool
+) -> None:
+    state = replace(state_in(Phase.LANDING), **begin)  # type: ignore[arg-type]
+    seen: list[Observation] = []
+    t_s = 10.0
+    for ticks, z_m, climb_mps, acc_g, thrust, age_s in bits:
+        for _ in range(ticks):
+            t_s += 0.02
+            tel = telemetry(
+                t_s - age_s, z_m, velocity_mps=(0.0, 0.0, climb_mps), acc_z_g=acc_g,
+                thrust=thrust, supervisor=AIRBORNE if flying else READY,
+            )  # fmt: skip
+            obs = observation(t_s, telemetry=tel, **doubt)
+            seen.append(obs)
+            entry_z_m = state.entry_m[2]
+            state, command = planner.step(state, obs, PROFILE)
+            assert not isinstance(command, EmergencyStop)
+            if isinstance(command, StopMotors):
+                floor = on_the_floor(seen, entry_z_m)
+                assert floor or ((begin or state.released_s) and on_the_ceiling(seen))
+                return
+            if state.phase is not Phase.LANDING:
+                return
+
+
+@pytest.mark.parametrize("z_m", [0.02, HANG_Z_M])
+def test_a_landing_that_is_proven_stops_the_motors(z_m: float) -> None:
+    """What the test above looks for does happen."""
+    begin = STATES[2] if z_m > 1.0 else {"orders": 1, "ordered_s": 9.9}
+    state = replace(state_in(Phase.LANDING), **begin)  # type: ignore[arg-type]
+    sent: list[object] = []
+    for i in range(1, 120):
+        tel = telemetry(10.0 + 0.02 * i, z_m, thrust=1000.0)
+        state, command = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        sent.append(command)
+    assert any(isinstance(c, StopMotors) for c in sent)
+
+
+# --- How old a word may be -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bit", [LOCKED, TUMBLED, CRASHED])
+def test_the_supervisors_word_has_no_age(bit: int) -> None:
+    """Whoever was locked before the telemetry stopped has its motors off: no landing is flown."""
+    state = state_in(Phase.ALIGN)
+    last = telemetry(10.0, supervisor=AIRBORNE | bit)
+    state, command = planner.step(state, observation(10.5, telemetry=last), PROFILE)
+    assert state.phase is Phase.ABORTED
+    assert isinstance(command, StopMotors)
+
+
+@pytest.mark.parametrize("phase", sorted(ALL, key=lambda p: p.value))
+def test_an_old_tilt_cuts_no_motor(phase: Phase) -> None:
+    """A gust tilts it, and then the telemetry stays away: nothing says that it still is."""
+    state = _begin(phase, "")
+    last = telemetry(10.0, state.entry_m[2], roll_rad=1.2)
+    for i in range(1, 80):
+        obs = observation(10.0 + 0.02 * i, telemetry=last)
+        state, command = planner.step(state, obs, PROFILE)
+        assert not isinstance(command, EmergencyStop | StopMotors)
+        assert state.phase is not Phase.ABORTED
