@@ -161,7 +161,7 @@ MEANINGS = {
     "planner.complete.slip_m": "hanging: at most so far below the contact",
     "planner.complete.slip_mps": "a slip: sinking faster",
     "planner.complete.slip_dwell_s": "a slip: for so long; a free fall is answered at once",
-    "planner.complete.slip_acc_g": "a free fall, or a slip wherever the estimate is: less than this",
+    "planner.complete.slip_acc_g": "a free fall, or a slip wherever the estimate is: less",
     "planner.complete.watch_s": "after the motor stop, before it counts as perched",
     "planner.recover.descend_m": "below where the attempt ended",
     "planner.recover.dwell_s": "for which it must be steady",
