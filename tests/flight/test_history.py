@@ -112,11 +112,14 @@ def test_a_flight_is_no_jump(way: float, mps: float, mps2: float, every: int) ->
     assert not jumped(*samples)
 
 
-def test_a_heading_that_jumps_lands() -> None:
-    rig = Rig(Vehicle(lambda s: replace(s, yaw_rad=1.0 if s.t_s > 1.5 else 0.0)))
+@pytest.mark.parametrize(
+    ("yaw_rad", "words"), [(0.4, "the state estimate jumped"), (1.0, "heading jumped: down level")]
+)
+def test_a_heading_that_jumps_lands(yaw_rad: float, words: str) -> None:
+    rig = Rig(Vehicle(lambda s: replace(s, yaw_rad=yaw_rad if s.t_s > 1.5 else 0.0)))
     report = rig.fly()
     assert report.outcome is Outcome.SAFETY
-    assert "the state estimate jumped" in report.reason
+    assert words in report.reason
 
 
 def test_an_estimate_that_is_no_number_for_long_is_stale() -> None:
