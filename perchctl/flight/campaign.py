@@ -106,9 +106,11 @@ def job_processes(jobs: int) -> Iterator[Executor]:
     except BaseException:
         with uninterrupted():
             executor.shutdown(wait=False, cancel_futures=True)
-            for child in context.active_children():
+            children = context.active_children()
+            for child in children:
                 child.terminate()
-            executor.shutdown(wait=True)
+            for child in children:
+                child.join()
         raise
     executor.shutdown()
 
