@@ -24,7 +24,7 @@ from perchctl.mission.guidance import (
     walk,
 )
 from perchctl.mission.landing import landing
-from perchctl.mission.release import Acted, catch, let_go, lower, stop_motors
+from perchctl.mission.release import Acted, catch, left_contact, let_go, lower, stop_motors
 from perchctl.mission.state import Condition, MotorStop, Phase
 from perchctl.vehicle import (
     EmergencyStop,
@@ -34,6 +34,7 @@ from perchctl.vehicle import (
     StopMotors,
 )
 
+AWAY_M = 0.05
 BLOCKED_ROOM_M = 0.1
 """How far a search keeps from what it once was pressed against."""
 WARY_MPS, WARY_M = 0.25, 0.2
@@ -182,6 +183,7 @@ def _recover(c: Context) -> Acted:
     along, so no controller is reset; the setpoint is below at once."""
     if (caught := catch(c)) is not None:
         return caught
+    c = left_contact(c, AWAY_M)
     state, away = unpressed(c)
     if away is not None:
         return state, away

@@ -15,7 +15,14 @@ from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import has_slipped
 from perchctl.mission.guidance import hold_here, limited, unpressed, walk
 from perchctl.mission.level import can_level, level_down
-from perchctl.mission.release import CATCH_STILL_ABOVE_M, Acted, catch, let_go, stop_motors
+from perchctl.mission.release import (
+    CATCH_STILL_ABOVE_M,
+    Acted,
+    catch,
+    left_contact,
+    let_go,
+    stop_motors,
+)
 from perchctl.mission.state import Condition
 from perchctl.profile import LandingConfig
 from perchctl.vehicle import Idle, Land, Telemetry
@@ -55,7 +62,8 @@ def landing(c: Context) -> Acted:
     state = c.state
     if state.stopped_s is not None:
         return _hang_on(c) if state.contact_z_m is not None else stop_motors(c)
-    if not state.caught and (caught := catch(c)) is not None:
+    level = state.heading_lost and can_level(c)
+    if not level and not state.caught and (caught := catch(c)) is not None:
         return caught
     if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
         return stop_motors(c)
@@ -63,8 +71,8 @@ def landing(c: Context) -> Acted:
         return _hang_on(c)
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
-    if state.heading_lost and can_level(c):
-        return level_down(_left_contact(c))
+    if level:
+        return level_down(left_contact(c, PEELED_M))
     state, away = unpressed(c)
     if away is not None and not _doubtful(c):
         return state, away
@@ -132,16 +140,8 @@ def _by_setpoints(c: Context) -> Acted:
     # A vehicle that does not follow is not pulled by a setpoint that runs away from it,
     # beyond what takes the thrust down to its least.
     setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - 0.35))
-    state = replace(_left_contact(c).state, setpoint=setpoint, caught=True)
+    state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
     return state, limited(c, setpoint)
-
-
-def _left_contact(c: Context) -> Context:
-    """Seen below the contact, it is free of the magnet."""
-    contact_z_m = c.state.contact_z_m
-    if contact_z_m is None or c.obs.telemetry.position_m[2] >= contact_z_m - PEELED_M:
-        return c
-    return Context(replace(c.state, contact_z_m=None), c.obs, c.profile)
 
 
 def _by_itself(c: Context) -> Acted:

@@ -39,5 +39,7 @@ def level_down(c: Context) -> Acted:
         before = state.level_thrust or hover
         thrust = min(thrust, before - RAMP_PER_S * hover * dt_s)
     thrust = max(0.4 * hover, min(60000.0, thrust))
-    state = replace(state, hover_thrust=hover, level_thrust=thrust, setpoint=None, orders=0)
+    state = replace(
+        state, hover_thrust=hover, level_thrust=thrust, setpoint=None, orders=0, caught=True
+    )
     return state, RawThrust(int(thrust))

@@ -167,11 +167,14 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
             return replace(new, contact_z_m=obs.telemetry.position_m[2], released_s=None)
         case Phase.RECOVER:
             still = old.released_s is not None or old.stopped_s is not None
-            blocked_z_m = obs.telemetry.position_m[2] if new.row == "blocked" else old.blocked_z_m
+            z_m = obs.telemetry.position_m[2]
+            blocked_z_m = z_m if new.row == "blocked" else old.blocked_z_m
+            touched = old.phase is Phase.PERCH or new.row == "blocked"
             return replace(
                 new,
                 stopped_s=None,
-                contact_z_m=None,
+                # In the magnet's reach until it is seen below.
+                contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
                 caught=new.row != "slipped",
                 catch_above_m=CATCH_STILL_ABOVE_M if still else CATCH_TURNING_ABOVE_M,

@@ -96,3 +96,11 @@ def catch(c: Context) -> Acted | None:
         )
         return replace(state, setpoint=setpoint), limited(c, setpoint)
     return None
+
+
+def left_contact(c: Context, below_m: float) -> Context:
+    """Seen so far below the contact, it is free of the magnet."""
+    contact_z_m = c.state.contact_z_m
+    if contact_z_m is None or c.obs.telemetry.position_m[2] >= contact_z_m - below_m:
+        return c
+    return Context(replace(c.state, contact_z_m=None), c.obs, c.profile)

@@ -287,7 +287,8 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "recovered", _only(P.RECOVER),
-        lambda c: c.held(C.STEADY) >= c.profile.planner.recover.dwell_s
+        lambda c: c.state.contact_z_m is None
+        and c.held(C.STEADY) >= c.profile.planner.recover.dwell_s
         and c.in_phase_s >= c.profile.planner.recover.dwell_s,
         P.ESTIMATE, "steady again, trying once more",
     ),
