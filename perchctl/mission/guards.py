@@ -11,6 +11,7 @@ from perchctl.mission.state import Condition, Phase
 
 FALLING_MPS = -0.05
 HUNG_WITHIN_M = 0.3
+HIGH_M, STAYED_M = 0.45, 0.15
 BELOW_S = 0.3
 WEAK_S = 2.0
 
@@ -64,6 +65,16 @@ def still_at_contact(c: Context) -> bool:
     if contact_z_m is None or not c.proves:
         return False
     return contact_z_m - c.obs.telemetry.position_m[2] <= HUNG_WITHIN_M
+
+
+def hangs_in_landing(c: Context) -> bool:
+    """With its motors off where the magnet had it, or where the landing began, up there: what
+    has not come down is not on the floor, whether or not a contact was noticed."""
+    z_m, ground = c.obs.telemetry.position_m[2], c.state.ground_m
+    began_m = c.state.entry_m[2]
+    high = began_m - (ground[2] if ground else 0.0) > HIGH_M
+    stayed = c.proves and high and began_m - z_m < STAYED_M
+    return stayed or still_at_contact(c)
 
 
 def settling_too_long(c: Context) -> bool:

@@ -16,9 +16,9 @@ from perchctl.mission.guards import has_slipped
 from perchctl.mission.guidance import hold_here, limited, unpressed, walk
 from perchctl.mission.level import can_level, level_down
 from perchctl.mission.release import (
-    CATCH_STILL_ABOVE_M,
     Acted,
     catch,
+    catch_above_m,
     left_contact,
     let_go,
     stop_motors,
@@ -39,6 +39,7 @@ comes out at 0.35 m/s at most."""
 PEEL_BLIND_S = 4.0
 MOST_DRIFT_M = 1.0
 PEELED_M = 0.1
+DROPPING_MPS = -0.35
 """Below the contact by so much, the magnet has let go."""
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
@@ -69,6 +70,8 @@ def landing(c: Context) -> Acted:
         return stop_motors(c)
     if state.released_s is not None:
         return _hang_on(c)
+    if _drops(c):
+        return _caught_again(c)
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
     if level:
@@ -86,16 +89,27 @@ def landing(c: Context) -> Acted:
 def _hang_on(c: Context) -> Acted:
     """Released or stopped at the ceiling; a slip is caught, and the landing goes on below."""
     if has_slipped(c):
-        tel = c.obs.telemetry
-        state = replace(
-            c.state, released_s=None, stopped_s=None, contact_z_m=None, caught=False,
-            catch_above_m=CATCH_STILL_ABOVE_M,
-            setpoint=None, ordered_s=None, orders=0,
-            entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
-        )  # fmt: skip
-        c = Context(state, c.obs, c.profile)
-        return catch(c) or _by_setpoints(c)
+        return _caught_again(c)
     return let_go(c) if c.state.stopped_s is None else stop_motors(c)
+
+
+def _drops(c: Context) -> bool:
+    """Peeled off with too little thrust left to go on down slowly."""
+    at_ceiling = c.state.contact_z_m is not None and c.state.orders == 0
+    return at_ceiling and c.proves and c.obs.telemetry.velocity_mps[2] < DROPPING_MPS
+
+
+def _caught_again(c: Context) -> Acted:
+    """It is free of the magnet, and falls: the landing begins anew below."""
+    tel = c.obs.telemetry
+    state = replace(
+        c.state, released_s=None, stopped_s=None, contact_z_m=None, caught=False, pressed=False,
+        catch_above_m=catch_above_m(c.state.hover_thrust, tel.thrust),
+        setpoint=None, ordered_s=None, orders=0,
+        entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
+    )  # fmt: skip
+    c = Context(state, c.obs, c.profile)
+    return catch(c) or _by_setpoints(c)
 
 
 def _is_peeling(c: Context) -> bool:

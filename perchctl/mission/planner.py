@@ -16,7 +16,7 @@ from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, ho
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
 from perchctl.mission.mounting import MountWatch, Sight, watched
-from perchctl.mission.release import CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M
+from perchctl.mission.release import catch_above_m
 from perchctl.mission.state import (
     TERMINALS,
     Condition,
@@ -27,6 +27,10 @@ from perchctl.mission.state import (
 from perchctl.mission.table import IN_THE_OPEN, TABLE, Row, first_match, risen
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, PositionSetpoint
+
+HOVER_WITHIN = 0.2
+_LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
+Place = tuple[float, float, float]
 
 
 def start(obs: Observation) -> PlannerState:
@@ -63,7 +67,7 @@ def is_over(state: PlannerState) -> bool:
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     state = _with_target(state, obs)
     if obs.jumped:
-        state = _jumped(state, obs)
+        state = _jumped(state, obs, obs.t_s - state.t_s)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
         # Where no hover thrust was learned yet, the present one has to do.
         hover = state.hover_thrust or obs.telemetry.thrust
@@ -73,23 +77,40 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     since = conditions_since(context)
     if state.hold:
         since = _kept(since)  # a held vehicle proves nothing: the dwell times begin anew
-    if state.phase in (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND) and hovers(context):
+    # Near the target an ascent may press against a ceiling that is lower than thought.
+    away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
+    if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
+    state = replace(state, last_m=obs.telemetry.position_m)
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
 
-def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
-    """The estimate's world has moved. What is held by the magnet has not: its references are
-    where the estimate has it now."""
-    if state.contact_z_m is not None:
-        tel = obs.telemetry
-        x, y, z = tel.position_m
-        setpoint = state.setpoint
-        if setpoint is not None:
-            below_m = setpoint.z_m - state.contact_z_m
-            setpoint = PositionSetpoint(x, y, z + below_m, tel.yaw_rad)
-        state = replace(state, contact_z_m=z, entry_m=(x, y, z), setpoint=setpoint)
-    return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
+def _jumped(state: PlannerState, obs: Observation, dt_s: float) -> PlannerState:
+    """The estimate's world has moved, the vehicle has not: ground, contact and what else is
+    remembered are where the estimate has them now, and it is held where it is."""
+    tel, last = obs.telemetry, state.last_m
+    if last is None:
+        return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
+    x, y, z = tel.position_m
+    vx, vy, vz = tel.velocity_mps
+    step = (x - last[0] - vx * dt_s, y - last[1] - vy * dt_s, z - last[2] - vz * dt_s)
+    setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
+    if setpoint is not None:
+        z_m = z if contact_z_m is None else setpoint.z_m + step[2]
+        setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
+    return replace(
+        state,
+        setpoint=setpoint,
+        ground_m=None if state.ground_m is None else _moved(state.ground_m, step),
+        entry_m=_moved(state.entry_m, step),
+        contact_z_m=None if contact_z_m is None else contact_z_m + step[2],
+        blocked_z_m=None if blocked_z_m is None else blocked_z_m + step[2],
+        jump_s=obs.t_s if state.jump_s is None else state.jump_s,
+    )
+
+
+def _moved(place: Place, step: Place) -> Place:
+    return (place[0] + step[0], place[1] + step[1], place[2] + step[2])
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -128,6 +149,8 @@ def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     thrust = obs.telemetry.thrust
     if state.hover_thrust == 0.0:
         return thrust
+    if abs(thrust / state.hover_thrust - 1.0) > HOVER_WITHIN:
+        return state.hover_thrust  # held by the ceiling, or by a hand: nothing hovers on that
     part = min(1.0, (obs.t_s - state.t_s) / 1.5)
     return state.hover_thrust + part * (thrust - state.hover_thrust)
 
@@ -166,7 +189,6 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
         case Phase.COMPLETE:
             return replace(new, contact_z_m=obs.telemetry.position_m[2], released_s=None)
         case Phase.RECOVER:
-            still = old.released_s is not None or old.stopped_s is not None
             z_m = obs.telemetry.position_m[2]
             blocked_z_m = z_m if new.row == "blocked" else old.blocked_z_m
             touched = old.phase is Phase.PERCH or new.row == "blocked"
@@ -177,7 +199,7 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
                 caught=new.row != "slipped",
-                catch_above_m=CATCH_STILL_ABOVE_M if still else CATCH_TURNING_ABOVE_M,
+                catch_above_m=catch_above_m(old.hover_thrust, obs.telemetry.thrust),
                 blocked_z_m=blocked_z_m,
             )
         case Phase.LANDING if old.phase is Phase.PERCH:

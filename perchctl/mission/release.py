@@ -82,6 +82,12 @@ def stop_motors(c: Context) -> Acted:
     return state, Idle()
 
 
+def catch_above_m(hover_thrust: float, thrust: float) -> float:
+    """How far above the falling vehicle the setpoint is that stops it."""
+    turning = thrust > 0.5 * hover_thrust
+    return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
+
+
 def catch(c: Context) -> Acted | None:
     """After a slip: far above until it hardly sinks, then held where it is; None when it
     is caught. (A setpoint below would cost the change of mode its height.)"""

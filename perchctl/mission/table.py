@@ -9,6 +9,7 @@ from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import (
     attempts_used,
     fence_broken,
+    hangs_in_landing,
     hangs_stopped,
     has_slipped,
     is_blocked,
@@ -16,7 +17,6 @@ from perchctl.mission.guards import (
     mounted_wrong,
     searched_out,
     settling_too_long,
-    still_at_contact,
     stopped_for_s,
     too_weak,
     unsure,
@@ -300,7 +300,7 @@ TABLE: tuple[Row, ...] = (
     # --- landing ---------------------------------------------------------------
     Row(
         "hung", _only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and still_at_contact(c), P.PERCHED,
+        lambda c: c.held(C.DOWN) >= 0.1 and hangs_in_landing(c), P.PERCHED,
         "the magnet holds: hanging with the motors off",
     ),
     Row(
