@@ -45,7 +45,7 @@ STOP_AFTER_S = 0.1
 """For so long the operator's stop is left to the loop, whose row records it."""
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 SINKING_MPS = -0.1
-SLIP_M, SLIP_MPS = 0.008, -0.12
+SLIP_M = 0.008
 STILL_MPS = 0.06
 PEEL_BELOW_M = 0.35
 
@@ -81,6 +81,7 @@ class Watchdog:
         self._landing = profile.planner.landing
         self._land_s = profile.safety.loop_late_land_s
         self._top_m = profile.safety.max_height_m
+        self._slip_mps = profile.planner.complete.slip_mps
         self._operator = operator
         self._turn: Turn | None = None
         self._closing = False
@@ -218,7 +219,7 @@ class Watchdog:
         x, y, z = known.position_m
         sink_mps = known.velocity_mps[2]
         if self._slipped_s is None:
-            if turn.held_m - z <= SLIP_M or sink_mps >= SLIP_MPS:
+            if turn.held_m - z <= SLIP_M or sink_mps >= -self._slip_mps:
                 return None
             self._slipped_s = now_s
         if self._held is not None or sink_mps >= 0.0 or now_s - self._slipped_s > CATCH_LIMIT_S:

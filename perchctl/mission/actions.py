@@ -1,4 +1,4 @@
-"""What each phase sends: one small function a phase, (view) -> (state, command).
+"""What each phase sends: one small function a phase, (context) -> (state, command).
 
 Before each command ask: what if it is the last packet? A position setpoint left
 alone levels out after 0.5 s and is cut after 2 s (docs/firmware.md, "When setpoints
@@ -24,7 +24,15 @@ from perchctl.mission.guidance import (
     walk,
 )
 from perchctl.mission.landing import landing
-from perchctl.mission.release import Acted, catch, left_contact, let_go, lower, stop_motors
+from perchctl.mission.release import (
+    Acted,
+    catch,
+    is_still,
+    left_contact,
+    let_go,
+    lower,
+    stop_motors,
+)
 from perchctl.mission.state import Condition, MotorStop, Phase
 from perchctl.vehicle import (
     EmergencyStop,
@@ -35,6 +43,7 @@ from perchctl.vehicle import (
 )
 
 AWAY_M = 0.05
+"""Below the contact by so much, or by half of the descent, a vehicle has left the ceiling."""
 BLOCKED_ROOM_M = 0.1
 """How far a search keeps from what it once was pressed against."""
 WARY_MPS, WARY_M = 0.25, 0.2
@@ -56,7 +65,8 @@ def _fly_to(c: Context, reference: PositionSetpoint, *, lift: bool = True) -> Ac
 def _walk_to(
     c: Context, goal: PositionSetpoint, *, up_mps: float = 0.0, down_mps: float = 0.4
 ) -> Acted:
-    """Only SEARCH and ASCEND pass an `up_mps`, and PERCH presses: nothing else climbs."""
+    """Only SEARCH and ASCEND pass an `up_mps`. What else climbs: APPROACH, the press of PERCH,
+    and the catch of a slip."""
     return _fly_to(c, _walked(c, goal, up_mps, down_mps))
 
 
@@ -183,11 +193,11 @@ def _recover(c: Context) -> Acted:
     along, so no controller is reset; the setpoint is below at once."""
     if (caught := catch(c)) is not None:
         return caught
-    c = left_contact(c, AWAY_M)
+    recover = c.profile.planner.recover
+    c = left_contact(c, min(AWAY_M, 0.5 * recover.descend_m))
     state, away = unpressed(c)
     if away is not None:
         return state, away
-    recover = c.profile.planner.recover
     if not state.caught:
         x, y, z = c.obs.telemetry.position_m  # from where it sinks no more
         state = replace(state, caught=True, setpoint=None, entry_m=(x, y, z + recover.descend_m))
@@ -209,7 +219,8 @@ def _terminal(c: Context) -> Acted:
 
 
 def _aborted(c: Context) -> Acted:
-    """The motors, once, as the row that aborted wants it."""
+    """The motors, once, as the row that aborted wants it. What hangs with its motors still
+    would be locked 2 s after the stream's end: it gets the pair that prevents that."""
     if c.state.orders:
         return c.state, Idle()
     state = replace(c.state, orders=1, ordered_s=c.obs.t_s)
@@ -219,7 +230,7 @@ def _aborted(c: Context) -> Acted:
         case MotorStop.PLAIN:
             return state, StopMotors()
         case MotorStop.NONE:
-            return state, Idle()
+            return state, StopMotors() if is_still(c) else Idle()
 
 
 ACTIONS: dict[Phase, Callable[[Context], Acted]] = {

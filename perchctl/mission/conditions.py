@@ -13,7 +13,7 @@ from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
 from perchctl.vehicle import FULL_THRUST
 
-DESCENDED_M, STAYED_M = 0.1, 0.1
+DESCENDED_M, HELD_WITHIN_M = 0.1, 0.1
 DRIFTED_M = 0.02
 """So far the estimate may have drifted up from the contact, and a slip counts all the same."""
 PRESSED_M = 0.08
@@ -149,7 +149,9 @@ def _hanging(c: Context) -> bool:
     )
     at_target = c.obs.target is not None and abs(c.error_z_m) <= 0.15
     # A landing that does not come down is held, wherever the target was thought to be.
-    stayed = c.state.phase is Phase.LANDING and c.state.entry_m[2] - tel.position_m[2] < STAYED_M
+    stayed = (
+        c.state.phase is Phase.LANDING and c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M
+    )
     return (
         c.state.hover_thrust > 0
         and tel.thrust <= complete.hold_ratio * c.state.hover_thrust

@@ -61,10 +61,11 @@ def hangs_stopped(c: Context) -> bool:
 def still_at_contact(c: Context) -> bool:
     """Where the magnet has it: a slip ends the contact at once, and what the estimate drifts
     while it hangs blind is less than this."""
-    contact_z_m = c.state.contact_z_m
+    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
     if contact_z_m is None or not c.proves:
         return False
-    return contact_z_m - c.obs.telemetry.position_m[2] <= HUNG_WITHIN_M
+    falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
+    return not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M
 
 
 def hangs_in_landing(c: Context) -> bool:

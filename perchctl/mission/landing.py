@@ -33,14 +33,13 @@ LEAST_ORDERS, MAX_ORDERS = 3, 6
 is cut (docs/firmware.md, "Order without notify"): no telemetry tells a lost notify, so the
 pair is sent three times, and more often while nothing shows."""
 PLANNED_MPS, SETTLING_S = 0.35, 1.8
-"""The quintic's largest speed, and time added for the begin: the change to the vehicle's own
-trajectory resets its controller, and what it then catches up with must be slow. Touchdown
-comes out at 0.35 m/s at most."""
-PEEL_BLIND_S = 4.0
+"""The quintic's largest speed, and time added for its begin: it starts at rest, while the
+vehicle comes sinking, and what the vehicle then catches up with must be slow."""
 MOST_DRIFT_M = 1.0
 PEELED_M = 0.1
-DROPPING_MPS = -0.35
 """Below the contact by so much, the magnet has let go."""
+PEEL_BLIND_S = 4.0
+DROPPING_MPS = -0.35
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 

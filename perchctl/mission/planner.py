@@ -67,7 +67,7 @@ def is_over(state: PlannerState) -> bool:
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     state = _with_target(state, obs)
     if obs.jumped:
-        state = _jumped(state, obs, obs.t_s - state.t_s)
+        state = _jumped(state, obs)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
         # Where no hover thrust was learned yet, the present one has to do.
         hover = state.hover_thrust or obs.telemetry.thrust
@@ -81,19 +81,21 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
     if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    state = replace(state, last_m=obs.telemetry.position_m)
+    state = replace(state, last=obs.telemetry)
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
 
-def _jumped(state: PlannerState, obs: Observation, dt_s: float) -> PlannerState:
+def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
     """The estimate's world has moved, the vehicle has not: ground, contact and what else is
     remembered are where the estimate has them now, and it is held where it is."""
-    tel, last = obs.telemetry, state.last_m
+    tel, last = obs.telemetry, state.last
     if last is None:
         return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
     x, y, z = tel.position_m
     vx, vy, vz = tel.velocity_mps
-    step = (x - last[0] - vx * dt_s, y - last[1] - vy * dt_s, z - last[2] - vz * dt_s)
+    dt_s = tel.t_s - last.t_s
+    lx, ly, lz = last.position_m
+    step = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
     if setpoint is not None:
         z_m = z if contact_z_m is None else setpoint.z_m + step[2]

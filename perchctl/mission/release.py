@@ -26,7 +26,6 @@ STOPS, STOP_PERIOD_S, STOP_AGAIN_S = 5, 0.1, 0.5
 CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
 """Motors that stand still need all the thrust there is. Those that turn with most of it
 would carry the vehicle back to the ceiling, beside the target's centre."""
-UNSEEN_S = 3.0
 CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
 CAUGHT_MPS = -0.1
 """By then the thrust is above the weight, and goes on rising until the setpoint is below."""
@@ -60,13 +59,17 @@ def let_go(c: Context) -> Acted:
     assert state.released_s is not None
     if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s:
         return stop_motors(c)
-    least_s = complete.ramp_s + complete.hang_s + UNSEEN_S
-    if not c.proves and c.obs.t_s - state.released_s > least_s:
-        return stop_motors(c)  # still for seconds by order: the pair only keeps it from locking
     part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
     start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
     start = min(start, THRUST_MIN)
     return state, RawThrust(int(start + part * (STILL_THRUST - start)))
+
+
+def is_still(c: Context) -> bool:
+    """Whether the motors stand still by raw thrust: what stops them then only ends the stream
+    in a way that does not lock."""
+    released_s = c.state.released_s
+    return released_s is not None and c.obs.t_s - released_s > c.profile.planner.complete.ramp_s
 
 
 def stop_motors(c: Context) -> Acted:

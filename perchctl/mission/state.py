@@ -174,7 +174,7 @@ class PlannerState:
     orders: int = 0
     stopped_s: float | None = None  # first order to stop the motors
     jump_s: float | None = None
-    last_m: tuple[float, float, float] | None = None  # position of the turn before
+    last: Telemetry | None = None  # of the turn before
     heading_lost: bool = False  # position control would lead away from its setpoint
     level_thrust: float = 0.0  # raw thrust of a level way down
     hold: str = ""  # why the vehicle is held in place, empty when it is not
