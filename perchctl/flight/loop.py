@@ -68,10 +68,15 @@ def fly(parts: FlightParts) -> FlightReport:
         return _mission(parts, senses, watchdog)
     except BaseException as error:
         watchdog.rescuing()
-        landing, newest = parts.profile.planner.landing, senses.history.newest
-        flown_s = parts.clock.now() - started_s
         safe = rescue(
-            parts.link, parts.clock, landing, parts.operator, newest, senses.ground_z_m, flown_s
+            parts.link,
+            parts.clock,
+            parts.profile.planner.landing,
+            parts.operator,
+            senses.history.newest,
+            senses.ground_z_m,
+            flown_s=parts.clock.now() - started_s,
+            held_m=watchdog.held_m,
         )
         _tell_rescue(parts, error, safe)
         raise

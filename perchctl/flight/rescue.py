@@ -7,10 +7,18 @@ from collections.abc import Callable
 from perchctl.flight.clock import Clock
 from perchctl.link.evidence import is_known, motors_may_run
 from perchctl.link.protocol import Link
-from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S, own_landing
+from perchctl.mission.landing import (
+    LEAST_ORDERS,
+    MAX_ORDERS,
+    PEEL_BELOW_M,
+    PEEL_BLIND_S,
+    PEELED_M,
+    REPEAT_ORDER_S,
+    own_landing,
+)
 from perchctl.mission.state import Operator
 from perchctl.profile import LandingConfig
-from perchctl.vehicle import HL_ACTIVE, EmergencyStop, Telemetry
+from perchctl.vehicle import HL_ACTIVE, EmergencyStop, PositionSetpoint, Telemetry
 
 LOOK_S = 0.5
 """For so long a vehicle must be seen with its motors off before a rescue leaves it."""
@@ -25,12 +33,14 @@ def rescue(
     known: Telemetry | None,
     ground_z_m: float = 0.0,
     flown_s: float = 0.0,
+    held_m: float | None = None,
 ) -> bool:
     """Order a landing and wait for it, bounded; whether the motors were seen off at the end.
     The landing needs no further packet once it is under way.
 
     `known` is the newest telemetry the loop has taken in, `ground_z_m` the height of the
-    ground in the estimate, `flown_s` for how long it has flown. On
+    ground in the estimate, `flown_s` for how long it has flown. What the ceiling held at
+    `held_m` is first peeled off: its own landing would run by the clock, and end up there. On
     the ground it is looked at again for `LOOK_S`: a take-off just begun does not show at once.
     """
     newest = known
@@ -45,6 +55,12 @@ def rescue(
         newest = samples[-1] if samples else newest
         if motors_may_run(newest, now_s):
             off_since_s = now_s
+            if orders == 0 and now_s < start_s + PEEL_BLIND_S:
+                peel = _peel(newest, now_s, held_m)
+                if peel is not None:
+                    link.send(peel)
+                    clock.wait_until(now_s + PERIOD_S)
+                    continue
             under_way = newest is not None and is_known(newest, now_s) and newest.has(HL_ACTIVE)
             seen = under_way and orders >= LEAST_ORDERS
             due = orders == 0 or (not seen and now_s - ordered_s > REPEAT_ORDER_S)
@@ -55,3 +71,13 @@ def rescue(
             return True
         clock.wait_until(now_s + PERIOD_S)
     return False
+
+
+def _peel(newest: Telemetry | None, now_s: float, held_m: float | None) -> PositionSetpoint | None:
+    """Below where it was held, until it is seen there."""
+    if newest is None or held_m is None:
+        return None
+    x, y, z = newest.position_m
+    if is_known(newest, now_s) and z < held_m - PEELED_M:
+        return None
+    return PositionSetpoint(x, y, held_m - PEEL_BELOW_M, newest.yaw_rad)

@@ -26,7 +26,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.link.evidence import is_cut, is_known, motors_may_run
-from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEELED_M, REPEAT_ORDER_S, own_landing
+from perchctl.mission.landing import (
+    LEAST_ORDERS,
+    MAX_ORDERS,
+    PEEL_BELOW_M,
+    PEELED_M,
+    REPEAT_ORDER_S,
+    own_landing,
+)
 from perchctl.mission.release import CATCH_LIMIT_S, CATCH_STILL_ABOVE_M, THRUST_MIN
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.profile import Profile
@@ -47,7 +54,6 @@ CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 SINKING_MPS = -0.1
 SLIP_M = 0.008
 STILL_MPS = 0.06
-PEEL_BELOW_M = 0.35
 
 
 @dataclass(frozen=True)
@@ -124,6 +130,11 @@ class Watchdog:
     def end(self, *, motors_off: bool) -> None:
         """The flight is over; `motors_off` where that is proven."""
         self._closing, self._motors_off = True, motors_off
+
+    @property
+    def held_m(self) -> float | None:
+        """Height of the body where the ceiling holds it, as of the last turn."""
+        return None if self._turn is None else self._turn.held_m
 
     # --- the link's side ---------------------------------------------------------------
 

@@ -38,7 +38,7 @@ vehicle comes sinking, and what the vehicle then catches up with must be slow.""
 MOST_DRIFT_M = 1.0
 PEELED_M = 0.1
 """Below the contact by so much, the magnet has let go."""
-PEEL_BLIND_S = 4.0
+PEEL_BELOW_M, PEEL_BLIND_S = 0.35, 4.0
 DROPPING_MPS = -0.35
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
@@ -152,7 +152,7 @@ def _by_setpoints(c: Context) -> Acted:
     )
     # A vehicle that does not follow is not pulled by a setpoint that runs away from it,
     # beyond what takes the thrust down to its least.
-    setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - 0.35))
+    setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
     state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
     return state, limited(c, setpoint)
 

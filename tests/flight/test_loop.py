@@ -15,7 +15,7 @@ from perchctl.flight import loop, senses
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
-from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS
+from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEEL_BLIND_S
 from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
@@ -228,9 +228,9 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry | None) -> None:
+    def rescue(self, known: Telemetry | None, **more: Any) -> None:
         landing = self.profile.planner.landing
-        rescue(self.link, self.clock or Clock(self.link), landing, self.operator, known)
+        rescue(self.link, self.clock or Clock(self.link), landing, self.operator, known, **more)
 
     def refused(self, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):
@@ -342,6 +342,27 @@ def test_a_failure_while_hanging_with_the_motors_off_starts_nothing() -> None:
     rig.rescue(telemetry(1.0, 2.0, thrust=0.0))
     assert rig.link.sent == []
     assert rig.link.now_s < 2.0
+
+
+def test_a_rescue_at_the_ceiling_peels_off_first() -> None:
+    """The vehicle's own landing would run by its clock and end up there, motors off."""
+    pressed = Vehicle()
+    pressed.z_m, pressed.motors = 2.0, True
+    rig = Rig(pressed)
+    rig.rescue(telemetry(0.0, 2.0), held_m=2.0)
+    first = rig.link.sent[0][1]
+    assert isinstance(first, PositionSetpoint)
+    assert first.z_m < 1.8
+    assert rig.link.said(Land)[0] > rig.link.said(PositionSetpoint)[-1]
+    assert rig.link.z_m == 0.0
+
+
+def test_a_rescue_of_what_does_not_peel_off_lands_all_the_same() -> None:
+    stuck = Vehicle(lambda s: replace(s, position_m=(0.0, 0.0, 2.0)))
+    stuck.z_m, stuck.motors = 2.0, True
+    rig = Rig(stuck)
+    rig.rescue(telemetry(0.0, 2.0), held_m=2.0)
+    assert PEEL_BLIND_S <= rig.link.said(Land)[0] < PEEL_BLIND_S + 0.2
 
 
 def test_the_rescue_is_bounded() -> None:
