@@ -25,6 +25,8 @@ AIRBORNE = READY | FLYING
 HOVER_THRUST = 56000.0
 CEILING_M = 2.2
 PROFILE = Profile()
+HANG_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
+"""Height of the body that hangs with its gear at the target."""
 
 
 def telemetry(t_s: float, z_m: float = 1.0, **changes: object) -> Telemetry:

@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from perchctl.mission import planner
 from perchctl.mission.state import (
@@ -30,12 +28,11 @@ from perchctl.vehicle import (
     PositionSetpoint,
     RawThrust,
     StopMotors,
-    Telemetry,
 )
 from tests.helpers.mission import (
     AIRBORNE,
     CEILING_M,
-    HOVER_THRUST,
+    HANG_Z_M,
     PROFILE,
     READY,
     observation,
@@ -270,8 +267,6 @@ def test_the_perch_ends_by_itself(mode: str) -> None:
 
 # --- What may stop the motors ------------------------------------------------------------
 
-HANG_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
-
 
 def hanging(phase: Phase = Phase.COMPLETE) -> PlannerState:
     """The thrust is released as far as position mode goes, and the magnet holds."""
@@ -423,162 +418,6 @@ def test_unknown_is_not_on_the_ground() -> None:
     assert orders >= 1
 
 
-def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
-    """After a minute of drift the estimate has it at 0.4 m: come down, carried by something
-    that is not the ceiling, and still."""
-    state = state_in(Phase.LANDING, z_m=1.5)
-    for i in range(1, 60):
-        t_s = 10.0 + 0.02 * i
-        tel = telemetry(t_s, 0.4, thrust=20000.0)
-        state, command = planner.step(state, observation(t_s, telemetry=tel), PROFILE)
-        if isinstance(command, StopMotors):
-            break
-    assert 0.5 <= t_s - 10.0 < 0.7
-
-
-@pytest.mark.parametrize("phase", [Phase.LANDING, Phase.RECOVER])
-def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: Phase) -> None:
-    """The integrators that a second of full thrust has wound up hold it there for seconds."""
-    state = replace(state_in(phase, z_m=1.0), pressed=True)
-    tel = telemetry(10.02, 1.0, thrust=65535.0)
-    state, command = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
-    assert isinstance(command, PositionSetpoint)
-    assert command.z_m < 0.2
-    away = telemetry(10.5, 0.85, thrust=45000.0, velocity_mps=(0.0, 0.0, -0.1))
-    state, command = planner.step(state, observation(10.5, telemetry=away), PROFILE)
-    assert not state.pressed
-    assert isinstance(command, PositionSetpoint)
-    assert command.z_m > 0.4
-
-
-def test_what_presses_when_its_way_down_begins_is_remembered() -> None:
-    for thrust, pressed in ((65535.0, True), (42000.0, False)):
-        state = state_in(Phase.SEARCH, z_m=1.0)
-        tel = telemetry(10.02, 1.0, thrust=thrust)
-        obs = observation(10.02, telemetry=tel, operator=Operator.LAND)
-        state, _ = planner.step(state, obs, PROFILE)
-        assert state.phase is Phase.LANDING
-        assert state.pressed is pressed
-
-
-# --- A landing stops no motor but on the floor's or the ceiling's proof ------------------------
-
-Bit = tuple[int, float, float, float, float, float]
-"""Ticks, and what is observed for them: height, climb, acceleration, thrust, age."""
-
-BITS = st.tuples(
-    st.integers(3, 70),
-    st.sampled_from([0.02, 0.1, 0.25, 0.6, 1.0, HANG_Z_M - 0.05, HANG_Z_M]),
-    st.sampled_from([0.0, 0.0, 0.0, -0.3]),
-    st.sampled_from([1.0, 1.0, 1.0, 0.3]),
-    st.sampled_from([0.0, 0.0, 1000.0, 20000.0, 33000.0, 56000.0]),
-    st.sampled_from([0.01, 0.01, 0.01, 0.15, 0.5]),
-)
-STATES: tuple[dict[str, object], ...] = (
-    {},
-    {"contact_z_m": HANG_Z_M},
-    {"contact_z_m": HANG_Z_M, "released_s": 9.9},
-    {"orders": 2, "ordered_s": 9.9},
-    {"hover_thrust": 0.0},
-)
-
-
-def _was_fresh(seen: list[Observation], for_s: float) -> list[Observation] | None:
-    """What was observed in that time, None unless there was something, all of it fresh."""
-    now_s = seen[-1].t_s
-    recent = [o for o in seen if o.t_s >= now_s - for_s - 1e-6]
-    long_enough = now_s - recent[0].t_s >= for_s - 1e-6
-    fresh = all(o.t_s - o.telemetry.t_s <= PROFILE.safety.proof_age_s + 1e-9 for o in recent)
-    return recent if long_enough and fresh else None
-
-
-def _at_rest(tel: Telemetry) -> bool:
-    return abs(tel.velocity_mps[2]) < 0.05 and abs(tel.acc_z_g - 1.0) <= 0.12
-
-
-def on_the_floor(seen: list[Observation], ground_z_m: dict[float, float], entry_m: float) -> bool:
-    """Half a second at rest, down, away from the target, on what could not carry it. Heights
-    are over the ground, which steps with the estimate: `ground_z_m` by time, and the landing
-    began at `entry_m`."""
-    recent = _was_fresh(seen, 0.5)
-    return recent is not None and all(
-        _at_rest(o.telemetry)
-        and o.telemetry.thrust <= 0.6 * HOVER_THRUST
-        and o.telemetry.position_m[2] - ground_z_m[o.t_s] < max(0.3, entry_m - 0.1) + 1e-9
-        and o.telemetry.position_m[2] < HANG_Z_M - 0.3
-        for o in recent
-    )
-
-
-def on_the_ceiling(seen: list[Observation]) -> bool:
-    """The whole weight for as long as it takes, where the target is or the contact was."""
-    recent = _was_fresh(seen, PROFILE.planner.complete.hang_s)
-    return recent is not None and all(
-        _at_rest(o.telemetry) and o.telemetry.thrust <= 5000.0 for o in recent
-    )
-
-
-@settings(max_examples=400)
-@given(
-    bits=st.lists(BITS, min_size=1, max_size=6),
-    begin=st.sampled_from(STATES),
-    doubt=st.sampled_from([{}, {"jumped": True}, {"link_problem": "gone"}, {"loop_late_s": 0.5}]),
-    flying=st.booleans(),
-)
-def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
-    bits: list[Bit], begin: dict[str, object], doubt: dict[str, object], flying: bool
-) -> None:
-    state = replace(state_in(Phase.LANDING), **begin)  # type: ignore[arg-type]
-    seen: list[Observation] = []
-    ground_z_m: dict[float, float] = {}
-    t_s = 10.0
-    for ticks, z_m, climb_mps, acc_g, thrust, age_s in bits:
-        for _ in range(ticks):
-            t_s += 0.02
-            tel = telemetry(
-                t_s - age_s, z_m, velocity_mps=(0.0, 0.0, climb_mps), acc_z_g=acc_g,
-                thrust=thrust, supervisor=AIRBORNE if flying else READY,
-            )  # fmt: skip
-            obs = observation(t_s, telemetry=tel, **doubt)
-            seen.append(obs)
-            state, command = planner.step(state, obs, PROFILE)
-            assert not isinstance(command, EmergencyStop)
-            assert state.ground_m is not None
-            ground_z_m[t_s] = state.ground_m[2]
-            if isinstance(command, StopMotors):
-                floor = on_the_floor(seen, ground_z_m, state.entry_m[2] - state.ground_m[2])
-                assert floor or ((begin or state.released_s) and on_the_ceiling(seen))
-                return
-            if state.phase is not Phase.LANDING:
-                return
-
-
-@pytest.mark.parametrize("z_m", [0.02, HANG_Z_M])
-def test_a_landing_that_is_proven_stops_the_motors(z_m: float) -> None:
-    """What the test above looks for does happen."""
-    begin = STATES[2] if z_m > 1.0 else {"orders": 1, "ordered_s": 9.9}
-    state = replace(state_in(Phase.LANDING), **begin)  # type: ignore[arg-type]
-    sent: list[object] = []
-    for i in range(1, 120):
-        tel = telemetry(10.0 + 0.02 * i, z_m, thrust=1000.0)
-        state, command = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
-        sent.append(command)
-    assert any(isinstance(c, StopMotors) for c in sent)
-
-
-# --- How old a word may be -----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("bit", [LOCKED, TUMBLED, CRASHED])
-def test_the_supervisors_word_has_no_age(bit: int) -> None:
-    """Whoever was locked before the telemetry stopped has its motors off: no landing is flown."""
-    state = state_in(Phase.ALIGN)
-    last = telemetry(10.0, supervisor=AIRBORNE | bit)
-    state, command = planner.step(state, observation(10.5, telemetry=last), PROFILE)
-    assert state.phase is Phase.ABORTED
-    assert isinstance(command, StopMotors)
-
-
 @pytest.mark.parametrize("phase", sorted(ALL, key=lambda p: p.value))
 def test_an_old_tilt_cuts_no_motor(phase: Phase) -> None:
     """A gust tilts it, and then the telemetry stays away: nothing says that it still is."""
@@ -589,41 +428,3 @@ def test_an_old_tilt_cuts_no_motor(phase: Phase) -> None:
         state, command = planner.step(state, obs, PROFILE)
         assert not isinstance(command, EmergencyStop | StopMotors)
         assert state.phase is not Phase.ABORTED
-
-
-def test_what_hangs_teaches_no_hover_thrust() -> None:
-    """Stuck to the ceiling on a third of the thrust, it would seem to hover on that, and its
-    hanging would never be noticed."""
-    state = state_in(Phase.ASCEND)
-    for i in range(1, 200):
-        tel = telemetry(10.0 + 0.02 * i, 1.0, thrust=20000.0)
-        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
-        assert state.hover_thrust > 0.8 * HOVER_THRUST
-
-
-@pytest.mark.parametrize("begin", [Phase.ESTIMATE, Phase.RECOVER])
-def test_what_has_not_come_down_is_not_landed(begin: Phase) -> None:
-    """Its own landing ended up there, motors off: it hangs, and is said to."""
-    state = replace(state_in(Phase.LANDING, z_m=1.8), orders=3, ordered_s=9.9)
-    for i in range(1, 40):
-        tel = telemetry(10.0 + 0.02 * i, 1.8, thrust=0.0, supervisor=READY)
-        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
-    assert state.phase is Phase.PERCHED
-    assert "hanging" in state.reason
-
-
-@pytest.mark.parametrize("step_m", [-0.6, 0.7])
-def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) -> None:
-    """The vehicle has not moved: held where it is, over a ground that is as far below."""
-    state = state_in(Phase.ALIGN)
-    for i in range(1, 4):
-        state, _ = planner.step(state, observation(10.0 + 0.02 * i), PROFILE)
-    assert state.ground_m is not None
-    ground_m = state.ground_m[2]
-    tel = telemetry(10.08, 1.0 + step_m)
-    obs = observation(10.08, telemetry=tel, jumped=True)
-    state, command = planner.step(state, obs, PROFILE)
-    assert isinstance(command, PositionSetpoint)
-    assert command.z_m == pytest.approx(1.0 + step_m, abs=0.02)
-    assert state.ground_m is not None
-    assert state.ground_m[2] == pytest.approx(ground_m + step_m, abs=0.02)
