@@ -16,7 +16,7 @@ from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, ho
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
 from perchctl.mission.mounting import MountWatch, Sight, watched
-from perchctl.mission.release import catch_above_m
+from perchctl.mission.release import catch_above_m, is_carried
 from perchctl.mission.state import (
     TERMINALS,
     Condition,
@@ -200,7 +200,7 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
-                caught=new.row != "slipped",
+                caught=new.row != "slipped" or is_carried(old.hover_thrust, obs.telemetry.thrust),
                 catch_above_m=catch_above_m(old.hover_thrust, obs.telemetry.thrust),
                 blocked_z_m=blocked_z_m,
             )

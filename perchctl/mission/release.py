@@ -27,6 +27,9 @@ CATCH_STILL_ABOVE_M, CATCH_TURNING_ABOVE_M = 1.0, 0.2
 """Motors that stand still need all the thrust there is. Those that turn with most of it
 would carry the vehicle back to the ceiling, beside the target's centre."""
 CATCH_LEAST_S, CATCH_LIMIT_S = 0.1, 2.0
+CARRIED_RATIO = 0.85
+"""Of the hover thrust: what still has so much sinks, and is let sink by its own controller. More
+thrust would bring it back to the ceiling, beside the target's centre."""
 CAUGHT_MPS = -0.1
 """By then the thrust is above the weight, and goes on rising until the setpoint is below."""
 
@@ -89,6 +92,11 @@ def catch_above_m(hover_thrust: float, thrust: float) -> float:
     """How far above the falling vehicle the setpoint is that stops it."""
     turning = thrust > 0.5 * hover_thrust
     return CATCH_TURNING_ABOVE_M if turning else CATCH_STILL_ABOVE_M
+
+
+def is_carried(hover_thrust: float, thrust: float) -> bool:
+    """Whether what slips hardly falls: most of the weight was on the motors."""
+    return thrust >= CARRIED_RATIO * hover_thrust
 
 
 def catch(c: Context) -> Acted | None:
