@@ -88,7 +88,7 @@ class Detections:
     large: Detection | None = None
     small: Detection | None = None
     full_frame: bool = True  # False: found in the predicted window
-    mirrored: bool = False  # the small marker decoded as its mirror image
+    mirrored: bool = False  # a marker decoded as its mirror image
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
     edge_shift: EdgeShift | None = None

@@ -19,6 +19,7 @@ from perchctl.vision.markers.drawing import drawing_of
 from perchctl.vision.markers.pattern import Pattern, Rim, pattern_of, rim_of_bits
 from perchctl.vision.types import MarkerName
 
+MIRROR_INDEX = 1
 _PRINT_M = 2e-5  # half a dot of a printer
 _MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, of 640 px
 _LOOSE_PERIMETER_RATE = 0.05
@@ -43,14 +44,13 @@ _LOOSE_THRESHOLDS = Thresholds(15, 35)
 class DetectorSetup:
     """What `detect` needs, made once by `make_detector`; nothing in it changes later.
 
-    `dictionaries` are the large and the small marker's; `mirror_index` is the mirror
-    image's place in the small marker's (None where it could be confused with the marker
-    itself), `patterns` how each marker looks, `ratio` the small marker's side over the
+    `dictionaries` are the large and the small marker's, each with the marker and, behind it
+    (`MIRROR_INDEX`), its mirror image where that cannot be confused with the marker
+    itself; `patterns` is how each marker looks, `ratio` the small marker's side over the
     large one's; the rest is the profile's.
     """
 
     dictionaries: tuple[Any, Any]
-    mirror_index: int | None
     patterns: dict[MarkerName, Pattern]
     ratio: float
     refinement: str
@@ -66,19 +66,12 @@ class DetectorSetup:
 def make_detector(config: DetectorConfig, target: TargetConfig) -> DetectorSetup:
     """Dictionaries of just the target's ids, and how its markers look."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
-    small_patterns = [small_bits]
-    mirror_index = None
-    mirror = np.ascontiguousarray(small_bits[:, ::-1])
-    if _distance(mirror, small_bits) > 2 * config.correction_bits_small + 1:
-        mirror_index = len(small_patterns)
-        small_patterns.append(mirror)
     ratio = target.small.side_m / target.large.side_m
     return DetectorSetup(
         dictionaries=(
-            _dictionary([large_bits], config.correction_bits_large),
-            _dictionary(small_patterns, config.correction_bits_small),
+            _dictionary(large_bits, config.correction_bits_large),
+            _dictionary(small_bits, config.correction_bits_small),
         ),
-        mirror_index=mirror_index,
         patterns={
             "large": pattern_of(
                 _rim(large_bits, target.large.side_m), drawing_of(large_bits, small_bits, ratio)
@@ -129,10 +122,13 @@ def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
 
 
-def _dictionary(patterns: list[NDArray[np.uint8]], correction_bits: int) -> Any:
+def _dictionary(bits: NDArray[np.uint8], correction_bits: int) -> Any:
+    patterns, mirror = [bits], np.ascontiguousarray(bits[:, ::-1])
+    if _distance(mirror, bits) > 2 * correction_bits + 1:
+        patterns.append(mirror)
     rows = [cv2.aruco.Dictionary.getByteListFromBits(np.ascontiguousarray(p)) for p in patterns]
     return cv2.aruco.Dictionary(
-        np.ascontiguousarray(np.concatenate(rows)), patterns[0].shape[0], correction_bits
+        np.ascontiguousarray(np.concatenate(rows)), bits.shape[0], correction_bits
     )
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.markers.detector import (
+    MIRROR_INDEX,
     OPENCV_THRESHOLDS,
     QUICK_THRESHOLDS,
     DetectorSetup,
@@ -117,7 +118,7 @@ def _pass(
     candidates: dict[MarkerName, list[Array]] = {"large": [], "small": []}
     mirrored = False
     for quad, index, dictionary in zip(corners, ids.ravel(), which.ravel(), strict=True):
-        if dictionary == 1 and index == setup.mirror_index:
+        if index == MIRROR_INDEX:
             mirrored = True
             continue
         name = MARKERS[int(dictionary)]

@@ -42,8 +42,13 @@ def test_a_picture_without_a_target_gives_nothing() -> None:
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_mirrored_picture_is_recognised_and_not_measured(axis: int) -> None:
-    image = np.ascontiguousarray(np.flip(render(*pose_of(0.0, 0.0, 0.3, 0.4)), axis=axis))
+@pytest.mark.parametrize("markers", [("large", "small"), ("large",), ("small",)])
+def test_a_mirrored_picture_is_recognised_and_not_measured(
+    axis: int, markers: tuple[str, ...]
+) -> None:
+    """By either marker: far away the small one cannot be read."""
+    picture = render(*pose_of(0.0, 0.0, 0.3, 0.4), markers=markers)
+    image = np.ascontiguousarray(np.flip(picture, axis=axis))
     found = detect(frame(image), None, SETUP, CAMERA)
     assert found.mirrored
     assert found.large is None

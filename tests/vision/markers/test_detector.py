@@ -6,19 +6,21 @@ import numpy as np
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
 from perchctl.profile.dictionaries import predefined
 from perchctl.vision.markers.detect import detect, make_detector
+from perchctl.vision.markers.detector import MIRROR_INDEX
 from tests.helpers.markers import frame
 from tests.helpers.target_picture import CAMERA
 
 
-def test_a_small_marker_like_its_own_mirror_image_gives_no_hint() -> None:
+def test_a_marker_like_its_own_mirror_image_gives_no_hint() -> None:
     target = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=0, side_m=0.025))
-    assert make_detector(DetectorConfig(), TargetConfig()).mirror_index == 1
+    usual = make_detector(DetectorConfig(), TargetConfig())
+    assert [len(d.bytesList) for d in usual.dictionaries] == [1 + MIRROR_INDEX, 1 + MIRROR_INDEX]
     setup = make_detector(DetectorConfig(), target)
     bits = predefined("DICT_ARUCO_ORIGINAL")
     grid = cv2.aruco.Dictionary.getBitsFromByteList(np.ascontiguousarray(bits.bytesList[0:1]), 5)
     symmetric = any(np.array_equal(np.rot90(grid, k), grid[:, ::-1]) for k in range(4))
     assert symmetric
-    assert setup.mirror_index is None
+    assert [len(d.bytesList) for d in setup.dictionaries] == [1 + MIRROR_INDEX, 1]
 
 
 def test_correction_bits_are_the_profiles() -> None:
