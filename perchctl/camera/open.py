@@ -13,7 +13,8 @@ from perchctl.errors import InvalidValue, NotFound, TimedOut
 ALLOWED = "camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, sim:"
 
 FIRST_FRAME_WITHIN_S = 8.0
-_SCHEMES = ("camera:", "video:", "images:", "http://", "https://", "sim:")
+SCHEMES = ("camera", "video", "images", "http", "https", "sim")
+RECORDED = ("video", "images")
 
 
 def source_spec(source: str) -> str:
@@ -21,7 +22,7 @@ def source_spec(source: str) -> str:
 
     Errors: NotFound for a path that is not there.
     """
-    if source.startswith(_SCHEMES):
+    if scheme_of(source) in SCHEMES:
         return source
     path = Path(source).expanduser()
     if path.is_dir() or any(c in source for c in "*?["):
@@ -36,9 +37,15 @@ def source_spec(source: str) -> str:
     return source  # `open_source` names what is allowed
 
 
+def scheme_of(spec: str) -> str:
+    """What stands before the colon; the empty string where there is none."""
+    scheme, colon, _ = spec.partition(":")
+    return scheme if colon else ""
+
+
 def is_live(spec: str) -> bool:
     """Whether the source runs in real time (cameras and streams), else it is a recording."""
-    return not spec.startswith(("video:", "images:"))
+    return scheme_of(spec) not in RECORDED
 
 
 def open_source(

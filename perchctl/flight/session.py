@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from perchctl.calibration.files import load_calibration
 from perchctl.camera.mirror import UnmirroredSource
-from perchctl.camera.open import ALLOWED, open_source
+from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
 from perchctl.camera.source import FrameSource
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError
 from perchctl.flight.clock import WallClock
@@ -28,9 +28,6 @@ from perchctl.vision.types import CameraModel
 
 if TYPE_CHECKING:
     from perchctl.sim.process.handle import SimProcess
-
-SOURCE_SCHEMES = ("camera", "video", "images", "http", "https", "sim")
-RECORDED = ("video", "images")
 
 
 @dataclass(frozen=True)
@@ -60,14 +57,14 @@ class SessionResult:
 def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
-    if options.source.partition(":")[0] not in SOURCE_SCHEMES:
+    if scheme_of(options.source) not in SCHEMES:
         raise InvalidValue(f"camera source {options.source!r} is unknown; allowed are {ALLOWED}")
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
             f"source {options.source} belongs to the simulated vehicle, but the URI is "
             f"{options.uri}; name the camera with --source (camera:N, http://...)"
         )
-    if options.source.partition(":")[0] in RECORDED and not options.simulated:
+    if not is_live(options.source) and not options.simulated:
         raise UsageError(
             f"source {options.source} is a recording, and {options.uri} a real vehicle: it would "
             f"be steered by pictures of another flight; fly sim://, or name a camera with --source"
