@@ -17,13 +17,14 @@ UNCONFIRMED = "could not be confirmed"
 @dataclass(frozen=True)
 class Promise:
     """`ends`: how a flight with one of the `faults` may end; `unseen`: also aborted, where the
-    landing was ordered and nobody saw it."""
+    landing was ordered and nobody saw it; `names`: what its last sentence says, unless it perched."""
 
     what: str
     happens: str
     faults: tuple[str, ...]
     ends: frozenset[End] = DOWN
     unseen: bool = False
+    names: str = ""
 
     def is_kept(self, result: FaultResult) -> bool:
         """Whether the flight ended as promised, and nothing avoidable went wrong in it."""
@@ -31,6 +32,8 @@ class Promise:
             return False
         if self.unseen and result.end == "aborted" and UNCONFIRMED in result.reason:
             return True
+        if result.end != "perched" and self.names not in result.reason:
+            return False
         return result.unavoidable is not None or result.end in self.ends
 
 
@@ -42,13 +45,18 @@ PROMISES = (
          "camera-out-of-order"),
     ),
     Promise(
-        "picture mirrored, camera turned",
-        "landed within three decimetres, and the key of the profile is named",
-        ("camera-mirrored", "camera-turned"),
+        "picture mirrored",
+        "not flown by; landed after the search, and `camera.mirrored` named",
+        ("camera-mirrored",), names="camera.mirrored",
+    ),
+    Promise(
+        "camera mounted 90 or 180 deg off",
+        "landed as soon as the target moves with the vehicle, and the turn that fits named",
+        ("camera-turned",), names="camera.mount",
     ),
     Promise(
         "telemetry old, or a part of it; loop late or hanging",
-        "held after 0.3 s, landed after 1 s; nothing old proves a contact or a landing",
+        "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a contact or a landing",
         ("downlink-silent", "state-block-dead", "attitude-block-dead", "telemetry-delayed",
          "slow", "hung"),
         unseen=True,

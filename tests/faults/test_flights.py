@@ -70,6 +70,11 @@ def test_a_broken_promise_is_seen() -> None:
     assert once.is_kept(made(1, "operator-once", Phase.ALIGN))
     assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, end="aborted"))
     assert not once.is_kept(made(1, "operator-once", Phase.ALIGN, counted=("fell",)))
+    turned = PROMISE_OF["camera-turned"]
+    assert turned.is_kept(
+        made(1, "camera-turned", Phase.ALIGN, reason="turn camera.mount by 90 deg")
+    )
+    assert not turned.is_kept(made(1, "camera-turned", Phase.ALIGN, reason="target not found"))
 
 
 @pytest.fixture(scope="module")
