@@ -17,7 +17,8 @@ UNCONFIRMED = "could not be confirmed"
 @dataclass(frozen=True)
 class Promise:
     """`ends`: how a flight with one of the `faults` may end; `unseen`: also aborted, where the
-    landing was ordered and nobody saw it; `names`: what its last sentence says, unless it perched."""
+    landing was ordered and nobody saw it; `names`: its last sentence says so,
+    unless it perched."""
 
     what: str
     happens: str
@@ -56,7 +57,8 @@ PROMISES = (
     ),
     Promise(
         "telemetry old, or a part of it; loop late or hanging",
-        "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a contact or a landing",
+        "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a contact or a "
+        "landing",
         ("downlink-silent", "state-block-dead", "attitude-block-dead", "telemetry-delayed",
          "slow", "hung"),
         unseen=True,
