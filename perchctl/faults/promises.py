@@ -57,8 +57,8 @@ PROMISES = (
     ),
     Promise(
         "telemetry old, or a part of it; loop late or hanging",
-        "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a contact or a "
-        "landing",
+        "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a "
+        "contact or a landing",
         ("downlink-silent", "state-block-dead", "attitude-block-dead", "telemetry-delayed",
          "slow", "hung"),
         unseen=True,

@@ -52,7 +52,7 @@ STOP_AFTER_S = 0.1
 """For so long the operator's stop is left to the loop, whose row records it."""
 CUT_PERIOD_S, MAX_CUTS = 0.1, 50
 SINKING_MPS = -0.1
-SLIP_M = 0.008
+SLIP_M = 0.008  # below where it was held; less is the estimate's noise
 STILL_MPS = 0.06
 
 
