@@ -5,13 +5,14 @@ Figures are drawn without pyplot, so nothing is kept open and no display is aske
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from perchctl.errors import InvalidValue
+from perchctl.files import write_files
 
 # Okabe and Ito's palette: told apart with any colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -28,8 +29,10 @@ def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
 
 
 def save_png(figure: Figure, file: Path | BinaryIO) -> None:
-    """Write the figure. Raises InvalidValue for a file that cannot be written."""
-    try:
-        figure.savefig(file, format="png", metadata={"Software": None})
-    except OSError as error:
-        raise InvalidValue(f"{file}: cannot be written: {error.strerror}") from None
+    """Write the figure; a file is there whole or not at all. Raises InvalidValue, NotFound."""
+    content = BytesIO()
+    figure.savefig(content, format="png", metadata={"Software": None})
+    if isinstance(file, Path):
+        write_files({file: content.getvalue()})
+    else:
+        file.write(content.getvalue())

@@ -8,13 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.errors import InvalidValue
+from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
 from perchctl.log.plot import plot_flight, title_of
 from perchctl.log.read import FlightLog, read_log
 from perchctl.log.summary import summary_of
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
+from tests.helpers.disk import full_disk
 
 
 @pytest.fixture(scope="module")
@@ -94,5 +95,13 @@ def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:
     empty = FlightLog(log.path, log.header, [], [], None, True)
     with pytest.raises(InvalidValue, match="no ticks"):
         plot_flight(empty, tmp_path / "f.png")
-    with pytest.raises(InvalidValue, match="cannot be written"):
+    with pytest.raises(NotFound, match=r"for folder\.png does not exist"):
         plot_flight(log, tmp_path / "no" / "folder.png")
+
+
+def test_a_full_disk_leaves_the_old_plot(log: FlightLog, tmp_path: Path) -> None:
+    png = tmp_path / "f.png"
+    png.write_bytes(b"old")
+    with full_disk(room=4_000), pytest.raises(InvalidValue, match="cannot be written"):
+        plot_flight(log, png)
+    assert [p.read_bytes() for p in tmp_path.glob("*.png")] == [b"old"]
