@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.connection import Connection, open_connection, send_packets
-from perchctl.link.encode import ARM, UNLOCK_THRUST, encode
+from perchctl.link.encode import ARM, UNLOCK_PERIOD_S, UNLOCK_THRUST, UNLOCK_TIMES, encode
 from perchctl.link.evidence import is_known, may_fly
 from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.prepare import check_firmware, set_parameters
@@ -130,7 +130,9 @@ class CflibLink:
             raise ConnectionFailed(
                 f"the vehicle at {self._uri} is flying already: land it before perchctl takes over"
             )
-        send_packets(connection.cf, UNLOCK_THRUST)
+        for _ in range(UNLOCK_TIMES):
+            send_packets(connection.cf, UNLOCK_THRUST)
+            time.sleep(UNLOCK_PERIOD_S)
 
     def _ask_guard(self) -> Command | None:
         """In the sender's thread."""

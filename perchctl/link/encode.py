@@ -89,4 +89,6 @@ ARM = (Packet(Port.SUPERVISOR, _REQUEST, bytes((_ARM, True))),)
 UNLOCK_THRUST = (_raw(0), _NOTIFY)
 """One zero-thrust packet since boot, on the ground, then the priority back: without the
 first a raw thrust stays 0, without the second the vehicle's own landing is not flown
-(docs/firmware.md, "Raw thrust")."""
+(docs/firmware.md, "Raw thrust"). Nothing tells whether it has arrived, and the first raw thrust
+in the air would be a cut: it is sent `UNLOCK_TIMES`."""
+UNLOCK_TIMES, UNLOCK_PERIOD_S = 5, 0.02

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
-from perchctl.link.encode import UNLOCK_THRUST, encode
+from perchctl.link.encode import UNLOCK_PERIOD_S, UNLOCK_THRUST, UNLOCK_TIMES, encode
 from perchctl.link.protocol import Guard
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
@@ -87,8 +87,9 @@ class MockLink:
 
     def connect(self) -> None:
         self.advance_to(self.now_s + SETTLE_S)
-        self._hand_over(UNLOCK_THRUST)
-        self.advance_to(self.now_s + 0.1)
+        for _ in range(UNLOCK_TIMES):
+            self._hand_over(UNLOCK_THRUST)
+            self.advance_to(self.now_s + UNLOCK_PERIOD_S)
 
     def telemetry(self) -> list[Telemetry]:
         self._collect()
