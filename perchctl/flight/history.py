@@ -40,7 +40,7 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
     samples = list(history.samples)
     jumped, turned_rad, changed = False, 0.0, history.battery_changed_s
     for sample in new:
-        if not _is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
+        if not is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
             continue
         if samples:
             jumped = jumped or _is_jump(samples, sample, safety)
@@ -128,6 +128,15 @@ def _between_s(a: Telemetry, b: Telemetry) -> float:
     return max(b.t_s - a.t_s, b.t_s - b.behind_s - (a.t_s - a.behind_s))
 
 
-def _is_finite(s: Telemetry) -> bool:
-    values = (*s.position_m, *s.velocity_mps, s.roll_rad, s.pitch_rad, s.yaw_rad, s.acc_z_g)
+def is_finite(s: Telemetry) -> bool:
+    """Whether all that a flight is steered by is a number."""
+    values = (
+        *s.position_m,
+        *s.velocity_mps,
+        s.roll_rad,
+        s.pitch_rad,
+        s.yaw_rad,
+        s.acc_z_g,
+        s.thrust,
+    )
     return all(math.isfinite(v) for v in values)

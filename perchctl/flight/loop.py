@@ -83,7 +83,7 @@ def fly(parts: FlightParts) -> FlightReport:
 
 
 def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
-    what = "landed, the motors are off"
+    what = "it is down, or hangs: the motors are off"
     if not safe:
         what = "a landing was ordered, but could not be confirmed: keep away from the vehicle"
     text = f"{type(error).__name__} in flight: {what}"
@@ -103,7 +103,7 @@ def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
         refuse(newest, parts.profile)
         waiting = still_waiting_for(
             newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
-            senses.target(now_s),
+            senses.target(now_s), 0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
         )  # fmt: skip
         if parts.source.finished:
             raise NotFound(

@@ -85,14 +85,18 @@ def still_waiting_for(
     waited_s: float,
     profile: Profile,
     target: TargetEstimate | None = None,
+    age_s: float = 0.0,
 ) -> str:
     """What is missing yet, or empty when ready. Errors: TimedOut past the bound, and
     SafetyAbort off the ground."""
     safety = profile.safety
     if telemetry is None:
         return _bounded("telemetry", waited_s, safety.estimator_wait_s)
+    if age_s > safety.telemetry_hold_s:
+        return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s,
+                        safety.estimator_wait_s)  # fmt: skip
     variance = telemetry.position_variance_m2
-    if variance is not None and variance > safety.estimator_variance_m2:
+    if variance is not None and not variance <= safety.estimator_variance_m2:
         return _bounded(
             f"the state estimate to settle (variance {variance:.3g} m^2, at most "
             f"{safety.estimator_variance_m2:g} allowed; is there a positioning system?)",

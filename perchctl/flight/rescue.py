@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from perchctl.flight.clock import Clock
+from perchctl.flight.history import is_finite
 from perchctl.link.evidence import is_known, motors_may_run
 from perchctl.link.protocol import Link
 from perchctl.mission.landing import (
@@ -52,7 +53,7 @@ def rescue(
             link.send(EmergencyStop())  # the link's guard repeats it
             return False
         samples = link.telemetry()
-        newest = samples[-1] if samples else newest
+        newest = next((s for s in reversed(samples) if is_finite(s)), newest)
         if motors_may_run(newest, now_s):
             off_since_s = now_s
             if orders == 0 and now_s < start_s + PEEL_BLIND_S:

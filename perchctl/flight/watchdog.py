@@ -17,7 +17,8 @@ What is safe to send again, by the last command (silence: since that command):
 
 From `safety.loop_late_land_s` on, or when the operator asks for it, a landing. From the
 ceiling it first peels off by a setpoint below; where the magnet holds all the same, the
-vehicle goes on hanging there with its motors ready.
+vehicle goes on hanging there with its motors ready. Without fresh telemetry the landing is
+ordered all the same: what hangs cannot be told from what flies.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from perchctl.link.evidence import is_cut, is_known, motors_may_run
+from perchctl.link.evidence import is_cut, is_placed, motors_may_run
 from perchctl.mission.landing import (
     LEAST_ORDERS,
     MAX_ORDERS,
@@ -154,7 +155,7 @@ class Watchdog:
         if silent_s < REPEAT_AFTER_S:
             self._revived()
             return None
-        known = newest if is_known(newest, now_s) else None
+        known = newest if is_placed(newest, now_s) else None
         late_s = now_s - turn.due_s
         if operator is Operator.LAND or late_s > self._land_s:
             self.overruled_s = max(self.overruled_s, late_s)

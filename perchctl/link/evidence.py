@@ -4,6 +4,8 @@ unknown counts as flying: `close` leaves the link by it, a rescue and the watchd
 
 from __future__ import annotations
 
+import math
+
 from perchctl.vehicle import FLYING, HL_ACTIVE, LOCKED, Telemetry
 
 FRESH_S = 0.3
@@ -12,6 +14,13 @@ FRESH_S = 0.3
 
 def is_known(newest: Telemetry | None, now_s: float) -> bool:
     return newest is not None and now_s - newest.t_s <= FRESH_S
+
+
+def is_placed(newest: Telemetry | None, now_s: float) -> bool:
+    """Whether its place and speed are known too: they come by a packet of their own."""
+    if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
+        return False
+    return all(math.isfinite(v) for v in (*newest.position_m, *newest.velocity_mps))
 
 
 def may_fly(newest: Telemetry | None, now_s: float) -> bool:

@@ -57,8 +57,9 @@ class Context:
 
     @property
     def variance_m2(self) -> float:
-        """Of the position; 0 where the firmware tells none."""
-        return self.obs.telemetry.position_variance_m2 or 0.0
+        """Of the position; 0 where the firmware tells none, endless where it is no number."""
+        variance = self.obs.telemetry.position_variance_m2 or 0.0
+        return math.inf if math.isnan(variance) else variance
 
     @property
     def flying(self) -> bool:

@@ -380,6 +380,30 @@ def test_the_rescue_orders_again_what_shows_no_effect() -> None:
     assert len(rig.link.said(Land)) == MAX_ORDERS
 
 
+def orders(rig: Rig) -> list[Land]:
+    return [command for _, command in rig.link.sent if isinstance(command, Land)]
+
+
+def test_a_rescue_lands_on_the_ground_that_it_started_from() -> None:
+    """On a table its own landing would else end below it, or over the floor far above."""
+    aims = []
+    for ground_z_m in (-1.0, 0.0, 0.75):
+        rig = Rig()
+        rig.rescue(telemetry(0.0, 1.5), ground_z_m=ground_z_m)
+        aims.append(orders(rig)[0].height_m - ground_z_m)
+    assert aims == pytest.approx([aims[0]] * 3)
+    assert -1.0 < aims[0] <= 0.0
+
+
+def test_a_rescue_steers_by_no_number_that_is_none() -> None:
+    rig = Rig(Vehicle(lambda s: replace(s, position_m=(math.nan,) * 3, supervisor=AIRBORNE)))
+    rig.rescue(telemetry(0.0, 2.0), held_m=2.0)
+    assert all(order.duration_s > 5.0 for order in orders(rig))
+    places = [c.z_m for _, c in rig.link.sent if isinstance(c, PositionSetpoint)]
+    assert places
+    assert all(z_m < 2.0 for z_m in places)
+
+
 def test_a_rescue_without_telemetry_still_orders_the_landing() -> None:
     rig = Rig(Vehicle(lambda s: None))
     rig.rescue(telemetry(0.0))

@@ -51,6 +51,25 @@ def on_the_ground(z_m: float = 0.0, **safety: float) -> str:
     return still_waiting_for(sample, True, None, 0.0, profile)
 
 
+@pytest.mark.parametrize(
+    ("age_s", "waits"), [(0.02, False), (0.2, False), (0.5, True), (5.0, True)]
+)
+def test_old_telemetry_is_waited_for(age_s: float, waits: bool) -> None:
+    """It may have stopped while the camera was waited for: nothing is taken over on it."""
+    sample = telemetry(1.0, 0.0, thrust=0.0, supervisor=READY)
+    waiting = still_waiting_for(sample, True, None, 0.0, PROFILE, age_s=age_s)
+    assert ("old" in waiting) is waits
+    if waits:
+        limit_s = PROFILE.safety.estimator_wait_s
+        with pytest.raises(TimedOut, match="old"):
+            still_waiting_for(sample, True, None, limit_s + 0.1, PROFILE, age_s=age_s)
+
+
+@pytest.mark.parametrize("variance", [float("nan"), 1.0])
+def test_a_variance_that_is_no_number_is_not_settled(variance: float) -> None:
+    rig(position_variance_m2=variance).refused(TimedOut, "settle")
+
+
 def test_a_table_may_be_the_ground() -> None:
     assert on_the_ground(0.8, ground_z_m=0.75) == ""
     with pytest.raises(SafetyAbort):

@@ -82,6 +82,16 @@ def test_a_loop_that_lives_is_left_alone(silent_s: float) -> None:
     assert Rig().after(silent_s) is None
 
 
+@pytest.mark.parametrize(
+    "unknown", [{"behind_s": 0.5}, {"position_m": (0.0, 0.0, float("nan"))}], ids=["old", "nan"]
+)
+def test_a_position_that_is_not_known_keeps_no_raw_thrust(unknown: dict[str, object]) -> None:
+    """Its packet comes no more, the attitude's does: nothing shows that it hangs."""
+    assert Rig(RELEASED, AT_CEILING, CEILING_M).after(0.35) == RELEASED
+    held = Rig(RELEASED, AT_CEILING, CEILING_M).after(0.35, **unknown)
+    assert held == PositionSetpoint(0.0, 0.0, CEILING_M, 0.0)
+
+
 # --- 0.3 s: the last safe setpoint ------------------------------------------------------------
 
 
