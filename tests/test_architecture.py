@@ -37,7 +37,8 @@ CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
 # before it; rooms in one line do not know of each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.errors",),
-    ("perchctl.geometry", "perchctl.files", "perchctl.plot", "perchctl.vehicle"),
+    ("perchctl.geometry", "perchctl.files", "perchctl.vehicle"),
+    ("perchctl.plot",),
     ("perchctl.profile",),
     ("perchctl.vision",),
     ("perchctl.mission",),
