@@ -20,11 +20,10 @@ from perchctl.faults.effects import (
 )
 from perchctl.faults.oracle import Flag
 from perchctl.flight.operator import AGAIN_S, HELD_S
+from perchctl.mission.guards import CATCHABLE_M
 
 CUT_S = 1.9
 """Silence for longer ends in the firmware's cut (2.0 s after the last setpoint)."""
-CATCHABLE_M = 1.0
-"""Hanging lower than this, a magnet of nearly the weight that lets go cannot be caught."""
 LEAST_LIFT = 1.02
 """Over the weight: with less nothing is held in the air."""
 NOTICED_S, DOWN_MPS = 1.5, 0.4

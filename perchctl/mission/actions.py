@@ -52,7 +52,8 @@ WARY_MPS, WARY_M = 0.25, 0.2
 
 def act(c: Context) -> Acted:
     """The phase's command for this tick."""
-    if c.state.hold and c.state.setpoint is not None:
+    falls = c.state.phase is Phase.RECOVER and not c.state.caught
+    if c.state.hold and c.state.setpoint is not None and not falls:
         return _fly_to(c, c.state.setpoint)
     return ACTIONS[c.state.phase](c)
 

@@ -224,7 +224,7 @@ def _blocked(c: Context) -> bool:
 def _saturated(c: Context) -> bool:
     """All the thrust there is, and it does not rise (nor is it just being caught)."""
     full = c.obs.telemetry.thrust >= SATURATED * FULL_THRUST
-    return full and c.height_m > 0.15 and -0.15 < c.obs.telemetry.velocity_mps[2] < 0.05
+    return full and -0.15 < c.obs.telemetry.velocity_mps[2] < 0.05
 
 
 CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
@@ -285,8 +285,8 @@ def conditions_since(c: Context) -> dict[Condition, float]:
 
 def _counts(c: Context, name: Condition) -> bool:
     if name is Condition.HANGING and c.state.phase is Phase.LANDING:
-        # It begins a release, which stops nothing and is taken back at the first slip: late
-        # telemetry may do that, where the vehicle would else hang there until it is cut.
+        # It begins a release, which goes on over fresh telemetry only: late telemetry may do
+        # that, where the vehicle would else hang there until it is cut.
         return c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
     return c.proves or name not in PROOFS
 

@@ -9,6 +9,9 @@ from perchctl.mission.context import Context
 from perchctl.mission.mounting import explained
 from perchctl.mission.state import Condition, Phase
 
+CATCHABLE_M = 1.0
+"""Hanging lower, a slip from still motors reaches the floor (docs/firmware.md, "Catching a
+slip": up to 0.8 m at 42 g)."""
 FALLING_MPS = -0.05
 HUNG_WITHIN_M = 0.3
 HIGH_M, STAYED_M = 0.45, 0.15
@@ -51,6 +54,19 @@ def too_weak(c: Context) -> bool:
 
 def stopped_for_s(c: Context) -> float:
     return -1.0 if c.state.stopped_s is None else c.obs.t_s - c.state.stopped_s
+
+
+def is_watched(c: Context) -> bool:
+    """The motors have been off for as long as a perched vehicle is watched."""
+    watched = stopped_for_s(c) >= c.profile.planner.complete.watch_s
+    return watched and c.held(Condition.DOWN) >= 0.1
+
+
+def hangs_where_it_did(c: Context) -> bool:
+    """At its contact; or, where the estimate drifts, seen to hang all the time. What telemetry
+    did not show for a moment may lie on the floor by now."""
+    seen = c.held(Condition.WEIGHT_HANGS) >= c.profile.planner.complete.watch_s
+    return seen or still_at_contact(c)
 
 
 def hangs_stopped(c: Context) -> bool:
@@ -101,6 +117,13 @@ def unsure(c: Context) -> str:
 def mounted_wrong(c: Context) -> bool:
     """The target moves with the vehicle, or seems to lie below it."""
     return c.state.mount.wrong or c.held(Condition.TARGET_BELOW) >= BELOW_S
+
+
+def why_contact(c: Context) -> str:
+    text = "contact proven by position, acceleration and thrust"
+    if c.height_m >= CATCHABLE_M:
+        return text
+    return f"{text}; at {c.height_m:.1f} m, too low for a slip to be caught"
 
 
 def why_mounted_wrong(c: Context) -> str:

@@ -36,10 +36,15 @@ PLANNED_MPS, SETTLING_S = 0.35, 1.8
 """The quintic's largest speed, and time added for its begin: it starts at rest, while the
 vehicle comes sinking, and what the vehicle then catches up with must be slow."""
 MOST_DRIFT_M = 1.0
+UNKNOWN_M = 1.0
+"""The height to come down from where none is known."""
 PEELED_M = 0.1
 """Below the contact by so much, the magnet has let go."""
 PEEL_BELOW_M, PEEL_BLIND_S = 0.35, 4.0
 DROPPING_MPS = -0.35
+OVERDUE = 0.5
+"""Of the landing's time: what is up there by then is left to its own landing."""
+FALLING_G = 0.5
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 
@@ -54,7 +59,8 @@ def own_landing(
     """
     below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
     aim_m = ground_z_m - below_m
-    height_m = 1.0 if newest is None else max(0.0, newest.position_m[2] - aim_m)
+    z_m = math.nan if newest is None else newest.position_m[2]
+    height_m = max(0.0, z_m - aim_m) if math.isfinite(z_m) else UNKNOWN_M
     return Land(aim_m, SETTLING_S + _PEAK_OF_MEAN * height_m / PLANNED_MPS)
 
 
@@ -63,8 +69,11 @@ def landing(c: Context) -> Acted:
     if state.stopped_s is not None:
         return _hang_on(c) if state.contact_z_m is not None else stop_motors(c)
     level = state.heading_lost and can_level(c)
-    if not level and not state.caught and (caught := catch(c)) is not None:
-        return caught
+    if not level and not state.caught:
+        if (caught := catch(c)) is not None:
+            return caught
+        state = replace(state, caught=True)
+        c = Context(state, c.obs, c.profile)
     if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
         return stop_motors(c)
     if state.released_s is not None:
@@ -80,7 +89,9 @@ def landing(c: Context) -> Acted:
         return state, away
     c = Context(state, c.obs, c.profile)
     low = c.height_m <= c.profile.planner.landing.handover_m
-    if state.orders or (not _is_peeling(c) and (low or _doubtful(c))):
+    # When its time is over nothing is sent any more: by then it must be landing by itself.
+    overdue = c.in_phase_s > OVERDUE * c.profile.planner.landing.timeout_s
+    if state.orders or overdue or (not _is_peeling(c) and (low or _doubtful(c))):
         return _by_itself(c)
     return _by_setpoints(c)
 
@@ -160,7 +171,8 @@ def _by_setpoints(c: Context) -> Acted:
 def _by_itself(c: Context) -> Acted:
     """The vehicle's own landing, given again while it shows no effect."""
     landing_config, state = c.profile.planner.landing, c.state
-    if c.proves and c.obs.telemetry.thrust < 1 and (state.orders or not c.flying):
+    carried = c.obs.telemetry.acc_z_g > FALLING_G
+    if c.proves and c.obs.telemetry.thrust < 1 and carried and (state.orders or not c.flying):
         return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0
     waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s

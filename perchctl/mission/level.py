@@ -22,8 +22,10 @@ STILL_MPS = 0.05
 
 
 def can_level(c: Context) -> bool:
-    """Whether height is measured, and the thrust known that carries the vehicle."""
-    return c.state.hover_thrust > 0 and c.proves
+    """Whether height is measured, and the thrust known that carries the vehicle. A change to the
+    vehicle's own landing and back costs more than a speed that is a moment old."""
+    recent = c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+    return c.state.hover_thrust > 0 and recent
 
 
 def level_down(c: Context) -> Acted:

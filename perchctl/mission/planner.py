@@ -16,7 +16,7 @@ from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, ho
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
 from perchctl.mission.mounting import MountWatch, Sight, watched
-from perchctl.mission.release import catch_above_m, is_carried
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
 from perchctl.mission.state import (
     TERMINALS,
     Condition,
@@ -29,6 +29,7 @@ from perchctl.profile import Profile
 from perchctl.vehicle import Command, PositionSetpoint
 
 HOVER_WITHIN = 0.2
+UNSEEN_S = 0.15
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 Place = tuple[float, float, float]
 
@@ -87,16 +88,29 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
 
 def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
     """The estimate's world has moved, the vehicle has not: ground, contact and what else is
-    remembered are where the estimate has them now, and it is held where it is."""
+    remembered are where the estimate has them now, and it is held where it is. Where samples
+    are missing before the step, it may be the vehicle that has moved, even to the floor."""
     tel, last = obs.telemetry, state.last
     if last is None:
         return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
     x, y, z = tel.position_m
     vx, vy, vz = tel.velocity_mps
-    dt_s = tel.t_s - last.t_s
+    dt_s = tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
     lx, ly, lz = last.position_m
     step = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
+    if dt_s > UNSEEN_S:
+        step = (0.0, 0.0, 0.0)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
+    if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
+        # Its own landing goes on along a line in the world that was: it dives, or climbs.
+        state = replace(
+            state,
+            entered_s=obs.t_s,
+            orders=0,
+            ordered_s=None,
+            caught=False,
+            catch_above_m=CATCH_STILL_ABOVE_M,
+        )
     if setpoint is not None:
         z_m = z if contact_z_m is None else setpoint.z_m + step[2]
         setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
@@ -178,7 +192,8 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         entry_yaw_rad=obs.telemetry.yaw_rad,
         search_step_s=obs.t_s,
         confirmed=0,
-        pressed=row.to in (Phase.RECOVER, Phase.LANDING) and presses(context),
+        # A fall that is just being caught turns at full thrust, in the air.
+        pressed=row.to in (Phase.RECOVER, Phase.LANDING) and state.caught and presses(context),
         ordered_s=None,
         orders=0,
     )

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import corrected, hold_here, limited
-from perchctl.mission.state import Condition, PlannerState
+from perchctl.mission.state import Condition, Phase, PlannerState
 from perchctl.vehicle import Command, Idle, PositionSetpoint, RawThrust, StopMotors
 
 Acted = tuple[PlannerState, Command]
@@ -40,6 +40,8 @@ def lower(c: Context) -> Acted:
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
     if perch.mode == "raw":
+        if not c.proves:
+            return ready(c)
         # The lowest step stays below what could carry the vehicle, above the idle cut.
         lowest = 0.9 * complete.hold_ratio * state.hover_thrust
         return state, RawThrust(int(perch.thrust + part * (lowest - perch.thrust)))
@@ -53,8 +55,12 @@ def lower(c: Context) -> Acted:
 
 
 def let_go(c: Context) -> Acted:
-    """Stage two, begun once: raw thrust down to still motors, and the stop when the whole
-    weight has hung long enough."""
+    """Stage two: raw thrust down to still motors, and the stop when the whole weight has hung
+    long enough. Without fresh telemetry it begins anew; a landing goes on while it is only
+    late, for else what hangs would end there by its own landing."""
+    late_s = c.profile.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
+    if not c.proves and c.telemetry_age_s > late_s:
+        return ready(c)
     complete, state = c.profile.planner.complete, c.state
     if state.released_s is None:
         z_m = c.obs.telemetry.position_m[2]
@@ -66,6 +72,17 @@ def let_go(c: Context) -> Acted:
     start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
     start = min(start, THRUST_MIN)
     return state, RawThrust(int(start + part * (STILL_THRUST - start)))
+
+
+def ready(c: Context) -> Acted:
+    """Held by position while nothing is known: what hangs stays on about the thrust that carries
+    it, what falls unseen is caught. Still motors would be a stop without a proof."""
+    state, tel = c.state, c.obs.telemetry
+    x, y, z_m = tel.position_m
+    if state.contact_z_m is not None:
+        z_m = state.contact_z_m
+    setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
+    return replace(state, setpoint=setpoint, released_s=None), limited(c, setpoint)
 
 
 def is_still(c: Context) -> bool:
@@ -101,9 +118,10 @@ def is_carried(hover_thrust: float, thrust: float) -> bool:
 
 def catch(c: Context) -> Acted | None:
     """After a slip: far above until it hardly sinks, then held where it is; None when it
-    is caught. (A setpoint below would cost the change of mode its height.)"""
+    is caught, or nothing new is known of it. (A setpoint below would cost the change of mode
+    its height.)"""
     state, tel = c.state, c.obs.telemetry
-    if state.caught:
+    if state.caught or not c.proves:
         return None
     begun = c.in_phase_s < CATCH_LEAST_S
     if begun or (tel.velocity_mps[2] < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):

@@ -11,15 +11,17 @@ from perchctl.mission.guards import (
     fence_broken,
     hangs_in_landing,
     hangs_stopped,
+    hangs_where_it_did,
     has_slipped,
     is_blocked,
+    is_watched,
     left_jump_hold,
     mounted_wrong,
     searched_out,
     settling_too_long,
-    stopped_for_s,
     too_weak,
     unsure,
+    why_contact,
     why_mounted_wrong,
     why_not_found,
 )
@@ -166,7 +168,7 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- something is in the way -----------------------------------------------
     Row(
-        "cannot-rise", _only(P.APPROACH), is_blocked, P.LANDING,
+        "cannot-rise", _only(P.APPROACH), lambda c: is_blocked(c) or too_weak(c), P.LANDING,
         lambda c: f"pressed at {c.height_m:.2f} m: something is above, or the thrust is weak",
         S.LAND, O.SAFETY,
     ),
@@ -254,7 +256,7 @@ TABLE: tuple[Row, ...] = (
     Row(
         "contact", _only(P.PERCH),
         lambda c: c.held(C.CONTACT) >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
-        "contact proven by position, acceleration and thrust",
+        why_contact,
     ),
     Row(
         "no-contact", _only(P.PERCH),
@@ -274,10 +276,12 @@ TABLE: tuple[Row, ...] = (
         P.RECOVER, "the thrust could not be released", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "perched", _only(P.COMPLETE),
-        lambda c: stopped_for_s(c) >= c.profile.planner.complete.watch_s
-        and c.held(C.DOWN) >= 0.1,
-        P.PERCHED, "hanging still with the motors off", outcome=O.PERCHED,
+        "perched", _only(P.COMPLETE), lambda c: is_watched(c) and hangs_where_it_did(c), P.PERCHED,
+        "hanging still with the motors off", outcome=O.PERCHED,
+    ),
+    Row(
+        "fell-unseen", _only(P.COMPLETE), is_watched, P.LANDING,
+        "it is not where it hung before", S.LAND, O.SAFETY,
     ),
     # --- the failed attempt --------------------------------------------------
     Row(

@@ -233,6 +233,10 @@ CASES: dict[str, Case] = {
         P.COMPLETE, P.PERCHED, flown(CONTACT_Z_M, **OFF), 0.3, O.PERCHED,
         state={"stopped_s": START_S - 3.0, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
     ),
+    "fell-unseen": Case(
+        P.COMPLETE, P.LANDING, flown(0.02, **OFF), 0.3, O.SAFETY,
+        state={"stopped_s": START_S - 3.0, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
+    ),
     "attempts-used": Case(
         P.RECOVER, P.LANDING, seen(), 0.7, O.ATTEMPTS_USED_UP,
         state={"attempts": PROFILE.planner.attempts},

@@ -1,0 +1,226 @@
+"""What happens while nothing new is known of the vehicle, and what counts afterwards."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from perchctl.mission import planner
+from perchctl.mission.guards import CATCHABLE_M
+from perchctl.mission.landing import own_landing
+from perchctl.mission.state import Outcome, Phase, PlannerState
+from perchctl.vehicle import (
+    FULL_THRUST,
+    HL_ACTIVE,
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+    Telemetry,
+)
+from tests.helpers.mission import (
+    AIRBORNE,
+    HANG_Z_M,
+    HOVER_THRUST,
+    PROFILE,
+    READY,
+    observation,
+    state_in,
+    telemetry,
+)
+
+
+def ticked(
+    state: PlannerState, t_s: float, tel: Telemetry, **obs: object
+) -> tuple[PlannerState, Command]:
+    return planner.step(state, observation(t_s, telemetry=tel, **obs), PROFILE)
+
+
+def released(phase: Phase = Phase.COMPLETE) -> PlannerState:
+    """Half a second into the release, the motors on their way down to still."""
+    state = state_in(phase, z_m=HANG_Z_M)
+    return replace(state, contact_z_m=HANG_Z_M, entered_s=8.0, released_s=9.5, t_s=9.98)
+
+
+def hangs(t_s: float, z_m: float = HANG_Z_M, **changes: object) -> Telemetry:
+    return telemetry(t_s, z_m, **{"thrust": 1000.0, **changes})
+
+
+# --- the release ----------------------------------------------------------------------
+
+
+def test_a_release_that_nobody_sees_goes_back_to_a_setpoint() -> None:
+    """Still motors would be a stop without a proof: what the magnet lets go of meanwhile is
+    on the floor before the link counts as lost."""
+    state, command = ticked(released(), 10.0, hangs(10.0))
+    assert isinstance(command, RawThrust)
+    state, command = ticked(state, 10.2, hangs(10.0))
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > HANG_Z_M
+    assert state.released_s is None
+    for i in range(12):  # seen again, it begins anew: the dwell times too
+        t_s = 10.22 + 0.02 * i
+        state, command = ticked(state, t_s, hangs(t_s, thrust=20000.0))
+        assert isinstance(command, PositionSetpoint), t_s
+
+
+def test_a_raw_release_waits_for_telemetry_too() -> None:
+    perch = PROFILE.planner.perch.model_copy(update={"mode": "raw"})
+    planned = PROFILE.planner.model_copy(update={"perch": perch})
+    profile = PROFILE.model_copy(update={"planner": planned})
+    state = replace(released(), released_s=None, setpoint=None, entered_s=9.6)
+    obs = observation(10.2, telemetry=hangs(10.0))
+    assert isinstance(planner.step(state, obs, profile)[1], PositionSetpoint)
+
+
+# --- after the stop -------------------------------------------------------------------
+
+
+def stopped(seen_since_s: float | None) -> PlannerState:
+    state = replace(released(), stopped_s=4.0, orders=5)
+    since = {} if seen_since_s is None else {planner.Condition.WEIGHT_HANGS: seen_since_s}
+    return replace(state, since=since)
+
+
+def after(state: PlannerState, z_m: float, lasts_s: float = 1.0) -> PlannerState:
+    for i in range(1, round(lasts_s / 0.02)):
+        t_s = 10.0 + 0.02 * i
+        off = telemetry(t_s, z_m, thrust=0.0, supervisor=READY)
+        state, _ = ticked(state, t_s, off)
+    return state
+
+
+def test_what_lies_on_the_floor_has_not_perched() -> None:
+    state = after(stopped(seen_since_s=None), z_m=0.02)
+    assert (state.phase, state.outcome) == (Phase.LANDED, Outcome.SAFETY)
+
+
+def test_what_hangs_where_it_did_has_perched() -> None:
+    assert after(stopped(seen_since_s=None), HANG_Z_M - 0.1).phase is Phase.PERCHED
+
+
+def test_an_estimate_that_drifts_while_it_is_watched_is_no_fall() -> None:
+    assert after(stopped(seen_since_s=4.0), HANG_Z_M - 0.6).phase is Phase.PERCHED
+
+
+# --- the estimate ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("gap_s", "moves"), [(0.02, True), (0.1, True), (0.3, False), (5.0, False)]
+)
+def test_a_step_behind_missing_samples_may_be_the_vehicle_s(gap_s: float, moves: bool) -> None:
+    """It was at rest before the silence and is at rest after it: on the floor."""
+    state = replace(state_in(Phase.LANDING, z_m=1.0), last=telemetry(10.0, 1.0))
+    assert state.ground_m is not None
+    ground_z_m = state.ground_m[2]
+    t_s = 10.0 + gap_s
+    new, _ = ticked(state, t_s, telemetry(t_s, 0.02), jumped=True)
+    assert new.ground_m is not None
+    moved_m = new.ground_m[2] - ground_z_m
+    assert moved_m == pytest.approx(-0.98 if moves else 0.0)
+
+
+def test_a_step_in_its_own_landing_is_braked_then_the_order_given_anew() -> None:
+    """By the line in the world that was it would dive by the step."""
+    lands = AIRBORNE | HL_ACTIVE
+    state = replace(state_in(Phase.LANDING, z_m=0.4), orders=3, ordered_s=9.0)
+    state = replace(state, last=telemetry(9.98, 0.4, supervisor=lands))
+    sinks = (0.0, 0.0, -0.3)
+    up = telemetry(10.0, 0.9, velocity_mps=sinks, supervisor=lands)
+    state, command = ticked(state, 10.0, up, jumped=True)
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > 1.2
+    slow = telemetry(10.14, 0.87, velocity_mps=(0.0, 0.0, -0.05), supervisor=lands)
+    state, command = ticked(state, 10.14, slow)
+    assert isinstance(command, Land)
+    assert state.ground_m is not None
+    assert command.height_m < state.ground_m[2]
+
+
+# --- a slip ---------------------------------------------------------------------------
+
+
+def slipping(t_s: float, **changes: object) -> Telemetry:
+    fast = {"velocity_mps": (0.0, 0.0, -0.5), "thrust": 1000.0, "acc_z_g": 0.2}
+    return telemetry(t_s, HANG_Z_M - 0.1, **{**fast, **changes})
+
+
+def caught_from(state_changes: dict[str, object]) -> PlannerState:
+    state = replace(state_in(Phase.RECOVER, z_m=HANG_Z_M), row="slipped", caught=False)
+    below = PositionSetpoint(0.0, 0.0, HANG_Z_M - 0.25, 0.0)
+    return replace(state, catch_above_m=1.0, setpoint=below, **state_changes)  # type: ignore[arg-type]
+
+
+def test_no_hold_keeps_a_slip_from_being_caught() -> None:
+    state, command = ticked(caught_from({}), 10.2, slipping(10.2), loop_late_s=0.4)
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > HANG_Z_M
+    assert not state.caught
+
+
+def test_nothing_is_caught_on_an_old_speed() -> None:
+    """Two seconds of full thrust on a speed of long ago would end far above."""
+    _, command = ticked(caught_from({}), 10.3, slipping(10.1))
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m < HANG_Z_M + 0.1
+
+
+@pytest.mark.parametrize("caught", [False, True])
+def test_a_fall_that_turns_at_full_thrust_presses_nothing(caught: bool) -> None:
+    state = replace(caught_from({}), caught=caught, attempts=PROFILE.planner.attempts)
+    turns = slipping(10.6, velocity_mps=(0.0, 0.0, 0.01), thrust=FULL_THRUST, acc_z_g=1.1)
+    state, _ = ticked(state, 10.6, turns)
+    assert state.phase is Phase.LANDING
+    assert state.pressed is caught
+
+
+def test_a_contact_too_low_for_a_catch_says_so() -> None:
+    z_m = CATCHABLE_M - 0.1
+    state = state_in(Phase.PERCH, z_m=z_m)
+    for i in range(1, 60):
+        t_s = 10.0 + 0.02 * i
+        target = observation(t_s, z_m).target
+        assert target is not None
+        touching = replace(target, e_m=target.e_m * 0.0)
+        tel = telemetry(t_s, z_m, thrust=1.14 * HOVER_THRUST)
+        state, _ = ticked(state, t_s, tel, target=touching)
+    assert state.phase is Phase.COMPLETE
+    assert "too low for a slip to be caught" in state.reason
+
+
+# --- the landing ----------------------------------------------------------------------
+
+
+def test_a_landing_that_takes_too_long_is_left_to_the_vehicle_in_time() -> None:
+    """At its time's end nothing is sent any more, and setpoints that end are cut."""
+    slow_s = PROFILE.planner.landing.timeout_s
+    state = replace(state_in(Phase.LANDING, z_m=3.0), entered_s=10.0 - 0.6 * slow_s)
+    assert isinstance(ticked(state, 10.0, telemetry(10.0, 3.0))[1], Land)
+
+
+def test_motors_that_stand_still_in_a_fall_are_no_landing() -> None:
+    """Orders lost, their notify not: cut in the air, and told to land again."""
+    state = replace(state_in(Phase.LANDING, z_m=1.5), orders=1, ordered_s=9.5)
+    falls = telemetry(10.0, 1.4, thrust=0.0, acc_z_g=0.02, velocity_mps=(0.0, 0.0, -0.4))
+    assert isinstance(ticked(state, 10.0, falls)[1], Land)
+    stands = telemetry(10.0, 0.02, thrust=0.0)
+    assert isinstance(ticked(state, 10.0, stands)[1], (Idle, StopMotors))
+
+
+@pytest.mark.parametrize("z_m", [math.nan, math.inf])
+def test_an_unknown_height_is_landed_slowly(z_m: float) -> None:
+    config = PROFILE.planner.landing
+    order = own_landing(config, 0.0, 1.0, telemetry(1.0, z_m))
+    assert order.duration_s == own_landing(config, 0.0, 1.0, None).duration_s > 5.0
+
+
+@pytest.mark.parametrize(("age_s", "level"), [(0.02, True), (0.2, True), (0.5, False)])
+def test_a_level_descent_does_not_change_its_mode_for_a_moment(age_s: float, level: bool) -> None:
+    state = replace(state_in(Phase.LANDING, z_m=1.5), heading_lost=True)
+    _, command = ticked(state, 10.5, telemetry(10.5 - age_s, 1.5))
+    assert isinstance(command, RawThrust) is level
