@@ -81,7 +81,9 @@ class Truth:
     def __init__(self, vehicle: SimulatedVehicle) -> None:
         self._vehicle = vehicle
         self._sink_mps = 0.0
+        self._was_down = True
         self.fell = False
+        self.touchdown_mps = 0.0
 
     def event(self, event: Event) -> None:
         return None
@@ -91,6 +93,9 @@ class Truth:
         on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
         if state.floor_contact and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
             self.fell = True
+        if state.floor_contact and not self._was_down:
+            self.touchdown_mps = max(self.touchdown_mps, self._sink_mps)
+        self._was_down = state.floor_contact
         self._sink_mps = -float(state.velocity_mps[2])
 
     def for_log(self) -> tuple[tuple[float, float, float], float]:
@@ -109,6 +114,7 @@ class LockstepFlight:
     fell: bool
     locked: bool
     simulated_s: float
+    touchdown_mps: float
 
     @property
     def perched_miss_m(self) -> float | None:
@@ -168,6 +174,7 @@ def fly_lockstep(
         fell=fell,
         locked=bool(vehicle.firmware.supervisor_info & LOCKED),
         simulated_s=link.now_s,
+        touchdown_mps=truth.touchdown_mps,
     )
 
 

@@ -215,6 +215,10 @@ def test_a_turned_mounting_is_named_within_three_decimetres(deg: int) -> None:
 # --- The operator ---------------------------------------------------------------------
 
 
+SOFT_MPS = 0.35
+"""A touchdown that hurts nothing; a landing that the vehicle flies alone makes 0.55 m/s."""
+
+
 @pytest.mark.parametrize("phase", SEVEN, ids=lambda p: p.value)
 def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     """On the floor; or, where the magnet has it already, peeled off in vain and left hanging,
@@ -230,6 +234,7 @@ def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     assert not flown.flight.locked
     assert not flown.flight.fell
     assert flown.z_m < ON_THE_FLOOR_M or flown.flight.hanging
+    assert flown.flight.touchdown_mps <= SOFT_MPS
     if phase not in (Phase.PERCH, Phase.COMPLETE):
         assert not flown.flight.hanging
 

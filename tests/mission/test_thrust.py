@@ -74,6 +74,21 @@ def test_saturated_thrust_teaches_nothing() -> None:
     assert flown(start, 0.3, thrust=float(FULL_THRUST)).hover_thrust == 60000.0
 
 
+@pytest.mark.parametrize("ratio", [0.55, 0.75, 1.25])
+def test_nothing_hovers_on_much_less_or_more_than_before(ratio: float) -> None:
+    """It is held by the ceiling or by a hand; learned, it would hide that."""
+    start = replace(state_in(Phase.ALIGN), hover_thrust=40000.0, target_spread_m=1.0)
+    assert flown(start, 0.3, thrust=ratio * 40000.0).hover_thrust == 40000.0
+
+
+@pytest.mark.parametrize(("z_m", "learns"), [(1.0, True), (CONTACT_Z_M - 0.05, False)])
+def test_near_the_target_an_ascent_learns_nothing(z_m: float, learns: bool) -> None:
+    """It may press against a ceiling that is lower than thought."""
+    start = replace(state_in(Phase.ASCEND, z_m=z_m), hover_thrust=50000.0)
+    hover = flown(start, 0.1, z_m, thrust=52000.0).hover_thrust
+    assert (hover > 50000.0) is learns
+
+
 def pressing(hover: float, thrust: float, profile: Profile = PROFILE) -> PlannerState:
     start = replace(state_in(Phase.PERCH, z_m=CONTACT_Z_M), hover_thrust=hover)
     return flown(start, 0.5, CONTACT_Z_M, profile, thrust=thrust)

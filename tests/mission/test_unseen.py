@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.mission import planner
 from perchctl.mission.guards import CATCHABLE_M
-from perchctl.mission.landing import own_landing
+from perchctl.mission.landing import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
 from perchctl.mission.state import Outcome, Phase, PlannerState
 from perchctl.vehicle import (
     FULL_THRUST,
@@ -210,6 +210,34 @@ def test_motors_that_stand_still_in_a_fall_are_no_landing() -> None:
     assert isinstance(ticked(state, 10.0, falls)[1], Land)
     stands = telemetry(10.0, 0.02, thrust=0.0)
     assert isinstance(ticked(state, 10.0, stands)[1], (Idle, StopMotors))
+
+
+def test_a_landing_aims_the_lower_the_longer_the_estimate_may_have_drifted() -> None:
+    config = PROFILE.planner.landing
+    aims = [own_landing(config, 0.0, flown_s, telemetry(1.0, 2.0)).height_m for flown_s in (0, 20)]
+    assert aims[0] == pytest.approx(-config.undershoot_m)
+    assert aims[1] == pytest.approx(aims[0] - 20 * config.drift_mps)
+    assert own_landing(config, 0.0, 1e6, None).height_m >= aims[0] - MOST_DRIFT_M
+
+
+@pytest.mark.parametrize("height_m", [0.1, 0.5, 2.5])
+def test_its_own_landing_is_slow_from_any_height(height_m: float) -> None:
+    """Of a quintic the largest speed is 15/8 of the mean; it begins while the vehicle sinks,
+    which costs time that is not way."""
+    order = own_landing(PROFILE.planner.landing, 0.0, 10.0, telemetry(1.0, height_m))
+    way_m = height_m - order.height_m
+    assert 15 / 8 * way_m / order.duration_s < PLANNED_MPS
+    assert order.duration_s - 15 / 8 * way_m / PLANNED_MPS == pytest.approx(SETTLING_S)
+
+
+def test_a_landing_that_stays_up_hangs_wherever_its_target_was_thought_to_be() -> None:
+    """Neither a contact was noticed nor is a target in sight: it is held, and put to the proof."""
+    state = state_in(Phase.LANDING, z_m=1.8)
+    for i in range(1, 80):
+        t_s = 10.0 + 0.02 * i
+        held = telemetry(t_s, 1.8, thrust=0.5 * HOVER_THRUST)
+        state, command = ticked(state, t_s, held, target=None)
+    assert isinstance(command, RawThrust)
 
 
 @pytest.mark.parametrize("z_m", [math.nan, math.inf])
