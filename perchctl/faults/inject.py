@@ -151,7 +151,12 @@ class Injector:
 
     @property
     def drifted_m(self) -> float:
-        """How far a slow drift has led the estimate astray by now."""
+        """How far a slow drift, or positions from outside that come no more, have led the
+        estimate astray by now."""
+        outside = self._outside
+        if outside is not None and outside[0].how == "silent" and outside[1] is not None:
+            now, world = self._edges.vehicle.firmware.estimator.now, self._edges.vehicle.world
+            return math.hypot(now.x_m - world.x_m, now.y_m - world.y_m)
         if self._estimate is None:
             return 0.0
         error, begin_s = self._estimate

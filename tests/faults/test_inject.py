@@ -134,9 +134,12 @@ def test_positions_from_outside_end(how: str) -> None:
     rig.injector.begin_now()
     rig.vehicle.world.set_pose((0.4, 0.0, 0.5), hold=True)
     rig.wait(0.9)
+    astray_m = abs(estimator.now.x_m - 0.4)
     if how == "silent":
         assert estimator.external_count == pytest.approx(50, abs=2)
+        assert rig.injector.drifted_m == pytest.approx(astray_m, abs=0.02)
     else:
+        assert rig.injector.drifted_m == 0.0  # what stands still can be seen
         assert abs(estimator.now.x_m) < 0.05  # where it was
     rig.wait(1.0)
     assert estimator.now.x_m == pytest.approx(0.4, abs=0.05)
