@@ -17,7 +17,7 @@ What is safe to send again, by the last command (silence: since that command):
 
 From `safety.loop_late_land_s` on, or when the operator asks for it, a landing. From the
 ceiling it first peels off by a setpoint below; where the magnet holds all the same, the
-vehicle goes on hanging there with its motors ready. Without fresh telemetry the landing is
+whole weight is put on it, and what hangs is stopped. Without fresh telemetry the landing is
 ordered all the same: what hangs cannot be told from what flies.
 """
 
@@ -31,11 +31,19 @@ from perchctl.mission.landing import (
     LEAST_ORDERS,
     MAX_ORDERS,
     PEEL_BELOW_M,
+    PEEL_BLIND_S,
     PEELED_M,
     REPEAT_ORDER_S,
     own_landing,
 )
-from perchctl.mission.release import CATCH_LIMIT_S, CATCH_STILL_ABOVE_M, THRUST_MIN
+from perchctl.mission.release import (
+    CATCH_LIMIT_S,
+    CATCH_STILL_ABOVE_M,
+    STILL_THRUST,
+    STOP_PERIOD_S,
+    STOPS,
+    THRUST_MIN,
+)
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -44,6 +52,7 @@ from perchctl.vehicle import (
     EmergencyStop,
     PositionSetpoint,
     RawThrust,
+    StopMotors,
     Telemetry,
 )
 
@@ -88,7 +97,7 @@ class Watchdog:
         self._landing = profile.planner.landing
         self._land_s = profile.safety.loop_late_land_s
         self._top_m = profile.safety.max_height_m
-        self._slip_mps = profile.planner.complete.slip_mps
+        self._complete = profile.planner.complete
         self._operator = operator
         self._turn: Turn | None = None
         self._closing = False
@@ -165,6 +174,9 @@ class Watchdog:
     def _revived(self) -> None:
         self._held: PositionSetpoint | None = None
         self._peel: PositionSetpoint | None = None
+        self._peel_s = 0.0
+        self._released_s: float | None = None
+        self._stop_s, self._stops = -STOP_PERIOD_S, 0
         self._slipped_s: float | None = None
         self._ordered_s, self._orders = -REPEAT_ORDER_S, 0
 
@@ -201,6 +213,8 @@ class Watchdog:
         caught = self._caught(now_s, turn, known)
         if caught is not None:
             return caught
+        if self._stops and known is None:
+            return None  # an order would spin the motors of what hangs up again
         free = self._orders > 0 or turn.by_itself or self._slipped_s is not None
         if not free and known is not None and turn.held_m is not None:
             if isinstance(turn.command, RawThrust) and turn.command.thrust <= THRUST_MIN:
@@ -209,7 +223,9 @@ class Watchdog:
                 if self._peel is None:
                     x, y, z = known.position_m
                     self._peel = PositionSetpoint(x, y, z - PEEL_BELOW_M, known.yaw_rad)
-                return self._peel
+                    self._peel_s = now_s
+                in_vain = now_s - self._peel_s > PEEL_BLIND_S
+                return self._let_go(now_s) if in_vain else self._peel
         if known is not None and not motors_may_run(known, now_s):
             return None
         enough = turn.by_itself or self._orders >= LEAST_ORDERS
@@ -222,16 +238,31 @@ class Watchdog:
         flown_s = now_s - turn.started_s
         return own_landing(self._landing, turn.ground_z_m, flown_s, known or turn.telemetry)
 
+    def _let_go(self, now_s: float) -> Command | None:
+        """The magnet holds on the least thrust of position mode: the whole weight is put on it
+        and watched, as the planner does, then the motors are stopped."""
+        if self._released_s is None:
+            self._released_s = now_s
+        since_s, complete = now_s - self._released_s, self._complete
+        if since_s < complete.ramp_s + complete.hang_s:
+            part = min(1.0, since_s / complete.ramp_s)
+            return RawThrust(int(THRUST_MIN + part * (STILL_THRUST - THRUST_MIN)))
+        if self._stops >= STOPS or now_s - self._stop_s < STOP_PERIOD_S - 1e-9:
+            return None
+        self._stop_s, self._stops = now_s, self._stops + 1
+        return StopMotors()
+
     def _caught(self, now_s: float, turn: Turn, known: Telemetry | None) -> Command | None:
         """Far above as long as what has slipped off the magnet sinks; None when there is
         nothing to catch, or no more."""
         released = isinstance(turn.command, RawThrust) and turn.command.thrust <= THRUST_MIN
+        released = released or self._released_s is not None
         if known is None or turn.held_m is None or not released or self._orders:
             return None
         x, y, z = known.position_m
         sink_mps = known.velocity_mps[2]
         if self._slipped_s is None:
-            if turn.held_m - z <= SLIP_M or sink_mps >= -self._slip_mps:
+            if turn.held_m - z <= SLIP_M or sink_mps >= -self._complete.slip_mps:
                 return None
             self._slipped_s = now_s
         if self._held is not None or sink_mps >= 0.0 or now_s - self._slipped_s > CATCH_LIMIT_S:

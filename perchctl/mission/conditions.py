@@ -150,7 +150,9 @@ def _hanging(c: Context) -> bool:
     at_target = c.obs.target is not None and abs(c.error_z_m) <= 0.15
     # A landing that does not come down is held, wherever the target was thought to be.
     stayed = (
-        c.state.phase is Phase.LANDING and c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M
+        c.state.phase is Phase.LANDING
+        and c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M
+        and not c.far_below_target
     )
     return (
         c.state.hover_thrust > 0

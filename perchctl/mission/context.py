@@ -13,6 +13,7 @@ from perchctl.mission.state import Condition, Observation, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, HL_ACTIVE, LOW_POWER, NO_BATTERY_READING_V
 
+FAR_BELOW_M = 0.5
 HANGING_S = 1.0
 """For how long a thrust below the weight must be enough before it proves the magnet."""
 
@@ -141,6 +142,12 @@ class Context:
         if self.target_m is None:
             return math.inf
         return float(self.target_m[2]) - self.profile.vehicle.gear_body_m[2]
+
+    @property
+    def far_below_target(self) -> bool:
+        """By the camera nothing holds it where it is, though its height stands still: that may be
+        a positioning system's which has frozen."""
+        return self.target_m is not None and self.error_z_m > FAR_BELOW_M
 
     @property
     def cone_m(self) -> float:

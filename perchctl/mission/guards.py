@@ -90,7 +90,7 @@ def hangs_in_landing(c: Context) -> bool:
     z_m, ground = c.obs.telemetry.position_m[2], c.state.ground_m
     began_m = c.state.entry_m[2]
     high = began_m - (ground[2] if ground else 0.0) > HIGH_M
-    stayed = c.proves and high and began_m - z_m < STAYED_M
+    stayed = c.proves and high and not c.far_below_target and began_m - z_m < STAYED_M
     return stayed or still_at_contact(c)
 
 

@@ -15,7 +15,7 @@ from perchctl.flight.watchdog import (
     Watchdog,
 )
 from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
-from perchctl.mission.release import CATCH_STILL_ABOVE_M, STILL_THRUST
+from perchctl.mission.release import CATCH_STILL_ABOVE_M, STILL_THRUST, STOPS
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -256,6 +256,37 @@ def test_the_operators_stop_cuts_while_the_loop_is_silent() -> None:
     rig.operator = Operator.STOP
     assert rig.after(0.02) is None  # the loop's own: its row records it
     assert rig.after(0.15) == EmergencyStop()
+
+
+def release_in_vain(rig: Rig, from_s: float, to_s: float, **changes: object) -> list[Command]:
+    """What is sent while it stays where it is."""
+    ticks = [from_s + 0.02 * i for i in range(round((to_s - from_s) / 0.02))]
+    sent = [rig.after(s, **changes) for s in ticks]
+    return [command for command in sent if command is not None]
+
+
+def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
+    """A loop that hangs for ever would else leave it there with turning motors."""
+    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
+    rig = Rig(below, AT_CEILING, CEILING_M)
+    sent = release_in_vain(rig, 1.1, 9.0, thrust=20000.0)
+    raw = [c.thrust for c in sent if isinstance(c, RawThrust)]
+    assert raw == sorted(raw, reverse=True)
+    assert raw[-1] == STILL_THRUST
+    complete = PROFILE.planner.complete
+    assert len(raw) * 0.02 == pytest.approx(complete.ramp_s + complete.hang_s, abs=0.1)
+    assert sent[-STOPS:] == [StopMotors()] * STOPS
+    assert rig.poll(9.5, None) is None  # no order spins its motors up again
+
+
+def test_what_slips_as_it_is_let_go_is_caught() -> None:
+    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
+    rig = Rig(below, AT_CEILING, CEILING_M)
+    release_in_vain(rig, 1.1, 5.6, thrust=10000.0)
+    falls = {"position_m": (0.0, 0.0, CEILING_M - 0.02), "velocity_mps": (0.0, 0.0, -0.3)}
+    caught = rig.after(5.62, **falls)
+    assert isinstance(caught, PositionSetpoint)
+    assert caught.z_m > CEILING_M
 
 
 @pytest.mark.parametrize("closing", ["rescue", "closing"])

@@ -240,6 +240,22 @@ def test_a_landing_that_stays_up_hangs_wherever_its_target_was_thought_to_be() -
     assert isinstance(command, RawThrust)
 
 
+def test_a_height_that_has_frozen_far_below_the_target_is_no_hanging() -> None:
+    """On the floor, where a positioning system's height stood still half a metre above it."""
+    state = state_in(Phase.LANDING, z_m=0.5)
+    target = observation(10.0, 0.5).target
+    for i in range(1, 80):
+        t_s = 10.0 + 0.02 * i
+        stands = telemetry(t_s, 0.5, thrust=0.4 * HOVER_THRUST)
+        state, command = ticked(state, t_s, stands, target=target)
+        assert not isinstance(command, RawThrust), t_s
+    for i in range(80, 90):
+        t_s = 10.0 + 0.02 * i
+        off = telemetry(t_s, 0.5, thrust=0.0, supervisor=READY)
+        state, _ = ticked(state, t_s, off, target=target)
+    assert state.phase is Phase.LANDED
+
+
 @pytest.mark.parametrize("z_m", [math.nan, math.inf])
 def test_an_unknown_height_is_landed_slowly(z_m: float) -> None:
     config = PROFILE.planner.landing
