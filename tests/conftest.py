@@ -5,11 +5,21 @@ Examples are drawn the same in each run, and no time decides a test.
 
 from __future__ import annotations
 
+import signal
+
 import pytest
 from hypothesis import settings
 
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
+
+# What tests start gets its signals as from a terminal, also where nohup or a background shell
+# started the tests with some of them ignored, which children inherit.
+for _name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP"):
+    _number = getattr(signal, _name, None)
+    if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
+        _usual = signal.default_int_handler if _name == "SIGINT" else signal.SIG_DFL
+        signal.signal(_number, _usual)
 
 SLOW_FIRST = (
     "flight/test_flights.py",
