@@ -97,6 +97,7 @@ class Watchdog:
         self._landing = profile.planner.landing
         self._land_s = profile.safety.loop_late_land_s
         self._top_m = profile.safety.max_height_m
+        self._proof_age_s = profile.safety.proof_age_s
         self._complete = profile.planner.complete
         self._operator = operator
         self._turn: Turn | None = None
@@ -225,7 +226,7 @@ class Watchdog:
                     self._peel = PositionSetpoint(x, y, z - PEEL_BELOW_M, known.yaw_rad)
                     self._peel_s = now_s
                 in_vain = now_s - self._peel_s > PEEL_BLIND_S
-                return self._let_go(now_s) if in_vain else self._peel
+                return self._let_go(now_s, known) if in_vain else self._peel
         if known is not None and not motors_may_run(known, now_s):
             return None
         enough = turn.by_itself or self._orders >= LEAST_ORDERS
@@ -238,13 +239,15 @@ class Watchdog:
         flown_s = now_s - turn.started_s
         return own_landing(self._landing, turn.ground_z_m, flown_s, known or turn.telemetry)
 
-    def _let_go(self, now_s: float) -> Command | None:
+    def _let_go(self, now_s: float, known: Telemetry) -> Command | None:
         """The magnet holds on the least thrust of position mode: the whole weight is put on it
-        and watched, as the planner does, then the motors are stopped."""
+        and watched, as the planner does, then the motors are stopped. Late telemetry ends no
+        watch."""
         if self._released_s is None:
             self._released_s = now_s
         since_s, complete = now_s - self._released_s, self._complete
-        if since_s < complete.ramp_s + complete.hang_s:
+        late = now_s - known.t_s + known.behind_s > self._proof_age_s
+        if since_s < complete.ramp_s + complete.hang_s or (late and not self._stops):
             part = min(1.0, since_s / complete.ramp_s)
             return RawThrust(int(THRUST_MIN + part * (STILL_THRUST - THRUST_MIN)))
         if self._stops >= STOPS or now_s - self._stop_s < STOP_PERIOD_S - 1e-9:

@@ -279,6 +279,16 @@ def test_what_does_not_peel_off_is_let_go_watched_and_stopped() -> None:
     assert rig.poll(9.5, None) is None  # no order spins its motors up again
 
 
+def test_late_telemetry_stops_nothing_that_was_let_go() -> None:
+    below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
+    rig = Rig(below, AT_CEILING, CEILING_M)
+    sent = release_in_vain(rig, 1.1, 9.0, thrust=20000.0, behind_s=0.15)
+    assert StopMotors() not in sent
+    assert sent[-1] == RawThrust(STILL_THRUST)
+    fresh = release_in_vain(rig, 9.0, 9.6)
+    assert fresh == [StopMotors()] * STOPS
+
+
 def test_what_slips_as_it_is_let_go_is_caught() -> None:
     below = PositionSetpoint(0.0, 0.0, CEILING_M - 0.25, 0.0)
     rig = Rig(below, AT_CEILING, CEILING_M)
