@@ -7,7 +7,7 @@ A profile is checked here and only here; `perchctl.profile.load` reads it from i
 from __future__ import annotations
 
 import datetime
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -49,6 +49,12 @@ class SimulationConfig(Section):
     camera_noise_sigma: Range = (4.0, 8.0)
     camera_exposure_s: float = Field(0.008, ge=0, le=0.05)
     camera_defocus_px: float = Field(0.6, ge=0, le=10)
+    camera_fields: Literal["progressive", "top", "bottom"] = "progressive"
+    camera_blended: bool = False
+    camera_readout_s: float = Field(0.0, ge=0, le=0.05)
+    camera_flicker: float = Field(0.0, ge=0, le=1)
+    camera_pumping: float = Field(0.0, ge=0, le=0.9)
+    camera_analogue: float = Field(0.0, ge=0, le=1)
     mount_error_deg: float = Field(1.0, ge=0, le=20)
     mount_error_m: float = Field(0.001, ge=0, le=0.05)
     estimate_noise_m: float = Field(0.002, ge=0, le=0.2)

@@ -12,11 +12,11 @@ import numpy as np
 from perchctl.geometry import Array, make_T
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
+from perchctl.sim.shutter import Shutter
 from perchctl.sim.surfaces import Picture
 
 SCHEDULE_STREAM = 411
 
-POSES_PER_EXPOSURE = 3
 JITTER_LIMIT_SIGMAS = 2.5
 
 
@@ -31,7 +31,8 @@ class BodyState(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class DeliveredFrame:
-    """A frame that has arrived; `t_exposure_s` is the middle of its exposure."""
+    """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
+    two fields of an interlaced one."""
 
     t_arrival_s: float
     t_exposure_s: float
@@ -59,7 +60,8 @@ class SimCamera:
         self.renderer = renderer
         self._T_body_cam = np.array(scenario.T_body_cam_true, np.float64)
         self._rng = np.random.default_rng([scenario.seed, SCHEDULE_STREAM])
-        self._half_s = max(scenario.camera_exposure_s, 0.0) / 2.0
+        self._shutter = Shutter(scenario)
+        self._half_s = self._shutter.half_s
         self._first_s = self._half_s + float(self._rng.random()) / scenario.camera_rate_hz
         self._index = 0
         self._burst_left = scenario.camera_burst[1] if scenario.camera_burst else 0
@@ -67,6 +69,11 @@ class SimCamera:
         self._last_image: Picture | None = None
         self._t_s = -np.inf
         self._under_way: deque[DeliveredFrame] = deque()
+
+    @property
+    def exposed_s(self) -> float:
+        """From the first light on a frame to the last."""
+        return 2.0 * self._half_s
 
     def advance(self, t_s: float, pose_at: Callable[[float], BodyState]) -> None:
         """Take all exposures that end at or before `t_s`.
@@ -103,17 +110,19 @@ class SimCamera:
         self._last_arrival_s = arrival_s
         frozen = s.camera_freeze_at_s is not None and middle_s >= s.camera_freeze_at_s
         if self._last_image is None or not frozen:
-            self._last_image = self.renderer.render(
-                [self._T_world_cam(pose_at(t)) for t in self._sample_times(middle_s)],
-                frame_index=self._index,
-            )
+            self._last_image = self._picture(middle_s, pose_at)
         self._under_way.append(DeliveredFrame(arrival_s, middle_s, self._last_image, self._index))
 
-    def _sample_times(self, middle_s: float) -> list[float]:
-        if self._half_s == 0.0:
-            return [middle_s]
-        steps = np.linspace(-self._half_s, self._half_s, POSES_PER_EXPOSURE)
-        return [middle_s + float(step) for step in steps]
+    def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Picture:
+        def T_world_cam_at(t_s: float) -> Array:
+            return self._T_world_cam(pose_at(t_s))
+
+        if self._shutter.plain:
+            samples = [T_world_cam_at(t) for t in self._shutter.exposure_times(middle_s)]
+            return self.renderer.render(samples, frame_index=self._index)
+        height = self.renderer.camera.size_px[1]
+        shots = self._shutter.shots(middle_s, T_world_cam_at, height)
+        return self.renderer.expose(shots, frame_index=self._index)
 
     def _T_world_cam(self, state: BodyState) -> Array:
         return make_T(state.R_world_body, state.position_m) @ self._T_body_cam

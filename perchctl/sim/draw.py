@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile
+from perchctl.profile.schema import SimulationConfig
 from perchctl.sim.scenario import Scenario
 
 _STREAM = 1  # the scenario's own random stream
@@ -56,14 +58,10 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         small_side_m=profile.target.small.side_m,
         gear_body_m=profile.vehicle.gear_body_m,
         T_body_cam_true=tuple(tuple(float(v) for v in row) for row in T_body_cam),
-        camera_rate_hz=sim.camera_rate_hz,
         camera_latency_s=latency_s,
-        camera_jitter_s=sim.camera_jitter_s,
-        camera_drop_rate=sim.camera_drop_rate,
         camera_burst=burst,
         camera_noise_sigma=noise_sigma,
-        camera_exposure_s=sim.camera_exposure_s,
-        camera_defocus_px=sim.camera_defocus_px,
+        **_as_they_stand(sim),
         estimate_noise_m=sim.estimate_noise_m,
         estimate_tilt_bias_rad=(float(tilt_bias[0]), float(tilt_bias[1])),
         drift_mps=(float(drift[0]), float(drift[1]), float(drift[2])),
@@ -71,7 +69,18 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         magnet_force_n=sim.magnet_force_n,
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         no_target=sim.no_target,
+        extra={"analogue": sim.camera_analogue} if sim.camera_analogue else {},
     )
+
+
+def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
+    """The camera's values that are not drawn."""
+    names = (
+        "camera_rate_hz", "camera_jitter_s", "camera_drop_rate", "camera_exposure_s",
+        "camera_defocus_px", "camera_fields", "camera_blended", "camera_readout_s",
+        "camera_flicker", "camera_pumping",
+    )  # fmt: skip
+    return {name: getattr(sim, name) for name in names}
 
 
 def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:

@@ -31,6 +31,10 @@ class RayGrid:
 
     stride: int
     xy: NDArray[np.float32]  # (rows, cols, 2)
+    down: NDArray[np.float32]  # (rows,), 0 in the picture's first row, 1 in its last
+
+    def crop(self, rows: slice, cols: slice) -> RayGrid:
+        return RayGrid(self.stride, self.xy[rows, cols], self.down[rows])
 
     @property
     def rays(self) -> NDArray[np.float32]:
@@ -57,7 +61,8 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     v = stride * (np.arange(rows) - 1) + (stride - 1) / 2.0
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     xy = undistorted_rays(camera, pixels)
-    return RayGrid(stride, np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32))
+    down = np.asarray(v / (camera.size_px[1] - 1.0), np.float32)
+    return RayGrid(stride, np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32), down)
 
 
 def plane_map(T_target_cam: Array) -> Array:
@@ -72,18 +77,37 @@ def plane_map(T_target_cam: Array) -> Array:
 
 
 def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where the grid's rays meet the plane, (rows, cols, 2) m, and which do not."""
+    """Where the grid's rays meet the plane, (rows, cols, 2) m, and which do not.
+
+    `to_plane` is the map (3, 3), or with a rolling shutter those of rows at equal distances
+    from the picture's first to its last, (n, 3, 3).
+    """
+    if to_plane.ndim == 3:
+        return _trace_by_row(grid, to_plane)
     if _all_rise(grid, to_plane):
         points = cv2.perspectiveTransform(grid.xy, to_plane)
         return np.asarray(points, np.float32), np.zeros(grid.xy.shape[:2], np.bool_)
     rays = grid.rays
     q = to_plane.astype(np.float32) @ rays.reshape(3, -1)
+    return _met(q.reshape(3, *rays.shape[1:]))
+
+
+def _trace_by_row(grid: RayGrid, maps: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    at = np.clip(grid.down, 0.0, 1.0) * (len(maps) - 1)
+    low = np.minimum(at.astype(int), len(maps) - 2)
+    share = (at - low)[:, None, None]
+    H = ((1.0 - share) * maps[low] + share * maps[low + 1]).astype(np.float32)  # (rows, 3, 3)
+    x, y = grid.xy[..., 0], grid.xy[..., 1]
+    return _met(np.stack([H[:, i, :1] * x + H[:, i, 1:2] * y + H[:, i, 2:] for i in range(3)]))
+
+
+def _met(q: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Points of (X w, Y w, w), shape (3, rows, cols)."""
     misses = q[2] < LEAST_RISE
     q[2, misses] = 1.0
-    points = np.stack([q[0] / q[2], q[1] / q[2]], axis=1)
+    points = np.stack([q[0] / q[2], q[1] / q[2]], axis=-1)
     points[misses] = FAR_AWAY_M
-    shape = rays.shape[1:]
-    return np.asarray(points.reshape(*shape, 2), np.float32), np.asarray(misses.reshape(shape))
+    return np.asarray(points, np.float32), np.asarray(misses)
 
 
 def _all_rise(grid: RayGrid, to_plane: Array) -> bool:

@@ -23,17 +23,18 @@ from perchctl.geometry import Array, invert_T, make_T, rot_z
 from perchctl.profile import TargetConfig
 from perchctl.sim.analogue import spoil
 from perchctl.sim.exposure import line_kernel, path_length_px, sample_count, spread
+from perchctl.sim.pixels import Mean, lit, sample, vignetting
 from perchctl.sim.rays import (
     COARSE_PX,
     FINE_PX,
     LEAST_RISE,
-    RayGrid,
     local_px_per_m,
     plane_map,
     ray_grid,
     trace,
 )
 from perchctl.sim.scenario import Scenario
+from perchctl.sim.shutter import Shot, blended, woven
 from perchctl.sim.surfaces import (
     CEILING_TEXTURE_PX,
     SAMPLING_SIGMA_PX,
@@ -49,10 +50,6 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 """Numbers of this part's random streams."""
 
 FLOOR_GREY = 60
-VIGNETTING_EXPONENT = 0.6
-"""Relative light is (1 + tan^2(angle))^-exponent; 2 would be the cos^4 law of a
-bare lens, real ones correct most of it."""
-
 _NOISE_BANK_PX = 1024
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
@@ -90,7 +87,7 @@ class Renderer:
         self._fine = ray_grid(camera, FINE_PX)
         self._coarse = ray_grid(camera, COARSE_PX)
         self._focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
-        self.shade = _vignetting(self._fine, camera.size_px)
+        self.shade = vignetting(self._fine, camera.size_px)
         self._noise = self._noise_bank()
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
@@ -117,9 +114,38 @@ class Renderer:
 
         Returns: uint8, shape (height, width).
         """
-        poses = [self._T_target_world @ np.asarray(T) for T in T_world_cam_samples]
-        motion_px = self._motion_px(poses)
-        maps = [plane_map(T) for T in spread(poses, sample_count(motion_px))]
+        shot = Shot((tuple(T_world_cam_samples),))
+        return self.expose([shot], frame_index=frame_index, defocus_px=defocus_px)
+
+    def expose(
+        self, shots: Sequence[Shot], frame_index: int = 0, defocus_px: float | None = None
+    ) -> Picture:
+        """The frame of one shot, or of two fields in their order of time; which rows are
+        the first one's, and whether they are blended, is the scenario's. Otherwise as
+        `render`."""
+        scene = self.scenario
+        top_first = scene.camera_fields != "bottom"
+        picture = woven([self._exposed(shot, defocus_px) for shot in shots], top_first)
+        if len(shots) > 1 and scene.camera_blended:
+            picture = blended(picture)
+        rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
+        if self._noise is not None:
+            width, height = self.camera.size_px
+            rows, cols = self._noise.shape
+            r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
+            noise = self._noise[r : r + height, c : c + width]
+            picture = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), np.uint8)
+        if self._analogue > 0.0:
+            picture = spoil(picture, self._analogue, rng)
+        return np.asarray(picture, np.uint8)
+
+    def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
+        """What falls onto the sensor in one shot, before noise."""
+        rows = [[self._T_target_world @ np.asarray(T) for T in poses] for poses in shot.rows]
+        motion_px = self._motion_px(rows[len(rows) // 2])
+        count = sample_count(motion_px)
+        by_row = [[plane_map(T) for T in spread(poses, count)] for poses in rows]
+        maps = by_row[0] if len(rows) == 1 else [np.stack(m) for m in zip(*by_row, strict=True)]
         picture: Any = self._optical(maps, motion_px)
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
         lens = math.sqrt(max(sigma**2 - SAMPLING_SIGMA_PX**2, 0.0))
@@ -127,14 +153,8 @@ class Renderer:
             picture = cv2.GaussianBlur(picture, (0, 0), lens)
         width, height = self.camera.size_px
         picture = cv2.multiply(picture[:height, :width], self.shade, scale=1.0 / 255.0)
-        rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
-        if self._noise is not None:
-            rows, cols = self._noise.shape
-            r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
-            picture = cv2.add(picture, self._noise[r : r + height, c : c + width], dtype=cv2.CV_8U)
-        if self._analogue > 0.0:
-            picture = spoil(picture, self._analogue, rng)
-        return np.asarray(picture, np.uint8)
+        picture = np.asarray(picture, np.uint8)
+        return picture if shot.light is None else lit(picture, shot.light)
 
     # -- through the lens ---------------------------------------------------
 
@@ -192,7 +212,7 @@ class Renderer:
         half = cv2.resize(texels.astype(np.float32), None, fx=COARSE_PX // 2, fy=COARSE_PX // 2)
         crop = COARSE_PX // 2
         half = np.ascontiguousarray(half[crop:-crop, crop:-crop])
-        picture = _sample(texture.image, half, cv2.BORDER_WRAP)
+        picture = sample(texture.image, half, cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip
@@ -236,17 +256,17 @@ class Renderer:
         j, i = int(rows.mean()), int(cols.mean())
         texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
         k = COARSE_PX // FINE_PX
-        grid = RayGrid(FINE_PX, self._fine.xy[top * k : bottom * k + 2, left * k : right * k + 2])
-        value, alpha = _Mean(len(maps)), _Mean(len(maps))
+        grid = self._fine.crop(slice(top * k, bottom * k + 2), slice(left * k, right * k + 2))
+        value, alpha = Mean(len(maps)), Mean(len(maps))
         for each in maps:
             points, _ = trace(grid, each)
             points *= texture.px_per_m
             points += texture.center_px
             texels = cv2.resize(points, None, fx=FINE_PX, fy=FINE_PX)
             texels = np.ascontiguousarray(texels[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX])
-            value.add(_sample(texture.value, texels))
+            value.add(sample(texture.value, texels))
             if not opaque:
-                alpha.add(_sample(texture.alpha, texels))
+                alpha.add(sample(texture.alpha, texels))
         area = picture[top * COARSE_PX : bottom * COARSE_PX, left * COARSE_PX : right * COARSE_PX]
         if opaque:
             area[:] = value.result()
@@ -292,38 +312,3 @@ class Renderer:
 def _printed_sheet(target_json: str) -> Sheet:
     """The sheet of a target; its textures cost more than a second, and flights share them."""
     return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))
-
-
-class _Mean:
-    """Mean of `count` pictures, rounded once."""
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self._sum: Any = None
-
-    def add(self, picture: Picture) -> None:
-        if self._count == 1:
-            self._sum = picture
-        elif self._sum is None:
-            self._sum = picture.astype(np.uint16)
-        else:
-            self._sum = cv2.add(self._sum, picture, dtype=cv2.CV_16U)
-
-    def result(self) -> Picture:
-        assert self._sum is not None
-        if self._count == 1:
-            return np.asarray(self._sum, np.uint8)
-        return np.asarray(cv2.convertScaleAbs(self._sum, alpha=1.0 / self._count), np.uint8)
-
-
-def _sample(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
-    """Bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
-    remap: Any = cv2.remap  # its stub denies that the second map may be None
-    return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
-
-
-def _vignetting(fine: RayGrid, size_px: tuple[int, int]) -> Picture:
-    r2 = (fine.rays[:2] ** 2).sum(axis=0)
-    light = (255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32)
-    full = cv2.resize(light, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
-    return np.asarray(np.rint(full[: size_px[1], : size_px[0]]), np.uint8)

@@ -24,6 +24,12 @@ class Scenario:
         gear_body_m: tip of the magnet gear in body axes (its truth).
         T_body_cam_true: rows of the camera's true pose, mounting error included.
         camera_*: what the camera and its radio do to the frames.
+        camera_fields: "progressive", or interlaced with the field of the "top" or the
+            "bottom" row first, half a period before the other; camera_blended: averaged
+            by a converter.
+        camera_readout_s: from a picture's (or field's) first row to its last.
+        camera_flicker, camera_pumping: share by which lamps (100 Hz) and an exposure control
+            that hunts change the brightness.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its gusts (`perchctl.sim.wind`).
         magnet_force_n: pull the magnet can hold.
@@ -57,6 +63,11 @@ class Scenario:
     camera_noise_sigma: float = 5.0
     camera_exposure_s: float = 0.008
     camera_defocus_px: float = 0.6
+    camera_fields: str = "progressive"
+    camera_blended: bool = False
+    camera_readout_s: float = 0.0
+    camera_flicker: float = 0.0
+    camera_pumping: float = 0.0
     estimate_noise_m: float = 0.002
     estimate_tilt_bias_rad: tuple[float, float] = (0.0, 0.0)
     drift_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -30,7 +30,8 @@ class SimulatedVehicle:
             renderer = Renderer(scenario, camera, target or TargetConfig(), scenario.seed)
             self.camera = SimCamera(scenario, renderer)
         # The past that an exposure may need.
-        steps = int(scenario.camera_exposure_s / CONTROL_PERIOD_S) + 8
+        exposed_s = 0.0 if self.camera is None else self.camera.exposed_s
+        steps = int(exposed_s / CONTROL_PERIOD_S) + 8
         self._past: deque[TrueState] = deque(maxlen=steps)
 
     @property
