@@ -71,6 +71,7 @@ MEANINGS = {
     "camera.mount.rpy_deg": "its turn from body axes ([Camera mount](conventions.md#camera-mount))",
     "camera.start_timeout_s": "wait for the first good picture",
     "camera.mirrored": "flip each picture before use",
+    "camera.fields": "interlaced pictures: found by measure, or which field is earlier, or never",
     "vehicle.gear_body_m": "tip of the magnet gear in body axes",
     "target.large.dictionary": "an OpenCV dictionary",
     "target.large.id": "within the dictionary",

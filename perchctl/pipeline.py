@@ -14,6 +14,7 @@ import numpy as np
 
 from perchctl.geometry import Array, rot_z, wrap_rad
 from perchctl.profile import KalmanConfig, Mounting, Profile
+from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
 from perchctl.vision.filter import (
     MAX_GAP_S,
     FilterSetup,
@@ -43,12 +44,14 @@ from perchctl.vision.types import (
 )
 
 __all__ = [
+    "FieldState",
     "Pipeline",
     "PipelineOutput",
     "PipelineState",
     "camera_profile",
     "estimate",
     "make_pipeline",
+    "pictures",
     "step",
 ]
 
@@ -64,6 +67,7 @@ class Pipeline:
     world_filter: FilterSetup
     kalman: KalmanConfig
     camera: CameraModel
+    fields: FieldsMode = "auto"
 
 
 def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
@@ -79,6 +83,7 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
         world_filter=make_filter(profile.kalman, in_world=True),
         kalman=profile.kalman,
         camera=camera,
+        fields=profile.camera.fields,
     )
 
 
@@ -95,14 +100,24 @@ def camera_profile(profile: Profile) -> Profile:
     )
 
 
+def pictures(
+    state: FieldState, frame: Frame, pipeline: Pipeline
+) -> tuple[FieldState, tuple[Frame, ...]]:
+    """What a stream's frame holds, each for a `step` of its own: one picture, or the two
+    fields of an interlaced camera in their order of time, each with its own time."""
+    return separated(state, frame, pipeline.fields)
+
+
 def step(
     state: PipelineState, frame: Frame, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
     """One frame. `attitude` is the vehicle's at the frame's time, None without one.
 
     Without an attitude the vehicle counts as level and at rest: the filter then works
-    in the level frame, whatever `kalman.frame` says.
+    in the level frame, whatever `kalman.frame` says. The frame is one picture of what
+    `pictures` makes of a stream's; one that was not looked at there is looked at here.
     """
+    frame = looked_at(frame, pipeline.fields)
     sighting = state.sighting
     expected, near = expected_corners(sighting, frame.t_s, attitude, pipeline.pose)
     # A first picture is looked at thoroughly, and of a stream without the target every Nth.
@@ -139,6 +154,7 @@ def step(
         target=target,
         stage=stage_of(detections.large is not None, detections.small is not None),
         disagreeing_frames=disagreeing,
+        fields=frame.fields or "whole",
     )
     return replace(new, target=target or state.target), output
 

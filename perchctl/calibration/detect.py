@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +12,14 @@ from perchctl.calibration.saddle import fit_saddles
 from perchctl.calibration.types import Grey, View
 from perchctl.geometry import Array
 from perchctl.target.boards import Board
+from perchctl.vision.fields import field_picture, is_combed
 
 MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
 SEARCH_PX = 1600
 """Larger pictures are scaled down to it for the search; corners are fitted at full size."""
+_MOST_MOTION_PX = 12.0
+"""Between two fields, for which the mean of both is a picture of the board too."""
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
 
@@ -26,7 +31,30 @@ def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -
         image: grey, uint8 (h, w).
         refine: fit the corners (`perchctl.calibration.saddle`); otherwise they are
             OpenCV's, with `cv2.cornerSubPix` and a window of 11x11 for chessboards.
+
+    Of an interlaced picture, whose fields show a moving board in two places, the view is the
+    mean of both fields' corners: where the board was half way between them.
     """
+    if is_combed(image):
+        fields = [_whole(field_picture(image, row), board, name, refine) for row in (0, 1)]
+        return _half_way(*fields)
+    return _whole(image, board, name, refine)
+
+
+def _half_way(a: View | str, b: View | str) -> View | str:
+    """The mean of the corners that both fields show; without a second field, the one."""
+    if isinstance(a, str) or isinstance(b, str):
+        return b if isinstance(a, str) else a
+    if np.linalg.norm(a.corners_px.mean(axis=0) - b.corners_px.mean(axis=0)) > _MOST_MOTION_PX:
+        return a if len(a.ids) >= len(b.ids) else b
+    _, in_a, in_b = np.intersect1d(a.ids, b.ids, return_indices=True)
+    if len(in_a) < MIN_CORNERS:
+        return a if len(a.ids) >= len(b.ids) else b
+    middle = (a.corners_px[in_a] + b.corners_px[in_b]) / 2.0
+    return replace(a, ids=a.ids[in_a], object_m=a.object_m[in_a], corners_px=middle)
+
+
+def _whole(image: Grey, board: Board, name: str, refine: bool) -> View | str:
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
     small = image

@@ -16,6 +16,7 @@ from perchctl.calibration.types import Grey, Rejection, View
 from perchctl.camera.files import VideoSource, image_files, read_grey
 from perchctl.errors import InvalidValue
 from perchctl.target.boards import Board
+from perchctl.vision.fields import field_picture, is_combed
 
 VIDEO_WINDOW = 8
 """Of so many frames in a row only the sharpest is searched for the board."""
@@ -107,6 +108,9 @@ def _sharpest(source: VideoSource) -> Iterator[tuple[str, Grey]]:
 
 
 def _sharpness(image: Grey) -> float:
+    """Of one field where there are two: the comb of a moving picture is no sharpness."""
+    if is_combed(image):
+        image = field_picture(image, 0)
     step = max(1, image.shape[1] // _SHARPNESS_WIDTH)
     small = np.ascontiguousarray(image[::step, ::step])
     return float(cv2.Laplacian(small, cv2.CV_32F).var())

@@ -231,17 +231,15 @@ class _Run:
         size_px = (frame.image.shape[1], frame.image.shape[0])
         check_size(size_px, self.camera, self.input.file_name(frame.index))
         name = self.input.frame_name(frame.index)
-        tracked = self._tracker.track(frame, name)
-        if tracked is None:
-            return
-        notes = self._tracker.notes
-        self.tally.add(tracked, notes)
-        self.prints.add(self._tracker.output)
-        self.notes.changes(name, notes)
-        sketch = sketch_of(frame, tracked, self._axis_m)
-        self.outputs.add(tracked, sketch)
-        if self._viewer is not None:
-            self._viewer.show(frame, sketch, tracked, notes)
+        for tracked in self._tracker.results(frame, name):
+            picture, notes = self._tracker.picture or frame, self._tracker.notes
+            self.tally.add(tracked, notes)
+            self.prints.add(self._tracker.output)
+            self.notes.changes(name, notes)
+            sketch = sketch_of(picture, tracked, self._axis_m)
+            self.outputs.add(tracked, sketch, drawn=not self._tracker.more)
+            if self._viewer is not None:
+                self._viewer.show(picture, sketch, tracked, notes)
         self._advance()
 
 

@@ -143,6 +143,8 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
             log_noted = True
             text = f"the log of this flight is incomplete: {obs.log_problem}"
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
+        for text in senses.take_remarks():
+            events.append(Event(now_s, EventKind.NOTE, text, state.phase))
         for event in events:
             if event.kind is EventKind.PHASE:
                 passed.append(event)

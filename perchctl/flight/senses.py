@@ -10,11 +10,13 @@ from perchctl.camera.mirror import MIRRORED
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import History, attitude_at, attitude_of, extended
 from perchctl.link.protocol import Link
-from perchctl.pipeline import Pipeline, estimate, step
+from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile
+from perchctl.vision.fields import BLENDED, INTERLACED
 from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineState, TargetEstimate
 
 MIRRORED_FRAMES = 5
+REMARK_PICTURES = 3
 
 
 @dataclass(eq=False)
@@ -39,6 +41,9 @@ class Senses:
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
     _mirrored: int = 0
+    _fields: FieldState = field(default_factory=FieldState)
+    _shown: dict[str, int] = field(default_factory=dict)
+    _remarks: list[str] = field(default_factory=list)
 
     def take_in(self, now_s: float, *, look: bool = True) -> None:
         """Telemetry and at most one frame. Without `look` the frame only counts as a sign
@@ -62,11 +67,29 @@ class Senses:
         self.last_good_frame_s = now_s
         self.frames += 1
         if look:
-            attitude = attitude_at(self.history, frame.t_s)
-            self.state, self.output = step(self.state, frame, attitude, self.pipeline)
-            self._mirrored = _mirrored_frames(self._mirrored, self.output.detections)
+            self._fields, found = pictures(self._fields, frame, self.pipeline)
+            for picture in found:
+                attitude = attitude_at(self.history, picture.t_s)
+                self.state, self.output = step(self.state, picture, attitude, self.pipeline)
+                self._mirrored = _mirrored_frames(self._mirrored, self.output.detections)
+                self._remark(self.output)
         mirrored = self._mirrored >= MIRRORED_FRAMES
         self.camera_problem = MIRRORED if mirrored else self._note
+
+    def take_remarks(self) -> list[str]:
+        """What is new about the pictures since the last call."""
+        new, self._remarks = self._remarks, []
+        return new
+
+    def _remark(self, output: PipelineOutput) -> None:
+        """Each is made once a flight, when three pictures have shown it."""
+        for text, shown in (
+            (INTERLACED, output.fields != "whole"),
+            (BLENDED, output.detections.ghost_px > 0.0),
+        ):
+            self._shown[text] = self._shown.get(text, 0) + shown
+            if shown and self._shown[text] == REMARK_PICTURES:
+                self._remarks.append(text)
 
     def target(self, now_s: float) -> TargetEstimate | None:
         """The estimate at the present. The filter coasts by frames: while none are looked

@@ -37,6 +37,7 @@ class CameraConfig(Section):
     mount: Mounting = Mounting()
     start_timeout_s: float = Field(8.0, gt=0, le=60)
     mirrored: bool = False  # flip the picture before use
+    fields: Literal["auto", "top", "bottom", "progressive"] = "auto"  # of interlaced pictures
 
 
 class VehicleConfig(Section):

@@ -69,18 +69,24 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         magnet_force_n=sim.magnet_force_n,
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         no_target=sim.no_target,
-        extra={"analogue": sim.camera_analogue} if sim.camera_analogue else {},
     )
 
 
 def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
     """The camera's values that are not drawn."""
-    names = (
-        "camera_rate_hz", "camera_jitter_s", "camera_drop_rate", "camera_exposure_s",
-        "camera_defocus_px", "camera_fields", "camera_blended", "camera_readout_s",
-        "camera_flicker", "camera_pumping",
-    )  # fmt: skip
-    return {name: getattr(sim, name) for name in names}
+    return {
+        "camera_rate_hz": sim.camera_rate_hz,
+        "camera_jitter_s": sim.camera_jitter_s,
+        "camera_drop_rate": sim.camera_drop_rate,
+        "camera_exposure_s": sim.camera_exposure_s,
+        "camera_defocus_px": sim.camera_defocus_px,
+        "camera_fields": sim.camera_fields,
+        "camera_blended": sim.camera_blended,
+        "camera_readout_s": sim.camera_readout_s,
+        "camera_flicker": sim.camera_flicker,
+        "camera_pumping": sim.camera_pumping,
+        "extra": {"analogue": sim.camera_analogue} if sim.camera_analogue else {},
+    }
 
 
 def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:

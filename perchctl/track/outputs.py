@@ -46,7 +46,8 @@ class Outputs:
             self.close(keep=False)
             raise
 
-    def add(self, tracked: Tracked, sketch: Sketch) -> None:
+    def add(self, tracked: Tracked, sketch: Sketch, drawn: bool = True) -> None:
+        """`drawn` false leaves the picture out of the video: of two fields, one is drawn."""
         if self._options.lines:
             line = (
                 json.dumps(track_record(tracked), allow_nan=False)
@@ -56,7 +57,7 @@ class Outputs:
             print(line, file=self._out, flush=self._flush)
         if self._csv is not None:
             self._csv.add(tracked)
-        if self._overlay is not None:
+        if self._overlay is not None and drawn:
             text = tuple(f"{name} {value}" for name, value in text_rows(tracked))
             self._overlay.add(tracked.t_s, replace(sketch, text=text))
 

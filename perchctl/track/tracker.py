@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from perchctl.camera.health import HealthState, Verdict, assess
 from perchctl.camera.mirror import MIRRORED
 from perchctl.display.page.live import State
 from perchctl.display.page.sketch import Sketch
-from perchctl.pipeline import Pipeline, camera_profile, make_pipeline, step
+from perchctl.pipeline import (
+    FieldState,
+    Pipeline,
+    camera_profile,
+    make_pipeline,
+    pictures,
+    step,
+)
 from perchctl.profile import Profile, TargetConfig
 from perchctl.target.print_check import (
     MIN_FRAMES,
@@ -21,6 +28,7 @@ from perchctl.target.print_check import (
     verdict,
 )
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
+from perchctl.vision.fields import BLENDED, INTERLACED
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
 
 MOST_NOTES = 20
@@ -42,9 +50,9 @@ def camera_pipeline(profile: Profile, camera: CameraModel, stills: bool = False)
 
 @dataclass(eq=False)
 class Tracker:
-    """Frame in, result out; remembers what the pipeline must (nothing with `stills`).
+    """Frame in, results out; remembers what the pipeline must (nothing with `stills`).
 
-    `notes` are the sentences that the newest frame deserves.
+    `notes` are the sentences that the newest picture deserves.
     """
 
     setup: Pipeline
@@ -54,24 +62,48 @@ class Tracker:
     disagreement_frames: int = 15
     notes: tuple[str, ...] = ()
     output: PipelineOutput | None = None
+    picture: Frame | None = None
+    more: bool = False  # another field of the same frame follows
     _state: PipelineState = field(default_factory=PipelineState)
+    _fields: FieldState = field(default_factory=FieldState)
     _health: HealthState = field(default_factory=HealthState)
     _last: Tracked | None = None
+    _interlaced: bool = False
 
-    def track(self, frame: Frame, name: str | int) -> Tracked | None:
-        """The frame's result; None for a live source's repetition of the last picture."""
+    def results(self, frame: Frame, name: str | int) -> Iterator[Tracked]:
+        """The frame's result, or those of its two fields; none for a live source's repetition
+        of the last picture. `picture`, `notes` and `output` are those of the newest."""
         judged = self._assess(frame)
         if self.live and judged.kind == "repeated":
-            return None
-        self.output = None
+            return
+        self.picture, self.output = frame, None
         self.notes = () if judged.kind in ("ok", "repeated") else (judged.text,)
         if self.live and judged.kind in _NO_PICTURE:
-            return Tracked(name, frame.t_s)
+            yield Tracked(name, frame.t_s)
+            return
+        if self.stills:
+            found: tuple[Frame, ...] = (frame,)
+        else:
+            self._fields, found = pictures(self._fields, frame, self.setup)
+        about, self.notes = self.notes, ()
+        for k, picture in enumerate(found, start=1):
+            self.more = k < len(found)
+            yield self._track(picture, name, about)
+
+    def _track(self, picture: Frame, name: str | int, about: tuple[str, ...]) -> Tracked:
         before = PipelineState() if self.stills else self._state
-        self._state, output = step(before, frame, None, self.setup)
+        self._state, output = step(before, picture, None, self.setup)
         last = None if self._last is None else self._last.target
-        self.output = output
-        self._last = tracked_of(name, frame.t_s, output, not self.stills, last)
+        self.picture, self.output = picture, output
+        self._last = tracked_of(name, picture.t_s, output, not self.stills, last)
+        self.notes = about
+        if output.fields != "whole" and self.stills:
+            self.notes += (INTERLACED,)
+        elif self._interlaced or output.fields != "whole":
+            self._interlaced = True  # at rest nothing is combed, and that is no news
+            self.notes += (INTERLACED,)
+        if output.detections.ghost_px > 0.0:
+            self.notes += (BLENDED,)
         if output.detections.mirrored:
             self.notes += (MIRRORED,)
         if output.disagreeing_frames >= (1 if self.stills else self.disagreement_frames):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 
 MarkerName = Literal["large", "small"]
+PictureKind = Literal["whole", "woven", "top", "bottom"]
 MARKERS: tuple[MarkerName, MarkerName] = ("large", "small")
 
 
@@ -46,13 +47,16 @@ class Frame:
     """One picture. `t_s` is the time of exposure on the loop's clock, as far as
     known: time of arrival less the profile's `camera.latency_s`.
 
-    `image` is grey, uint8, shape (height, width).
+    `image` is grey, uint8, shape (height, width). `fields` says whether it is a picture of one
+    moment: ``whole``; ``woven`` of two fields; the ``top`` or ``bottom`` field of such a one
+    at full height; None while nobody has looked (`perchctl.vision.fields`).
     """
 
     index: int
     t_s: float
     image: NDArray[np.uint8]
     t_arrival_s: float = 0.0
+    fields: PictureKind | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +96,7 @@ class Detections:
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
     edge_shift: EdgeShift | None = None
+    ghost_px: float = 0.0  # between the double edges of two blended fields; 0: single edges
 
     def get(self, marker: MarkerName) -> Detection | None:
         return self.large if marker == "large" else self.small
@@ -240,3 +245,4 @@ class PipelineOutput:
     target: TargetEstimate | None  # at the frame's time
     stage: Stage  # by this frame's detections
     disagreeing_frames: int = 0  # frames in a row in which the two markers contradict
+    fields: PictureKind = "whole"  # what the picture was

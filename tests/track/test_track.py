@@ -361,12 +361,10 @@ def tracker(live: bool) -> Tracker:
 def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
     image = picture(VIEWS["both"])
     live = tracker(live=True)
-    first = live.track(Frame(0, 0.0, image), 0)
-    assert first is not None
+    [first] = live.results(Frame(0, 0.0, image), 0)
     assert first.stage == "both"
-    assert live.track(Frame(1, 0.03, image), 1) is None
-    frozen = live.track(Frame(2, 1.0, image), 2)
-    assert frozen is not None
+    assert list(live.results(Frame(1, 0.03, image), 1)) == []
+    [frozen] = live.results(Frame(2, 1.0, image), 2)
     assert frozen.stage == "none"
     assert frozen.target is None
     assert live.notes == ("the picture stands still",)
@@ -375,8 +373,7 @@ def test_a_live_picture_that_repeats_is_no_frame_and_then_frozen() -> None:
 def test_a_live_snow_is_no_measurement() -> None:
     live = tracker(live=True)
     noise = np.random.default_rng(1).integers(0, 256, (480, 640)).astype(np.uint8)
-    seen = live.track(Frame(0, 0.0, noise), 0)
-    assert seen is not None
+    [seen] = live.results(Frame(0, 0.0, noise), 0)
     assert seen.stage == "none"
     assert "snow" in live.notes[0]
 
@@ -390,7 +387,7 @@ def test_markers_that_contradict_are_named(tmp_path: Path) -> None:
         camera_pipeline(load_profile(str(profile)), camera()), live=False, stills=True
     )
     image = picture((0.45, 0.0, 0.0, 0.0, 0.0, 0.3))
-    doubting.track(Frame(0, 0.0, image), 0)
+    assert len(list(doubting.results(Frame(0, 0.0, image), 0))) == 1
     assert [note.partition(":")[0] for note in doubting.notes] == ["the two markers contradict"]
 
 

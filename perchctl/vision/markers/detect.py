@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.vision.fields import halves
+from perchctl.vision.markers.between import between
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.corners import RefinedCorners
 from perchctl.vision.markers.detector import DetectorSetup, make_detector
 from perchctl.vision.markers.follow import follow
+from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.improve import improved, lines_suffice
 from perchctl.vision.markers.lines import refine
 from perchctl.vision.markers.motion import predicted_corners, with_motion
@@ -55,11 +58,31 @@ def detect(
     it gives the place to look at first and decides between look-alikes. `expected` are better
     predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
     `thorough` looks once more, all over a picture in which nothing was found and nothing
-    is expected, for a target hidden by blur.
+    is expected, for a target hidden by blur. In a frame of two fields each is looked at,
+    and the result is the mean: where the markers were at the frame's own time.
     """
-    image = frame.image
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     shift = known_from(None if previous is None else previous.edge_shift)
+
+    def look(picture: Frame) -> Detections:
+        return _looked(picture, expected, setup, camera, shift, thorough)
+
+    if frame.fields == "woven":
+        return with_motion(between(*(look(field) for field in halves(frame))), previous)
+    result = with_motion(look(frame), previous)
+    return with_ghosts(result, frame.image) if frame.fields == "whole" else result
+
+
+def _looked(
+    frame: Frame,
+    expected: Mapping[MarkerName, Array],
+    setup: DetectorSetup,
+    camera: CameraModel,
+    shift: EdgeShift | None,
+    thorough: bool,
+) -> Detections:
+    """What is in a picture of one moment."""
+    image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
     seen = _followed(image, expected, setup, camera, shift)
     if not seen or _missing(seen, expected, image.shape):
@@ -68,7 +91,7 @@ def detect(
             seen = _refined(image, found, setup, camera)
     if not seen and setup.blurred and setup.by_lines:
         seen = _in_blur(image, expected, setup, camera, thorough)
-    result = Detections(
+    return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
         large=_detection("large", seen),
@@ -77,7 +100,6 @@ def detect(
         mirrored=found.mirrored and not seen,
         edge_shift=next((r.edge_shift for r in seen.values() if r.edge_shift is not None), None),
     )
-    return with_motion(result, previous)
 
 
 def _followed(

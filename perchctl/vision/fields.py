@@ -1,0 +1,205 @@
+"""Pictures of interlaced cameras: found out, taken apart, and put in their order of time; pure.
+
+An interlaced frame is two pictures, half a frame's period apart, each in every second row.
+What moved between them stands in it like a comb, and a marker so combed is not read.
+Three things about a stream are found by measure, none is configured:
+
+- whether a frame is combed: then a row is unlike the rows beside it, which are of the other
+  field, and like the rows two away, which are of its own. In a whole picture, nearer rows
+  are more alike; in noise, all are alike unlike. Strong differences only are counted, so
+  that a small target in a noisy picture is enough;
+- which field is the earlier one: of two frames in a row the later field of the first
+  is more like the earlier field of the second than the other way around;
+- how far they are apart: half the frames' period.
+
+While the order is not known yet (a first frame, a single picture) both fields are measured and
+the mean is taken, which belongs to the middle moment in either order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.vision.types import Frame
+
+FieldsMode = Literal["auto", "top", "bottom", "progressive"]
+Grey = NDArray[np.uint8]
+
+INTERLACED = "interlaced: the two fields of a frame are measured each for itself"
+BLENDED = (
+    "blended: moving edges are double, as if the camera's fields had been averaged: switch that "
+    "off in the receiver or converter"
+)
+
+_COMBED = 1.4
+# Of so many rows in a group all but the outer four are compared with their neighbours, in
+# one go. Odd and even rows must both be: a single lost line of an analogue picture then counts
+# among the differences to its own field's rows as much as among the others.
+_GROUP = 8
+_STRONG = 5.0  # of the mean difference within a field, for one to count
+_LEAST_GREY = 8.0
+_FLOOR = 0.25  # grey^2 a pixel that noise may leave of strong differences
+_TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0  # a cubic's, half way
+
+_PERIODS_S = (1 / 30, 1 / 25)  # of NTSC and PAL frames
+_VIDEO_PERIODS_S = (0.029, 0.045)  # taken for one of them
+_ANY_PERIOD_S = (0.004, 0.1)
+_KEPT_PERIODS = 25
+_MAX_GAP_S = 0.25  # older pictures say nothing of the order
+_EVIDENCE = 1.0  # a sum of votes, of at most 1 each, that decides: two frames at least
+_MOST_EVIDENCE = 3.0  # so that a changed order is found in time
+_TURNED_EVIDENCE = 1.0  # against an order that was taken for known
+
+
+@dataclass(frozen=True, eq=False)
+class FieldState:
+    """What is known of a stream. `votes`: for the top field being the earlier one.
+    `top_first`: None until it is known. `previous`: the last picture, where it was combed."""
+
+    votes: float = 0.0
+    top_first: bool | None = None
+    periods_s: tuple[float, ...] = ()
+    last_s: float | None = None
+    previous: Grey | None = None
+
+    @property
+    def period_s(self) -> float:
+        """Of the frames: television's where it is near to that."""
+        if not self.periods_s:
+            return _PERIODS_S[1]
+        period_s = median(self.periods_s)
+        if _VIDEO_PERIODS_S[0] < period_s < _VIDEO_PERIODS_S[1]:
+            return min(_PERIODS_S, key=lambda p: abs(p - period_s))
+        return period_s
+
+
+def combing(image: Grey) -> float:
+    """How much more the rows differ from the other field's than from their own field's;
+    from 1.4 on the picture counts as combed: fields a pixel apart. Grey, (h, w)."""
+    groups, width = len(image) // _GROUP, image.shape[1]
+    if groups == 0:
+        return 0.0
+    # Groups of rows side by side, so that the next row is `width` further along.
+    flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)
+    above2, above, row, below, below2 = (
+        flat[:, k * width : (k + _GROUP - 4) * width] for k in range(5)
+    )
+    other = cv2.absdiff(row, cv2.addWeighted(above, 0.5, below, 0.5, 0.0))
+    own = cv2.absdiff(row, cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0))
+    least = max(_STRONG * cv2.mean(own)[0], _LEAST_GREY)
+    energy = [
+        cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO)[1], cv2.NORM_L2SQR)
+        for each in (other, own)
+    ]
+    return energy[0] / (energy[1] + _FLOOR * row.size)
+
+
+def is_combed(image: Grey) -> bool:
+    return combing(image) > _COMBED
+
+
+def field_picture(image: Grey, first_row: int) -> Grey:
+    """One field at full height: its own rows (`first_row`, and every second after it) stay
+    where they are, those between are interpolated. What is at row y in the frame is there
+    in this picture."""
+    own = image[first_row::2]
+    # Row k of the result lies between rows k and k + 1 of the field.
+    between = cv2.filter2D(own, -1, _TAPS[:, None], anchor=(0, 1), borderType=cv2.BORDER_REPLICATE)
+    picture = image.copy()
+    if first_row == 0:
+        picture[1::2] = between[: len(picture[1::2])]
+    else:
+        picture[2::2] = between[: len(picture[2::2])]
+        picture[0] = own[0]
+    return picture
+
+
+def looked_at(frame: Frame, mode: FieldsMode) -> Frame:
+    """The frame, with `fields` saying what it is."""
+    if frame.fields is not None:
+        return frame
+    if mode == "progressive":
+        return replace(frame, fields="whole")
+    combed = mode != "auto" or is_combed(frame.image)
+    return replace(frame, fields="woven" if combed else "whole")
+
+
+def halves(frame: Frame) -> tuple[Frame, Frame]:
+    """The top and the bottom field of a woven frame, both at the frame's time."""
+    return (
+        replace(frame, image=field_picture(frame.image, 0), fields="top"),
+        replace(frame, image=field_picture(frame.image, 1), fields="bottom"),
+    )
+
+
+def separated(
+    state: FieldState, frame: Frame, mode: FieldsMode
+) -> tuple[FieldState, tuple[Frame, ...]]:
+    """The pictures of a stream's frame, in their order of time: one, or two fields.
+
+    The frame's time is the middle between its fields. `mode`: ``auto`` finds all by measure,
+    ``top`` and ``bottom`` say that every frame is woven and which field is earlier,
+    ``progressive`` that none is.
+    """
+    frame = looked_at(frame, mode)
+    if frame.fields == "whole":
+        return _timed(replace(state, previous=None), frame), (frame,)
+    if mode in ("top", "bottom"):
+        state = replace(_timed(state, frame), top_first=mode == "top")
+    else:
+        state = _voted(state, frame)
+    if frame.fields != "woven" or state.top_first is None:
+        return state, (frame,)
+    top, bottom = halves(frame)
+    early, late = (top, bottom) if state.top_first else (bottom, top)
+    apart_s = state.period_s / 2.0
+    return state, (
+        replace(early, t_s=frame.t_s - apart_s / 2.0),
+        replace(late, t_s=frame.t_s + apart_s / 2.0),
+    )
+
+
+def _timed(state: FieldState, frame: Frame) -> FieldState:
+    """With the time since the last frame."""
+    periods_s = state.periods_s
+    if state.last_s is not None:
+        gap_s = frame.t_s - state.last_s
+        if _ANY_PERIOD_S[0] < gap_s < _ANY_PERIOD_S[1]:
+            periods_s = (*periods_s[1 - _KEPT_PERIODS :], gap_s)
+    return replace(state, periods_s=periods_s, last_s=frame.t_s)
+
+
+def _voted(state: FieldState, frame: Frame) -> FieldState:
+    """With the evidence of this frame and the one before about the order."""
+    before, votes, top_first = state.previous, state.votes, state.top_first
+    near = state.last_s is not None and 0.0 < frame.t_s - state.last_s < _MAX_GAP_S
+    if near and before is not None and before.shape == frame.image.shape:
+        votes = min(max(votes + _vote(before, frame.image), -_MOST_EVIDENCE), _MOST_EVIDENCE)
+    if top_first is None and abs(votes) > _EVIDENCE:
+        top_first = votes > 0.0
+    elif top_first is not None and (votes if not top_first else -votes) > _TURNED_EVIDENCE:
+        top_first = not top_first
+    state = replace(_timed(state, frame), votes=votes, top_first=top_first)
+    return replace(state, previous=frame.image)
+
+
+def _vote(before: Grey, now: Grey) -> float:
+    """-1 (the bottom field is earlier) .. 1 (the top field is).
+
+    Rows are compared with the mean of their two neighbours of the other field, or motion
+    along the columns would count for one of the two orders.
+    """
+    rows = (min(len(before), len(now)) - 2) // 2 * 2
+    tops = [image[0:rows:2] for image in (before, now)]
+    bottoms = [image[1 : rows + 1 : 2] for image in (before, now)]
+    low = cv2.addWeighted(bottoms[0][:-1], 0.5, bottoms[0][1:], 0.5, 0.0)
+    bottom_to_top = cv2.norm(low, tops[1][1:], cv2.NORM_L2SQR)
+    high = cv2.addWeighted(tops[0][:-1], 0.5, tops[0][1:], 0.5, 0.0)
+    top_to_bottom = cv2.norm(high, bottoms[1][:-1], cv2.NORM_L2SQR)
+    return (top_to_bottom - bottom_to_top) / max(top_to_bottom + bottom_to_top, 1.0)

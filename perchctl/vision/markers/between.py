@@ -1,0 +1,35 @@
+"""The markers of two fields, at the moment half way between them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from perchctl.vision.types import MARKERS, Detection, Detections
+
+
+def between(a: Detections, b: Detections) -> Detections:
+    """The mean of both fields' corners, which is right for either order of the fields.
+
+    A marker that only one field shows is left out where the other marker is in both: the
+    two would belong to different moments.
+    """
+    both = {
+        name: _middle(one, other)
+        for name in MARKERS
+        if (one := a.get(name)) is not None and (other := b.get(name)) is not None
+    }
+    if not both:
+        alone = a if a.large is not None or a.small is not None else b
+        return replace(alone, mirrored=alone.mirrored or b.mirrored)
+    return replace(a, large=both.get("large"), small=both.get("small"), mirrored=False)
+
+
+def _middle(a: Detection, b: Detection) -> Detection:
+    """Each field has its own noise, so the mean is surer than either."""
+    return Detection(
+        a.marker,
+        (a.corners_px + b.corners_px) / 2.0,
+        ((a.sigma_px**2 + b.sigma_px**2) / 4.0) ** 0.5,
+        a.refined and b.refined,
+        max(a.shift_sigma_px, b.shift_sigma_px),
+    )

@@ -1,0 +1,133 @@
+"""The flight loop under an interlaced camera: each field with the attitude of its own time."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from perchctl.flight.senses import REMARK_PICTURES, Senses
+from perchctl.geometry import rpy_from_rotation
+from perchctl.link.protocol import Link
+from perchctl.pipeline import make_pipeline
+from perchctl.profile import Profile
+from perchctl.vehicle import FLYING, Telemetry
+from perchctl.vision.types import Frame
+from tests.helpers.interlaced import Pass
+from tests.helpers.target_picture import CAMERA
+
+PERIOD_S = 0.01
+PROFILE = Profile.model_validate(
+    {"camera": {"mount": {"position_m": [0, 0, 0]}}, "vehicle": {"gear_body_m": [0, 0, 0]}}
+)
+
+
+class Vehicle:
+    """Its telemetry is the truth, every 10 ms."""
+
+    def __init__(self, scene: Pass) -> None:
+        self._scene, self._next_s, self.now_s = scene, 0.0, 0.0
+
+    def telemetry(self) -> list[Telemetry]:
+        new = []
+        while self._next_s <= self.now_s:
+            T = self._scene.T_world_cam(self._next_s)
+            x, y, z = (float(v) for v in T[:3, 3])
+            roll, pitch, yaw = rpy_from_rotation(T[:3, :3])
+            new.append(
+                Telemetry(
+                    t_s=self._next_s,
+                    position_m=(x, y, z),
+                    velocity_mps=(0.0, 0.0, 0.0),
+                    roll_rad=roll,
+                    pitch_rad=pitch,
+                    yaw_rad=yaw,
+                    acc_z_g=1.0,
+                    thrust=3e4,
+                    battery_v=3.9,
+                    supervisor=FLYING,
+                )
+            )
+            self._next_s += PERIOD_S
+        return new
+
+
+class Camera:
+    """Gives each frame when it has arrived."""
+
+    live, finished, size_px = True, False, CAMERA.size_px
+
+    def __init__(self, scene: Pass, count: int) -> None:
+        self._frames = list(scene.frames(count))
+
+    def poll(self, now_s: float) -> Frame | None:
+        if self._frames and self._frames[0].t_arrival_s <= now_s:
+            return self._frames.pop(0)
+        return None
+
+    def problem(self, now_s: float) -> str | None:
+        return None
+
+    def describe(self) -> str:
+        return "a camera"
+
+
+def flown_by(scene: Pass, count: int = 14) -> tuple[list[Any], list[str]]:
+    """The outputs of all turns with a frame, and what was remarked."""
+    vehicle = Vehicle(scene)
+    pipeline = make_pipeline(PROFILE, CAMERA)
+    senses = Senses(cast(Link, vehicle), cast(Any, Camera(scene, count)), pipeline, PROFILE)
+    outputs, remarks = [], []
+    for k in range(1, 80):
+        vehicle.now_s = k * PERIOD_S
+        senses.take_in(vehicle.now_s)
+        remarks += senses.take_remarks()
+        if senses.output is not None:
+            outputs.append(senses.output)
+    return outputs, remarks
+
+
+@pytest.mark.parametrize("first", ["top", "bottom"])
+def test_a_target_stands_still_under_fields_in_flight(first: str) -> None:
+    scene = Pass(0.25, (0.25, 0.1, 0.0), camera_fields=first, camera_latency_s=0.06)
+    outputs, remarks = flown_by(scene)
+    assert len(outputs) == 14
+    assert {output.fields for output in outputs[5:]} == {"bottom" if first == "top" else "top"}
+    places = [output.target.world_m for output in outputs[5:]]
+    # Fields 10 ms from their time would be 2.7 mm aside.
+    there = np.array([0.0, 0.0, scene.scenario.ceiling_z_m])
+    assert np.abs(np.array(places) - there).max() < 7e-4
+    assert [text.partition(":")[0] for text in remarks] == ["interlaced"]
+
+
+def test_both_fields_are_measured() -> None:
+    """The later one is a turn's output; the filter had the earlier one too."""
+    scene = Pass(0.25, (0.2, 0.0, 0.0), camera_fields="top")
+    seen: list[float] = []
+
+    class Noting(Senses):
+        def _remark(self, output: Any) -> None:
+            seen.append(output.detections.t_s)
+
+    vehicle = Vehicle(scene)
+    noting = Noting(
+        cast(Link, vehicle), cast(Any, Camera(scene, 10)), make_pipeline(PROFILE, CAMERA), PROFILE
+    )
+    for k in range(1, 60):
+        vehicle.now_s = k * PERIOD_S
+        noting.take_in(vehicle.now_s)
+    assert len(seen) >= 16
+    assert np.diff(seen)[-6:] == pytest.approx(0.02, abs=1e-3)
+
+
+def test_blended_fields_are_remarked_once() -> None:
+    scene = Pass(0.3, (0.25, 0.05, 0.0), camera_fields="top", camera_blended=True)
+    _, remarks = flown_by(scene, REMARK_PICTURES + 6)
+    assert [text.partition(":")[0] for text in remarks] == ["blended"]
+
+
+def test_of_whole_pictures_there_is_nothing_to_remark() -> None:
+    outputs, remarks = flown_by(Pass(0.25, (0.25, 0.1, 0.0)), 6)
+    assert {output.fields for output in outputs} == {"whole"}
+    assert remarks == []

@@ -1,0 +1,311 @@
+"""Interlaced pictures: found out, taken apart and measured, against a known truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from perchctl.geometry import Array
+from perchctl.pipeline import FieldState, Pipeline, PipelineState, pictures, step
+from perchctl.vision.fields import (
+    FieldsMode,
+    combing,
+    field_picture,
+    halves,
+    is_combed,
+    looked_at,
+    separated,
+)
+from perchctl.vision.types import CameraModel, Frame, PictureKind
+from tests.helpers.interlaced import Pass
+
+SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
+PAL_S = 0.04
+
+Build = Callable[..., Pipeline]
+
+
+def woven_frames(count: int, first: str = "top", **scenario: Any) -> tuple[Pass, list[Frame]]:
+    scene = Pass(camera_fields=first, **scenario)
+    return scene, list(scene.frames(count))
+
+
+# --- Fields ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first_row", [0, 1])
+def test_a_field_at_full_height_keeps_everything_in_its_place(first_row: int) -> None:
+    """Half a row's offset would move the whole picture."""
+    rows = np.arange(48.0)
+    truth = np.rint(127.0 + 100.0 * np.sin(rows / 7.0))[:, None].repeat(32, axis=1)
+    picture = field_picture(truth.astype(np.uint8), first_row)
+    assert np.array_equal(picture[first_row::2], truth[first_row::2])
+    assert np.abs(picture[4:-4] - truth[4:-4]).max() <= 1.0
+    assert np.abs(picture[[0, -1]] - truth[[0, -1]]).max() <= 20.0  # one row on, at the rims
+
+
+def test_only_the_rows_of_a_field_are_in_its_picture() -> None:
+    image = np.random.default_rng(1).integers(0, 256, (40, 30)).astype(np.uint8)
+    other = image.copy()
+    other[1::2] = 255 - other[1::2]
+    assert np.array_equal(field_picture(image, 0), field_picture(other, 0))
+    assert not np.array_equal(field_picture(image, 1), field_picture(other, 1))
+
+
+# --- Combed or not -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", ["top", "bottom"])
+@pytest.mark.parametrize("below_m", [0.1, 0.3, 1.0])
+def test_two_moments_in_one_picture_are_seen(below_m: float, first: str) -> None:
+    _, frames = woven_frames(2, first, below_m=below_m, camera_noise_sigma=8.0)
+    assert all(is_combed(frame.image) for frame in frames)
+
+
+@pytest.mark.parametrize("analogue", [0.0, 0.3, 0.6, 0.9])
+@pytest.mark.parametrize("below_m", [0.08, 0.4, 1.6])
+def test_a_whole_picture_is_never_taken_for_two(below_m: float, analogue: float) -> None:
+    for noise in (0.0, 7.0):
+        scene = Pass(below_m, camera_noise_sigma=noise, extra={"analogue": analogue})
+        for frame in scene.frames(3):
+            assert not is_combed(frame.image)
+
+
+def test_noise_and_snow_and_nothing_are_not_combed() -> None:
+    rng = np.random.default_rng(2)
+    snow = rng.integers(0, 256, (480, 640)).astype(np.uint8)
+    noise = np.clip(120 + rng.normal(0, 12, (480, 640)), 0, 255).astype(np.uint8)
+    for image in (snow, noise, np.full((480, 640), 90, np.uint8), snow[:6]):
+        assert not is_combed(image)
+
+
+@pytest.mark.parametrize("folder", ["scenes", "hard/progressive", "hard/true", "hard/false"])
+def test_no_shared_whole_picture_is_taken_for_two(folder: str) -> None:
+    if not (SHARED / folder).is_dir():
+        pytest.skip(f"the shared pictures are absent ({SHARED / folder})")
+    files = [f for f in (SHARED / folder).rglob("*") if f.suffix in (".jpg", ".png")]
+    measured = {f.name: combing(np.asarray(cv2.imread(str(f), 0), np.uint8)) for f in files}
+    assert len(measured) >= 16
+    assert max(measured.values()) < 1.0  # 1.4 would be combed
+
+
+# --- Order and time ------------------------------------------------------------------------
+
+
+def kinds(state: FieldState, frames: list[Frame], mode: FieldsMode = "auto") -> list[Any]:
+    found = []
+    for frame in frames:
+        state, parts = separated(state, frame, mode)
+        found.append(tuple(part.fields for part in parts))
+    return found
+
+
+@pytest.mark.parametrize("first", ["top", "bottom"])
+@pytest.mark.parametrize(
+    "velocity_mps", [(0.2, 0.0, 0.0), (0.0, 0.15, 0.0), (0.0, -0.05, 0.0), (0.1, 0.1, 0.2)]
+)
+def test_the_order_is_found_within_a_few_frames(
+    first: PictureKind, velocity_mps: tuple[float, float, float]
+) -> None:
+    """Motion along the columns too, where a row of the one field lies between two of the other."""
+    scene = Pass(0.25, velocity_mps, turn_radps=0.0, camera_fields=first)
+    found = kinds(FieldState(), list(scene.frames(6)))
+    second = "bottom" if first == "top" else "top"
+    assert found[0] == ("woven",)
+    assert found[5] == (first, second)
+    assert set(found) <= {("woven",), (first, second)}
+
+
+def test_a_standing_picture_says_nothing_of_the_order() -> None:
+    _, (frame,) = woven_frames(1)
+    state = FieldState()
+    for k in range(8):
+        again = replace(frame, t_s=frame.t_s + k * PAL_S)
+        state, parts = separated(state, again, "auto")
+        assert [part.fields for part in parts] == ["woven"]
+    assert abs(state.votes) < 0.1
+
+
+def test_a_changed_order_is_found() -> None:
+    """A receiver that loses its lock may come back with its fields exchanged."""
+    _, tops = woven_frames(5, "top")
+    _, bottoms = woven_frames(12, "bottom")
+    later = [replace(frame, t_s=frame.t_s + 1.0) for frame in bottoms]
+    found = kinds(FieldState(), tops + later)
+    assert found[4] == ("top", "bottom")
+    assert found[-1] == ("bottom", "top")
+
+
+@pytest.mark.parametrize(
+    ("period_s", "apart_s"), [(1 / 25, 0.02), (1 / 30, 1 / 60), (1 / 60, 1 / 120), (1 / 12, 1 / 24)]
+)
+def test_fields_are_half_a_period_apart(period_s: float, apart_s: float) -> None:
+    """Found from times that jitter, of frames of which some are lost."""
+    rng = np.random.default_rng(6)
+    _, frames = woven_frames(3)
+    state = FieldState()
+    index = 0
+    for k in range(40):
+        index += 1 + (rng.random() < 0.1)
+        t_s = index * period_s + rng.normal(0.0, 0.03 * period_s)
+        state, parts = separated(state, replace(frames[k % 3], t_s=t_s), "top")
+    early, late = parts
+    assert (early.t_s + late.t_s) / 2.0 == pytest.approx(t_s)
+    assert late.t_s - early.t_s == pytest.approx(apart_s, rel=0.03)
+
+
+def test_the_profile_may_know_better() -> None:
+    _, frames = woven_frames(2, "top")
+    assert kinds(FieldState(), frames, "bottom") == [("bottom", "top")] * 2
+    assert kinds(FieldState(), frames, "top") == [("top", "bottom")] * 2
+    assert kinds(FieldState(), frames, "progressive") == [("whole",)] * 2
+    still = list(Pass().frames(2))
+    assert kinds(FieldState(), still, "auto") == [("whole",)] * 2
+    assert kinds(FieldState(), still, "top") == [("top", "bottom")] * 2
+
+
+def test_what_was_looked_at_is_not_looked_at_again() -> None:
+    _, (frame,) = woven_frames(1)
+    whole = replace(frame, fields="whole")
+    assert looked_at(whole, "auto") is whole
+    assert looked_at(frame, "auto").fields == "woven"
+    top, bottom = halves(frame)
+    assert (top.fields, bottom.fields) == ("top", "bottom")
+    assert (top.index, top.t_s, top.t_arrival_s) == (frame.index, frame.t_s, frame.t_arrival_s)
+
+
+# --- The target ----------------------------------------------------------------------------
+
+
+def measured(scene: Pass, frames: list[Frame], setup: Pipeline) -> tuple[list[Array], int]:
+    """Errors, mm, of the poses at their pictures' own times, and the number of pictures."""
+    state, fields, errors, count = PipelineState(), FieldState(), [], 0
+    for frame in frames:
+        fields, parts = pictures(fields, frame, setup)
+        for part in parts:
+            count += 1
+            state, output = step(state, part, None, setup)
+            if output.poses:
+                pose = next(iter(output.poses.values()))
+                assert pose.t_s == part.t_s
+                errors.append((pose.tvec_m - scene.target_m(part.t_s)) * 1000.0)
+    return errors, count
+
+
+@pytest.mark.parametrize("first", ["top", "bottom"])
+def test_each_field_is_measured_at_its_own_time(build: Build, first: str) -> None:
+    scene, frames = woven_frames(12, first, below_m=0.25)
+    setup = build()
+    errors, count = measured(scene, frames, setup)
+    assert count >= 20
+    assert len(errors) == count
+    # Taken as a moment 10 ms off, the target would be 2 mm aside.
+    assert (np.median(np.abs(errors), axis=0) < [0.03, 0.03, 0.08]).all()
+    assert np.sqrt(np.mean(np.square(errors[6:]), axis=0)).max() < 0.1
+
+
+def test_as_whole_pictures_they_would_be_lost(build: Build) -> None:
+    """What the separation is for."""
+    scene, frames = woven_frames(8, below_m=0.12, velocity_mps=(0.3, 0.1, 0.05))
+    setup = build()
+    apart, count = measured(scene, frames, setup)
+    together, _ = measured(scene, frames, replace(setup, fields="progressive"))
+    assert len(apart) == count
+    assert len(together) < 0.5 * len(frames)
+
+
+def test_a_single_woven_picture_gives_the_middle_moment(build: Build) -> None:
+    """In either order, of which one picture knows nothing."""
+    for first in ("top", "bottom"):
+        scene, (frame,) = woven_frames(1, first)
+        _, output = step(PipelineState(), frame, None, build())
+        assert output.fields == "woven"
+        pose = output.poses["joint"]
+        assert np.abs(pose.tvec_m - scene.target_m(frame.t_s)).max() < 1e-4
+
+
+def test_whole_pictures_go_on_as_ever(build: Build) -> None:
+    scene = Pass()
+    setup = build()
+    state = plain = PipelineState()
+    fields = FieldState()
+    for frame in scene.frames(4):
+        fields, (part,) = pictures(fields, frame, setup)
+        assert part.image is frame.image
+        assert part.t_s == frame.t_s
+        state, one = step(state, part, None, setup)
+        plain, other = step(plain, replace(frame, fields="whole"), None, setup)
+        assert one.target is not None
+        assert other.target is not None
+        assert np.array_equal(one.target.e_m, other.target.e_m)
+
+
+# --- Blended -----------------------------------------------------------------------------
+
+
+def ghosts(setup: Pipeline, scene: Pass) -> list[tuple[float, float]]:
+    """The double edges' distance and the corners' spread, by picture."""
+    state, found = PipelineState(), []
+    for frame in scene.frames(6):
+        state, output = step(state, frame, None, setup)
+        if (seen := output.detections.large or output.detections.small) is not None:
+            found.append((output.detections.ghost_px, seen.sigma_px))
+    return found
+
+
+@pytest.mark.parametrize("below_m", [0.15, 0.3, 0.5])
+def test_blended_fields_are_named_and_not_trusted(build: Build, below_m: float) -> None:
+    speed = 0.75 * below_m  # 6 px between the fields
+    scene = Pass(below_m, (speed, 0.2 * speed, 0.0), camera_fields="top", camera_blended=True)
+    found = ghosts(build(), scene)
+    assert len(found) >= 4
+    assert all(4.0 < px < 8.0 for px, _ in found)
+    assert all(sigma > 0.2 * px for px, sigma in found)
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, 0.008, 0.02])
+@pytest.mark.parametrize("below_m", [0.1, 0.3, 0.5, 1.2])
+def test_motion_and_its_blur_are_not_blended_fields(
+    build: Build, below_m: float, exposure_s: float
+) -> None:
+    scene = Pass(below_m, (0.8 * below_m, 0.3 * below_m, 0.0), camera_exposure_s=exposure_s)
+    state, setup = PipelineState(), build()
+    for frame in scene.frames(5):
+        state, output = step(state, frame, None, setup)
+        assert output.detections.ghost_px == 0.0
+
+
+# --- Shared pictures ---------------------------------------------------------------------------
+
+
+def shared_errors(folder: str, build: Build) -> Array:
+    hard = SHARED / "hard"
+    if not hard.is_dir():
+        pytest.skip(f"the shared pictures are absent ({hard})")
+    storage = cv2.FileStorage(str(hard / "camera.yaml"), cv2.FILE_STORAGE_READ)
+    K, dist = (storage.getNode(name).mat() for name in ("camera_matrix", "distortion_coefficients"))
+    setup = build(camera=CameraModel((640, 480), K, dist.ravel()))
+    errors = []
+    for name, truth in json.loads((hard / "truth.json").read_text()).items():
+        if not name.startswith(folder):
+            continue
+        image = np.asarray(cv2.imread(str(hard / folder / name), cv2.IMREAD_GRAYSCALE), np.uint8)
+        _, output = step(PipelineState(), Frame(0, 0.0, image), None, setup)
+        assert output.target is not None, name
+        errors.append((output.target.e_m - np.array(truth["t"])) * 1000.0)
+    assert len(errors) == 16
+    return np.sqrt(np.mean(np.square(errors), axis=0))
+
+
+def test_shared_woven_pictures_are_as_good_as_whole_ones(build: Build) -> None:
+    woven, whole = (shared_errors(folder, build) for folder in ("weave", "progressive"))
+    assert woven[2] < 2.0 * whole[2]
+    assert woven[2] < 0.05
+    assert woven[:2].max() < 0.03
