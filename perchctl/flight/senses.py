@@ -82,14 +82,16 @@ class Senses:
         return new
 
     def _remark(self, output: PipelineOutput) -> None:
-        """Each is made once a flight, when three pictures have shown it."""
+        """Each is made once a flight, when three pictures in a row have shown it."""
         for text, shown in (
             (INTERLACED, output.fields != "whole"),
             (BLENDED, output.detections.ghost_px > 0.0),
         ):
-            self._shown[text] = self._shown.get(text, 0) + shown
-            if shown and self._shown[text] == REMARK_PICTURES:
-                self._remarks.append(text)
+            before = self._shown.get(text, 0)
+            if before < REMARK_PICTURES:
+                self._shown[text] = before + 1 if shown else 0
+                if self._shown[text] == REMARK_PICTURES:
+                    self._remarks.append(text)
 
     def target(self, now_s: float) -> TargetEstimate | None:
         """The estimate at the present. The filter coasts by frames: while none are looked

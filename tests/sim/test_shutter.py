@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.shutter import FLICKER_HZ, Shutter, blended
 from perchctl.sim.surfaces import Picture
+from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vision.types import CameraModel
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
@@ -106,9 +108,10 @@ def test_lamps_make_bands_of_a_rolling_shutter() -> None:
 
 def test_an_exposure_of_one_swing_sees_no_lamps() -> None:
     whole = replace(STILL, camera_flicker=0.5, camera_exposure_s=1.0 / FLICKER_HZ)
-    shots = Shutter(whole).shots(0.1, lambda t: np.eye(4), 480)
-    assert shots[0].light is not None
-    assert np.ptp(shots[0].light) < 1e-9
+    for t_s in (0.1, 0.102, 0.105, 0.107):
+        (shot,) = Shutter(whole).shots(t_s, lambda t: np.eye(4), 480)
+        assert shot.light is not None
+        assert np.abs(shot.light - 1.0).max() < 1e-9
 
 
 def test_a_hunting_exposure_changes_whole_pictures_slowly() -> None:
@@ -143,6 +146,26 @@ def test_a_frame_never_arrives_before_its_last_light() -> None:
     assert len(arrived) >= 2
     for frame in arrived:
         assert frame.t_arrival_s >= frame.t_exposure_s + 0.024 - 1e-9
+
+
+def test_the_vehicle_remembers_as_far_back_as_a_frame_looks() -> None:
+    slow = replace(STILL, camera_fields="top", camera_readout_s=0.02, camera_exposure_s=0.008)
+    vehicle = SimulatedVehicle(slow, CAMERA)
+    assert vehicle.camera is not None
+    oldest: list[float] = []
+    seen = vehicle.camera.advance
+
+    def advance(t_s: float, pose_at: Any) -> None:
+        def asked(at_s: float) -> Any:
+            oldest.append(abs(pose_at(at_s).t_s - at_s))
+            return pose_at(at_s)
+
+        seen(t_s, asked)
+
+    vehicle.camera.advance = advance  # type: ignore[method-assign]
+    vehicle.advance_to(0.15)
+    assert len(oldest) > 20
+    assert max(oldest) < CONTROL_PERIOD_S
 
 
 def test_the_default_camera_is_plain() -> None:

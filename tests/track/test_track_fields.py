@@ -63,6 +63,17 @@ def test_the_fields_of_a_video_are_tracked_one_by_one(
     assert int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == FRAMES
 
 
+def test_a_camera_that_rests_and_moves_is_named_once(
+    tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At rest nothing is combed, and when it moves again that is no news."""
+    images = [f.image for f in Pass(0.3, (0.2, 0.05, 0.0), camera_fields="top").frames(4)]
+    still = [f.image for f in Pass(0.3, (0.0, 0.0, 0.0), 0.0, camera_fields="top").frames(3)]
+    file = write_video(tmp_path / "rests.avi", images + still + images, rate_hz=1 / PAL_S)
+    track(file, calibration)
+    assert capsys.readouterr().err.count("interlaced") == 2
+
+
 def test_stills_have_one_result_each(
     tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

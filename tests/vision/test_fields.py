@@ -275,7 +275,10 @@ def test_blended_fields_are_named_and_not_trusted(build: Build, below_m: float) 
 def test_motion_and_its_blur_are_not_blended_fields(
     build: Build, below_m: float, exposure_s: float
 ) -> None:
-    scene = Pass(below_m, (0.8 * below_m, 0.3 * below_m, 0.0), camera_exposure_s=exposure_s)
+    scene = Pass(
+        below_m, (0.8 * below_m, 0.3 * below_m, 0.0),
+        camera_exposure_s=exposure_s, camera_noise_sigma=12.0,
+    )  # fmt: skip
     state, setup = PipelineState(), build()
     for frame in scene.frames(5):
         state, output = step(state, frame, None, setup)
