@@ -72,6 +72,7 @@ MEANINGS = {
     "camera.start_timeout_s": "wait for the first good picture",
     "camera.mirrored": "flip each picture before use",
     "camera.fields": "interlaced pictures: found by measure, or which field is earlier, or never",
+    "camera.readout_s": "rolling shutter: from the first row to the last; none: not known",
     "vehicle.gear_body_m": "tip of the magnet gear in body axes",
     "target.large.dictionary": "an OpenCV dictionary",
     "target.large.id": "within the dictionary",

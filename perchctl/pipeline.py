@@ -74,7 +74,10 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
     """The profile's pipeline for a calibrated camera. It is never changed: several streams may
     share one, each with a `PipelineState` of its own."""
     mount, gear_body_m = profile.camera.mount, profile.vehicle.gear_body_m
-    pose = make_pose_setup(profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera)
+    pose = make_pose_setup(
+        profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera,
+        profile.camera.readout_s,
+    )  # fmt: skip
     return Pipeline(
         detector=make_detector(profile.detector, profile.target),
         pose=pose,

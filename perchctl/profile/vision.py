@@ -38,6 +38,7 @@ class CameraConfig(Section):
     start_timeout_s: float = Field(8.0, gt=0, le=60)
     mirrored: bool = False  # flip the picture before use
     fields: Literal["auto", "top", "bottom", "progressive"] = "auto"  # of interlaced pictures
+    readout_s: float | None = Field(0.0, ge=0, le=0.05)  # of a rolling shutter; none: unknown
 
 
 class VehicleConfig(Section):

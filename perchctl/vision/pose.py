@@ -61,6 +61,7 @@ class PoseSetup:
     T_body_cam: Array
     gear_body_m: Array
     camera: CameraModel
+    readout_s: float | None = 0.0  # of the camera's shutter; None: not known
 
 
 def make_pose_setup(
@@ -69,6 +70,7 @@ def make_pose_setup(
     T_body_cam: Array,
     gear_body_m: Sequence[float] | Array,
     camera: CameraModel,
+    readout_s: float | None = 0.0,
 ) -> PoseSetup:
     return PoseSetup(
         config=config,
@@ -79,6 +81,7 @@ def make_pose_setup(
         T_body_cam=np.asarray(T_body_cam, dtype=np.float64),
         gear_body_m=np.asarray(gear_body_m, dtype=np.float64),
         camera=camera,
+        readout_s=readout_s,
     )
 
 

@@ -84,8 +84,9 @@ class TiltPrior:
 @dataclass(frozen=True, eq=False)
 class Points:
     """object_m (n, 3) and image_px (n, 2) of a pinhole K; sigma_px (n,); whitening
-    (2n, 2n) makes errors independent and of unit spread; shift (2n,) is one standard
-    deviation of the shift that all edges share, whitened."""
+    (2n, 2n) makes errors independent and of unit spread; shift (2n, k): one standard deviation
+    each of what moves corners together, whitened: the shift that all edges share, and
+    the detections' `common_px`."""
 
     object_m: Array
     image_px: Array
@@ -100,7 +101,7 @@ def make_points(
 ) -> Points:
     n = len(image_px)
     W = np.zeros((2 * n, 2 * n))
-    shift = np.zeros(2 * n)
+    shift = np.zeros((2 * n, 2))
     sigma_px = np.empty(n)
     for i, d in enumerate(detections):
         rows = slice(8 * i, 8 * i + 8)
@@ -115,7 +116,9 @@ def make_points(
             # A corner moves a pixel along the normals of both of its sides.
             moved = np.empty((4, 2))
             moved[:, 0], moved[:, 1] = nx + nx[_BEFORE], ny + ny[_BEFORE]
-            shift[rows] = d.shift_sigma_px * moved.ravel()
+            shift[rows, 0] = d.shift_sigma_px * moved.ravel()
+        if d.common_px is not None:
+            shift[rows, 1] = d.common_px.ravel()
     return Points(object_m, image_px, sigma_px, W, W @ shift, K)
 
 
@@ -187,7 +190,7 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
 def covariance(points: Points, scored: Scored) -> tuple[Array, float]:
     """Of (rvec, tvec), (6, 6), and the squared error per degree of freedom: the inverse
     information, grown as far as the residuals show that the corners spread more than
-    they claim, and what the common shift does to the pose."""
+    they claim, and what common shifts do to the pose."""
     A, error = points.whitening @ scored.jacobian, points.whitening @ scored.error_px.ravel()
     freedom = len(error) - 6
     try:
@@ -197,7 +200,7 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float]:
     chi2 = float(error @ error)
     growth = max((_TRUST + chi2) / (_TRUST + freedom), 0.7)
     common = inverse @ (A.T @ points.shift)
-    return inverse * growth + np.outer(common, common), chi2 / freedom
+    return inverse * growth + common @ common.T, chi2 / freedom
 
 
 def mirror_solution(rvec: Array, tvec: Array) -> Array | None:

@@ -24,6 +24,7 @@ from perchctl.vision.merge import (
     merge_variance,
 )
 from perchctl.vision.pose import PoseSetup, estimate_pose, level_rotation
+from perchctl.vision.rolling import seen_at_once
 from perchctl.vision.types import (
     MARKERS,
     Attitude,
@@ -89,7 +90,9 @@ class Weights:
     tracks: tuple[str, ...] = MARKERS
 
     def measure(self, detections: Detections, prior: Prior) -> Measured:
-        singles = _singles(_seen(detections), detections.t_s, prior, self.pose, prior.near)
+        singles = _singles(
+            _seen(detections, self.pose), detections.t_s, prior, self.pose, prior.near
+        )
         contradicting = _contradict(singles, self.config)
         fed = _usable(singles, contradicting, prior, self.config, self.pose)
         return Measured(singles, fed, contradicting)
@@ -130,7 +133,7 @@ class Joint:
     tracks: tuple[str, ...] = ("joint",)
 
     def measure(self, detections: Detections, prior: Prior) -> Measured:
-        seen, t_s = _seen(detections), detections.t_s
+        seen, t_s = _seen(detections, self.pose), detections.t_s
         joint = None
         if len(seen) == 2:
             joint = estimate_pose(
@@ -166,8 +169,8 @@ def make_strategy(config: MergeConfig, pose: PoseSetup) -> MergeStrategy:
     return Joint(config, pose) if config.method == "joint" else Weights(config, pose)
 
 
-def _seen(detections: Detections) -> list[Detection]:
-    return [d for name in MARKERS if (d := detections.get(name)) is not None]
+def _seen(detections: Detections, setup: PoseSetup) -> list[Detection]:
+    return seen_at_once(detections, setup.readout_s, setup.camera.size_px[1])
 
 
 def _singles(

@@ -73,6 +73,7 @@ class Detection:
     sigma_px: float
     refined: bool
     shift_sigma_px: float = 0.0  # of what moved all of a picture's edges alike, outwards
+    common_px: Array | None = None  # (4, 2): one sigma of what moved all corners together
 
 
 @dataclass(frozen=True)

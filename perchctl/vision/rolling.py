@@ -1,0 +1,52 @@
+"""Corners of a rolling shutter at one moment.
+
+The rows of such a picture are exposed one after the other within the read-out time, and what
+moves is sheared, stretched or squeezed: at 20 ms and 0.3 m/s by as much as the target moves in
+a few milliseconds. A frame's time is its middle row's. Each corner is moved back along
+its own motion in the picture, by the time that its row was exposed later.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from perchctl.geometry import Array
+from perchctl.vision.types import MARKERS, Detection, Detections
+
+UNKNOWN_READOUT_S = 0.012
+"""One standard deviation of a camera's read-out time where nobody has said it."""
+
+
+def seen_at_once(
+    detections: Detections, readout_s: float | None, height_px: int
+) -> list[Detection]:
+    """The markers with their corners at the frame's own time, as far as their motion is known.
+
+    `readout_s` is from a picture's first row to its last; where it is None the corners stay
+    where they are, with what a likely read-out would do to them for an error (`common_px`).
+    """
+    seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
+    if readout_s == 0.0:
+        return seen
+    late = UNKNOWN_READOUT_S if readout_s is None else readout_s
+    out = []
+    for d in seen:
+        flow = detections.flow_px_s.get(d.marker, detections.velocity_px_s)
+        if flow is None:
+            out.append(d)
+            continue
+        # From frame to frame a corner that moves down is also seen later.
+        flow = flow / (1.0 + flow[..., 1:] * late / (height_px - 1.0))
+        moved_px = flow * _late_s(d.corners_px, late, height_px)
+        if readout_s is None:
+            out.append(replace(d, common_px=moved_px))
+        else:
+            out.append(replace(d, corners_px=d.corners_px - moved_px))
+    return out
+
+
+def _late_s(corners_px: Array, readout_s: float, height_px: int) -> Array:
+    """How much later than the middle row each corner's row is exposed, (4, 1)."""
+    return np.asarray((corners_px[:, 1:] / (height_px - 1.0) - 0.5) * readout_s)
