@@ -12,20 +12,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perchctl.geometry import Array, rot_z, wrap_rad
+from perchctl.geometry import Array, rot_z
 from perchctl.profile import KalmanConfig, Mounting, Profile
 from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
 from perchctl.vision.filter import (
     MAX_GAP_S,
     FilterSetup,
     make_filter,
-    measured_noise,
     predicted,
     step_track,
 )
 from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
 from perchctl.vision.merge import stage_of
-from perchctl.vision.pose import PoseSetup, level_rotation, make_pose_setup, normal_cam
+from perchctl.vision.places import measurement, seen_from, to_level, to_world
+from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners
 from perchctl.vision.strategies import Merged, MergeStrategy, Prior, make_strategy
 from perchctl.vision.types import (
@@ -33,7 +33,6 @@ from perchctl.vision.types import (
     CameraModel,
     Detections,
     Frame,
-    MarkerPose,
     MarkerTrack,
     Measured,
     PipelineOutput,
@@ -50,6 +49,7 @@ __all__ = [
     "PipelineState",
     "camera_profile",
     "estimate",
+    "follow",
     "make_pipeline",
     "pictures",
     "step",
@@ -121,11 +121,20 @@ def step(
     `pictures` makes of a stream's; one that was not looked at there is looked at here.
     """
     frame = looked_at(frame, pipeline.fields)
-    sighting = state.sighting
-    expected, near = expected_corners(sighting, frame.t_s, attitude, pipeline.pose)
+    expected, _ = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
     # A first picture is looked at thoroughly, and of a stream without the target every Nth.
     thorough = state.empty_frames % pipeline.detector.blurred_every == 0
     detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, thorough)
+    new, output = follow(state, detections, attitude, pipeline)
+    return new, replace(output, fields=frame.fields or "whole")
+
+
+def follow(
+    state: PipelineState, detections: Detections, attitude: Attitude | None, pipeline: Pipeline
+) -> tuple[PipelineState, PipelineOutput]:
+    """`step` from the corners on: what a picture gave, at its time."""
+    sighting, t_s = state.sighting, detections.t_s
+    _, near = expected_corners(sighting, t_s, attitude, pipeline.pose)
     normal = None if sighting is None else normal_cam(sighting.pose)
     measured = pipeline.strategy.measure(detections, Prior(attitude, near, normal))
 
@@ -135,7 +144,7 @@ def step(
     if both:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
     in_world = pipeline.kalman.frame == "world" and attitude is not None
-    tracks = _step_tracks(state, measured, frame.t_s, attitude if in_world else None, pipeline)
+    tracks = _step_tracks(state, measured, t_s, attitude, in_world, pipeline)
     surest = next(iter(measured.poses.values()), None)
     if surest is not None:
         sighting = Sighting(surest, attitude)
@@ -145,19 +154,18 @@ def step(
         measured=measured,
         attitude=attitude,
         target=state.target,
-        last=detections if anything else _still_useful(state.last, frame.t_s),
+        last=detections if anything else _still_useful(state.last, t_s),
         sighting=sighting if surest is not None or tracks else None,
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
     )
-    target = _at_frame(new, frame.t_s, pipeline)
+    target = _at_frame(new, t_s, pipeline)
     output = PipelineOutput(
         detections=detections,
         poses=measured.poses,
         target=target,
         stage=stage_of(detections.large is not None, detections.small is not None),
         disagreeing_frames=disagreeing,
-        fields=frame.fields or "whole",
     )
     return replace(new, target=target or state.target), output
 
@@ -200,44 +208,23 @@ def _step_tracks(
     state: PipelineState,
     measured: Measured,
     t_s: float,
-    world: Attitude | None,
+    attitude: Attitude | None,
+    in_world: bool,
     pipeline: Pipeline,
 ) -> dict[str, MarkerTrack]:
-    """All tracks one frame on; `world` is the attitude where they live in the world."""
-    constants = pipeline.level_filter if world is None else pipeline.world_filter
-    old = state.tracks if state.in_world == (world is not None) else {}
+    """All tracks one frame on."""
+    constants = pipeline.world_filter if in_world else pipeline.level_filter
+    old = state.tracks if state.in_world == in_world else {}
     stepped: dict[str, MarkerTrack] = {}
     for name in pipeline.strategy.tracks:
         pose = measured.fed.get(name)
-        z = None if pose is None else _measurement(pose, world, pipeline)
-        R = None if pose is None else _noise(pose, world, constants, pipeline)
-        track = step_track(old.get(name), z, t_s, constants, R)
+        z = None
+        if pose is not None:
+            z = measurement(pose, attitude, in_world, constants, pipeline.pose)
+        track = step_track(old.get(name), z, t_s, constants)
         if track is not None:
             stepped[name] = track
     return stepped
-
-
-def _measurement(pose: MarkerPose, world: Attitude | None, pipeline: Pipeline) -> Array:
-    """(yaw, x, y, z) in the tracks' frame."""
-    if world is None:
-        return np.array([pose.e_yaw_rad, *pose.e_m])
-    position, yaw = _to_world(pose.e_m, pose.e_yaw_rad, world, pipeline)
-    return np.array([yaw, *position])
-
-
-def _noise(
-    pose: MarkerPose, world: Attitude | None, constants: FilterSetup, pipeline: Pipeline
-) -> Array | None:
-    """Covariance (4, 4) of `_measurement`, None for the fixed one."""
-    if pose.cov is None or constants.attitude_sigma_rad is None:
-        return None
-    cov, arm = pose.cov, pipeline.pose.T_body_cam[:3, :3] @ pose.tvec_m
-    if world is not None:
-        arm = level_rotation(world) @ arm
-        turn = np.eye(4)
-        turn[:3, :3] = rot_z(world.yaw_rad)
-        cov, arm = turn @ cov @ turn.T, turn[:3, :3] @ arm
-    return measured_noise(cov, arm, constants)
 
 
 # --- from the tracks to the target -------------------------------------------------
@@ -263,14 +250,14 @@ def _at_frame(state: PipelineState, t_s: float, pipeline: Pipeline) -> TargetEst
         e_m=merged.vector[:3],
         e_yaw_rad=float(merged.vector[3]),
         velocity_mps=merged.velocity_mps,
-        sigma_m=_sigma(merged.cov_m2),
+        sigma_m=_sigma(merged.cov_m2, merged.tilt_m),
         sigma_yaw_rad=float(np.sqrt(max(merged.var_yaw_rad2, 0.0))),
     )
     if attitude is None:
         return base
     if state.in_world:
         return _in_world(merged, base, t_s, attitude, pipeline)
-    world_m, world_yaw_rad = _to_world(base.e_m, base.e_yaw_rad, attitude, pipeline)
+    world_m, world_yaw_rad = to_world(base.e_m, base.e_yaw_rad, attitude, pipeline.pose)
     return replace(base, world_m=world_m, world_yaw_rad=world_yaw_rad)
 
 
@@ -283,10 +270,11 @@ def _in_world(
 ) -> TargetEstimate:
     """`base` with place and motion of world tracks, as seen from the vehicle at `attitude`."""
     turn = rot_z(-attitude.yaw_rad)
+    tilt_m = seen_from(merged.tilt_m, attitude, pipeline.world_filter, pipeline.pose)
     target = replace(
         base,
         velocity_mps=turn @ merged.velocity_mps,
-        sigma_m=_sigma(turn @ merged.cov_m2 @ turn.T),
+        sigma_m=_sigma(turn @ merged.cov_m2 @ turn.T, tilt_m),
         sigma_yaw_rad=float(np.sqrt(max(merged.var_yaw_rad2, 0.0))),
         world_m=merged.vector[:3],
         world_yaw_rad=float(merged.vector[3]),
@@ -301,26 +289,10 @@ def _carried(
     """The same place in the world, seen from the vehicle at `attitude`."""
     assert target.world_m is not None
     assert target.world_yaw_rad is not None
-    e_m, e_yaw_rad = _to_level(target.world_m, target.world_yaw_rad, attitude, pipeline)
+    e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
-def _to_world(
-    e_m: Array, e_yaw_rad: float, attitude: Attitude, pipeline: Pipeline
-) -> tuple[Array, float]:
-    gear_level = level_rotation(attitude) @ pipeline.pose.gear_body_m
-    position = np.asarray(attitude.position_m) + rot_z(attitude.yaw_rad) @ (e_m + gear_level)
-    return position, wrap_rad(e_yaw_rad + attitude.yaw_rad)
-
-
-def _to_level(
-    position_m: Array, yaw_rad: float, attitude: Attitude, pipeline: Pipeline
-) -> tuple[Array, float]:
-    """Inverse of `_to_world`."""
-    gear_level = level_rotation(attitude) @ pipeline.pose.gear_body_m
-    arm = rot_z(-attitude.yaw_rad) @ (position_m - np.asarray(attitude.position_m))
-    return arm - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)
-
-
-def _sigma(cov: Array) -> Array:
-    return np.asarray(np.sqrt(np.maximum(np.diag(cov), 0.0)))
+def _sigma(cov_m2: Array, tilt_m: Array) -> Array:
+    variance = np.diag(cov_m2) + (tilt_m**2).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -87,12 +87,14 @@ class PoseConfig(Section):
 
 
 class KalmanConfig(Section):
-    """The paper's filter. k1 and k2 are variances in cm^2 and deg^2, as the paper's
-    error vector is in centimetres and degrees.
+    """The paper's filter, and what its noise is.
 
-    `noise`: ``fixed`` takes k1 for every measurement, as the paper does; ``measured``
-    the covariance of the very pose, plus what `attitude_sigma_deg` of error in the
-    vehicle's roll and pitch does at the target's distance.
+    `noise`: ``fixed`` takes k1 for every measurement and k2 for every step, as the paper does:
+    variances in cm^2 and deg^2, as its error vector is in centimetres and degrees.
+    ``measured`` takes the covariance of the very pose, and for the motion accelerations: in
+    the level frame `acceleration_mps2` of the camera or target and `turn_radps2` of the
+    camera's attitude and heading, in the world `drift_mps2` of the state estimate. A constant
+    error of the vehicle's roll and pitch, `attitude_sigma_deg`, then widens what is claimed.
 
     `drift_mps`: a target stands still, so while it is not measured it moves in the world
     of the state estimate by that estimate's drift only, at most so fast.
@@ -103,8 +105,11 @@ class KalmanConfig(Section):
     alpha: float = Field(0.85, gt=0, le=1)
     n_max: int = Field(8, ge=0, le=100)
     frame: Literal["level", "world"] = "world"
-    noise: Literal["fixed", "measured"] = "fixed"
-    attitude_sigma_deg: float = Field(0.5, ge=0, le=10)
+    noise: Literal["fixed", "measured"] = "measured"
+    acceleration_mps2: float = Field(3.0, gt=0, le=100)
+    turn_radps2: float = Field(10.0, gt=0, le=1000)
+    drift_mps2: float = Field(0.1, gt=0, le=100)
+    attitude_sigma_deg: float = Field(0.3, ge=0, le=10)
     drift_mps: float = Field(0.05, ge=0, le=1)
 
 

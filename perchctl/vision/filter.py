@@ -3,12 +3,19 @@
 State order as in the paper: yaw, yaw rate, then position and velocity of x, y, z.
 The time step is the real one: with 15 % late frames a fixed step gave 0.63 cm RMS,
 the real one 0.19 cm.
+
+The paper's constants are the same for every frame (`kalman.noise: fixed`). A pose is a tenth
+of a millimetre true near the target and centimetres far from it, so by default each brings
+its own covariance, and the process noise is what accelerates: the vehicle in the level frame,
+the state estimate's drift in the world (`measured`). A constant error of the vehicle's roll
+and pitch, which no average takes away, is carried along as a consider term: by how much it
+has moved each state. It changes no gain, only what is claimed.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from filterpy.kalman import predict, update
@@ -32,61 +39,99 @@ H[range(4), MEASURED] = 1.0  # equation 2
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_LEAST_NOISE = np.array([1e-4, 1e-4, 1e-4, 1e-4]) ** 2  # 0.1 mm, 0.006 deg: lens and print
+_LEAST_NOISE = np.array([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
 _UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # of the paper, per state
+
+_PUSH_S = 0.1
+"""How long an acceleration lasts: white noise of its square times this, (m/s^2)^2 s."""
+_WANDER = np.array([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
+"""Of yaw, x, y and z of the state estimate: 0.1 deg and 5 mm in a second's random walk, as
+2 mm that are forgotten within 0.3 s look from one frame to the next."""
+_HEADING_RADPS2 = 0.1  # of the state estimate's heading
+
+
+@dataclass(frozen=True)
+class ProcessNoise:
+    """Accelerations of a tracked target, standard deviations: along each axis, of its heading,
+    and of the frame's own turning about level axes, which moves what is far the most."""
+
+    acceleration_mps2: float
+    heading_radps2: float
+    turn_radps2: float = 0.0
+    wanders: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class FilterSetup:
     """R (4, 4) and Q (8, 8) are ``k1 I`` and ``k2 I`` of the paper (cm^2, deg^2) in SI;
-    P0 (8, 8) is the covariance after the first measurement."""
+    P0 (8, 8) is the covariance after the first measurement.
+
+    `process` replaces Q, and a pose's own covariance R, where it is not None.
+    """
 
     R: Array
     Q: Array
     P0: Array
     alpha: float
     n_max: int
-    attitude_sigma_rad: float | None = None  # None: R for every measurement
+    process: ProcessNoise | None = None
+    tilt_sigma_rad: float = 0.0  # constant error of the vehicle's roll and pitch
     drift_mps: float = math.inf  # most that the target moves while nothing is measured
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """z = (yaw, x, y, z) of a target, (4,); R (4, 4), None for the setup's; and `tilt` (4, 2),
+    by how much one standard deviation of a constant error of roll and pitch moves z."""
+
+    z: Array
+    R: Array | None = None
+    tilt: Array | None = None
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
     """The filter's constants. At first sight, a target in the world stands nearly still
-    (5 cm/s of drift); one in the level frame moves as the vehicle does (30 cm/s)."""
-    first_rate = 5.0 if in_world else 30.0  # cm/s and deg/s
+    (5 cm/s of drift); one in the level frame moves as the vehicle does (30 cm/s), or, where
+    the camera may be in a hand, faster."""
+    measured = config.noise == "measured"
+    level_rate = 100.0 if measured else 30.0
     first = np.full(8, config.k1)
-    first[RATES] = first_rate**2
+    first[RATES] = (5.0 if in_world else level_rate) ** 2  # cm/s and deg/s
     squares = _UNITS**2
+    process = None
+    if measured:
+        process = (
+            ProcessNoise(config.drift_mps2, _HEADING_RADPS2, wanders=True)
+            if in_world
+            else ProcessNoise(config.acceleration_mps2, config.turn_radps2, config.turn_radps2)
+        )
     return FilterSetup(
         R=np.diag(config.k1 * squares[MEASURED]),
         Q=np.diag(config.k2 * squares),
         P0=np.diag(first * squares),
         alpha=config.alpha,
         n_max=config.n_max,
-        attitude_sigma_rad=(
-            math.radians(config.attitude_sigma_deg) if config.noise == "measured" else None
-        ),
+        process=process,
+        tilt_sigma_rad=math.radians(config.attitude_sigma_deg) if measured else 0.0,
         drift_mps=config.drift_mps if in_world else math.inf,
     )
 
 
-def measured_noise(cov: Array, arm_m: Array, setup: FilterSetup) -> Array | None:
-    """R (4, 4) of a measured (yaw, x, y, z) from the pose's covariance of (x, y, z, yaw)
-    and the way from camera to target (3,), all in the same axes; None where R is fixed.
-
-    An error of roll and pitch turns the way about level axes: heights change with the
-    horizontal way, places with the height. The heading is the vehicle's own matter.
-    """
-    if setup.attitude_sigma_rad is None or not np.isfinite(cov).all():
+def pose_noise(cov: Array) -> Array | None:
+    """R (4, 4) of a measured (yaw, x, y, z) from a pose's covariance of (x, y, z, yaw), None
+    where that is not finite."""
+    if not np.isfinite(cov).all():
         return None
-    x, y, z = arm_m
-    turned = np.array([[0.0, z], [-z, 0.0], [y, -x]]) * setup.attitude_sigma_rad
-    R = np.empty((4, 4))
     order = [3, 0, 1, 2]
-    R[:] = cov[np.ix_(order, order)]
-    R[1:, 1:] += turned @ turned.T
+    R = np.array(cov[np.ix_(order, order)])
     R[range(4), range(4)] += _LEAST_NOISE
     return R
+
+
+def tilted(way_m: Array) -> Array:
+    """Change of a way (3,) with a turn about the level x and y axes, m/rad, (3, 2)."""
+    x, y, z = way_m
+    return np.array([[0.0, z], [-z, 0.0], [y, -x]])
 
 
 def transition(dt_s: float) -> Array:
@@ -96,56 +141,82 @@ def transition(dt_s: float) -> Array:
     return F
 
 
-def start_track(z: Array, t_s: float, setup: FilterSetup, R: Array | None = None) -> MarkerTrack:
-    """A track at its first measurement z = (yaw, x, y, z), SI."""
+def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
+    """Q (8, 8) of a step, for a target at `position_m` (3,) in the tracks' frame."""
+    noise = setup.process
+    if noise is None:
+        return setup.Q
+    density = np.zeros((4, 4))  # of yaw, x, y and z, as `MEASURED`
+    density[0, 0] = noise.heading_radps2**2
+    sideways = float(position_m @ position_m) * np.eye(3) - np.outer(position_m, position_m)
+    density[1:, 1:] = noise.acceleration_mps2**2 * np.eye(3) + noise.turn_radps2**2 * sideways
+    density *= _PUSH_S
+    Q = np.zeros((8, 8))
+    Q[np.ix_(MEASURED, MEASURED)] = density * dt_s**3 / 3.0
+    Q[np.ix_(MEASURED, RATES)] = Q[np.ix_(RATES, MEASURED)] = density * dt_s**2 / 2.0
+    Q[np.ix_(RATES, RATES)] = density * dt_s
+    if noise.wanders:
+        Q[MEASURED, MEASURED] += _WANDER * dt_s
+    return Q
+
+
+def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
+    """A track at its first measurement."""
     x = np.zeros(8)
-    x[MEASURED] = z
-    x[YAW] = wrap_rad(float(z[0]))
+    x[MEASURED] = measured.z
+    x[YAW] = wrap_rad(float(measured.z[0]))
     P = setup.P0.copy()
-    if R is not None:
-        P[np.ix_(MEASURED, MEASURED)] = R
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0)
+    if measured.R is not None:
+        P[np.ix_(MEASURED, MEASURED)] = measured.R
+    tilt = np.zeros((8, 2))
+    if measured.tilt is not None:
+        tilt[MEASURED] = measured.tilt
+    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, tilt=tilt)
 
 
 def step_track(
     track: MarkerTrack | None,
-    z: Array | None,
+    measured: Measurement | None,
     t_s: float,
     setup: FilterSetup,
-    R: Array | None = None,
 ) -> MarkerTrack | None:
     """One frame's predict and, where the marker was seen, update.
 
     Args:
         track: the track so far, None before the first sight.
-        z: measured (yaw, x, y, z) in SI, (4,), or None where nothing was seen. A
-            measurement that is not finite counts as nothing seen.
+        measured: None where nothing was seen. A measurement that is not finite counts as
+            nothing seen.
         t_s: the frame's time.
-        R: the measurement's covariance (4, 4); the setup's if None.
 
     Returns None when there is nothing (left) to track: never seen, or unseen for more
     than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the
     track changes nothing. A gap beyond `MAX_GAP_S` in either direction starts afresh.
     """
-    if z is not None and not np.isfinite(z).all():
-        z = None
+    if measured is not None and not np.isfinite(measured.z).all():
+        measured = None
     if not math.isfinite(t_s):
         return track
     if track is None:
-        return None if z is None else start_track(z, t_s, setup, R)
+        return None if measured is None else start_track(measured, t_s, setup)
     dt_s = t_s - track.t_s
     if abs(dt_s) > MAX_GAP_S or not np.isfinite(track.x).all():
-        return None if z is None else start_track(z, t_s, setup, R)
+        return None if measured is None else start_track(measured, t_s, setup)
     if dt_s <= 0.0:
         return track
-    if z is None:
+    if measured is None:
         return _coast(track, dt_s, t_s, setup)
-    x, P = predict(track.x, track.P, F=transition(dt_s), Q=setup.Q)
-    on_branch = np.array(z, dtype=np.float64)  # the yaw nearest to the prediction
-    on_branch[0] = x[YAW] + wrap_rad(float(z[0]) - float(x[YAW]))
-    x, P = update(x, P, on_branch, setup.R if R is None else R, H)
+    F, Q = transition(dt_s), process_noise(dt_s, track.x[POSITION], setup)
+    x, P = predict(track.x, track.P, F=F, Q=Q)
+    on_branch = np.array(measured.z, dtype=np.float64)  # the yaw nearest to the prediction
+    on_branch[0] = x[YAW] + wrap_rad(float(on_branch[0]) - float(x[YAW]))
+    R = setup.R if measured.R is None else measured.R
+    x, P = update(x, P, on_branch, R, H)
     x[YAW] = wrap_rad(float(x[YAW]))
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0)
+    tilt = F @ track.tilt
+    if measured.tilt is not None:
+        gain = np.linalg.solve(R, H @ P).T  # P H^T R^-1, with the P after the update
+        tilt = tilt + gain @ (measured.tilt - H @ tilt)
+    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, tilt=tilt)
 
 
 def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
@@ -153,8 +224,7 @@ def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
-    x, P = _moved(track.x, track.P, dt_s, setup)
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=track.unseen)
+    return replace(_moved(track, track.x, dt_s, setup), t_s=t_s)
 
 
 def _coast(track: MarkerTrack, dt_s: float, t_s: float, setup: FilterSetup) -> MarkerTrack | None:
@@ -162,16 +232,16 @@ def _coast(track: MarkerTrack, dt_s: float, t_s: float, setup: FilterSetup) -> M
         return None
     x = track.x.copy()
     x[RATES] *= setup.alpha  # equation 3
-    x, P = _moved(x, track.P, dt_s, setup)
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=track.unseen + 1)
+    return replace(_moved(track, x, dt_s, setup), t_s=t_s, unseen=track.unseen + 1)
 
 
-def _moved(x: Array, P: Array, dt_s: float, setup: FilterSetup) -> tuple[Array, Array]:
-    """State and covariance after `dt_s` without a measurement."""
+def _moved(track: MarkerTrack, x: Array, dt_s: float, setup: FilterSetup) -> MarkerTrack:
+    """The track, its state being x, after `dt_s` without a measurement."""
     speed_mps = float(np.linalg.norm(x[VELOCITY]))
     if speed_mps > setup.drift_mps:
         x = x.copy()
         x[VELOCITY] *= setup.drift_mps / speed_mps
-    x, P = predict(x, P, F=transition(dt_s), Q=setup.Q)
+    F = transition(dt_s)
+    x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
     x[YAW] = wrap_rad(float(x[YAW]))
-    return x, P
+    return replace(track, x=x, P=P, tilt=F @ track.tilt)

@@ -149,14 +149,22 @@ class MarkerTrack:
     """A marker's Kalman filter between two frames (paper, section II-A.1).
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI,
-    indexed by the names in `perchctl.vision.filter`. `unseen` counts the frames
-    since the last measurement.
+    indexed by the names in `perchctl.vision.filter`. P (8, 8) is what the noise of
+    measurements and motion leaves open; `tilt` (8, 2), by how much one standard deviation of
+    a constant error of the vehicle's roll and pitch has moved the state. `unseen` counts the
+    frames since the last measurement.
     """
 
     t_s: float
     x: Array
     P: Array
     unseen: int = 0
+    tilt: Array = field(default_factory=lambda: np.zeros((8, 2)))
+
+    @property
+    def cov(self) -> Array:
+        """Of the state, with both, (8, 8)."""
+        return self.P + self.tilt @ self.tilt.T
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from perchctl.vision.filter import (
     YAW,
     YAW_RATE,
     H,
+    Measurement,
     X,
     Y,
     Z,
@@ -31,7 +32,7 @@ from perchctl.vision.filter import (
 )
 from perchctl.vision.types import MarkerTrack
 
-CONFIG = KalmanConfig()
+CONFIG = KalmanConfig(noise="fixed")
 SETUP = make_filter(CONFIG)
 
 
@@ -48,7 +49,7 @@ def test_state_order_is_the_papers() -> None:
 
 
 def test_gains_are_the_papers_units_in_si() -> None:
-    setup = make_filter(KalmanConfig(k1=0.09, k2=0.01))
+    setup = make_filter(KalmanConfig(k1=0.09, k2=0.01, noise="fixed"))
     assert np.allclose(np.sqrt(np.diag(setup.R)), [math.radians(0.3), 0.003, 0.003, 0.003])
     assert np.allclose(np.sqrt(np.diag(setup.Q))[[X, VX, YAW]], [0.001, 0.001, math.radians(0.1)])
     assert np.count_nonzero(setup.R - np.diag(np.diag(setup.R))) == 0
@@ -69,14 +70,14 @@ steps = st.lists(
 @given(steps=steps, k1=st.floats(0.001, 1.0), k2=st.floats(0.0001, 0.1))
 @settings(max_examples=60, deadline=None)
 def test_equals_a_filter_written_out_by_hand(steps, k1: float, k2: float) -> None:  # type: ignore[no-untyped-def]
-    setup = make_filter(KalmanConfig(k1=k1, k2=k2, n_max=100, alpha=0.85))
+    setup = make_filter(KalmanConfig(k1=k1, k2=k2, n_max=100, alpha=0.85, noise="fixed"))
     z0 = np.array([0.1, 0.2, -0.1, 0.5])
-    track: MarkerTrack | None = start_track(z0, 0.0, setup)
+    track: MarkerTrack | None = start_track(Measurement(z0), 0.0, setup)
     x, P, t = np.zeros(8), setup.P0.copy(), 0.0
     x[[0, 2, 4, 6]] = z0
     for dt, was_seen, z in steps:
         t += dt
-        track = step_track(track, np.array(z) if was_seen else None, t, setup)
+        track = step_track(track, Measurement(np.array(z)) if was_seen else None, t, setup)
         F = np.eye(8)
         F[[0, 2, 4, 6], [1, 3, 5, 7]] = t - (t - dt)
         if not was_seen:
@@ -103,7 +104,7 @@ def test_yaw_follows_across_the_wrap(start: float, rate: float) -> None:
     track = None
     for k in range(40):
         yaw = wrap_rad(start + rate * k / 30)
-        track = step_track(track, np.array([yaw, 0.0, 0.0, 0.5]), k / 30, SETUP)
+        track = step_track(track, Measurement(np.array([yaw, 0.0, 0.0, 0.5])), k / 30, SETUP)
     assert track is not None
     assert -math.pi < track.x[YAW] <= math.pi
     assert abs(wrap_rad(float(track.x[YAW]) - yaw)) < 0.15
@@ -122,19 +123,21 @@ def test_velocities_decay_and_the_track_is_dropped_after_n_max() -> None:
         position = position + track.x[VELOCITY] / 30
         assert np.allclose(track.x[POSITION], position)
     assert step_track(track, None, (CONFIG.n_max + 1) / 30, SETUP) is None
-    again = step_track(track, np.array([0.0, 1.0, 2.0, 3.0]), (CONFIG.n_max + 1) / 30, SETUP)
+    again = step_track(
+        track, Measurement(np.array([0.0, 1.0, 2.0, 3.0])), (CONFIG.n_max + 1) / 30, SETUP
+    )
     assert again is not None
     assert again.unseen == 0
 
 
 def test_n_max_zero_does_not_coast() -> None:
     setup = make_filter(KalmanConfig(n_max=0))
-    track = step_track(None, np.zeros(4), 0.0, setup)
+    track = step_track(None, Measurement(np.zeros(4)), 0.0, setup)
     assert step_track(track, None, 0.03, setup) is None
 
 
 def test_the_first_measurement_is_the_state() -> None:
-    track = step_track(None, np.array([0.3, 0.01, -0.02, 0.7]), 5.0, SETUP)
+    track = step_track(None, Measurement(np.array([0.3, 0.01, -0.02, 0.7])), 5.0, SETUP)
     assert track is not None
     assert np.allclose(track.x, [0.3, 0, 0.01, 0, -0.02, 0, 0.7, 0])
     assert step_track(None, None, 5.0, SETUP) is None
@@ -143,7 +146,7 @@ def test_the_first_measurement_is_the_state() -> None:
 def test_real_time_steps_are_used() -> None:
     track = None
     for t in (0.0, 0.03, 0.07, 0.10, 0.25, 0.28, 0.31, 0.33, 0.47, 0.5, 0.55, 0.6, 0.7, 0.8):
-        track = step_track(track, np.array([0.0, 0.3 * t, 0.0, 0.5]), t, SETUP)
+        track = step_track(track, Measurement(np.array([0.0, 0.3 * t, 0.0, 0.5])), t, SETUP)
     assert track is not None
     assert track.x[VX] == pytest.approx(0.3, abs=0.03)
     assert track.x[X] == pytest.approx(0.24, abs=0.004)
@@ -151,25 +154,25 @@ def test_real_time_steps_are_used() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_measurement_that_is_not_finite_counts_as_unseen(bad: float) -> None:
-    start = start_track(np.zeros(4), 0.0, SETUP)
-    track = step_track(start, np.array([0.0, bad, 0.0, 0.5]), 0.03, SETUP)
+    start = start_track(Measurement(np.zeros(4)), 0.0, SETUP)
+    track = step_track(start, Measurement(np.array([0.0, bad, 0.0, 0.5])), 0.03, SETUP)
     assert track is not None
     assert track.unseen == 1
     assert np.isfinite(track.x).all()
-    assert step_track(None, np.array([bad, 0, 0, 0]), 0.0, SETUP) is None
+    assert step_track(None, Measurement(np.array([bad, 0, 0, 0])), 0.0, SETUP) is None
 
 
 @pytest.mark.parametrize("t_s", [0.0, -0.5, math.nan])
 def test_a_frame_that_is_not_newer_changes_nothing(t_s: float) -> None:
-    start = start_track(np.array([0.1, 0.2, 0.3, 0.4]), 0.0, SETUP)
-    assert step_track(start, np.ones(4), t_s, SETUP) is start
+    start = start_track(Measurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
+    assert step_track(start, Measurement(np.ones(4)), t_s, SETUP) is start
     assert step_track(start, None, t_s, SETUP) is start
 
 
 @pytest.mark.parametrize("t_s", [1.5, -1.5])
 def test_a_long_gap_starts_afresh(t_s: float) -> None:
-    start = start_track(np.array([0.1, 0.2, 0.3, 0.4]), 0.0, SETUP)
-    track = step_track(start, np.ones(4), t_s, SETUP)
+    start = start_track(Measurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
+    track = step_track(start, Measurement(np.ones(4)), t_s, SETUP)
     assert track is not None
     assert np.allclose(track.x[[YAW, X, Y, Z]], 1.0)
     assert np.array_equal(track.P, SETUP.P0)
@@ -177,9 +180,9 @@ def test_a_long_gap_starts_afresh(t_s: float) -> None:
 
 
 def test_the_old_track_is_not_written_to() -> None:
-    start = start_track(np.array([0.1, 0.2, 0.3, 0.4]), 0.0, SETUP)
+    start = start_track(Measurement(np.array([0.1, 0.2, 0.3, 0.4])), 0.0, SETUP)
     x, P = start.x.copy(), start.P.copy()
-    step_track(start, np.ones(4), 0.03, SETUP)
+    step_track(start, Measurement(np.ones(4)), 0.03, SETUP)
     step_track(start, None, 0.03, SETUP)
     assert np.array_equal(start.x, x)
     assert np.array_equal(start.P, P)
@@ -218,6 +221,6 @@ def test_a_measured_velocity_is_free() -> None:
     track = None
     for k in range(60):
         z = np.array([0.0, 0.3 * k / 30.0, 0.0, 0.0])
-        track = step_track(track, z, k / 30.0, WORLD)
+        track = step_track(track, Measurement(z), k / 30.0, WORLD)
     assert track is not None
     assert track.x[VX] > 0.2

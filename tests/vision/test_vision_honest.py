@@ -1,0 +1,173 @@
+"""What the filter claims is what it errs by, and it errs no more than each frame alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.geometry import (
+    R_MARKER_TARGET,
+    Array,
+    invert_T,
+    make_T,
+    rot_z,
+    rotation_from_rpy,
+    wrap_rad,
+)
+from perchctl.pipeline import Pipeline, follow
+from perchctl.profile import KalmanConfig
+from perchctl.vision.camera_model import project
+from perchctl.vision.filter import X, Y, Z, make_filter, process_noise
+from perchctl.vision.places import measurement
+from perchctl.vision.pose import square
+from perchctl.vision.types import (
+    MARKERS,
+    Attitude,
+    Detection,
+    Detections,
+    MarkerPose,
+    PipelineState,
+)
+from tests.helpers.target_picture import CAMERA
+
+Build = Callable[..., Pipeline]
+SIDES_M = {"large": 0.150, "small": 0.025}
+TARGET_M = np.array([0.2, -0.1, 2.2])
+BIAS_RAD = math.radians(0.3)
+BINS_M = (0.0, 0.2, 0.6, 2.0)
+HZ = 30.0
+
+
+def body_at(t_s: float, phase: Array) -> tuple[Array, tuple[float, float, float]]:
+    """Between 8 cm and 1.4 m under the target, at up to 0.5 m/s: position, roll pitch yaw."""
+    z = 0.74 + 0.66 * math.cos(0.6 * t_s + phase[0])
+    x, y = 0.2 * z * np.sin(0.9 * t_s + phase[1:3])
+    roll, pitch = 0.05 * np.sin(2.0 * t_s + phase[3:5])
+    return TARGET_M + np.array([x, y, -z]), (float(roll), float(pitch), 0.8 * math.sin(0.4 * t_s))
+
+
+def seen_from(T_world_body: Array, t_s: float, rng: np.random.Generator) -> Detections:
+    """Both markers' corners as far as they are in the picture, 0.1 px off."""
+    T = invert_T(T_world_body) @ make_T(R_MARKER_TARGET, TARGET_M)
+    rvec = np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=float).ravel()
+    found = {}
+    for name in MARKERS:
+        true = project(square(SIDES_M[name]), rvec, T[:3, 3], CAMERA)
+        side = np.linalg.norm(true[0] - true[2]) / math.sqrt(2.0)
+        if (true > 0.0).all() and (true < np.array(CAMERA.size_px) - 1).all() and side > 12.0:
+            found[name] = Detection(name, true + rng.normal(0.0, 0.1, (4, 2)), 0.1, True)
+    return Detections(0, t_s, **found)
+
+
+def errors(setup: Pipeline, in_world: bool, bias_rad: float) -> Array:
+    """Rows of range, filter's error, still's error (m), and the filter's squared error in
+    units of its spread, a degree of freedom."""
+    rows = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        phase = rng.uniform(0.0, 2.0 * math.pi, 5)
+        state = PipelineState()
+        for k in range(360):
+            position, (roll, pitch, yaw) = body_at(k / HZ, phase)
+            T = make_T(rotation_from_rpy(roll, pitch, yaw), position)
+            attitude = None
+            if in_world:
+                here = (float(position[0]), float(position[1]), float(position[2]))
+                attitude = Attitude(k / HZ, roll + bias_rad, pitch - bias_rad, yaw, here)
+            state, output = follow(state, seen_from(T, k / HZ, rng), attitude, setup)
+            target, pose = output.target, next(iter(output.poses.values()), None)
+            if target is None or pose is None:
+                continue
+            way = TARGET_M - position
+            e = rot_z(-yaw) @ way if in_world else T[:3, :3].T @ way
+            turned = T[:3, :3].T[:, 0]
+            heading = wrap_rad(-yaw) if in_world else math.atan2(turned[1], turned[0])
+            off = np.append(target.e_m - e, wrap_rad(target.e_yaw_rad - heading))
+            squared = (off / np.append(target.sigma_m, target.sigma_yaw_rad)) ** 2
+            still = np.linalg.norm(pose.e_m - e)
+            rows.append([way[2], np.linalg.norm(off[:3]), still, squared.mean()])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("in_world", "bias_rad", "sigma_deg"),
+    [(False, 0.0, 0.3), (True, 0.0, 0.0), (True, BIAS_RAD, 0.3)],
+)
+def test_the_filter_is_no_worse_than_the_stills_and_knows_how_good_it_is(
+    build: Build, in_world: bool, bias_rad: float, sigma_deg: float
+) -> None:
+    setup = build(kalman=KalmanConfig(attitude_sigma_deg=sigma_deg))
+    rows = errors(setup, in_world, bias_rad)
+    for low, high in pairwise(BINS_M):
+        _, filtered, still, squared = rows[(rows[:, 0] > low) & (rows[:, 0] <= high)].T
+        assert len(filtered) > 50
+        assert math.sqrt((filtered**2).mean()) <= 1.5 * math.sqrt((still**2).mean())
+        assert 0.5 < squared.mean() < 2.0
+
+
+angles = st.floats(-0.05, 0.05)
+
+
+@given(
+    rpy=st.tuples(angles, angles, st.floats(-3.0, 3.0)),
+    e_m=st.tuples(*[st.floats(-1.5, 1.5)] * 3),
+    bias_rad=st.tuples(*[st.floats(-0.005, 0.005)] * 2),
+    in_world=st.booleans(),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_consider_term_is_what_a_wrong_attitude_does(
+    build: Build,
+    rpy: tuple[float, float, float],
+    e_m: tuple[float, float, float],
+    bias_rad: tuple[float, float],
+    in_world: bool,
+) -> None:
+    """A pose that is solved with roll and pitch off by a little is off by `tilt` times it."""
+    setup = build(gear_body_m=(0.01, -0.02, 0.03), kalman=KalmanConfig(attitude_sigma_deg=0.3))
+    constants = setup.world_filter if in_world else setup.level_filter
+    true = Attitude(0.0, *rpy, (0.3, -0.2, 1.0))
+    wrong = Attitude(0.0, rpy[0] + bias_rad[0], rpy[1] + bias_rad[1], rpy[2], true.position_m)
+    in_body = rotation_from_rpy(rpy[0], rpy[1], 0.0).T @ e_m
+
+    def measured(attitude: Attitude) -> tuple[Array, Array]:
+        level = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, 0.0) @ in_body
+        pose = MarkerPose(
+            "joint", 0.0, np.zeros(3), np.zeros(3), level, 0.2, np.ones(3), 1.0, 0.0,
+            cov=1e-6 * np.eye(4),
+        )  # fmt: skip
+        found = measurement(pose, attitude, in_world, constants, setup.pose)
+        assert found.tilt is not None
+        return found.z, found.tilt
+
+    (z, tilt), (moved, _) = measured(true), measured(wrong)
+    expected = tilt @ np.array(bias_rad) / math.radians(0.3)
+    # To first order in the bias, and as if roll turned about the level axis.
+    turned = float(np.linalg.norm(bias_rad))
+    assert (
+        np.abs((moved - z) - expected).max() <= 0.1 * turned * (np.linalg.norm(e_m) + 0.05) + 1e-12
+    )
+
+
+@given(dt_s=st.floats(0.001, 0.2), z_m=st.floats(0.05, 2.0), in_world=st.booleans())
+def test_the_process_noise_of_a_step_is_that_of_its_halves(
+    dt_s: float, z_m: float, in_world: bool
+) -> None:
+    """Physical units: it does not depend on how often frames come."""
+    setup = make_filter(KalmanConfig(), in_world)
+    place = np.array([0.0, 0.0, z_m])
+    F = np.eye(8)
+    F[[0, 2, 4, 6], [1, 3, 5, 7]] = dt_s / 2.0
+    half = process_noise(dt_s / 2.0, place, setup)
+    whole = process_noise(dt_s, place, setup)
+    assert np.allclose(F @ half @ F.T + half, whole, rtol=1e-9, atol=0.0)
+    assert np.linalg.eigvalsh(whole).min() > -1e-15
+    spread = np.sqrt(np.diag(whole))[[X, Y, Z]]
+    # Turning moves what is far to the side, not towards the camera.
+    assert in_world or spread[0] > spread[2]
