@@ -19,10 +19,33 @@ KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "p
 MODELS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "fisheye": (4,), "equidistant": (4,)}
 
 
-def load_calibration(file: Path | str) -> CameraModel:
+class SizeMissing(InvalidValue):
+    """A calibration does not say for pictures of which size it holds."""
+
+
+def load_sized(file: Path | str) -> CameraModel | None:
+    """As `load_calibration`; None where all but the pictures' size is there."""
+    try:
+        return load_calibration(file)
+    except SizeMissing:
+        return None
+
+
+def assumed_size(file: Path | str, size_px: tuple[int, int]) -> str:
+    """The warning that goes with a size taken from the first picture."""
+    w, h = size_px
+    return (
+        f"{file}: the image size is missing; {w}x{h} px is taken from the first picture, which is "
+        f"right only if the camera was calibrated at that size: add image_width: {w} and "
+        f"image_height: {h} to the file"
+    )
+
+
+def load_calibration(file: Path | str, size_px: tuple[int, int] | None = None) -> CameraModel:
     """Read a camera model from a file, or by the name of one in `calib/`.
 
-    Errors: NotFound (no file), InvalidValue (wrong content)."""
+    `size_px` is the pictures' size (width, height) where the file has none.
+    Errors: NotFound (no file), SizeMissing, InvalidValue (wrong content)."""
     path = find_calibration(file) if isinstance(file, str) else file
     try:
         text = path.read_text(encoding="utf-8")
@@ -31,7 +54,7 @@ def load_calibration(file: Path | str) -> CameraModel:
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidValue(f"{path}: cannot be read as a calibration: {error}") from None
     if "opencv-matrix" in text or "<opencv_storage>" in text:
-        return _checked(path, _opencv_values(path))
+        return _checked(path, _opencv_values(path), size_px)
     raw = _mapping(path, text)
     cameras = [key for key in raw if str(key).startswith("cam") and str(key)[3:].isdigit()]
     try:
@@ -40,7 +63,7 @@ def load_calibration(file: Path | str) -> CameraModel:
         raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
     except (TypeError, ValueError) as error:
         raise InvalidValue(f"{path}: a value is not a number: {error}") from None
-    return _checked(path, values)
+    return _checked(path, values, size_px)
 
 
 def _mapping(path: Path, text: str) -> dict[Any, Any]:
@@ -58,7 +81,7 @@ def _mapping(path: Path, text: str) -> dict[Any, Any]:
 
 def _ros_values(raw: dict[Any, Any]) -> dict[str, Any]:
     return {
-        "size": (int(raw["image_width"]), int(raw["image_height"])),
+        "size": _size(raw.get("image_width"), raw.get("image_height")),
         "K": np.array(raw["camera_matrix"]["data"], dtype=float),
         "dist": np.array(raw["distortion_coefficients"]["data"], dtype=float),
         "model": str(raw.get("distortion_model", "plumb_bob")),
@@ -110,10 +133,8 @@ def _opencv_values(path: Path) -> dict[str, Any]:
             raise InvalidValue(
                 f"{path}: camera_matrix and distortion_coefficients are needed in an OpenCV file"
             )
-        size = (
-            int(storage.getNode("image_width").real()),
-            int(storage.getNode("image_height").real()),
-        )
+        nodes = [storage.getNode(key) for key in ("image_width", "image_height")]
+        size = _size(*(None if node.empty() else node.real() for node in nodes))
         # Written by OpenCV's calibration program where the lens is its fisheye's.
         fisheye = storage.getNode("fisheye_model")
         is_fisheye = not fisheye.empty() and fisheye.real() != 0
@@ -127,8 +148,15 @@ def _opencv_values(path: Path) -> dict[str, Any]:
         storage.release()
 
 
-def _checked(path: Path, values: dict[str, Any]) -> CameraModel:
-    size, model = values["size"], values["model"]
+def _size(width: Any, height: Any) -> tuple[int, int] | None:
+    """None where either is missing."""
+    return None if width is None or height is None else (int(width), int(height))
+
+
+def _checked(
+    path: Path, values: dict[str, Any], otherwise_px: tuple[int, int] | None
+) -> CameraModel:
+    size, model = values["size"] or otherwise_px, values["model"]
     if model not in MODELS:
         raise InvalidValue(
             f"{path}: distortion_model {model!r} is unknown; allowed are {', '.join(MODELS)}"
@@ -139,6 +167,11 @@ def _checked(path: Path, values: dict[str, Any]) -> CameraModel:
     dist = values["dist"].ravel()
     if not (np.isfinite(K).all() and np.isfinite(dist).all()):
         raise InvalidValue(f"{path}: camera_matrix or distortion holds NaN or infinity")
+    if size is None:
+        raise SizeMissing(
+            f"{path}: the image size is missing: add image_width and image_height, in px, of the "
+            f"pictures that the camera was calibrated with"
+        )
     if size[0] <= 0 or size[1] <= 0:
         raise InvalidValue(f"{path}: image_width and image_height must be positive, found {size}")
     if model == "plumb_bob" and dist.size == 8:

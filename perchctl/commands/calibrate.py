@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration.check import check
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import assumed_size, load_calibration, load_sized
 from perchctl.calibration.lens import MODEL_NAMES
 from perchctl.calibration.pictures import views_of_images, views_of_video
 from perchctl.calibration.report import (
@@ -123,8 +123,11 @@ def _calibrate(request: CalibrateRequest, source: str, board: Board) -> int:
 
 def _check(request: CalibrateRequest, file: Path, source: str, board: Board) -> int:
     """Judge an existing calibration by new pictures."""
-    camera = load_calibration(file)
+    camera = load_sized(file)
     found = _find_views(request, source, board)
+    if camera is None:
+        camera = load_calibration(file, found.size_px)
+        say(assumed_size(file, found.size_px))
     check_size(found.size_px, camera, source)
     result = check(camera, found.views)
     for item in found.missing:

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import assumed_size, load_calibration, load_sized
 from perchctl.camera.files import ImagesSource, Recording
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.mjpeg import without_password
@@ -180,7 +180,9 @@ class _Input:
         return str(self.paths[index]) if self.paths else self.source.describe()
 
 
-def _open(options: TrackOptions, size_px: tuple[int, int], now: Callable[[], float]) -> _Input:
+def _open(
+    options: TrackOptions, size_px: tuple[int, int] | None, now: Callable[[], float]
+) -> _Input:
     config = options.profile.camera
     raw = open_source(options.source, config.latency_s, size_px, now)
     source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
@@ -201,14 +203,18 @@ class _Run:
         stop: Stopper,
         stack: contextlib.ExitStack,
     ) -> None:
-        self.camera = load_calibration(options.calibration)
-        setup = camera_pipeline(options.profile, self.camera, options.stills)
-        self.tally, self.notes = Tally(), Notes(say)
-        self.prints = PrintCheck(self.camera, options.profile.target)
-        self.input = _open(options, self.camera.size_px, now)
+        camera = load_sized(options.calibration)
+        self.input = _open(options, None if camera is None else camera.size_px, now)
         source = self.input.source
         stack.callback(source.close)
-        check_size(source.size_px, self.camera, self.input.file_name(0))
+        if camera is None:
+            camera = load_calibration(options.calibration, source.size_px)
+            say(assumed_size(options.calibration, camera.size_px))
+        self.camera = camera
+        check_size(source.size_px, camera, self.input.file_name(0))
+        setup = camera_pipeline(options.profile, camera, options.stills)
+        self.tally, self.notes = Tally(), Notes(say)
+        self.prints = PrintCheck(camera, options.profile.target)
         self.outputs = Outputs(options.outputs, self.camera, self.input.rate_hz, out)
         stack.callback(self.outputs.close, keep=False)
         stack.enter_context(stop.installed())  # until here Ctrl-C ends at once

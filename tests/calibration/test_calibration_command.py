@@ -97,6 +97,12 @@ def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
     other = tmp_path / "other.yaml"
     other.write_text(file.read_text().replace("image_width: 480", "image_width: 481"))
     assert "calibrat" in refused(calibrate(source, "-b", BOARD, "--check", str(other)), 30)
+    for key in ("image_width", "image_height"):
+        del raw[key]
+    other.write_text(yaml.safe_dump(raw))
+    unsized = calibrate(source, "-b", BOARD, "--check", str(other))
+    assert unsized.exit_code == 1
+    assert "image size is missing; " in unsized.stderr
 
 
 def test_an_existing_file_needs_force(rendered: Rendered, tmp_path: Path) -> None:

@@ -202,7 +202,9 @@ def test_each_key_is_read_by_something(section: str, key: str) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("image_width: 640\n", "image_height"),
+        ("image_width: 640\n", "camera_matrix"),
+        ("image_width: 640\ncamera_matrix: {data: [380, 0, 320, 0, 380, 240, 0, 0, 1]}\n"
+         "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n", "size is missing.*image_height"),
         ("nothing\n", "camera_info"),
         ("image_width: 640\nimage_height: 480\ncamera_matrix: {data: [1, 2]}\n"
          "distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n", "9 numbers"),

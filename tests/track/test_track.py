@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import SizeMissing, load_calibration
 from perchctl.cli import app
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
@@ -284,6 +284,37 @@ def test_the_opencv_fisheye_flag_is_heeded(tmp_path: Path) -> None:
     storage.write("distortion_coefficients", np.zeros((4, 1)))
     storage.release()
     assert load_calibration(path).model == "fisheye"
+
+
+def test_a_missing_size_is_taken_from_the_first_picture_with_a_warning(
+    tmp_path: Path, pictures: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dist = [-0.17, 0.04, 0.0004, -0.0007, 0.0]
+    K = [380.0, 0.0, 321.5, 0.0, 380.6, 238.2, 0.0, 0.0, 1.0]
+    whole = write_ros(tmp_path, K, dist)
+    known = track(pictures / "near.png", stills=True, calibration=whole)
+    assert "image size" not in capsys.readouterr().err
+    ros, opencv = tmp_path / "without.yaml", tmp_path / "opencv.yml"
+    ros.write_text(whole.read_text().replace("image_width: 640\nimage_height: 480\n", ""))
+    storage = cv2.FileStorage(str(opencv), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array(K).reshape(3, 3))
+    storage.write("distortion_coefficients", np.array(dist).reshape(5, 1))
+    storage.release()
+    for file in (ros, opencv):
+        with pytest.raises(SizeMissing, match="image size is missing: add image_width"):
+            load_calibration(file)
+        assert track(pictures / "near.png", stills=True, calibration=file) == known
+        told = capsys.readouterr().err
+        assert "the image size is missing; 640x480 px is taken from the first picture" in told
+
+
+def test_a_missing_size_is_refused_where_the_centre_is_outside_of_the_picture(
+    tmp_path: Path,
+) -> None:
+    ros = write_ros(tmp_path, [760.0, 0.0, 643.0, 0.0, 761.0, 476.0, 0.0, 0.0, 1.0], [0.0] * 5)
+    ros.write_text(ros.read_text().replace("image_width: 640\nimage_height: 480\n", ""))
+    with pytest.raises(InvalidValue, match="does not fit a 640x480 picture"):
+        load_calibration(ros, (640, 480))
 
 
 def test_another_size_is_refused_before_anything_is_tracked(
