@@ -102,6 +102,7 @@ MEANINGS = {
     "kalman.turn_radps2": "of the camera's attitude and heading, likewise",
     "kalman.drift_mps2": "of the state estimate's drift, for tracks in the world, likewise",
     "kalman.attitude_sigma_deg": "constant error of roll and pitch, likewise",
+    "kalman.gate": "a pose that contradicts the target's track is not taken",
     "kalman.drift_mps": "an unmeasured target moves in the estimate's world at most so fast",
     "merge.method": "the paper's weights, or both markers solved as one",
     "merge.weights.x": "the large marker's share; the small one has the rest",

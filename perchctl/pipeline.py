@@ -15,26 +15,19 @@ import numpy as np
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import KalmanConfig, Mounting, Profile
 from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
-from perchctl.vision.filter import (
-    MAX_GAP_S,
-    FilterSetup,
-    make_filter,
-    predicted,
-    step_track,
-)
+from perchctl.vision.filter import MAX_GAP_S, predicted
 from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
 from perchctl.vision.merge import stage_of
-from perchctl.vision.places import measurement, seen_from, to_level, to_world
+from perchctl.vision.places import seen_from, to_level, to_world
 from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners
 from perchctl.vision.strategies import Merged, MergeStrategy, Prior, make_strategy
+from perchctl.vision.tracks import TrackSetup, followed_on, make_track_setup
 from perchctl.vision.types import (
     Attitude,
     CameraModel,
     Detections,
     Frame,
-    MarkerTrack,
-    Measured,
     PipelineOutput,
     PipelineState,
     Sighting,
@@ -56,6 +49,9 @@ __all__ = [
 ]
 
 
+SEVERAL = "more than one target in view: the one that was tracked is followed"
+
+
 @dataclass(frozen=True, eq=False)
 class Pipeline:
     """What does not change from frame to frame, made once by `make_pipeline`."""
@@ -63,8 +59,7 @@ class Pipeline:
     detector: DetectorSetup
     pose: PoseSetup
     strategy: MergeStrategy
-    level_filter: FilterSetup
-    world_filter: FilterSetup
+    tracks: TrackSetup
     kalman: KalmanConfig
     camera: CameraModel
     fields: FieldsMode = "auto"
@@ -78,12 +73,12 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
         profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera,
         profile.camera.readout_s,
     )  # fmt: skip
+    strategy = make_strategy(profile.merge, pose)
     return Pipeline(
         detector=make_detector(profile.detector, profile.target),
         pose=pose,
-        strategy=make_strategy(profile.merge, pose),
-        level_filter=make_filter(profile.kalman, in_world=False),
-        world_filter=make_filter(profile.kalman, in_world=True),
+        strategy=strategy,
+        tracks=make_track_setup(profile.kalman, strategy.tracks, pose),
         kalman=profile.kalman,
         camera=camera,
         fields=profile.camera.fields,
@@ -138,26 +133,31 @@ def follow(
     normal = None if sighting is None else normal_cam(sighting.pose)
     measured = pipeline.strategy.measure(detections, Prior(attitude, near, normal))
 
+    in_world = pipeline.kalman.frame == "world" and attitude is not None
+    followed = followed_on(state, measured, t_s, attitude, in_world, pipeline.tracks)
+    measured, taken = followed.measured, followed.taken
+
     both = detections.large is not None and detections.small is not None
     anything = detections.large is not None or detections.small is not None
     disagreeing = state.disagreeing_frames
-    if both:
+    if both and taken:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
-    in_world = pipeline.kalman.frame == "world" and attitude is not None
-    tracks = _step_tracks(state, measured, t_s, attitude, in_world, pipeline)
     surest = next(iter(measured.poses.values()), None)
-    if surest is not None:
+    sees = surest is not None and taken
+    if surest is not None and sees:
         sighting = Sighting(surest, attitude)
     new = PipelineState(
-        tracks=tracks,
+        tracks=followed.tracks,
         in_world=in_world,
         measured=measured,
         attitude=attitude,
         target=state.target,
-        last=detections if anything else _still_useful(state.last, t_s),
-        sighting=sighting if surest is not None or tracks else None,
+        last=detections if anything and taken else _still_useful(state.last, t_s),
+        sighting=sighting if sees or followed.tracks else None,
         disagreeing_frames=disagreeing,
         empty_frames=0 if anything else state.empty_frames + 1,
+        lock=followed.lock,
+        stranger=followed.stranger,
     )
     target = _at_frame(new, t_s, pipeline)
     output = PipelineOutput(
@@ -166,6 +166,7 @@ def follow(
         target=target,
         stage=stage_of(detections.large is not None, detections.small is not None),
         disagreeing_frames=disagreeing,
+        lock_note=followed.note or (SEVERAL if detections.targets > 1 else ""),
     )
     return replace(new, target=target or state.target), output
 
@@ -191,7 +192,7 @@ def estimate(
         return _carried(target, t_s, attitude, pipeline)
     if not state.in_world:
         return _carried(target, t_s, attitude, pipeline)
-    tracks = {n: predicted(t, t_s, pipeline.world_filter) for n, t in state.tracks.items()}
+    tracks = {n: predicted(t, t_s, pipeline.tracks.world) for n, t in state.tracks.items()}
     merged = pipeline.strategy.merge(tracks, state.measured.fed)
     assert merged is not None
     return _in_world(merged, target, t_s, attitude, pipeline)
@@ -199,32 +200,6 @@ def estimate(
 
 def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
     return last if last is not None and 0.0 <= t_s - last.t_s <= MAX_GAP_S else None
-
-
-# --- filtering -----------------------------------------------------------------
-
-
-def _step_tracks(
-    state: PipelineState,
-    measured: Measured,
-    t_s: float,
-    attitude: Attitude | None,
-    in_world: bool,
-    pipeline: Pipeline,
-) -> dict[str, MarkerTrack]:
-    """All tracks one frame on."""
-    constants = pipeline.world_filter if in_world else pipeline.level_filter
-    old = state.tracks if state.in_world == in_world else {}
-    stepped: dict[str, MarkerTrack] = {}
-    for name in pipeline.strategy.tracks:
-        pose = measured.fed.get(name)
-        z = None
-        if pose is not None:
-            z = measurement(pose, attitude, in_world, constants, pipeline.pose)
-        track = step_track(old.get(name), z, t_s, constants)
-        if track is not None:
-            stepped[name] = track
-    return stepped
 
 
 # --- from the tracks to the target -------------------------------------------------
@@ -270,7 +245,7 @@ def _in_world(
 ) -> TargetEstimate:
     """`base` with place and motion of world tracks, as seen from the vehicle at `attitude`."""
     turn = rot_z(-attitude.yaw_rad)
-    tilt_m = seen_from(merged.tilt_m, attitude, pipeline.world_filter, pipeline.pose)
+    tilt_m = seen_from(merged.tilt_m, attitude, pipeline.tracks.world, pipeline.pose)
     target = replace(
         base,
         velocity_mps=turn @ merged.velocity_mps,

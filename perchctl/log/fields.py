@@ -67,6 +67,7 @@ FIELDS: dict[str, str] = {
             (f"{short}_rms_px", f"{name}: RMS reprojection error"),
         )
     },
+    "lock_note": "why the frame's pose was not taken for the target's, or where it was taken anew",
     "cam_age_s": "since the last good frame",
     # the target's estimate at t_s, which the planner steers by: the paper's error vector
     "ex_m": "target relative to the gear, level frame",
@@ -205,6 +206,7 @@ def _output_values(output: PipelineOutput | None) -> dict[str, Any]:
     values: dict[str, Any] = {
         "frame": output.detections.frame_index,
         "frame_t_s": output.detections.t_s,
+        "lock_note": output.lock_note or None,
     }
     for marker in MARKERS:
         detection = output.detections.get(marker)

@@ -107,10 +107,11 @@ class KalmanConfig(Section):
     frame: Literal["level", "world"] = "world"
     noise: Literal["fixed", "measured"] = "measured"
     acceleration_mps2: float = Field(3.0, gt=0, le=100)
-    turn_radps2: float = Field(10.0, gt=0, le=1000)
+    turn_radps2: float = Field(3.0, gt=0, le=1000)
     drift_mps2: float = Field(0.1, gt=0, le=100)
     attitude_sigma_deg: float = Field(0.3, ge=0, le=10)
     drift_mps: float = Field(0.05, ge=0, le=1)
+    gate: bool = True  # a pose that contradicts the target's track is not taken
 
 
 class WeightsConfig(Section):

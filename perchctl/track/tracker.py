@@ -97,13 +97,15 @@ class Tracker:
         self.picture, self.output = picture, output
         self._last = tracked_of(name, picture.t_s, output, not self.stills, last)
         self.notes = about
-        if output.fields != "whole" and self.stills:
-            self.notes += (INTERLACED,)
-        elif self._interlaced or output.fields != "whole":
-            self._interlaced = True  # at rest nothing is combed, and that is no news
+        interlaced = output.fields != "whole"
+        if not self.stills:  # at rest nothing is combed, and that is no news
+            self._interlaced = interlaced = interlaced or self._interlaced
+        if interlaced:
             self.notes += (INTERLACED,)
         if output.detections.ghost_px > 0.0:
             self.notes += (BLENDED,)
+        if output.lock_note:
+            self.notes += (output.lock_note,)
         if output.detections.mirrored:
             self.notes += (MIRRORED,)
         if output.disagreeing_frames >= (1 if self.stills else self.disagreement_frames):

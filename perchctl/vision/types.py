@@ -94,6 +94,7 @@ class Detections:
     small: Detection | None = None
     full_frame: bool = True  # False: found in the predicted window
     mirrored: bool = False  # a marker decoded as its mirror image
+    targets: int = 0  # whole targets, both markers, that a search saw
     velocity_px_s: Array | None = None  # of the markers in the picture, (2,)
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
     edge_shift: EdgeShift | None = None
@@ -216,6 +217,42 @@ class Sighting:
 
 
 @dataclass(frozen=True, eq=False)
+class Lock:
+    """The target that the pipeline holds on to: `track` as its last pose left it.
+
+    Attributes:
+        in_world: the track's frame.
+        frames: how many poses it has taken.
+        whole: one of them rested on both markers.
+    """
+
+    track: MarkerTrack
+    pose: MarkerPose
+    in_world: bool
+    frames: int
+    whole: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Stranger:
+    """What looks like the target, but is not where the target can be.
+
+    Attributes:
+        since_s: its first frame; `frames` counts all, `whole` those that showed both markers.
+        another_range: it was nearer or farther, too; or is of another size.
+        text: where it was.
+    """
+
+    track: MarkerTrack
+    in_world: bool
+    since_s: float
+    frames: int
+    whole: int
+    another_range: bool
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
 class Measured:
     """What one frame's corners gave.
 
@@ -243,6 +280,8 @@ class PipelineState:
     sighting: Sighting | None = None  # the last
     disagreeing_frames: int = 0
     empty_frames: int = 0  # in a row, without either marker
+    lock: Lock | None = None
+    stranger: Stranger | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,3 +294,4 @@ class PipelineOutput:
     stage: Stage  # by this frame's detections
     disagreeing_frames: int = 0  # frames in a row in which the two markers contradict
     fields: PictureKind = "whole"  # what the picture was
+    lock_note: str = ""  # why this frame's pose was not taken, or taken at another place

@@ -15,6 +15,13 @@ from perchctl.vision.camera_model import undistort
 from perchctl.vision.types import CameraModel
 
 LARGE_M, SMALL_M, SHEET_M = 0.150, 0.025, 0.200
+BACKGROUND = 120.0
+Drawn = tuple[str, int, float]
+"""A marker by its dictionary, its id, and its side in metres."""
+MARKERS: dict[str, Drawn] = {
+    "large": ("DICT_4X4_1000", 997, LARGE_M),
+    "small": ("DICT_ARUCO_ORIGINAL", 5, SMALL_M),
+}
 CAMERA = CameraModel(
     (640, 480),
     np.array([[400.0, 0.0, 322.0], [0.0, 402.0, 236.0], [0.0, 0.0, 1.0]]),
@@ -43,15 +50,16 @@ def render(
     tvec: Array,
     camera: CameraModel = CAMERA,
     *,
-    markers: tuple[str, ...] = ("large", "small"),
+    markers: tuple[str | Drawn, ...] = ("large", "small"),
+    sheet_m: float = SHEET_M,
     blur_px: float = 0.7,
     noise: float = 0.0,
     white: float = 205.0,
     black: float = 30.0,
-    background: float = 120.0,
+    background: float = BACKGROUND,
     seed: int = 0,
 ) -> NDArray[np.uint8]:
-    """Grey picture (h, w), uint8."""
+    """Grey picture (h, w), uint8, of the markers on a sheet (0: none)."""
     rays = _rays(camera)
     h, w = rays.shape[:2]
     R = cv2.Rodrigues(rvec)[0]
@@ -60,20 +68,25 @@ def render(
         depth = (n @ tvec) / (rays @ n)
     points = (rays * depth[..., None] - tvec) @ R  # in marker axes
     x, y = points[..., 0], points[..., 1]
-    near = (depth > 0) & (np.abs(x) < 0.6 * SHEET_M) & (np.abs(y) < 0.6 * SHEET_M)
+    near = (depth > 0) & (np.abs(x) < 0.6 * sheet_m) & (np.abs(y) < 0.6 * sheet_m)
     picture = np.full((h, w), background)
     x, y = x[near], y[near]
     soft = blur_px * depth[near] / camera.K[0, 0]
-    sheet = _box(x, -SHEET_M / 2, SHEET_M / 2, soft) * _box(y, -SHEET_M / 2, SHEET_M / 2, soft)
+    sheet = _box(x, -sheet_m / 2, sheet_m / 2, soft) * _box(y, -sheet_m / 2, sheet_m / 2, soft)
     dark = np.zeros_like(x)
-    if "large" in markers:
-        dark += _pattern("DICT_4X4_1000", 997, LARGE_M, x, y, soft)
-    if "small" in markers:
-        dark += _pattern("DICT_ARUCO_ORIGINAL", 5, SMALL_M, x, y, soft)
+    for marker in markers:
+        dark += _pattern(*(MARKERS[marker] if isinstance(marker, str) else marker), x, y, soft)
     picture[near] = background + sheet * (white - background) - dark * (white - black)
     if noise > 0.0:
         picture += np.random.default_rng(seed).normal(0.0, noise, picture.shape)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+
+
+def side_by_side(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], background: float = BACKGROUND
+) -> NDArray[np.uint8]:
+    """Both pictures' sheets in one; both without noise."""
+    return np.where(second == np.uint8(background), first, second)
 
 
 def bits_of(name: str, index: int) -> NDArray[np.uint8]:

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -141,6 +142,7 @@ def test_every_field_is_filled_by_something() -> None:
     seen: set[str] = set()
     frame = synthetic.output(3, pose, rng)
     frame.poses["joint"] = frame.poses["large"]
+    frame = replace(frame, lock_note="not the tracked target")
     commands = (Land(-0.05, 2.0), PositionSetpoint(0.0, 0.0, 1.0, 0.1), RawThrust(1))
     for command in commands:
         record = tick_record(

@@ -98,6 +98,7 @@ def _looked(
         small=_detection("small", seen),
         full_frame=found.full_frame,
         mirrored=found.mirrored and not seen,
+        targets=found.targets,
         edge_shift=next((r.edge_shift for r in seen.values() if r.edge_shift is not None), None),
     )
 

@@ -50,11 +50,13 @@ class Box:
 @dataclass(frozen=True, eq=False)
 class Found:
     """Raw corners (4, 2) px of at most one of each marker, whether the small marker's
-    mirror image is there, and whether it was looked for in the whole picture."""
+    mirror image is there, whether it was looked for in the whole picture, and how many whole
+    targets, both markers, there were to choose from."""
 
     corners_px: dict[MarkerName, Array]
     mirrored: bool
     full_frame: bool
+    targets: int = 0
 
 
 def search(
@@ -123,7 +125,8 @@ def _pass(
             continue
         name = MARKERS[int(dictionary)]
         candidates[name].append(np.asarray(quad, dtype=np.float64).reshape(4, 2) + first)
-    return Found(choose(candidates, expected, setup.ratio), mirrored, full_frame)
+    targets = len(_wholes(candidates, setup.ratio))
+    return Found(choose(candidates, expected, setup.ratio), mirrored, full_frame, targets)
 
 
 def choose(
@@ -132,15 +135,19 @@ def choose(
     """At most one of each marker: look-alikes and what does not fit together are dropped.
 
     A small marker in the centre of a large one, of the right size and turn, verifies
-    both. Without such a pair the last detections decide; without these, a lone marker is
-    taken, and of several the evidence is too thin to take any.
+    both; of several such pairs the one counts that is nearest to the last detections. Without
+    a pair the last detections decide; without these, a lone marker is taken, and of several
+    the evidence is too thin to take any.
     """
     large, small = candidates["large"], candidates["small"]
-    pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
-    if pairs:
-        best, i, j = min(pairs)
-        if best <= 1.0:
-            return {"large": large[i], "small": small[j]}
+    wholes = _wholes(candidates, ratio)
+    if wholes:
+        _, i, j = wholes[0]
+        if expected and len(wholes) > 1:
+            centre = next(iter(expected.values())).mean(axis=0)
+            away = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
+            _, i, j = wholes[int(np.argmin(away))]
+        return {"large": large[i], "small": small[j]}
     near_large = _nearest("large", large, expected, ratio)
     near_small = _nearest("small", small, expected, ratio)
     if near_large is not None:
@@ -153,6 +160,20 @@ def choose(
     if len(small) == 1 and not large:
         return {"small": small[0]}
     return {}
+
+
+def _wholes(
+    candidates: Mapping[MarkerName, list[Array]], ratio: float
+) -> list[tuple[float, int, int]]:
+    """Pairs that belong together, each large marker in one: misfit and both indices, the best
+    first."""
+    large, small = candidates["large"], candidates["small"]
+    pairs = [(misfit(a, b, ratio), i, j) for i, a in enumerate(large) for j, b in enumerate(small)]
+    best: dict[int, tuple[float, int, int]] = {}
+    for pair in sorted(pairs):
+        if pair[0] <= 1.0:
+            best.setdefault(pair[1], pair)
+    return list(best.values())
 
 
 def misfit(large_px: Array, small_px: Array, ratio: float) -> float:

@@ -32,6 +32,25 @@ def test_the_window_leaves_room_for_the_large_marker_around_the_small_one() -> N
         ([box(200, 200, 60)], [box(300, 200, 10)], {}, {"large": 0}),
         # turned by a quarter: not this target
         ([box(200, 200, 60)], [np.roll(box(200, 200, 10), 1, axis=0)], {}, {"large": 0}),
+        # of two whole targets the one that the last detections continue, else the better
+        (
+            [box(200, 200, 60), box(400, 200, 60)],
+            [box(200, 200, 10), box(400.5, 200, 10)],
+            {"large": box(395, 205, 60)},
+            {"large": 1, "small": 1},
+        ),
+        (
+            [box(200, 200, 60), box(400, 200, 60)],
+            [box(200, 200, 10), box(400.5, 200, 10)],
+            {"small": box(210, 205, 10)},
+            {"large": 0, "small": 0},
+        ),
+        (
+            [box(200, 200, 60), box(400, 200, 60)],
+            [box(200, 200, 10), box(400.5, 200, 10)],
+            {},
+            {"large": 0, "small": 0},
+        ),
         # two of the same and nothing to choose by
         ([], [box(200, 200, 30), box(400, 200, 30)], {}, {}),
         ([], [box(200, 200, 30)], {}, {"small": 0}),

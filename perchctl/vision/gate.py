@@ -1,0 +1,232 @@
+"""Whether a pose is the target's that was locked on.
+
+Something else can look like the target: one more of it, a smaller one, or one of its markers,
+lone and of another size. In a picture it cannot be told from the target, but the target does not
+jump. A pose that contradicts the lock by more than noise, motion and drift explain is a
+stranger's and feeds no filter; the planner then sees a target that is not measured. The stranger
+is watched: as long as it goes on it stays one, however vague the lock becomes meanwhile.
+
+The lock goes over to a stranger explicitly: to one that rests on both markers, at once if the
+lock never did or was hardly begun, or, if it is as far away as the target was, after
+`REACQUIRE_S` in which the target was not seen. A lock that nothing has confirmed for `FORGET_S`
+is forgotten.
+
+Where the state estimate jumps, the target seems to jump in the world, but not in the picture:
+a pose that goes on from the last one relative to the vehicle is the target's, too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from perchctl.geometry import Array, wrap_rad
+from perchctl.vision.filter import (
+    MAX_GAP_S,
+    MEASURED,
+    FilterSetup,
+    H,
+    Measurement,
+    predicted,
+    start_track,
+    step_track,
+)
+from perchctl.vision.types import Lock, MarkerPose, MarkerTrack, Stranger
+
+REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
+FORGET_S = 10.0
+ESTABLISHED_FRAMES = 5
+"""A lock of fewer frames was perhaps no target: a stranger that was seen more often counts more."""
+
+_JUMPED = "the state estimate jumped, the target did not"
+_GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
+_SAME_RANGE = 4.0  # standard deviations
+# What no covariance knows of: calibration, print, latency; beside it a share of the range.
+_LEAST_M, _LEAST_YAW_RAD = 0.01, math.radians(4.0)
+_SIDEWAYS, _ALONG = 0.015, 0.02
+# How a hovering vehicle moves relative to the target while its estimate jumps.
+_CALM_S, _CALM_MPS, _CALM_RADPS = 0.1, 0.3, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A frame's pose, as a measurement of the tracks; `whole` if it rests on both markers."""
+
+    t_s: float
+    pose: MarkerPose
+    measured: Measurement
+    in_world: bool
+    whole: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Whether the pose is the target's; if so, whether the tracks have to begin anew there,
+    else whose it is; and a sentence for people where that is not as ever."""
+
+    taken: bool
+    afresh: bool = False
+    stranger: Stranger | None = None
+    text: str = ""
+
+
+def judged(
+    lock: Lock | None, stranger: Stranger | None, sight: Sight, constants: FilterSetup
+) -> Verdict:
+    """The verdict on a frame's pose."""
+    lock, stranger = remembered(lock, stranger, sight.t_s)
+    if stranger is not None and stranger.in_world != sight.in_world:
+        stranger = None
+    if lock is None or lock.in_world != sight.in_world or sight.t_s <= lock.track.t_s:
+        return Verdict(taken=True)
+    wanted = _expected(lock.track, sight.t_s, constants)
+    fit = _misfit(wanted, sight, constants)
+    other = None
+    if stranger is not None:
+        other = _misfit(_expected(stranger.track, sight.t_s, constants), sight, constants)
+    theirs = other is not None and other.squared <= _GATE
+    if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
+        return Verdict(taken=True, stranger=stranger)
+    if not theirs and _goes_on(lock, sight):
+        return Verdict(
+            taken=True, afresh=True, text="the state estimate jumped, the target did not"
+        )
+    seen = _watched(stranger if theirs else None, sight, fit, constants)
+    if _believed(lock, seen, sight):
+        text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
+        return Verdict(taken=True, afresh=True, text=text)
+    return Verdict(taken=False, stranger=seen, text=f"not the tracked target: {seen.text}")
+
+
+def remembered(
+    lock: Lock | None, stranger: Stranger | None, t_s: float
+) -> tuple[Lock | None, Stranger | None]:
+    """What of both still counts."""
+    if stranger is not None and not 0.0 <= t_s - stranger.track.t_s <= MAX_GAP_S:
+        stranger = None
+    if lock is None:
+        return None, None
+    age_s = t_s - lock.track.t_s
+    # A place in the level frame means nothing for long, but a stranger stays a stranger.
+    lasting = lock.in_world or stranger is not None
+    if abs(age_s) > (FORGET_S if lasting else MAX_GAP_S):
+        return None, None
+    return lock, stranger
+
+
+def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, afresh: bool) -> Lock:
+    """The lock after a pose that was taken; `track` is what it fed."""
+    before = None if afresh else lock
+    return Lock(
+        track=track,
+        pose=sight.pose,
+        in_world=sight.in_world,
+        frames=1 if before is None else before.frames + 1,
+        whole=sight.whole or (before is not None and before.whole),
+    )
+
+
+# --- how well a pose fits ----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Squared distance in units of its spread; the same with what a vaguer claim costs; how far
+    away and how much farther up (m), and whether that alone is too much."""
+
+    squared: float
+    cost: float
+    away_m: float
+    farther_m: float
+    another_range: bool
+
+
+def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> MarkerTrack:
+    """The track at a later time, however late: what is not measured drifts."""
+    ahead = predicted(track, t_s, constants)
+    # The most that it drifts counts as three standard deviations.
+    drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(t_s - track.t_s, 0.0)
+    wider = np.zeros((8, 8))
+    place = MEASURED[1:]
+    wider[place, place] = drift_m**2
+    return replace(ahead, P=ahead.P + wider)
+
+
+def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
+    measured = sight.measured
+    off = measured.z - H @ track.x
+    off[0] = wrap_rad(float(off[0]))
+    tilt = H @ track.tilt
+    if measured.tilt is not None:
+        tilt = measured.tilt - tilt  # a constant error of the attitude moves both
+    R = constants.R if measured.R is None else measured.R
+    S = H @ track.P @ H.T + R + tilt @ tilt.T + _unknown(float(np.linalg.norm(sight.pose.tvec_m)))
+    squared = float(off @ np.linalg.solve(S, off))
+    return _Fit(
+        squared=squared,
+        cost=squared + float(np.linalg.slogdet(S)[1]),
+        away_m=float(np.linalg.norm(off[1:])),
+        farther_m=float(off[3]),
+        another_range=bool(off[3] ** 2 > _SAME_RANGE**2 * S[3, 3]),
+    )
+
+
+def _unknown(range_m: float) -> Array:
+    """Variances of (yaw, x, y, z) that no pose claims."""
+    sideways_m, along_m = _LEAST_M + _SIDEWAYS * range_m, _LEAST_M + _ALONG * range_m
+    return np.diag([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m]) ** 2
+
+
+def _goes_on(lock: Lock, sight: Sight) -> bool:
+    """Whether the pose goes on from the last one as seen from the vehicle."""
+    dt_s = sight.t_s - lock.track.t_s
+    if not sight.in_world or dt_s > _CALM_S:
+        return False
+    range_m = float(np.linalg.norm(sight.pose.tvec_m))
+    off = np.array([wrap_rad(sight.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
+    off[1:] = sight.pose.e_m - lock.pose.e_m
+    moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
+    S = _unknown(range_m) + np.diag([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m]) ** 2
+    return float(off @ np.linalg.solve(S, off)) <= _GATE
+
+
+# --- strangers ---------------------------------------------------------------------
+
+
+def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: FilterSetup) -> Stranger:
+    if before is not None:
+        track = step_track(before.track, sight.measured, sight.t_s, constants)
+        assert track is not None
+        whole = before.whole + int(sight.whole)
+        return replace(before, track=track, frames=before.frames + 1, whole=whole)
+    where = f"{fit.away_m:.2f} m away from it"
+    if fit.another_range:
+        where = f"{abs(fit.farther_m):.2f} m {'above' if fit.farther_m > 0.0 else 'below'} it"
+        where += ", or of another size"
+    return Stranger(
+        track=start_track(sight.measured, sight.t_s, constants),
+        in_world=sight.in_world,
+        since_s=sight.t_s,
+        frames=1,
+        whole=int(sight.whole),
+        another_range=fit.another_range,
+        text=where,
+    )
+
+
+def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
+    """Whether the target is there now, and not where the lock has it."""
+    if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
+        return True
+    if stranger.whole < ESTABLISHED_FRAMES or not sight.whole:
+        return False
+    if not lock.whole:
+        return True
+    unseen_s = sight.t_s - max(stranger.since_s, lock.track.t_s)
+    return (
+        not stranger.another_range
+        and stranger.whole >= REACQUIRE_FRAMES
+        and unseen_s >= REACQUIRE_S
+    )

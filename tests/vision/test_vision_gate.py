@@ -1,0 +1,193 @@
+"""A locked target does not jump: what contradicts it is no measurement, and for how long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from perchctl.geometry import make_T, rot_z, rotation_from_rpy
+from perchctl.pipeline import Pipeline, follow
+from perchctl.profile import KalmanConfig, MergeConfig
+from perchctl.vision.gate import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S
+from perchctl.vision.types import Attitude, Detections, PipelineOutput, PipelineState
+from tests.helpers.seen import seen_from
+
+Build = Callable[..., Pipeline]
+HZ = 30.0
+TARGET_M = np.array([0.1, -0.05, 2.0])
+RANGE_M = 0.6
+LOCKED = 8
+
+
+@dataclass(eq=False)
+class Watch:
+    """A camera that sways under the target, and what its pipeline makes of what it is shown."""
+
+    setup: Pipeline
+    in_world: bool
+    k: int = 0
+    jumped_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the estimate
+    state: PipelineState = field(default_factory=PipelineState)
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(3))
+
+    def show(self, frames: int, **what: object) -> list[PipelineOutput]:
+        """So many frames of the target, `away_m` from its place and otherwise as
+        `seen_from` has it; of nothing, if `markers` is empty."""
+        away_m = np.array(what.pop("away_m", (0.0, 0.0, 0.0)))
+        outputs = []
+        for _ in range(frames):
+            t = self.k / HZ
+            x, y, z = TARGET_M + np.array([0.03 * np.sin(2 * t), 0.02 * np.cos(3 * t), -RANGE_M])
+            yaw = 0.2 * np.sin(t)
+            T = make_T(rotation_from_rpy(0.02 * np.sin(2 * t), 0.0, yaw), (x, y, z))
+            seen: Detections = seen_from(T, TARGET_M + away_m, t, self.rng, **what)  # type: ignore[arg-type]
+            attitude = None
+            if self.in_world:
+                jx, jy, jz = self.jumped_m
+                here = (x + jx, y + jy, z + jz)
+                attitude = Attitude(t, 0.02 * np.sin(2 * t), 0.0, yaw, here)
+            self.state, output = follow(self.state, seen, attitude, self.setup)
+            outputs.append(output)
+            self.k += 1
+        return outputs
+
+
+@pytest.fixture(params=["track", "fly"])
+def watch(build: Build, request: pytest.FixtureRequest) -> Watch:
+    return Watch(build(), in_world=request.param == "fly")
+
+
+def measured(outputs: list[PipelineOutput]) -> list[bool]:
+    return [output.target is not None and output.target.measured for output in outputs]
+
+
+HALF = {"scale": 0.5}
+DECOYS = {
+    "half the size": HALF,
+    "half the size, aside": {"scale": 0.5, "away_m": (0.1, 0.05, 0.0)},
+    "lone small, four times too large": {"markers": ("small",), "scale": 4.0},
+    "lone large, half the size": {"markers": ("large",), "scale": 0.5},
+    "lone large, aside": {"markers": ("large",), "away_m": (-0.24, 0.0, 0.0)},
+    "a second one, aside": {"away_m": (0.24, 0.0, 0.0)},
+    "turned": {"heading_rad": 1.0},
+}
+
+
+@pytest.mark.parametrize("name", DECOYS)
+def test_what_contradicts_the_lock_is_not_measured(watch: Watch, name: str) -> None:
+    assert all(measured(watch.show(LOCKED)))
+    outputs = watch.show(72, **DECOYS[name])
+    assert all(output.poses for output in outputs)  # it was seen
+    assert not any(measured(outputs))
+    assert all(o.lock_note.startswith("not the tracked target: ") for o in outputs)
+    told = [o.target for o in outputs if o.target is not None]
+    assert len(told) == watch.setup.kalman.n_max
+    assert all(abs(t.e_m[2] - RANGE_M) < 0.03 for t in told)
+    (back,) = watch.show(1)
+    assert measured([back]) == [True]
+    assert back.lock_note == ""
+
+
+def test_without_the_gate_all_of_them_steer(build: Build) -> None:
+    watch = Watch(build(kalman=KalmanConfig(gate=False)), in_world=True)
+    watch.show(LOCKED)
+    assert all(measured(watch.show(5, **HALF)))
+
+
+def test_a_target_that_moved_is_taken_up_anew_after_a_while(watch: Watch) -> None:
+    watch.show(LOCKED)
+    outputs = watch.show(int(1.2 * REACQUIRE_S * HZ), away_m=(0.3, 0.0, 0.0))
+    first = measured(outputs).index(True)
+    assert REACQUIRE_S * HZ - 1 <= first <= REACQUIRE_S * HZ + 2
+    assert all(measured(outputs[first:]))
+    assert outputs[first].lock_note.startswith("target taken up anew, 0.3")
+    target = outputs[first].target
+    assert target is not None
+    assert np.linalg.norm(target.e_m[:2]) > 0.2
+
+
+def test_a_flickering_stranger_is_still_the_same_one(watch: Watch) -> None:
+    """Unseen for a few frames, it is not taken for the target because that got vague."""
+    watch.show(LOCKED)
+    for _ in range(8):  # not for so long that it is believed
+        assert not any(measured(watch.show(5, away_m=(0.24, 0.0, 0.0))))
+        watch.show(5, markers=())
+
+
+def test_no_jump_locks_the_pipeline_out_for_ever(watch: Watch) -> None:
+    watch.show(LOCKED)
+    assert not any(measured(watch.show(int((FORGET_S - 0.1) * HZ), **HALF)))
+    assert any(measured(watch.show(int(0.5 * HZ), **HALF)))
+
+
+def test_what_was_unseen_for_long_may_be_anywhere_for_a_camera_in_a_hand(build: Build) -> None:
+    watch = Watch(build(), in_world=False)
+    watch.show(LOCKED)
+    watch.show(int(1.2 * HZ), markers=())
+    assert all(measured(watch.show(3, **HALF)))
+
+
+def test_what_was_unseen_for_long_is_where_it_was_in_flight(build: Build) -> None:
+    watch = Watch(build(), in_world=True)
+    watch.show(LOCKED)
+    watch.show(int(4.0 * HZ), markers=())
+    assert not any(measured(watch.show(10, **HALF)))
+    assert all(measured(watch.show(3)))
+
+
+@pytest.mark.parametrize("jump_m", [(0.5, 0.0, 0.0), (0.0, 0.0, 0.4), (0.1, -1.0, 0.0)])
+def test_an_estimate_that_jumps_loses_no_target(
+    build: Build, jump_m: tuple[float, float, float]
+) -> None:
+    watch = Watch(build(), in_world=True)
+    watch.show(LOCKED)
+    watch.jumped_m = jump_m
+    outputs = watch.show(10)
+    assert all(measured(outputs))
+    assert outputs[0].lock_note == "the state estimate jumped, the target did not"
+    for output in outputs:
+        assert output.target is not None
+        assert output.target.world_m is not None
+        assert np.abs(output.target.world_m - TARGET_M - jump_m).max() < 0.015
+
+
+def test_both_markers_overrule_a_lock_on_one(watch: Watch) -> None:
+    """What was locked on was perhaps never the target."""
+    watch.show(20, markers=("large",), scale=0.5)
+    outputs = watch.show(ESTABLISHED_FRAMES + 1)
+    assert measured(outputs) == [False] * (ESTABLISHED_FRAMES - 1) + [True] * 2
+
+
+def test_a_lock_of_a_moment_gives_way_to_what_lasts(watch: Watch) -> None:
+    watch.show(2, **HALF)
+    outputs = watch.show(6)
+    assert measured(outputs) == [False] * 2 + [True] * 4
+
+
+def test_a_lone_marker_never_moves_an_established_lock(watch: Watch) -> None:
+    watch.show(LOCKED)
+    outputs = watch.show(int(2.0 * REACQUIRE_S * HZ), markers=("large",), away_m=(0.3, 0.0, 0.0))
+    assert not any(measured(outputs))
+
+
+@pytest.mark.parametrize("method", ["joint", "weights"])
+def test_the_target_goes_on_when_the_attitude_comes_and_goes(build: Build, method: str) -> None:
+    merge = MergeConfig(method=method)  # type: ignore[arg-type]
+    watch = Watch(build(merge=merge), in_world=True)
+    watch.show(LOCKED)
+    watch.in_world = False
+    assert all(measured(watch.show(3)))
+    watch.in_world = True
+    assert all(measured(watch.show(3)))
+
+
+def test_of_two_targets_in_view_one_is_told(build: Build) -> None:
+    watch = Watch(build(), in_world=True)
+    watch.show(LOCKED)
+    T = make_T(rot_z(0.0), TARGET_M - [0.0, 0.0, RANGE_M])
+    seen = seen_from(T, TARGET_M, watch.k / HZ, watch.rng)
+    _, output = follow(watch.state, replace(seen, targets=2), None, watch.setup)
+    assert "more than one target in view" in output.lock_note
