@@ -90,9 +90,7 @@ def judged(
     if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
         return Verdict(taken=True, stranger=stranger)
     if not theirs and _goes_on(lock, sight):
-        return Verdict(
-            taken=True, afresh=True, text="the state estimate jumped, the target did not"
-        )
+        return Verdict(taken=True, afresh=True, text=_JUMPED)
     seen = _watched(stranger if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
         text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
