@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import undistort_px
-from perchctl.vision.markers.drawing import Drawing, Rendering, beyond_sheet, blurred, drawn
+from perchctl.vision.markers.cells import cells_seen
+from perchctl.vision.markers.drawing import (
+    Drawing,
+    Rendering,
+    beyond_sheet,
+    blurred,
+    drawn,
+    soft_cells,
+)
 from perchctl.vision.markers.grid import (
     Grid,
     Patch,
@@ -73,6 +81,8 @@ class Alignment:
     pattern: float
     strength: float
     worst_cell: float
+    flip: float
+    flip_sigma: float
     blur_px: float
     gain: float
     moved_px: float
@@ -115,11 +125,14 @@ class _Fit:
 @dataclass(frozen=True, eq=False)
 class _Equations:
     """The light in which a fit looks most like the picture's grey values, what it leaves
-    over, and the normal equations N x = g of the next increment, per unit of noise."""
+    over, the changes J with the unknowns, and the normal equations N x = g of the next
+    increment, per unit of noise."""
 
     grey: Array
     light: Light
     error: Array
+    J: Array
+    noise: float
     N: Array
     g: Array
 
@@ -228,7 +241,7 @@ def _equations(fit: _Fit, scene: _Scene) -> _Equations | None:
     N[range(_LIGHT, len(g)), range(_LIGHT, len(g))] += 1e-6
     N[range(8), range(8)] += _PRIOR
     g[_SHAPE] -= _PRIOR * fit.total
-    return _Equations(grey, light, error, N, g)
+    return _Equations(grey, light, error, J, noise, N, g)
 
 
 def _solved(equations: _Equations) -> Array | None:
@@ -270,8 +283,20 @@ def _alignment(
     grid, light, error = scene.grid, equations.light, equations.error
     corners_px = through_lens(projected(fit.H, *UNIT.T), scene.camera)
     pattern = pattern_seen(drawing, grid, fit.blur_px / scene.node_px, light, error)
-    covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE]
-    covariance = covariance * repeated(error.reshape(grid.n, grid.n))
+    covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE] * repeated(
+        error.reshape(grid.n, grid.n)
+    )
+    many = repeated(error.reshape(grid.n, grid.n))
+    soft = soft_cells(drawing, grid.axis, drawing.reach / grid.n, fit.blur_px / scene.node_px)
+    cells = cells_seen(
+        drawing.cells,
+        soft,
+        error,
+        equations.J,
+        equations.N * equations.noise,
+        many * equations.noise,
+        light.gain,
+    )
     J = _corner_jacobian(fit.H)
     return Alignment(
         corners_px=corners_px,
@@ -280,6 +305,8 @@ def _alignment(
         pattern=pattern.correlation,
         strength=pattern.strength,
         worst_cell=worst_cell(error / light.gain, grid, len(drawing.cells)),
+        flip=cells.flip,
+        flip_sigma=cells.sigma,
         blur_px=fit.blur_px,
         gain=light.gain,
         moved_px=float(np.abs(corners_px - start_px).max()),

@@ -140,7 +140,9 @@ def _refined(
     rims = [setup.patterns[name].rim for name in names]
     refined = refine(image, raw, rims, camera, setup.refinement)
     seen = dict(zip(names, refined, strict=True))
-    return improved(image, seen, setup.patterns, camera) if setup.by_lines else seen
+    if not setup.by_lines:
+        return seen
+    return improved(image, seen, setup.patterns, camera, searched=True)
 
 
 def _in_blur(

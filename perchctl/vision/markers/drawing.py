@@ -75,6 +75,16 @@ def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32
     return (1.0 - black).astype(np.float32)
 
 
+def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) -> Array:
+    """Share of each row (or column) of cells in each node (n, cells), blurred by sigma nodes:
+    a cell's share in the drawing is the product of its row's and its column's."""
+    wide = _coverage(_wide(axis, half_node), half_node, len(drawing.cells), 1.0)
+    soft = cv2.GaussianBlur(
+        wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(soft[_EDGE : _EDGE + len(axis)], dtype=np.float64)
+
+
 def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32] | None:
     """Share of each node that is not on the paper, likewise; None without an end."""
     if drawing.sheet is None:

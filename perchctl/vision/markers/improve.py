@@ -36,8 +36,12 @@ def improved(
     seen: Mapping[MarkerName, RefinedCorners],
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
+    searched: bool = False,
 ) -> dict[MarkerName, RefinedCorners]:
-    """The markers that were seen, with better corners and with the other marker if it shows."""
+    """The markers that were seen, with better corners and with the other marker if it shows.
+
+    What a search found, its bits read one by one, stays only where lines suffice, the drawing
+    confirms it, or the other marker was seen with it."""
     better = dict(seen)
     if "small" in better and "large" not in better:
         large = around(image, better["small"], patterns, camera)
@@ -47,10 +51,15 @@ def improved(
         start = _start(name, better, patterns, camera)
         if start is None or not within(start, image.shape):
             continue
-        max_sigma = _MAX_SIGMA if _OTHER[name] in better else _MAX_SIGMA_ALONE
-        exact = aligned(image, start, patterns[name], camera, _REACH, max_sigma=max_sigma)
+        alone = _OTHER[name] not in better
+        max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
+        exact = aligned(
+            image, start, patterns[name], camera, _REACH, max_sigma=max_sigma, alone=alone
+        )
         if exact is not None:
             better[name] = exact
+        elif alone and searched:
+            better.pop(name, None)
         elif name not in better and resembles(image, start, patterns[name]):
             better[name] = RefinedCorners(start, NESTED_SIGMA_PX, False)
     return better
