@@ -1,21 +1,25 @@
-"""What is taken for the target without being it: stills with foreign codewords and tiles.
+"""What is taken for the target without being it: stills with foreign codewords and tiles, then
+what steers after a lock (`decoys_tracked.py`).
 
     python benchmarks/decoys.py [--quick]
 
 Markers whose codeword is a few bits beside the target's, and walls of black and white tiles,
 0.7 to 3 blurs a cell (where bits begin to run together), 100 of each a blur. Beside them the
-true target and its small marker alone, likewise: what the checks cost.
+true target and its small marker alone, likewise: what the checks cost. Exit code 1 where more
+than 1 of 100 foreign stills is taken, or something steers that is not the target.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from functools import cache
 
 import cv2
 import numpy as np
 from common import CAMERA, Picture, arguments, setup_with, table
+from decoys_tracked import report_tracked
 
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig
@@ -26,6 +30,7 @@ from perchctl.vision.types import Frame
 BLURS_PX = (0.6, 1.0, 1.5, 2.0, 2.8, 4.0)
 CELLS_IN_BLURS = (0.7, 3.0)
 LEAST_SIDE_PX = 13.0
+OWN, MOST_FOREIGN = ("the target", "its small marker"), 0.01
 DOTS, FINE = 40, 3  # drawn so many dots a cell, rendered so many times finer than the picture
 SETUP = setup_with()
 LARGE = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
@@ -119,15 +124,15 @@ def cases() -> dict[str, Callable[[Rng, float], Picture]]:
         "ORIGINAL, 3 bits away": of(foreign(SMALL, 3)),
         "4X4_1000, 2 bits away": of(foreign(LARGE, 2)),
         "tiles": wall,
-        "the target": of(lambda _: own[LARGE.dictionary], own[SMALL.dictionary]),
-        "its small marker": of(lambda _: own[SMALL.dictionary]),
+        OWN[0]: of(lambda _: own[LARGE.dictionary], own[SMALL.dictionary]),
+        OWN[1]: of(lambda _: own[SMALL.dictionary]),
     }
 
 
-def main() -> None:
+def main() -> int:
     options = arguments(__doc__ or "")
     pictures = 20 if options.quick else 100
-    rows = []
+    rows, good = [], True
     for number, (name, make) in enumerate(cases().items()):
         found = []
         for blur_px in BLURS_PX:
@@ -137,11 +142,13 @@ def main() -> None:
                 frame = Frame(0, 0.0, make(rng, blur_px))
                 result = detect(frame, None, SETUP.detector, CAMERA)
                 seen += result.large is not None or result.small is not None
+            good = good and (name in OWN or seen <= MOST_FOREIGN * pictures)
             found.append(str(seen))
         rows.append([name, *found])
     title = f"taken for the target, of {pictures} stills, by blur (sigma, px)"
     table(title, ["", *(f"{b:g}" for b in BLURS_PX)], rows)
+    return 0 if report_tracked(2 if options.quick else 6) and good else 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from common import Picture, arguments, setup_with, table
+from common import Picture, setup_with, table
 
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.pipeline import step
@@ -146,13 +146,3 @@ def report_tracked(seeds: int) -> bool:
     head = ("tracked", "", "frames", "measured", "wrong", "worst mm", "")
     table(f"After {LOCKED} frames of the target", head, rows)
     return good
-
-
-def main() -> None:
-    quick = arguments(__doc__ or "").quick
-    good = report_tracked(2 if quick else 6)
-    print("\nnothing steered but the target" if good else "\nsomething steered")
-
-
-if __name__ == "__main__":
-    main()

@@ -85,7 +85,7 @@ MEANINGS = {
     "detector.refinement": "of corners: lines fitted to the sides, OpenCV's sub-pixel, or none",
     "detector.window": "look around the last pose first",
     "detector.blurred": "look once more where blur may hide the target",
-    "detector.blurred_every": "... in every Nth picture of a stream without it",
+    "detector.blurred_every": "... in every Nth picture of a stream without it, instead of a sharp one",
     "detector.correction_bits_large": "wrong cells that are corrected",
     "detector.correction_bits_small": "wrong cells that are corrected",
     "pose.solver": "OpenCV's solver for the first guess",

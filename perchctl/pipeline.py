@@ -117,9 +117,9 @@ def step(
     """
     frame = looked_at(frame, pipeline.fields)
     expected, _ = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
-    # A first picture is looked at thoroughly, and of a stream without the target every Nth.
-    thorough = state.empty_frames % pipeline.detector.blurred_every == 0
-    detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, thorough)
+    # A first picture is searched for everything.
+    empty = None if state.last is None and state.empty_frames == 0 else state.empty_frames
+    detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, empty)
     new, output = follow(state, detections, attitude, pipeline)
     return new, replace(output, fields=frame.fields or "whole")
 

@@ -74,7 +74,7 @@ class DetectorConfig(Section):
     refinement: Literal["none", "subpix", "line"] = "line"
     window: bool = True  # search around the last pose first
     blurred: bool = True  # look once more where blur may hide the target
-    blurred_every: int = Field(4, ge=1, le=100)  # ... in every Nth frame of a stream without it
+    blurred_every: int = Field(4, ge=1, le=100)  # ... then every Nth of a stream without it
     correction_bits_large: int = Field(0, ge=0, le=3)
     correction_bits_small: int = Field(1, ge=0, le=3)
 

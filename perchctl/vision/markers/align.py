@@ -48,6 +48,8 @@ from perchctl.vision.types import CameraModel
 _MAX_GRID, _MIN_GRID = 44, 18
 _GRID_PX = 0.8  # picture pixels from node to node
 _ROUNDS = 12
+_HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
+"""A marker's likeness is above 0.9 after two rounds; what is still far from it is none."""
 _STILL_PX = 0.02
 _LENS_PX = 0.3  # what the lens does is computed anew after this way
 _MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
@@ -146,7 +148,8 @@ def align(
 ) -> Alignment | None:
     """Lay the drawing over the picture, starting with corners `start_px` (4, 2) and a blur.
 
-    None where the marker leaves the picture, has no contrast, or the fit breaks down.
+    None where the marker leaves the picture, has no contrast, is not alike at all, or the fit
+    breaks down.
     """
     start = undistort_px(start_px, camera)
     scene = _scene(image, start, drawing, camera)
@@ -157,6 +160,8 @@ def align(
         fit = _seen_through_lens(fit, scene)
         equations = _equations(fit, scene)
         if equations is None:
+            return None
+        if fit.rounds == _HOPE_ROUNDS and likeness(equations.grey, equations.error) < _LEAST_HOPE:
             return None
         step = _solved(equations)
         if step is None:

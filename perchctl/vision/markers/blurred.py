@@ -6,7 +6,7 @@ over the picture itself, does not verify (`perchctl.vision.markers.by_drawing`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +17,7 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.by_drawing import aligned
 from perchctl.vision.markers.corners import RefinedCorners
 from perchctl.vision.markers.detector import DetectorSetup, loose_detector
-from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance
+from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance, resemblances
 from perchctl.vision.markers.square import mapped, mean_side_px, side_lengths_px, to_unit, within
 from perchctl.vision.types import MARKERS, CameraModel, MarkerName
 
@@ -25,6 +25,7 @@ _BLURS_PX, _BLUR_PX = (1.5, 3.0), 2.0  # to start with
 _SEARCH_PX, _SEARCH_SIDES = 10.0, 0.5  # how far a prediction may be off
 _MAX_TEMPLATE_PX, _MIN_TEMPLATE_PX = 96.0, 6
 _MIN_RESEMBLANCE = 0.5
+_NEAR_RESEMBLANCE = 0.45  # where it is expected; textures seldom reach it, and cost a fit each
 _MAX_CANDIDATES = 3
 _CENTRE_GREY, _BEYOND_GREY = 0.3, 0.6  # where there may be anything
 _SAME = 0.15  # of a side
@@ -54,6 +55,8 @@ def expected_in_blur(
         if mean_side_px(corners) < LEAST_SIDE_PX:
             continue
         start = _shifted(image, corners, patterns[name])
+        if resemblance(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
+            continue
         for blur_px in _BLURS_PX:
             seen = aligned(image, start, patterns[name], camera, blur_px=blur_px)
             if seen is not None:
@@ -67,7 +70,7 @@ def hidden_in_blur(
     """A marker anywhere in the picture: of all its quadrilaterals, those whose grey values
     go best with a marker's cells are verified."""
     corners, _, others, _ = loose_detector(setup).detectMarkersMultiDict(image)
-    quads = [np.asarray(q, dtype=np.float64).reshape(4, 2) for q in (*corners, *others)]
+    quads = np.array((*corners, *others), dtype=np.float64).reshape(-1, 4, 2)
     for candidate in _best(_candidates(image, quads, setup.patterns)):
         pattern = setup.patterns[candidate.name]
         seen = aligned(image, candidate.corners_px, pattern, camera, blur_px=_BLUR_PX)
@@ -77,15 +80,15 @@ def hidden_in_blur(
 
 
 def _candidates(
-    image: NDArray[np.uint8], quads: Iterable[Array], patterns: Mapping[MarkerName, Pattern]
+    image: NDArray[np.uint8], quads: Array, patterns: Mapping[MarkerName, Pattern]
 ) -> list[_Candidate]:
-    """The quadrilaterals that resemble one of the markers."""
+    """Those of the quadrilaterals (m, 4, 2) that resemble one of the markers."""
+    quads = quads[side_lengths_px(quads).min(axis=1) >= LEAST_SIDE_PX]
+    if len(quads) == 0:
+        return []
     found = []
-    for quad in quads:
-        if float(side_lengths_px(quad).min()) < LEAST_SIDE_PX:
-            continue
-        for name in MARKERS:
-            of_turns = resemblance(image, quad, patterns[name])
+    for name in MARKERS:
+        for quad, of_turns in zip(quads, resemblances(image, quads, patterns[name]), strict=True):
             turn = int(np.argmax(of_turns))
             if of_turns[turn] > _MIN_RESEMBLANCE:
                 rolled = np.roll(quad, turn, axis=0)

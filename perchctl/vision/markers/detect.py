@@ -25,7 +25,7 @@ from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.improve import improved, lines_suffice
 from perchctl.vision.markers.lines import refine
 from perchctl.vision.markers.motion import predicted_corners, with_motion
-from perchctl.vision.markers.search import Found, search
+from perchctl.vision.markers.search import Found, Look, search
 from perchctl.vision.markers.shift import known_from
 from perchctl.vision.markers.square import completed, side_lengths_px, within
 from perchctl.vision.types import (
@@ -50,27 +50,40 @@ def detect(
     setup: DetectorSetup,
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
-    thorough: bool = True,
+    empty_frames: int | None = None,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
     `previous` is what an earlier frame gave (the last one that saw something is best);
     it gives the place to look at first and decides between look-alikes. `expected` are better
     predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
-    `thorough` looks once more, all over a picture in which nothing was found and nothing
-    is expected, for a target hidden by blur. In a frame of two fields each is looked at,
-    and the result is the mean: where the markers were at the frame's own time.
+    `empty_frames` is how many frames in a row have shown nothing: in a stream the searches take
+    turns by it, since all of them in one frame take longer than a frame may. None searches by
+    all. In a frame of two fields each is looked at, and the result is the mean: where the
+    markers were at the frame's own time.
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
+    look = _look(empty_frames, bool(expected), setup)
     shift = known_from(None if previous is None else previous.edge_shift)
 
-    def look(picture: Frame) -> Detections:
-        return _looked(picture, expected, setup, camera, shift, thorough)
+    def looked(picture: Frame) -> Detections:
+        return _looked(picture, expected, setup, camera, shift, look)
 
     if frame.fields == "woven":
-        return with_motion(between(*(look(field) for field in halves(frame))), previous)
-    result = with_motion(look(frame), previous)
+        return with_motion(between(*(looked(field) for field in halves(frame))), previous)
+    result = with_motion(looked(frame), previous)
     return with_ghosts(result, frame.image) if frame.fields == "whole" else result
+
+
+def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
+    """After a loss the place where the target should be and the whole picture take turns, then
+    a sharp target and, in every Nth frame, a blurred one."""
+    if empty_frames is None:
+        return "all"
+    if expected and setup.window:
+        return "sharp" if empty_frames % 2 else "near"
+    blurs = setup.blurred and setup.by_lines and empty_frames % setup.blurred_every == 0
+    return "blurred" if blurs and setup.blurred_every > 1 else "all" if blurs else "sharp"
 
 
 def _looked(
@@ -79,18 +92,18 @@ def _looked(
     setup: DetectorSetup,
     camera: CameraModel,
     shift: EdgeShift | None,
-    thorough: bool,
+    look: Look,
 ) -> Detections:
     """What is in a picture of one moment."""
     image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
     seen = _followed(image, expected, setup, camera, shift)
-    if not seen or _missing(seen, expected, image.shape):
-        found = search(image, expected, setup)
+    if look != "blurred" and (not seen or _missing(seen, expected, image.shape)):
+        found = search(image, expected, setup, look)
         if len(found.corners_px) >= len(seen):
             seen = _refined(image, found, setup, camera)
-    if not seen and setup.blurred and setup.by_lines:
-        seen = _in_blur(image, expected, setup, camera, thorough)
+    if not seen and look != "sharp" and setup.blurred and setup.by_lines:
+        seen = _in_blur(image, expected, setup, camera)
     return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
@@ -150,13 +163,11 @@ def _in_blur(
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     camera: CameraModel,
-    thorough: bool,
 ) -> _Seen:
     """What only the drawing shows: near to where it is expected, or anywhere."""
-    seen: _Seen = {}
     if expected:
         seen = expected_in_blur(image, expected, setup.patterns, camera)
-    elif thorough:
+    else:
         seen = hidden_in_blur(image, setup, camera)
     return improved(image, seen, setup.patterns, camera)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.markers.drawing import Drawing
-from perchctl.vision.markers.square import from_unit, mapped
+from perchctl.vision.markers.square import from_unit
 
 LEAST_SIDE_PX = 7.0  # below it a marker is a spot
 _MIN_CONTRAST = 10.0  # grey levels
@@ -146,34 +146,42 @@ def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> 
 def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
     """Correlation of the cells' grey values with the pattern for corners (4, 2) rolled on
     by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
-    grey = _read(image, corners_px, pattern)
-    if grey is None:
-        return np.zeros(4)
-    grey -= grey.mean()
-    spread = math.sqrt(float(grey @ grey))
+    return resemblances(image, corners_px[None], pattern)[0]
+
+
+def resemblances(image: NDArray[np.uint8], quads_px: Array, pattern: Pattern) -> Array:
+    """`resemblance` of many at a time: corners (m, 4, 2) to (m, 4)."""
+    grey, inside = _read(image, quads_px, pattern)
+    grey -= grey.mean(axis=1, keepdims=True)
+    spread = np.sqrt((grey * grey).sum(axis=1))
     # Black and white each on about half of the spots are 2 spreads apart.
-    if spread < 0.5 * _MIN_CONTRAST * math.sqrt(len(grey)):
-        return np.zeros(4)
-    return np.asarray(pattern.soft @ grey / spread)
+    contrast = inside & (spread >= 0.5 * _MIN_CONTRAST * math.sqrt(grey.shape[1]))
+    like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)[:, None]
+    return np.asarray(np.where(contrast[:, None], like, 0.0))
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
     """Mean grey value of each cell that is read, None where one is outside of the picture."""
-    grey = _read(image, corners_px, pattern)
-    if grey is None:
+    grey, inside = _read(image, corners_px[None], pattern)
+    if not inside[0]:
         return None
-    return np.asarray(np.bincount(pattern.owner, weights=grey) / pattern.spots_per_cell)
+    return np.asarray(np.bincount(pattern.owner, weights=grey[0]) / pattern.spots_per_cell)
 
 
-def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
-    """Grey values at the pattern's spots, None where one is outside of the picture."""
-    at = mapped(from_unit(corners_px), pattern.spots)
-    (x0, y0), (x1, y1) = at.min(axis=0).tolist(), at.max(axis=0).tolist()
+def _read(
+    image: NDArray[np.uint8], quads_px: Array, pattern: Pattern
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Grey values (m, k) at the pattern's k spots for corners (m, 4, 2), and whether all of
+    a marker's are in the picture (m,)."""
     h, w = image.shape
-    if not (x0 >= 0.0 and y0 >= 0.0 and x1 <= w - 1 and y1 <= h - 1):
-        return None
-    nearest = (at + 0.5).astype(np.intp)
-    return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
+    H = np.array([from_unit(quad) for quad in quads_px])
+    at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at /= pattern.spots @ H[:, 2, :2, None] + H[:, 2, 2, None, None]
+        low, high = at.min(axis=1), at.max(axis=1)
+        inside = (low >= 0.0).all(axis=1) & (high <= (w - 1, h - 1)).all(axis=1)
+        nearest = np.where(inside[:, None, None], at + 0.5, 0.0).astype(np.intp)
+    return image[nearest[..., 1], nearest[..., 0]].astype(np.float64), inside
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:
