@@ -117,8 +117,9 @@ def step(
     """
     frame = looked_at(frame, pipeline.fields)
     expected, _ = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
-    # A first picture is searched for everything.
-    empty = None if state.last is None and state.empty_frames == 0 else state.empty_frames
+    # A first picture is searched by all means.
+    first = state.last is None and state.stranger is None and state.empty_frames == 0
+    empty = None if first else state.empty_frames
     detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, empty)
     new, output = follow(state, detections, attitude, pipeline)
     return new, replace(output, fields=frame.fields or "whole")

@@ -82,8 +82,12 @@ def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Loo
         return "all"
     if expected and setup.window:
         return "sharp" if empty_frames % 2 else "near"
-    blurs = setup.blurred and setup.by_lines and empty_frames % setup.blurred_every == 0
-    return "blurred" if blurs and setup.blurred_every > 1 else "all" if blurs else "sharp"
+    if not (setup.blurred and setup.by_lines):
+        return "sharp"
+    if setup.blurred_every == 1:
+        return "all"
+    # At 0 something was seen, though not where the target should be.
+    return "blurred" if empty_frames and empty_frames % setup.blurred_every == 0 else "sharp"
 
 
 def _looked(

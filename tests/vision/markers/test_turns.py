@@ -119,3 +119,15 @@ def test_blur_after_a_loss_is_seen_through_near_the_old_place(stream: Stream) ->
         stream.see(EMPTY)
     assert any(stream.see(picture) for _ in range(2))
     assert stream.done[-1].near_in_blur == 1
+
+
+def test_what_is_seen_and_not_the_target_does_not_end_the_sharp_search(stream: Stream) -> None:
+    """A stranger in every frame: once nothing is expected any more, all is searched."""
+    for _ in range(8):
+        assert stream.see(render(*NEAR))
+    farther = render(*pose_of(-0.3, 0.2, 2.2, 0.4))
+    for _ in range(45):
+        stream.see(farther)
+    assert stream.state.lock is not None
+    assert stream.state.lock.pose.tvec_m[2] < 1.3
+    assert [(done.whole, done.all_in_blur) for done in stream.done[-10:]] == [(1, 0)] * 10
