@@ -108,7 +108,9 @@ def make_points(
         corners = image_px[4 * i : 4 * i + 4]
         sigma_px[4 * i : 4 * i + 4] = d.sigma_px
         nx, ny = _outward_normals(corners)
-        if d.refined:
+        if d.cov_px2 is not None:
+            W[rows, rows] = _whitened(d.cov_px2)
+        elif d.refined:
             W[rows, rows] = _line_whitening(nx, ny, d.sigma_px)
         else:
             W[range(8 * i, 8 * i + 8), range(8 * i, 8 * i + 8)] = 1.0 / d.sigma_px
@@ -129,6 +131,14 @@ def _outward_normals(corners: Array) -> tuple[Array, Array]:
     nx, ny = side[:, 1] / length, -side[:, 0] / length
     turn = side[0, 0] * side[1, 1] - side[0, 1] * side[1, 0]
     return (nx, ny) if turn > 0.0 else (-nx, -ny)
+
+
+def _whitened(cov_px2: Array) -> Array:
+    """(8, 8): what makes errors of that covariance independent and of unit spread."""
+    try:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_px2)), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return np.diag(1.0 / np.sqrt(np.maximum(np.diagonal(cov_px2), 1e-6)))
 
 
 def _line_whitening(nx: Array, ny: Array, sigma_px: float) -> Array:

@@ -65,7 +65,9 @@ class Detection:
     orders them; pixel (0, 0) is the centre of the top-left pixel.
 
     `sigma_px` is the spread of the corners, from the line fit's residuals, or a
-    default where no line could be fitted.
+    default where no line could be fitted. Corners that follow from a part of the drawing may
+    lie outside of the picture; they have a covariance `cov_px2` (8, 8), in pixels of a pinhole,
+    x and y of each corner by turns.
     """
 
     marker: MarkerName
@@ -74,6 +76,7 @@ class Detection:
     refined: bool
     shift_sigma_px: float = 0.0  # of what moved all of a picture's edges alike, outwards
     common_px: Array | None = None  # (4, 2): one sigma of what moved all corners together
+    cov_px2: Array | None = None
 
 
 @dataclass(frozen=True)

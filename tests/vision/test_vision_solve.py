@@ -66,3 +66,12 @@ def test_a_known_tilt_is_contradicted_beyond_its_spread_alone() -> None:
     assert known.contradicts(other)
     assert not TiltPrior(normal(TRUE), math.pi).contradicts(other)
     assert not UNKNOWN.contradicts(other)
+
+
+def test_corners_with_a_covariance_of_their_own_count_as_it_says() -> None:
+    corners = project(square(0.15), TRUE.rvec, TRUE.tvec, CAMERA)
+    half = np.random.default_rng(1).normal(0.0, 0.1, (8, 8))
+    cov_px2 = half @ half.T + 0.01 * np.eye(8)
+    detection = Detection("large", corners, 0.05, True, cov_px2=cov_px2)
+    made = make_points([detection], square(0.15), undistort_px(corners, CAMERA), CAMERA.K)
+    assert np.allclose(made.whitening @ cov_px2 @ made.whitening.T, np.eye(8), atol=1e-9)

@@ -42,7 +42,7 @@ from perchctl.vision.markers.grid import (
 from perchctl.vision.markers.light import BEND, Light, fit_light, lit_jacobian
 from perchctl.vision.markers.likeness import likeness, pattern_seen, repeated, worst_cell
 from perchctl.vision.markers.products import gram
-from perchctl.vision.markers.square import UNIT, from_unit
+from perchctl.vision.markers.square import UNIT, corner_jacobian, from_unit
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18
@@ -302,7 +302,7 @@ def _alignment(
         many * equations.noise,
         light.gain,
     )
-    J = _corner_jacobian(fit.H)
+    J = corner_jacobian(fit.H)
     return Alignment(
         corners_px=corners_px,
         sigma_px=math.sqrt(max(float(np.trace(J @ covariance @ J.T)) / 8.0, 0.0)),
@@ -316,16 +316,3 @@ def _alignment(
         gain=light.gain,
         moved_px=float(np.abs(corners_px - start_px).max()),
     )
-
-
-def _corner_jacobian(H: Array) -> Array:
-    """Change of the four pinhole corners with the increment's terms, (8, 8)."""
-    rows = []
-    for u, v in UNIT:
-        d = H[2] @ (u, v, 1.0)
-        x, y = H[0] @ (u, v, 1.0) / d, H[1] @ (u, v, 1.0) / d
-        A = np.array([(H[0, :2] - x * H[2, :2]) / d, (H[1, :2] - y * H[2, :2]) / d])
-        du = np.array([u, v, 1, 0, 0, 0, -u * u, -u * v])
-        dv = np.array([0, 0, 0, u, v, 1, -u * v, -v * v])
-        rows.append(A @ np.stack([du, dv]))
-    return np.concatenate(rows)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from perchctl.geometry import Array
 from perchctl.vision.types import MARKERS, Detection, Detections
 
 
@@ -32,4 +35,13 @@ def _middle(a: Detection, b: Detection) -> Detection:
         ((a.sigma_px**2 + b.sigma_px**2) / 4.0) ** 0.5,
         a.refined and b.refined,
         max(a.shift_sigma_px, b.shift_sigma_px),
+        cov_px2=_mean_cov_px2(a, b),
     )
+
+
+def _mean_cov_px2(a: Detection, b: Detection) -> Array | None:
+    """None where in both the corners spread alike."""
+    if a.cov_px2 is None and b.cov_px2 is None:
+        return None
+    one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
+    return np.asarray((one + other) / 4.0)

@@ -24,8 +24,9 @@ NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothi
 @dataclass(frozen=True, eq=False)
 class RefinedCorners:
     """corners_px (4, 2), their spread, whether lines or the drawing were fitted, the spread
-    of a shift that is common to all sides (outwards), the edges' blur, in px, and the shift
-    that was taken out."""
+    of a shift that is common to all sides (outwards), the edges' blur, in px, the shift
+    that was taken out, and, where the corners follow from a part of the drawing, their
+    covariance (8, 8) in pixels of a pinhole, x and y of each corner by turns."""
 
     corners_px: Array
     sigma_px: float
@@ -33,6 +34,7 @@ class RefinedCorners:
     shift_sigma_px: float = 0.0
     blur_px: float = 0.0
     edge_shift: EdgeShift | None = None
+    cov_px2: Array | None = None
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:

@@ -4,7 +4,9 @@
 2. by a search in a window around that place, then in the whole picture (`search`);
 3. where blur may hide them (`blurred`).
 
-Each step takes place within the same frame, and only where the one before saw too little.
+A marker of which the picture's edge, or light that glares, hides a part is measured by what is
+seen of it (`partly`). Each step takes place within the same frame, and only where the one
+before saw too little.
 """
 
 from __future__ import annotations
@@ -25,9 +27,11 @@ from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.improve import improved, lines_suffice
 from perchctl.vision.markers.lines import refine
 from perchctl.vision.markers.motion import predicted_corners, with_motion
+from perchctl.vision.markers.partly import clear_of_the_edge, seen_partly
 from perchctl.vision.markers.search import Found, Look, search
+from perchctl.vision.markers.seen_edges import ROOM_PX
 from perchctl.vision.markers.shift import known_from
-from perchctl.vision.markers.square import completed, side_lengths_px, within
+from perchctl.vision.markers.square import completed, nested, side_lengths_px, within
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -159,7 +163,29 @@ def _refined(
     seen = dict(zip(names, refined, strict=True))
     if not setup.by_lines:
         return seen
+    seen = _whole_or_partly(image, seen, setup, camera)
     return improved(image, seen, setup.patterns, camera, searched=True)
+
+
+def _whole_or_partly(
+    image: NDArray[np.uint8], seen: _Seen, setup: DetectorSetup, camera: CameraModel
+) -> _Seen:
+    """What the search found, those without four lines for sides by what of these is seen. A
+    search takes the picture's edge for the side of a marker that is cut off there."""
+    fitted = dict(seen)
+    for name, r in seen.items():
+        if r.refined and clear_of_the_edge(r, image.shape):
+            continue
+        pattern, small = setup.patterns[name], seen.get("small")
+        start = r.corners_px
+        if name == "large" and small is not None and small.refined:
+            start = nested(small.corners_px, 1.0 / setup.ratio, camera)
+        partly = seen_partly(image, start, pattern, camera, "other" if len(seen) == 2 else "bits")
+        if partly is not None:
+            fitted[name] = partly
+        elif not within(r.corners_px, image.shape, ROOM_PX):
+            del fitted[name]
+    return fitted
 
 
 def _in_blur(
@@ -180,4 +206,4 @@ def _detection(name: MarkerName, seen: _Seen) -> Detection | None:
     r = seen.get(name)
     if r is None:
         return None
-    return Detection(name, r.corners_px, r.sigma_px, r.refined, r.shift_sigma_px)
+    return Detection(name, r.corners_px, r.sigma_px, r.refined, r.shift_sigma_px, cov_px2=r.cov_px2)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import NESTED_SIGMA_PX, RefinedCorners
 from perchctl.vision.markers.lines import refine_lines
+from perchctl.vision.markers.partly import clear_of_the_edge, seen_partly
 from perchctl.vision.markers.pattern import (
     LEAST_SIDE_PX,
     Pattern,
@@ -22,6 +23,7 @@ from perchctl.vision.markers.pattern import (
     cells_mostly_agree,
     resembles,
 )
+from perchctl.vision.markers.seen_edges import ROOM_PX
 from perchctl.vision.markers.square import mean_side_px, nested, side_lengths_px, within
 from perchctl.vision.types import MARKERS, CameraModel, EdgeShift, MarkerName
 
@@ -35,25 +37,36 @@ def follow(
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
     shift: EdgeShift | None = None,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """The expected markers (corners (4, 2) px) that are verified by sides and cells; `shift`
-    is what was measured of the edges in an earlier picture."""
+    is what was measured of the edges in an earlier picture, `hidden` (h, w) where there is
+    something else."""
     names = [
         name
         for name in MARKERS
         if name in expected
-        and within(expected[name], image.shape)
+        and within(expected[name], image.shape, ROOM_PX)
         and side_lengths_px(expected[name]).min() > _LEAST_CELL_PX * patterns[name].rim.cells
     ]
-    if not names:
-        return {}
-    raw = np.stack([expected[name] for name in names])
-    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
-    seen = {
-        name: result
-        for name, result in zip(names, fitted, strict=True)
-        if result is not None and cells_agree(image, result.corners_px, patterns[name])
-    }
+    seen: dict[MarkerName, RefinedCorners] = {}
+    if names:
+        raw = np.stack([expected[name] for name in names])
+        fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
+        for name, result in zip(names, fitted, strict=True):
+            if (
+                result is not None
+                and clear_of_the_edge(result, image.shape)
+                and cells_agree(image, result.corners_px, patterns[name])
+            ):
+                seen[name] = result
+    for name in MARKERS:
+        if name in expected and name not in seen:
+            partly = seen_partly(
+                image, expected[name], patterns[name], camera, "track", hidden, shift
+            )
+            if partly is not None:
+                seen[name] = partly
     large = seen.get("large")
     if large is not None and "small" not in seen:
         # Too small for lines, but where it must be: enough to know that it is there.
@@ -68,21 +81,35 @@ def around(
     small: RefinedCorners,
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> RefinedCorners | None:
     """The large marker around a small one that was found: something may cover a part of
-    it, so long as its sides are lines for the most part and most cells show."""
+    it, and it may be cut off by the picture's edge, so long as its sides are lines where they
+    are seen and most cells show."""
     pattern = patterns["large"]
-    ratio = pattern.drawing.ratio
-    start = nested(small.corners_px, 1.0 / ratio, camera)
-    if not within(start, image.shape):
+    start = nested(small.corners_px, 1.0 / pattern.drawing.ratio, camera)
+    if not np.isfinite(start).all():
         return None
-    # A small marker gives a rough place; the first fit is where to look closely.
-    found = refine_lines(image, start[None], [pattern.rim], camera)[0]
-    if found is not None:
-        found = refine_lines(image, found.corners_px[None], [pattern.rim], camera)[0]
-    if found is None:
-        return None
-    centre = nested(found.corners_px, ratio, camera)
+    if within(start, image.shape, ROOM_PX):
+        # A small marker gives a rough place; the first fit is where to look closely.
+        found = refine_lines(image, start[None], [pattern.rim], camera)[0]
+        if found is not None:
+            found = refine_lines(image, found.corners_px[None], [pattern.rim], camera)[0]
+        if (
+            found is not None
+            and clear_of_the_edge(found, image.shape)
+            and _centred(found, small, pattern, camera)
+            and cells_mostly_agree(image, found.corners_px, pattern)
+        ):
+            return found
+    partly = seen_partly(image, start, pattern, camera, "other", hidden)
+    return partly if partly and _centred(partly, small, pattern, camera) else None
+
+
+def _centred(
+    large: RefinedCorners, small: RefinedCorners, pattern: Pattern, camera: CameraModel
+) -> bool:
+    """Whether the small marker is where the large one has it."""
+    centre = nested(large.corners_px, pattern.drawing.ratio, camera)
     off_px = float(np.abs(centre - small.corners_px).max())
-    near = off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
-    return found if near and cells_mostly_agree(image, found.corners_px, pattern) else None
+    return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)

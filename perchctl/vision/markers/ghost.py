@@ -37,6 +37,8 @@ def with_ghosts(now: Detections, image: NDArray[np.uint8]) -> Detections:
     if velocity is not None and float(np.hypot(*velocity)) < SLOW_PX_S:
         return now
     seen = [d for name in MARKERS if (d := now.get(name)) is not None]
+    if any(d.cov_px2 is not None for d in seen):
+        return now  # sides that are outside of the picture show nothing
     ghost_px = max((double_edge_px(image, d) for d in seen), default=0.0)
     if ghost_px == 0.0:
         return now

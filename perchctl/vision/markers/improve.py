@@ -75,6 +75,8 @@ def _start(
     use."""
     this, other = seen.get(name), seen.get(_OTHER[name])
     if this is not None:
+        if this.cov_px2 is not None:
+            return None  # what hides a part of it would spoil the drawing, too
         # Small cells matter only where no larger ones were measured.
         enough = lines_suffice(this, patterns[name]) or (name == "small" and other is not None)
         return None if this.refined and enough else this.corners_px

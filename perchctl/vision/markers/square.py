@@ -38,6 +38,20 @@ def mapped(H: Array, points: Array) -> Array:
     return np.asarray(images, dtype=np.float64).reshape(points.shape)
 
 
+def corner_jacobian(H: Array) -> Array:
+    """Change (8, 8) of the four corners that H (3, 3) makes of the unit square with the terms of
+    an increment P, H (1 + P): its rows one after the other, without the last term."""
+    rows = []
+    for u, v in UNIT:
+        d = H[2] @ (u, v, 1.0)
+        x, y = H[0] @ (u, v, 1.0) / d, H[1] @ (u, v, 1.0) / d
+        A = np.array([(H[0, :2] - x * H[2, :2]) / d, (H[1, :2] - y * H[2, :2]) / d])
+        du = np.array([u, v, 1, 0, 0, 0, -u * u, -u * v])
+        dv = np.array([0, 0, 0, u, v, 1, -u * v, -v * v])
+        rows.append(A @ np.stack([du, dv]))
+    return np.concatenate(rows)
+
+
 def side_lengths_px(corners_px: Array) -> Array:
     """Lengths of the four sides, (..., 4)."""
     d = corners_px.take(NEXT, axis=-2) - corners_px
@@ -55,13 +69,14 @@ def doubled_area(corners: Array) -> Array:
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
-def within(corners_px: Array, shape: tuple[int, ...]) -> bool:
-    """Whether all corners (4, 2) are finite and inside a picture of that shape."""
+def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> bool:
+    """Whether all corners (4, 2) are finite and inside a picture of that shape, at least
+    `room_px` from its edge."""
     h, w = shape[:2]
     return bool(
         np.isfinite(corners_px).all()
-        and corners_px.min() >= 0.0
-        and (corners_px.max(axis=0) <= (w - 1, h - 1)).all()
+        and corners_px.min() >= room_px
+        and (corners_px.max(axis=0) <= (w - 1 - room_px, h - 1 - room_px)).all()
     )
 
 
