@@ -73,6 +73,7 @@ MEANINGS = {
     "camera.mount.rpy_deg": "its turn from body axes ([Camera mount](conventions.md#camera-mount))",
     "camera.start_timeout_s": "wait for the first good picture",
     "camera.mirrored": "flip each picture before use",
+    "camera.mask": "picture of what the vehicle itself covers, white ([own gear](#own-gear))",
     "camera.fields": "interlaced pictures: found by measure, or which field is earlier, or never",
     "camera.readout_s": "rolling shutter: from the first row to the last; none: not known",
     "vehicle.gear_body_m": "tip of the magnet gear in body axes",

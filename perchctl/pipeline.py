@@ -14,9 +14,11 @@ import numpy as np
 
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import KalmanConfig, Mounting, Profile
+from perchctl.profile.mask import read_mask
 from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
 from perchctl.vision.filter import MAX_GAP_S, predicted
 from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
+from perchctl.vision.markers.mask import GearMask, make_mask
 from perchctl.vision.merge import stage_of
 from perchctl.vision.places import seen_from, to_level, to_world
 from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
@@ -67,7 +69,8 @@ class Pipeline:
 
 def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
     """The profile's pipeline for a calibrated camera. It is never changed: several streams may
-    share one, each with a `PipelineState` of its own."""
+    share one, each with a `PipelineState` of its own. Errors: NotFound, InvalidValue
+    (`camera.mask`)."""
     mount, gear_body_m = profile.camera.mount, profile.vehicle.gear_body_m
     pose = make_pose_setup(
         profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera,
@@ -75,7 +78,7 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
     )  # fmt: skip
     strategy = make_strategy(profile.merge, pose)
     return Pipeline(
-        detector=make_detector(profile.detector, profile.target),
+        detector=make_detector(profile.detector, profile.target, _mask(profile, camera)),
         pose=pose,
         strategy=strategy,
         tracks=make_track_setup(profile.kalman, strategy.tracks, pose),
@@ -83,6 +86,15 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
         camera=camera,
         fields=profile.camera.fields,
     )
+
+
+def _mask(profile: Profile, camera: CameraModel) -> GearMask | None:
+    """What the vehicle's own gear covers. The file is of the camera's own pictures, which
+    `camera.mirrored` has turned over since."""
+    if profile.camera.mask is None:
+        return None
+    covered = read_mask(profile.camera.mask, camera.size_px)
+    return make_mask(covered[:, ::-1] if profile.camera.mirrored else covered)
 
 
 def camera_profile(profile: Profile) -> Profile:

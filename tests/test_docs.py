@@ -26,6 +26,7 @@ from perchctl.mission.table import TABLE
 from perchctl.profile import Profile, load_profile
 from tests.helpers.boards import CHARUCO, render_folder
 from tests.helpers.flights import ROOT, SEED, short_profile
+from tests.helpers.gear import write_turned_about
 from tests.helpers.recording import make_recording
 from tests.helpers.weights_data import known
 from tests.helpers.weights_data import write as write_session
@@ -104,6 +105,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     make_recording(folder)
     render_folder(folder / "board", load_calibration(folder / "camera.yaml"), CHARUCO, 8, seed=1)
+    write_turned_about(folder / "turned")
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
     (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")

@@ -52,6 +52,14 @@ def calibrate(
         Path | None,
         typer.Option("--convert", help="Read an OpenCV, Kalibr or ROS file and write --output."),
     ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            "--mask",
+            help="Learn what the vehicle itself covers of the picture, while it is turned about, "
+            "and write that PNG file (camera.mask) instead.",
+        ),
+    ] = None,
     reject: Annotated[
         bool, typer.Option("--reject/--no-reject", help="Leave out outlier views and corners.")
     ] = True,
@@ -83,6 +91,7 @@ def calibrate(
             force=force,
             check=check,
             convert=convert,
+            mask=mask,
             reject=reject,
             plain_corners=plain_corners,
             keep_pictures=keep_pictures,

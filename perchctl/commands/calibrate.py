@@ -24,6 +24,7 @@ from perchctl.camera.files import VideoSource, image_files, read_grey
 from perchctl.camera.open import source_spec
 from perchctl.camera.source import check_size
 from perchctl.commands.calibrate_live import captured_views
+from perchctl.commands.calibrate_mask import write_mask
 from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
@@ -49,6 +50,7 @@ class CalibrateRequest:
     force: bool = False
     check: Path | None = None
     convert: Path | None = None
+    mask: Path | None = None
     reject: bool = True
     plain_corners: bool = False
     keep_pictures: Path | None = None
@@ -70,18 +72,22 @@ class _Found:
 
 
 def run(request: CalibrateRequest) -> int:
-    """Calibrate, check or convert; returns the exit code.
+    """Calibrate, check, convert or learn a mask; returns the exit code.
 
     Errors: NotFound, InvalidValue, UsageError, TimedOut (a silent camera).
     """
     if request.convert is not None:
-        if request.source is not None or request.check is not None:
-            raise UsageError("--convert takes a file and no source or --check")
+        if not (request.source is request.check is request.mask is None):
+            raise UsageError("--convert takes a file and no source, --check or --mask")
         return _convert(request, request.convert)
     if request.source is None:
         raise UsageError(
             "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N or http://..."
         )
+    if request.mask is not None:
+        if request.check is not None or request.output is not None:
+            raise UsageError("--mask names its file itself, and takes no --output or --check")
+        return write_mask(source_spec(request.source), request.mask, request.force, request.as_json)
     source, board = source_spec(request.source), parse_board(request.board)
     _check_request(request)
     if request.check is not None:

@@ -40,6 +40,7 @@ from perchctl.profile import (
     load_profile,
     read_weights,
 )
+from perchctl.profile.mask import find_mask
 
 EXIT_CODE_OF: dict[Outcome, int] = {
     Outcome.PERCHED: 0,
@@ -112,12 +113,14 @@ def ask_before_arming(uri: str) -> None:
 def plan(options: FlyOptions) -> dict[str, Any]:
     """What would be flown, fully resolved; nothing is connected."""
     calibration = find_calibration(options.profile.camera.calibration)
+    mask = options.profile.camera.mask
     return {
         "uri": options.uri,
         "source": options.source,
         "seed": options.seed if options.simulated else None,
         "profile_file": str(options.profile_path),
         "calibration_file": str(calibration),
+        "mask_file": None if mask is None else str(find_mask(mask)),
         "log_directory": str(options.log_dir),
         "profile": options.profile.model_dump(mode="json"),
     }
@@ -135,7 +138,8 @@ def plan_text(options: FlyOptions) -> str:
     )
     lines = [
         f"vehicle      {resolved['uri']}" + (f", seed {options.seed}" if options.simulated else ""),
-        f"camera       {resolved['source']}, calibration {resolved['calibration_file']}",
+        f"camera       {resolved['source']}, calibration {resolved['calibration_file']}"
+        + (f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""),
         f"profile      {resolved['profile_file']}: {options.profile.description}".rstrip(": "),
         f"target       {target.large.side_m * 1e3:g} mm {target.large.dictionary}/"
         f"{target.large.id} around {target.small.side_m * 1e3:g} mm "

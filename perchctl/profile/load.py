@@ -100,7 +100,7 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
     values = _with_present_keys(_read_yaml(path), path)
-    for section, key in (("merge", "weights_file"), ("camera", "calibration")):
+    for section, key in (("merge", "weights_file"), ("camera", "calibration"), ("camera", "mask")):
         _place_beside(values, path, section, key)
     base_name = values.pop("extends", None)
     if base_name is None:

@@ -37,6 +37,7 @@ class CameraConfig(Section):
     mount: Mounting = Mounting()
     start_timeout_s: float = Field(8.0, gt=0, le=60)
     mirrored: bool = False  # flip the picture before use
+    mask: str | None = None  # picture of what the vehicle's own gear covers
     fields: Literal["auto", "top", "bottom", "progressive"] = "auto"  # of interlaced pictures
     readout_s: float | None = Field(0.0, ge=0, le=0.05)  # of a rolling shutter; none: unknown
 

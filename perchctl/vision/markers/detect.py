@@ -4,14 +4,15 @@
 2. by a search in a window around that place, then in the whole picture (`search`);
 3. where blur may hide them (`blurred`).
 
-A marker of which the picture's edge, or light that glares, hides a part is measured by what is
-seen of it (`partly`). Each step takes place within the same frame, and only where the one
-before saw too little.
+A marker of which the picture's edge, light that glares, or the vehicle's own gear (`mask`) hides
+a part is measured by what is seen of it (`partly`). Each step takes place within the same frame,
+and only where the one before saw too little.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,10 @@ from perchctl.vision.markers.follow import follow
 from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.improve import improved, lines_suffice
 from perchctl.vision.markers.lines import refine
+from perchctl.vision.markers.mask import Covered, filled, hidden_in, hides
 from perchctl.vision.markers.motion import predicted_corners, with_motion
-from perchctl.vision.markers.partly import clear_of_the_edge, seen_partly
+from perchctl.vision.markers.partly import seen_partly, wholly_seen
+from perchctl.vision.markers.pattern import KnownBy
 from perchctl.vision.markers.search import Found, Look, search
 from perchctl.vision.markers.seen_edges import ROOM_PX
 from perchctl.vision.markers.shift import known_from
@@ -71,7 +74,10 @@ def detect(
     shift = known_from(None if previous is None else previous.edge_shift)
 
     def looked(picture: Frame) -> Detections:
-        return _looked(picture, expected, setup, camera, shift, look)
+        hidden = hidden_in(picture, setup.mask)
+        if hidden is not None:
+            picture = replace(picture, image=filled(picture.image, hidden))
+        return _looked(picture, hidden, expected, setup, camera, shift, look)
 
     if frame.fields == "woven":
         return with_motion(between(*(looked(field) for field in halves(frame))), previous)
@@ -96,20 +102,21 @@ def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Loo
 
 def _looked(
     frame: Frame,
+    hidden: Covered | None,
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     camera: CameraModel,
     shift: EdgeShift | None,
     look: Look,
 ) -> Detections:
-    """What is in a picture of one moment."""
+    """What is in a picture of one moment; `hidden` (h, w) is where that is not seen."""
     image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
-    seen = _followed(image, expected, setup, camera, shift)
-    if look != "blurred" and (not seen or _missing(seen, expected, image.shape)):
+    seen = _followed(image, hidden, expected, setup, camera, shift)
+    if look != "blurred" and (not seen or _missing(seen, expected, image.shape, hidden)):
         found = search(image, expected, setup, look)
         if len(found.corners_px) >= len(seen):
-            seen = _refined(image, found, setup, camera)
+            seen = _refined(image, hidden, found, setup, camera)
     if not seen and look != "sharp" and setup.blurred and setup.by_lines:
         seen = _in_blur(image, expected, setup, camera)
     return Detections(
@@ -126,6 +133,7 @@ def _looked(
 
 def _followed(
     image: NDArray[np.uint8],
+    hidden: Covered | None,
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     camera: CameraModel,
@@ -135,25 +143,35 @@ def _followed(
     if not (setup.window and expected and setup.by_lines):
         return {}
     both = completed(expected, setup.ratio, camera)
-    seen = follow(image, both, setup.patterns, camera, shift)
+    seen = follow(image, both, setup.patterns, camera, shift, hidden)
     if any(lines_suffice(r, setup.patterns[name]) for name, r in seen.items()):
         return seen
-    return improved(image, seen, setup.patterns, camera)
+    return improved(image, seen, setup.patterns, camera, hidden=hidden)
 
 
-def _missing(seen: _Seen, expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
-    """Whether a marker that should be in the picture was not verified, other than one too
-    far away to be found by a search."""
+def _missing(
+    seen: _Seen,
+    expected: Mapping[MarkerName, Array],
+    shape: tuple[int, ...],
+    hidden: Covered | None,
+) -> bool:
+    """Whether a marker that should be in the picture, and not hidden, was not verified, other
+    than one too far away to be found by a search."""
     return any(
         name not in seen
         and within(corners, shape)
         and side_lengths_px(corners).min() > _SEARCHED_SIDE_PX
+        and not hides(hidden, corners)
         for name, corners in expected.items()
     )
 
 
 def _refined(
-    image: NDArray[np.uint8], found: Found, setup: DetectorSetup, camera: CameraModel
+    image: NDArray[np.uint8],
+    hidden: Covered | None,
+    found: Found,
+    setup: DetectorSetup,
+    camera: CameraModel,
 ) -> _Seen:
     """What the search found, by the profile's refinement."""
     names = [name for name in MARKERS if name in found.corners_px]
@@ -163,27 +181,32 @@ def _refined(
     seen = dict(zip(names, refined, strict=True))
     if not setup.by_lines:
         return seen
-    seen = _whole_or_partly(image, seen, setup, camera)
-    return improved(image, seen, setup.patterns, camera, searched=True)
+    seen = _whole_or_partly(image, hidden, seen, setup, camera)
+    return improved(image, seen, setup.patterns, camera, searched=True, hidden=hidden)
 
 
 def _whole_or_partly(
-    image: NDArray[np.uint8], seen: _Seen, setup: DetectorSetup, camera: CameraModel
+    image: NDArray[np.uint8],
+    hidden: Covered | None,
+    seen: _Seen,
+    setup: DetectorSetup,
+    camera: CameraModel,
 ) -> _Seen:
     """What the search found, those without four lines for sides by what of these is seen. A
     search takes the picture's edge for the side of a marker that is cut off there."""
     fitted = dict(seen)
     for name, r in seen.items():
-        if r.refined and clear_of_the_edge(r, image.shape):
+        if r.refined and wholly_seen(r, image.shape, hidden):
             continue
         pattern, small = setup.patterns[name], seen.get("small")
         start = r.corners_px
         if name == "large" and small is not None and small.refined:
             start = nested(small.corners_px, 1.0 / setup.ratio, camera)
-        partly = seen_partly(image, start, pattern, camera, "other" if len(seen) == 2 else "bits")
+        known_by: KnownBy = "other" if len(seen) == 2 else "bits"
+        partly = seen_partly(image, start, pattern, camera, known_by, hidden)
         if partly is not None:
             fitted[name] = partly
-        elif not within(r.corners_px, image.shape, ROOM_PX):
+        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(hidden, r.corners_px):
             del fitted[name]
     return fitted
 

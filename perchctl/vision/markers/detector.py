@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
 from perchctl.profile.dictionaries import predefined
 from perchctl.vision.markers.drawing import drawing_of
+from perchctl.vision.markers.mask import GearMask
 from perchctl.vision.markers.pattern import Pattern, Rim, pattern_of, rim_of_bits
 from perchctl.vision.types import MarkerName
 
@@ -47,7 +48,7 @@ class DetectorSetup:
     `dictionaries` are the large and the small marker's, each with the marker and, behind it
     (`MIRROR_INDEX`), its mirror image where that cannot be confused with the marker
     itself; `patterns` is how each marker looks, `ratio` the small marker's side over the
-    large one's; the rest is the profile's.
+    large one's, `mask` what the vehicle covers; the rest is the profile's.
     """
 
     dictionaries: tuple[Any, Any]
@@ -57,13 +58,16 @@ class DetectorSetup:
     window: bool
     blurred: bool
     blurred_every: int
+    mask: GearMask | None = None
 
     @property
     def by_lines(self) -> bool:
         return self.refinement == "line"
 
 
-def make_detector(config: DetectorConfig, target: TargetConfig) -> DetectorSetup:
+def make_detector(
+    config: DetectorConfig, target: TargetConfig, mask: GearMask | None = None
+) -> DetectorSetup:
     """Dictionaries of just the target's ids, and how its markers look."""
     large_bits, small_bits = _bits(target.large), _bits(target.small)
     ratio = target.small.side_m / target.large.side_m
@@ -83,6 +87,7 @@ def make_detector(config: DetectorConfig, target: TargetConfig) -> DetectorSetup
         window=config.window,
         blurred=config.blurred,
         blurred_every=config.blurred_every,
+        mask=mask,
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.markers.corners import NESTED_SIGMA_PX, RefinedCorners
 from perchctl.vision.markers.lines import refine_lines
-from perchctl.vision.markers.partly import clear_of_the_edge, seen_partly
+from perchctl.vision.markers.partly import seen_partly, wholly_seen
 from perchctl.vision.markers.pattern import (
     LEAST_SIDE_PX,
     Pattern,
@@ -56,7 +56,7 @@ def follow(
         for name, result in zip(names, fitted, strict=True):
             if (
                 result is not None
-                and clear_of_the_edge(result, image.shape)
+                and wholly_seen(result, image.shape, hidden)
                 and cells_agree(image, result.corners_px, patterns[name])
             ):
                 seen[name] = result
@@ -97,7 +97,7 @@ def around(
             found = refine_lines(image, found.corners_px[None], [pattern.rim], camera)[0]
         if (
             found is not None
-            and clear_of_the_edge(found, image.shape)
+            and wholly_seen(found, image.shape, hidden)
             and _centred(found, small, pattern, camera)
             and cells_mostly_agree(image, found.corners_px, pattern)
         ):

@@ -13,6 +13,7 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.by_drawing import aligned
 from perchctl.vision.markers.corners import NESTED_SIGMA_PX, RefinedCorners
 from perchctl.vision.markers.follow import around
+from perchctl.vision.markers.mask import hides
 from perchctl.vision.markers.pattern import Pattern, resembles
 from perchctl.vision.markers.square import mean_side_px, nested, within
 from perchctl.vision.types import MARKERS, CameraModel, MarkerName
@@ -37,19 +38,21 @@ def improved(
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
     searched: bool = False,
+    hidden: NDArray[np.bool_] | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
     """The markers that were seen, with better corners and with the other marker if it shows.
 
-    What a search found, its bits read one by one, stays only where lines suffice, the drawing
+    `hidden` (h, w) is where there is something else: a drawing is not laid over that. What a
+    search found, its bits read one by one, stays only where lines suffice, the drawing
     confirms it, or the other marker was seen with it."""
     better = dict(seen)
     if "small" in better and "large" not in better:
-        large = around(image, better["small"], patterns, camera)
+        large = around(image, better["small"], patterns, camera, hidden)
         if large is not None:
             better["large"] = large
     for name in MARKERS:
         start = _start(name, better, patterns, camera)
-        if start is None or not within(start, image.shape):
+        if start is None or not within(start, image.shape) or hides(hidden, start):
             continue
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import distort, undistort_px
 from perchctl.vision.markers.corners import RefinedCorners
+from perchctl.vision.markers.mask import hides
 from perchctl.vision.markers.pattern import KnownBy, Pattern, visible_cells_agree
 from perchctl.vision.markers.profiles import PROFILES
 from perchctl.vision.markers.seen_edges import OUT, ROOM_PX, SeenEdges, look
@@ -102,9 +103,14 @@ def seen_partly(
     return found if agree else None
 
 
-def clear_of_the_edge(found: RefinedCorners, shape: tuple[int, ...]) -> bool:
-    """Whether the picture's edge is too far away to take anything from the sides' blur."""
-    return within(found.corners_px, shape, ROOM_PX + found.blur_px)
+def wholly_seen(
+    found: RefinedCorners, shape: tuple[int, ...], hidden: NDArray[np.bool_] | None
+) -> bool:
+    """Whether nothing of the marker is hidden, and the picture's edge too far away to take
+    anything from the sides' blur."""
+    return within(found.corners_px, shape, ROOM_PX + found.blur_px) and not hides(
+        hidden, found.corners_px
+    )
 
 
 def _prior_px(seen: SeenEdges) -> float:

@@ -1,0 +1,55 @@
+"""The profile's picture of what the vehicle's own gear covers (`camera.mask`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.errors import InvalidValue, NotFound
+
+MOST_COVERED = 0.75
+"""Of the picture; with more of it covered there is no room for a target."""
+_WHITE = 127
+
+
+def find_mask(name: str) -> Path:
+    """The file of a mask. (`load_profile` has found one that stands beside its profile.)"""
+    path = Path(name).expanduser()
+    if not path.is_file():
+        raise NotFound(
+            f"camera.mask: {name} is neither beside the profile nor a path; "
+            f"perchctl calibrate SOURCE --mask {path.name} makes one, or remove the key"
+        )
+    return path
+
+
+def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where the vehicle covers a picture of that width and height, (height, width): white in
+    the file. Errors: NotFound, InvalidValue."""
+    path = find_mask(name)
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InvalidValue(f"camera.mask: {path} cannot be read as a picture")
+    height, width = image.shape[:2]
+    if (width, height) != size_px:
+        raise InvalidValue(
+            f"camera.mask: {path} has {width}x{height} px, but the calibration was made at "
+            f"{size_px[0]}x{size_px[1]} px: the mask must be of the camera's own pictures"
+        )
+    covered = np.asarray(image > _WHITE)
+    share = float(covered.mean())
+    if share > MOST_COVERED:
+        raise InvalidValue(
+            f"camera.mask: {path} covers {100 * share:.0f} % of the picture, at most "
+            f"{100 * MOST_COVERED:.0f} % are allowed: white is what the vehicle covers, "
+            f"black is free"
+        )
+    if share == 0.0:
+        raise InvalidValue(
+            f"camera.mask: {path} covers nothing: white is what the vehicle covers; "
+            f"remove the key if that is nothing"
+        )
+    return covered
