@@ -238,7 +238,7 @@ def _at_frame(state: PipelineState, t_s: float, pipeline: Pipeline) -> TargetEst
         e_m=merged.vector[:3],
         e_yaw_rad=float(merged.vector[3]),
         velocity_mps=merged.velocity_mps,
-        sigma_m=_sigma(merged.cov_m2, merged.tilt_m),
+        sigma_m=_sigma(merged.cov_m2, merged.bias_m),
         sigma_yaw_rad=float(np.sqrt(max(merged.var_yaw_rad2, 0.0))),
     )
     if attitude is None:
@@ -258,11 +258,11 @@ def _in_world(
 ) -> TargetEstimate:
     """`base` with place and motion of world tracks, as seen from the vehicle at `attitude`."""
     turn = rot_z(-attitude.yaw_rad)
-    tilt_m = seen_from(merged.tilt_m, attitude, pipeline.tracks.world, pipeline.pose)
+    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
     target = replace(
         base,
         velocity_mps=turn @ merged.velocity_mps,
-        sigma_m=_sigma(turn @ merged.cov_m2 @ turn.T, tilt_m),
+        sigma_m=_sigma(turn @ merged.cov_m2 @ turn.T, bias_m),
         sigma_yaw_rad=float(np.sqrt(max(merged.var_yaw_rad2, 0.0))),
         world_m=merged.vector[:3],
         world_yaw_rad=float(merged.vector[3]),
@@ -281,6 +281,6 @@ def _carried(
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
 
 
-def _sigma(cov_m2: Array, tilt_m: Array) -> Array:
-    variance = np.diag(cov_m2) + (tilt_m**2).sum(axis=1)
+def _sigma(cov_m2: Array, bias_m: Array) -> Array:
+    variance = np.diag(cov_m2) + (bias_m**2).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

@@ -86,7 +86,7 @@ def requested_target(request: TargetRequest, profile: Profile) -> TargetConfig:
             f"the small marker ({millimetres(markers['small'].side_m)} mm) must be less than half "
             f"of the large one ({millimetres(markers['large'].side_m)} mm)"
         )
-    return TargetConfig(**markers)
+    return profile.target.model_copy(update=markers)
 
 
 def check_within(name: str, value: float, low: float, high: float, unit: str) -> None:

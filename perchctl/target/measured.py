@@ -15,8 +15,11 @@ from perchctl.target.lengths import millimetres
 
 MAX_SCALE_ERROR = 0.1
 """A print off by more than this was not measured in the unit that was meant."""
+MEASURED_SIGMA = 0.001
+"""What measured sizes may be off by, relative: 0.15 mm of a large marker."""
 NOTABLE_SCALE_ERROR = 0.01
 """Printers err by some 0.3 %; from here on a viewer has scaled the page."""
+_UNMEASURED_SIGMA = TargetConfig().size_sigma
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,10 @@ class Measured:
 def measured_target(
     nominal: TargetConfig, large_m: float | None, small_m: float | None
 ) -> Measured:
-    """Raises InvalidValue for a size that cannot be this marker's."""
+    """The target with these sides. Both together make its sizes count as measured.
+
+    Raises InvalidValue for a size that cannot be this marker's.
+    """
     notes, sides, scales = [], {}, {}
     for name, side_m in (("large", large_m), ("small", small_m)):
         marker: MarkerConfig = getattr(nominal, name)
@@ -61,7 +67,10 @@ def measured_target(
             f"the small marker ({millimetres(small.side_m)} mm) must be less than half of the "
             f"large one ({millimetres(large.side_m)} mm): measure both black squares"
         )
-    target = TargetConfig(large=large, small=small)
+    size_sigma = min(nominal.size_sigma, MEASURED_SIGMA) if len(sides) == 2 else nominal.size_sigma
+    if size_sigma > MEASURED_SIGMA:
+        notes.append("measure both markers: distances claim less until both sizes are known")
+    target = nominal.model_copy(update={"large": large, "small": small, "size_sigma": size_sigma})
     return Measured(target, tuple(notes))
 
 
@@ -69,6 +78,8 @@ def new_profile_text(base: str, target: TargetConfig) -> str:
     """A small profile that extends `base` and holds the target."""
     lines = [f"extends: {_scalar(base)}", "", "target:", "  # sides of the black squares, measured"]
     lines += [f"  {name}: {_flow(marker)}" for name, marker in _markers(target)]
+    if target.size_sigma != _UNMEASURED_SIGMA:
+        lines.append(f"  size_sigma: {target.size_sigma:g}")
     return "\n".join(lines) + "\n"
 
 
@@ -79,7 +90,7 @@ def updated_profile_text(path: Path, text: str, target: TargetConfig) -> str:
     """
     for name, marker in reversed(_markers(target)):
         text = _with_side(path, text, name, marker)
-    return text
+    return text if target.size_sigma == _UNMEASURED_SIGMA else _with_sigma(text, target)
 
 
 def write_profile(path: Path, text: str, expected: Profile) -> None:
@@ -139,6 +150,17 @@ def _with_side(path: Path, text: str, name: str, marker: MarkerConfig) -> str:
     if side is None:
         return _inserted(text, node, f"side_m: {marker.side_m:g}")
     return text[: side.start_mark.index] + f"{marker.side_m:g}" + text[side.end_mark.index :]
+
+
+def _with_sigma(text: str, target: TargetConfig) -> str:
+    """`text` has a section of the target's."""
+    root: Any = yaml.compose(text)
+    section = _child(root, "target")
+    node = _child(section, "size_sigma")
+    if node is None:
+        return _inserted(text, section, f"size_sigma: {target.size_sigma:g}")
+    start, end = node.start_mark.index, node.end_mark.index
+    return f"{text[:start]}{target.size_sigma:g}{text[end:]}"
 
 
 def _child(node: yaml.MappingNode, key: str) -> Any:

@@ -7,9 +7,9 @@ the real one 0.19 cm.
 The paper's constants are the same for every frame (`kalman.noise: fixed`). A pose is a tenth
 of a millimetre true near the target and centimetres far from it, so by default each brings
 its own covariance, and the process noise is what accelerates: the vehicle in the level frame,
-the state estimate's drift in the world (`measured`). A constant error of the vehicle's roll
-and pitch, which no average takes away, is carried along as a consider term: by how much it
-has moved each state. It changes no gain, only what is claimed.
+the state estimate's drift in the world (`measured`). Constant errors, which no average takes
+away, are carried along as consider terms: by how much the vehicle's roll and pitch, the print's
+size and its curl have moved each state. They change no gain, only what is claimed.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ MEASURED = [YAW, X, Y, Z]
 RATES = [YAW_RATE, VX, VY, VZ]
 POSITION = [X, Y, Z]
 VELOCITY = [VX, VY, VZ]
+TILTS, PRINT = slice(0, 2), slice(2, 4)  # of the constant errors
 
 MAX_GAP_S = 1.0
 MAX_PREDICTION_S = 1.0
@@ -81,12 +82,12 @@ class FilterSetup:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """z = (yaw, x, y, z) of a target, (4,); R (4, 4), None for the setup's; and `tilt` (4, 2),
-    by how much one standard deviation of a constant error of roll and pitch moves z."""
+    """z = (yaw, x, y, z) of a target, (4,); R (4, 4), None for the setup's; and `bias` (4, 4),
+    by how much one standard deviation of each constant error moves z."""
 
     z: Array
     R: Array | None = None
-    tilt: Array | None = None
+    bias: Array | None = None
 
 
 def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
@@ -168,10 +169,10 @@ def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> Marker
     P = setup.P0.copy()
     if measured.R is not None:
         P[np.ix_(MEASURED, MEASURED)] = measured.R
-    tilt = np.zeros((8, 2))
-    if measured.tilt is not None:
-        tilt[MEASURED] = measured.tilt
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, tilt=tilt)
+    bias = np.zeros((8, 4))
+    if measured.bias is not None:
+        bias[MEASURED] = measured.bias
+    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
 
 
 def step_track(
@@ -212,11 +213,11 @@ def step_track(
     R = setup.R if measured.R is None else measured.R
     x, P = update(x, P, on_branch, R, H)
     x[YAW] = wrap_rad(float(x[YAW]))
-    tilt = F @ track.tilt
-    if measured.tilt is not None:
+    bias = F @ track.bias
+    if measured.bias is not None:
         gain = np.linalg.solve(R, H @ P).T  # P H^T R^-1, with the P after the update
-        tilt = tilt + gain @ (measured.tilt - H @ tilt)
-    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, tilt=tilt)
+        bias = bias + gain @ (measured.bias - H @ bias)
+    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
 
 
 def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
@@ -244,4 +245,4 @@ def _moved(track: MarkerTrack, x: Array, dt_s: float, setup: FilterSetup) -> Mar
     F = transition(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
     x[YAW] = wrap_rad(float(x[YAW]))
-    return replace(track, x=x, P=P, tilt=F @ track.tilt)
+    return replace(track, x=x, P=P, bias=F @ track.bias)

@@ -156,11 +156,11 @@ def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
     measured = sight.measured
     off = measured.z - H @ track.x
     off[0] = wrap_rad(float(off[0]))
-    tilt = H @ track.tilt
-    if measured.tilt is not None:
-        tilt = measured.tilt - tilt  # a constant error of the attitude moves both
+    bias = H @ track.bias
+    if measured.bias is not None:
+        bias = measured.bias - bias  # a constant error moves both
     R = constants.R if measured.R is None else measured.R
-    S = H @ track.P @ H.T + R + tilt @ tilt.T + _unknown(float(np.linalg.norm(sight.pose.tvec_m)))
+    S = H @ track.P @ H.T + R + bias @ bias.T + _unknown(float(np.linalg.norm(sight.pose.tvec_m)))
     squared = float(off @ np.linalg.solve(S, off))
     return _Fit(
         squared=squared,

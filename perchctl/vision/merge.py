@@ -57,9 +57,11 @@ def merge_variance(large: Array, small: Array, weights: WeightsConfig) -> Array:
 
 def disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
     """Whether the markers contradict: farther apart than the limit and than four
-    standard deviations, in any axis (a far small marker is merely vague)."""
+    standard deviations, in any axis (a far small marker is merely vague). What is
+    wrong with the print moves both alike, and excuses no gap."""
     gap = np.abs(large.e_m - small.e_m)
-    vague = 4.0 * np.hypot(large.sigma_m, small.sigma_m)
+    variance = [np.maximum(p.sigma_m**2 - (p.print_m**2).sum(axis=1), 0.0) for p in (large, small)]
+    vague = 4.0 * np.sqrt(variance[0] + variance[1])
     return bool((gap > np.maximum(limit_m, vague)).any())
 
 

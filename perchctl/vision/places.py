@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.vision.filter import FilterSetup, Measurement, pose_noise, tilted
+from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, pose_noise, tilted
 from perchctl.vision.pose import PoseSetup, level_rotation
 from perchctl.vision.types import Attitude, MarkerPose
 
@@ -47,19 +47,21 @@ def measurement(
         z = np.array([yaw, *position])
     if constants.process is None or pose.cov is None:
         return Measurement(z)
-    turned = np.eye(4)
+    turned, noise = np.eye(4), pose.cov.copy()
     turned[:3, :3] = turn
-    R = pose_noise(turned @ pose.cov @ turned.T)
-    if attitude is None:
-        return Measurement(z, R)
-    tilt = np.zeros((4, 2))
-    tilt[1:] = turn @ tilted(way) * constants.tilt_sigma_rad
-    return Measurement(z, R, tilt)
+    noise[:3, :3] -= pose.print_m @ pose.print_m.T
+    bias = np.zeros((4, 4))
+    bias[1:, PRINT] = turn @ pose.print_m
+    if attitude is not None:
+        bias[1:, TILTS] = turn @ tilted(way) * constants.tilt_sigma_rad
+    return Measurement(z, pose_noise(turned @ noise @ turned.T), bias)
 
 
-def seen_from(tilt_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup) -> Array:
-    """What a constant error of roll and pitch makes of the way from the gear to a target in the
-    world, level axes (3, 2): of `tilt_m` (3, 2), by which it has moved the target, less what
-    it makes of the gear's place."""
+def seen_from(bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup) -> Array:
+    """What constant errors make of the way from the gear to a target in the world, level axes
+    (3, 4): of `bias_m` (3, 4), by which they have moved the target, less what roll and pitch
+    make of the gear's place."""
     gear_level = level_rotation(attitude) @ setup.gear_body_m
-    return rot_z(-attitude.yaw_rad) @ tilt_m - tilted(gear_level) * constants.tilt_sigma_rad
+    moved = rot_z(-attitude.yaw_rad) @ bias_m
+    moved[:, TILTS] -= tilted(gear_level) * constants.tilt_sigma_rad
+    return np.asarray(moved)

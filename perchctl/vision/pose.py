@@ -62,6 +62,8 @@ class PoseSetup:
     gear_body_m: Array
     camera: CameraModel
     readout_s: float | None = 0.0  # of the camera's shutter; None: not known
+    size_sigma: float = 0.0  # of the printed sizes, a share of them
+    curl_per_m: float = 0.0  # of the sheet: lift over the square of the way from its centre
 
 
 def make_pose_setup(
@@ -82,6 +84,8 @@ def make_pose_setup(
         gear_body_m=np.asarray(gear_body_m, dtype=np.float64),
         camera=camera,
         readout_s=readout_s,
+        size_sigma=target.size_sigma,
+        curl_per_m=target.curl_per_m,
     )
 
 
@@ -180,7 +184,7 @@ def _level_pose(
     """The solution, relative to the gear in the level frame, with its covariance there."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body @ R_body_cam
-    cov, chi2 = covariance(points, solution)
+    cov, chi2, curl = covariance(points, solution)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
     e_m = R_level_body @ (R_body_cam @ solution.tvec + t_body_cam_m - setup.gear_body_m)
     heading = R_level_cam @ R @ R_MARKER_TARGET
@@ -188,6 +192,10 @@ def _level_pose(
     G[:3, 3:] = R_level_cam
     G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
     cov_e = G @ cov @ G.T
+    # A target that is larger by a share is farther away by that share of the way to it.
+    size_m = setup.size_sigma * (R_level_cam @ solution.tvec)
+    print_m = np.stack([size_m, setup.curl_per_m * (G[:3] @ curl)], axis=1)
+    cov_e[:3, :3] += print_m @ print_m.T
     variance = np.maximum(np.diagonal(cov_e), 0.0)
     return MarkerPose(
         source=source,
@@ -201,6 +209,7 @@ def _level_pose(
         reprojection_px=solution.rms_px,
         chi2=chi2,
         cov=cov_e,
+        print_m=print_m,
     )
 
 

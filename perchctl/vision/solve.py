@@ -197,20 +197,28 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
     return None
 
 
-def covariance(points: Points, scored: Scored) -> tuple[Array, float]:
-    """Of (rvec, tvec), (6, 6), and the squared error per degree of freedom: the inverse
-    information, grown as far as the residuals show that the corners spread more than
-    they claim, and what common shifts do to the pose."""
+def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
+    """Of (rvec, tvec), (6, 6), the squared error per degree of freedom, and by how much the
+    sheet's curl moves them, (6,), of a place r from its centre being r^2 off its plane.
+
+    The covariance is the inverse information, grown as far as the residuals show that the
+    corners spread more than they claim, and what common shifts do to the pose; not the curl.
+    """
     A, error = points.whitening @ scored.jacobian, points.whitening @ scored.error_px.ravel()
     freedom = len(error) - 6
     try:
         inverse = np.linalg.inv(A.T @ A)
     except np.linalg.LinAlgError:
-        return np.full((6, 6), np.inf), math.inf
+        return np.full((6, 6), np.inf), math.inf, np.zeros(6)
     chi2 = float(error @ error)
     growth = max((_TRUST + chi2) / (_TRUST + freedom), 0.7)
     common = inverse @ (A.T @ points.shift)
-    return inverse * growth + common @ common.T, chi2 / freedom
+    # A corner out of the sheet's plane is where a target moved along its normal would have it.
+    normal = cv2.Rodrigues(scored.rvec)[0][:, 2]
+    lift = (points.object_m[:, :2] ** 2).sum(axis=1)
+    lifted = (scored.jacobian[:, 3:] @ normal) * lift.repeat(2)
+    curl = inverse @ (A.T @ (points.whitening @ lifted))
+    return inverse * growth + common @ common.T, chi2 / freedom, curl
 
 
 def mirror_solution(rvec: Array, tvec: Array) -> Array | None:

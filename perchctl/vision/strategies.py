@@ -44,13 +44,13 @@ _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `tilt_m` (3, 2) is
-    what the tracks' `tilt` makes of the place."""
+    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `bias_m` (3, 4) is
+    what the tracks' `bias` makes of the place."""
 
     vector: Array
     velocity_mps: Array
     cov_m2: Array
-    tilt_m: Array
+    bias_m: Array
     var_yaw_rad2: float
     unseen: int
     stage: Stage
@@ -120,7 +120,7 @@ class Weights:
             vector=merge_pair(large.x[order], small.x[order], weights),
             velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
             cov_m2=np.diag(variance[:3]),
-            tilt_m=w[:, None] * large.tilt[POSITION] + (1.0 - w[:, None]) * small.tilt[POSITION],
+            bias_m=w[:, None] * large.bias[POSITION] + (1.0 - w[:, None]) * small.bias[POSITION],
             var_yaw_rad2=float(variance[3]),
             unseen=least,
             stage=Stage.BOTH if fed else Stage.NONE,
@@ -223,7 +223,7 @@ def _alone(track: MarkerTrack, pose: MarkerPose | None) -> Merged:
         vector=np.array([*track.x[POSITION], track.x[YAW]]),
         velocity_mps=track.x[VELOCITY],
         cov_m2=track.P[np.ix_(POSITION, POSITION)],
-        tilt_m=track.tilt[POSITION],
+        bias_m=track.bias[POSITION],
         var_yaw_rad2=float(track.P[YAW, YAW]),
         unseen=track.unseen,
         stage=Stage.NONE if pose is None else _STAGE_OF[pose.source],

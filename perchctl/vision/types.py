@@ -133,6 +133,9 @@ class MarkerPose:
         reprojection_px: RMS over the corners used.
         chi2: their squared errors in units of their spread, per degree of freedom.
         cov: covariance (4, 4) of (e_x, e_y, e_z, e_yaw), SI.
+        print_m: by how much one standard deviation of the print's errors moves `e_m`, (3, 2):
+            its size's, and of the sheet's curl. Included in `sigma_m` and `cov`, but the same
+            in every frame.
     """
 
     source: Literal["large", "small", "joint"]
@@ -146,6 +149,7 @@ class MarkerPose:
     reprojection_px: float
     chi2: float = 0.0
     cov: Array | None = None
+    print_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,21 +158,21 @@ class MarkerTrack:
 
     State x (8,): yaw, yaw rate, then position and velocity of x, y, z, in SI,
     indexed by the names in `perchctl.vision.filter`. P (8, 8) is what the noise of
-    measurements and motion leaves open; `tilt` (8, 2), by how much one standard deviation of
-    a constant error of the vehicle's roll and pitch has moved the state. `unseen` counts the
-    frames since the last measurement.
+    measurements and motion leaves open; `bias` (8, 4), by how much one standard deviation
+    of each constant error has moved the state: of the vehicle's roll and pitch, of the print's
+    size and of its curl. `unseen` counts the frames since the last measurement.
     """
 
     t_s: float
     x: Array
     P: Array
     unseen: int = 0
-    tilt: Array = field(default_factory=lambda: np.zeros((8, 2)))
+    bias: Array = field(default_factory=lambda: np.zeros((8, 4)))
 
     @property
     def cov(self) -> Array:
         """Of the state, with both, (8, 8)."""
-        return self.P + self.tilt @ self.tilt.T
+        return self.P + self.bias @ self.bias.T
 
 
 @dataclass(frozen=True, eq=False)

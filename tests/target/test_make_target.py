@@ -130,12 +130,15 @@ def test_measured_sizes_make_a_small_profile() -> None:
     found = load_profile("./mine.yaml")
     assert found.target.large.side_m == 0.1496
     assert found.target.small.side_m == 0.0249
+    assert found.target.size_sigma == 0.001
     assert found.vehicle == load_profile("crazyflie").vehicle
     assert Path("mine.yaml").read_text().startswith("extends: crazyflie\n")
 
 
 def test_a_new_file_named_by_p_extends_the_real_vehicle_s_profile() -> None:
-    call("-p", "new.yaml", "--measured-small", "25.1")
+    out, _ = call("-p", "new.yaml", "--measured-small", "25.1")
+    assert "measure both markers" in out
+    assert load_profile("./new.yaml").target.size_sigma == 0.005
     assert load_profile("./new.yaml").target.small.side_m == 0.0251
     assert load_profile("./new.yaml").link == load_profile("crazyflie").link
 
@@ -143,6 +146,7 @@ def test_a_new_file_named_by_p_extends_the_real_vehicle_s_profile() -> None:
 PROFILES = {
     "flow": "extends: sim\ntarget:\n  # measured\n  large: {dictionary: DICT_4X4_1000, id: 997, "
     "side_m: 0.150}  # keep\n  small: {dictionary: DICT_ARUCO_ORIGINAL, id: 5, side_m: 0.025}\n",
+    "known": "extends: sim\ntarget:\n  size_sigma: 0.01  # keep\n",
     "block": "extends: sim\n# keep\ntarget:\n  large:\n    side_m: 15.0e-2\n    dictionary: "
     "DICT_4X4_1000\n    id: 997\n",
     "no target": "# keep\nextends: sim\nlog: {plot: false}",
@@ -165,6 +169,7 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     call(*words, "--force")
     after = load_profile("./mine.yaml")
     assert (after.target.large.side_m, after.target.small.side_m) == (0.1496, 0.0249)
+    assert after.target.size_sigma == 0.001
     assert after.target.large.id == before.target.large.id
     assert after.model_copy(update={"target": before.target}) == before
     assert "keep" in path.read_text()

@@ -68,6 +68,7 @@ def measured(scene: Pass, readout_s: float | None) -> tuple[Array, float]:
     values: dict[str, Any] = {
         "camera": {"mount": {"position_m": [0, 0, 0]}, "readout_s": readout_s},
         "vehicle": {"gear_body_m": [0, 0, 0]},
+        "target": {"size_sigma": 0.0, "curl_per_m": 0.0},
     }
     setup = make_pipeline(Profile.model_validate(values), CAMERA)
     state, fields, errors, nees = PipelineState(), FieldState(), [], []

@@ -19,8 +19,8 @@ from perchctl.geometry import (
     wrap_rad,
 )
 from perchctl.pipeline import Pipeline, follow
-from perchctl.profile import KalmanConfig
-from perchctl.vision.filter import X, Y, Z, make_filter, process_noise
+from perchctl.profile import KalmanConfig, TargetConfig
+from perchctl.vision.filter import TILTS, X, Y, Z, make_filter, process_noise
 from perchctl.vision.places import measurement
 from perchctl.vision.types import (
     Attitude,
@@ -44,9 +44,9 @@ def body_at(t_s: float, phase: Array) -> tuple[Array, tuple[float, float, float]
     return TARGET_M + np.array([x, y, -z]), (float(roll), float(pitch), 0.8 * math.sin(0.4 * t_s))
 
 
-def errors(setup: Pipeline, in_world: bool, bias_rad: float) -> Array:
+def errors(setup: Pipeline, in_world: bool, bias_rad: float, scale: float) -> Array:
     """Rows of range, filter's error, still's error (m), and the filter's squared error in
-    units of its spread, a degree of freedom."""
+    units of its spread, a degree of freedom; of a print that is `scale` times as large."""
     rows = []
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -59,7 +59,8 @@ def errors(setup: Pipeline, in_world: bool, bias_rad: float) -> Array:
             if in_world:
                 here = (float(position[0]), float(position[1]), float(position[2]))
                 attitude = Attitude(k / HZ, roll + bias_rad, pitch - bias_rad, yaw, here)
-            state, output = follow(state, seen_from(T, TARGET_M, k / HZ, rng), attitude, setup)
+            seen = seen_from(T, TARGET_M, k / HZ, rng, scale=scale)
+            state, output = follow(state, seen, attitude, setup)
             target, pose = output.target, next(iter(output.poses.values()), None)
             if target is None or pose is None:
                 continue
@@ -76,14 +77,22 @@ def errors(setup: Pipeline, in_world: bool, bias_rad: float) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("in_world", "bias_rad", "sigma_deg"),
-    [(False, 0.0, 0.3), (True, 0.0, 0.0), (True, BIAS_RAD, 0.3)],
+    ("in_world", "bias_rad", "sigma_deg", "scale", "size_sigma"),
+    [
+        (False, 0.0, 0.3, 1.0, 0.0),
+        (True, 0.0, 0.0, 1.0, 0.0),
+        (True, BIAS_RAD, 0.3, 1.0, 0.0),
+        (False, 0.0, 0.3, 1.007, 0.005),
+        (True, 0.0, 0.0, 0.993, 0.005),
+    ],
 )
 def test_the_filter_is_no_worse_than_the_stills_and_knows_how_good_it_is(
-    build: Build, in_world: bool, bias_rad: float, sigma_deg: float
-) -> None:
-    setup = build(kalman=KalmanConfig(attitude_sigma_deg=sigma_deg))
-    rows = errors(setup, in_world, bias_rad)
+    build: Build, in_world: bool, bias_rad: float, sigma_deg: float, scale: float,
+    size_sigma: float,
+) -> None:  # fmt: skip
+    target = TargetConfig(size_sigma=size_sigma, curl_per_m=0.0)
+    setup = build(kalman=KalmanConfig(attitude_sigma_deg=sigma_deg), target=target)
+    rows = errors(setup, in_world, bias_rad, scale)
     for low, high in pairwise(BINS_M):
         _, filtered, still, squared = rows[(rows[:, 0] > low) & (rows[:, 0] <= high)].T
         assert len(filtered) > 50
@@ -122,8 +131,8 @@ def test_the_consider_term_is_what_a_wrong_attitude_does(
             cov=1e-6 * np.eye(4),
         )  # fmt: skip
         found = measurement(pose, attitude, in_world, constants, setup.pose)
-        assert found.tilt is not None
-        return found.z, found.tilt
+        assert found.bias is not None
+        return found.z, found.bias[:, TILTS]
 
     (z, tilt), (moved, _) = measured(true), measured(wrong)
     expected = tilt @ np.array(bias_rad) / math.radians(0.3)

@@ -39,7 +39,7 @@ GEAR = np.array([0.004, -0.003, 0.03])
 def setup_with(mount: Array | None = None, gear: Array | None = None, **config) -> PoseSetup:  # type: ignore[no-untyped-def]
     return make_pose_setup(
         PoseConfig(**config),
-        TargetConfig(),
+        TargetConfig(size_sigma=0.0, curl_per_m=0.0),
         np.eye(4) if mount is None else mount,
         np.zeros(3) if gear is None else gear,
         CAMERA,
