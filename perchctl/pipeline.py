@@ -17,6 +17,7 @@ from perchctl.profile import KalmanConfig, Mounting, Profile
 from perchctl.profile.mask import read_mask
 from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
 from perchctl.vision.filter import MAX_GAP_S, predicted
+from perchctl.vision.markers.cut import prepare
 from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
 from perchctl.vision.markers.mask import GearMask, make_mask
 from perchctl.vision.merge import stage_of
@@ -77,8 +78,11 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
         profile.camera.readout_s,
     )  # fmt: skip
     strategy = make_strategy(profile.merge, pose)
+    detector = make_detector(profile.detector, profile.target, _mask(profile, camera))
+    if detector.cut:
+        prepare(detector.patterns, camera)
     return Pipeline(
-        detector=make_detector(profile.detector, profile.target, _mask(profile, camera)),
+        detector=detector,
         pose=pose,
         strategy=strategy,
         tracks=make_track_setup(profile.kalman, strategy.tracks, pose),

@@ -85,6 +85,7 @@ class DetectorConfig(Section):
     window: bool = True  # search around the last pose first
     blurred: bool = True  # look once more where blur may hide the target
     blurred_every: int = Field(4, ge=1, le=100)  # ... then every Nth of a stream without it
+    cut: bool = True  # where the picture cuts both markers: by what is left of them
     correction_bits_large: int = Field(0, ge=0, le=3)
     correction_bits_small: int = Field(1, ge=0, le=3)
 

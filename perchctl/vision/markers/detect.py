@@ -1,8 +1,9 @@
 """Finding the two markers of the target in a picture: the steps of a frame, in order.
 
 1. where they are expected, by verification instead of search (`follow`);
-2. by a search in a window around that place, then in the whole picture (`search`);
-3. where blur may hide them (`blurred`).
+2. where the picture cuts them, by what is left of the drawing (`cut`);
+3. by a search in a window around that place, then in the whole picture (`search`);
+4. where blur may hide them (`blurred`).
 
 A marker of which the picture's edge, light that glares, or the vehicle's own gear (`mask`) hides
 a part is measured by what is seen of it (`partly`). Each step takes place within the same frame,
@@ -22,6 +23,7 @@ from perchctl.vision.fields import halves
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.corners import RefinedCorners
+from perchctl.vision.markers.cut import cut_markers, is_cut, measured_lately
 from perchctl.vision.markers.detector import DetectorSetup, make_detector
 from perchctl.vision.markers.follow import follow
 from perchctl.vision.markers.ghost import with_ghosts
@@ -71,13 +73,14 @@ def detect(
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     look = _look(empty_frames, bool(expected), setup)
+    lately = measured_lately(previous, frame.t_s)
     shift = known_from(None if previous is None else previous.edge_shift)
 
     def looked(picture: Frame) -> Detections:
         hidden = hidden_in(picture, setup.mask)
         if hidden is not None:
             picture = replace(picture, image=filled(picture.image, hidden))
-        return _looked(picture, hidden, expected, setup, camera, shift, look)
+        return _looked(picture, hidden, expected, setup, camera, shift, look, lately)
 
     if frame.fields == "woven":
         return with_motion(between(*(looked(field) for field in halves(frame))), previous)
@@ -108,11 +111,17 @@ def _looked(
     camera: CameraModel,
     shift: EdgeShift | None,
     look: Look,
+    lately: bool,
 ) -> Detections:
-    """What is in a picture of one moment; `hidden` (h, w) is where that is not seen."""
+    """What is in a picture of one moment; `hidden` (h, w) is where that is not seen, `lately`
+    whether the target was measured a moment ago."""
     image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
     seen = _followed(image, hidden, expected, setup, camera, shift)
+    if not seen and lately and setup.cut:
+        both = completed(expected, setup.ratio, camera)
+        if is_cut(both, image.shape, hidden):
+            seen = cut_markers(image, expected, setup.patterns, camera, hidden)
     if look != "blurred" and (not seen or _missing(seen, expected, image.shape, hidden)):
         found = search(image, expected, setup, look)
         if len(found.corners_px) >= len(seen):

@@ -58,6 +58,7 @@ class DetectorSetup:
     window: bool
     blurred: bool
     blurred_every: int
+    cut: bool
     mask: GearMask | None = None
 
     @property
@@ -87,6 +88,7 @@ def make_detector(
         window=config.window,
         blurred=config.blurred,
         blurred_every=config.blurred_every,
+        cut=config.cut and config.refinement == "line",
         mask=mask,
     )
 

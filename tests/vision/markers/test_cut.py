@@ -1,0 +1,270 @@
+"""Markers that the picture cuts: what is left of the drawing, with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from perchctl.geometry import Array
+from perchctl.vision.camera_model import distort, project, undistort, undistort_px
+from perchctl.vision.markers.between import between
+from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut
+from perchctl.vision.markers.detect import detect
+from perchctl.vision.markers.ghost import with_ghosts
+from perchctl.vision.markers.outline import outline_of
+from perchctl.vision.markers.overview import lattice_of
+from perchctl.vision.markers.square import within
+from perchctl.vision.markers.visible import RigidPose, fitted
+from perchctl.vision.pose import square
+from perchctl.vision.types import Detection, Detections, MarkerName
+from tests.helpers.markers import SETUP, both, corners, frame
+from tests.helpers.target_picture import CAMERA, pose_of, render
+
+# The camera beside the gear along the picture's height and along its width, under it, and so
+# far aside that the large marker alone is left.
+BESIDE_HEIGHT = pose_of(0.002, -0.030, 0.034, 0.03, 0.01, -0.02)
+BESIDE_WIDTH = pose_of(-0.031, 0.003, 0.030, -0.04, 0.0, 0.02)
+UNDER = pose_of(0.001, -0.002, 0.014, 0.05, -0.02, 0.01)
+ASIDE = pose_of(-0.116, 0.010, 0.105, 0.1, 0.02, 0.02)
+LINE = pose_of(-0.045, 0.0, 0.026)  # nothing but one edge, which says nothing of one direction
+POSES = {
+    "height": BESIDE_HEIGHT,
+    "width": BESIDE_WIDTH,
+    "under": UNDER,
+    "aside": ASIDE,
+    "line": LINE,
+    "corner": pose_of(-0.092, 0.020, 0.075, 0.1, 0.02, 0.02),
+}
+SHAPE = (480, 640)
+
+
+@cache
+def picture(name: str) -> NDArray[np.uint8]:
+    return render(*POSES[name], noise=4.0, blur_px=1.0)
+
+
+def seen_before(name: str, age_s: float = 1 / 30) -> Detections:
+    """The markers where they are, `age_s` before frame 0."""
+    at = both(POSES[name])
+    large, small = (Detection(n, at[n], 0.1, True) for n in ("large", "small"))
+    return Detections(-1, -age_s, large=large, small=small)
+
+
+def look(
+    name: str, image: NDArray[np.uint8] | None = None, off_px: float = 0.0, age_s: float = 1 / 30
+) -> Detections:
+    expected = both(POSES[name], off_px)
+    image = picture(name) if image is None else image
+    return detect(frame(image), seen_before(name, age_s), SETUP, CAMERA, expected)
+
+
+def nothing(found: Detections) -> bool:
+    return found.large is None and found.small is None
+
+
+@pytest.mark.parametrize(("name", "off_px"), [("height", 25.0), ("width", -30.0), ("under", 20.0)])
+def test_corners_follow_from_what_is_left(name: str, off_px: float) -> None:
+    true = corners("small", POSES[name])
+    assert not within(true, SHAPE)
+    found = look(name, off_px=off_px).small
+    assert found is not None
+    assert found.cov_px2 is not None
+    error = undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)
+    assert float(error.ravel() @ np.linalg.solve(found.cov_px2, error.ravel())) < 20.0
+    inside = (true >= 0).all(axis=1) & (true <= (639, 479)).all(axis=1)
+    assert np.abs(error[inside]).max(initial=0.0) < 0.3
+
+
+def test_the_large_marker_stands_for_what_shows_nothing_of_the_small_one() -> None:
+    found = look("aside", off_px=12.0)
+    assert found.small is None
+    assert found.large is not None
+    assert found.large.cov_px2 is not None
+    true = corners("large", ASIDE)
+    error = (undistort_px(found.large.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
+    assert float(error @ np.linalg.solve(found.large.cov_px2, error)) < 20.0
+
+
+def test_it_is_never_a_first_sight() -> None:
+    image, expected = picture("height"), both(BESIDE_HEIGHT)
+    assert nothing(detect(frame(image), None, SETUP, CAMERA, expected))
+    empty = Detections(-1, -1 / 30)
+    assert nothing(detect(frame(image), empty, SETUP, CAMERA, expected))
+    assert not nothing(look("height"))
+
+
+def test_it_needs_a_target_that_was_measured_lately() -> None:
+    assert not nothing(look("height", age_s=MOST_AGE_S - 0.01))
+    assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
+
+
+def test_it_can_be_switched_off() -> None:
+    setup = replace(SETUP, cut=False)
+    expected, before = both(BESIDE_HEIGHT), seen_before("height")
+    assert nothing(detect(frame(picture("height")), before, setup, CAMERA, expected))
+
+
+def _bare(kind: str) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(3)
+    if kind == "blank":
+        image = np.full(SHAPE, 180.0)
+    elif kind == "tiles":
+        y, x = np.mgrid[:480, :640]
+        image = np.where((x // 90 + y // 70) % 2 == 0, 60.0, 200.0)
+    elif kind == "seams":
+        image = np.full(SHAPE, 190.0)
+        image[200:225] = image[:, 300:330] = 40.0
+    else:
+        image = np.kron(rng.integers(0, 2, (8, 11)), np.ones((60, 60)))[:480, :640] * 150.0 + 40.0
+    soft = cv2.GaussianBlur(image, (0, 0), 1.2) + rng.normal(0.0, 4.0, SHAPE)
+    return np.clip(soft, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("name", ["height", "width", "under", "aside"])
+@pytest.mark.parametrize("kind", ["blank", "tiles", "seams", "blocks"])
+def test_what_is_not_the_target_is_refused(name: str, kind: str) -> None:
+    assert nothing(look(name, _bare(kind)))
+
+
+@pytest.mark.parametrize("name", ["height", "width", "under"])
+def test_other_markers_in_its_place_are_refused(name: str) -> None:
+    other = render(
+        *POSES[name], blur_px=1.0, noise=4.0,
+        markers=(("DICT_4X4_1000", 5, 0.150), ("DICT_ARUCO_ORIGINAL", 300, 0.025)),
+    )  # fmt: skip
+    assert nothing(look(name, other))
+
+
+@pytest.mark.parametrize("name", ["height", "width"])
+def test_a_plain_square_in_the_small_marker_s_place_is_refused(name: str) -> None:
+    """All edges but those of its cells are there."""
+    image = render(*POSES[name], blur_px=1.0, noise=4.0, markers=("large",))
+    rvec, tvec = POSES[name]
+    square_px = project(square(0.025), rvec, tvec, CAMERA)
+    cv2.fillConvexPoly(image, np.rint(square_px).astype(np.int32), 30)
+    assert nothing(look(name, cv2.GaussianBlur(image, (0, 0), 1.0)))
+
+
+def test_what_leaves_a_direction_open_is_refused() -> None:
+    """With a lens through which its corners could be told."""
+    plain = replace(CAMERA, dist=np.zeros(5))
+    outline = outline_of(SETUP.patterns["large"].drawing)
+    image = render(*LINE, plain, noise=4.0, blur_px=1.0)
+    found = fitted(image, _pose("line"), outline, 0.0 * outline.cell, plain)
+    assert found is not None
+    assert found.shown == found.in_view
+    expected: dict[MarkerName, Array] = {"small": project(square(0.025), *LINE, plain)}
+    assert cut_markers(image, expected, SETUP.patterns, plain) == {}
+
+
+@pytest.mark.parametrize("name", ["height", "width"])
+def test_the_target_elsewhere_is_refused(name: str) -> None:
+    """Half a marker away from where it can be."""
+    rvec, tvec = POSES[name]
+    moved = render(rvec, tvec + np.array((0.011, 0.009, 0.0)), blur_px=1.0, noise=4.0)
+    assert nothing(look(name, moved))
+
+
+def gear(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The picture with a ragged piece of the vehicle in it, and its mask."""
+    mask = np.zeros(SHAPE, dtype=np.uint8)
+    outline = np.array([[130, 480], [150, 310], [240, 280], [330, 330], [420, 270], [470, 480]])
+    cv2.fillPoly(mask, [outline], 1)
+    covered = image.copy()
+    covered[mask > 0] = np.where(np.arange(int(mask.sum())) % 40 < 20, 90, 20)
+    return covered, cv2.dilate(mask, np.ones((5, 5))).astype(bool)
+
+
+def test_what_the_gear_covers_counts_neither_way() -> None:
+    image, mask = gear(picture("height"))
+    true = corners("small", BESIDE_HEIGHT)
+    expected = both(BESIDE_HEIGHT, 10.0)
+    assert cut_markers(image, expected, SETUP.patterns, CAMERA) == {}
+    outline = outline_of(SETUP.patterns["large"].drawing)
+    own = mask.astype(np.uint8)
+    fit = fitted(image, _pose("height"), outline, 0.0 * outline.cell, CAMERA, own)
+    assert fit is not None
+    assert fit.shown == fit.in_view
+    found = cut_markers(image, expected, SETUP.patterns, CAMERA, mask)["small"]
+    assert found.cov_px2 is not None
+    error = (undistort_px(found.corners_px, CAMERA) - undistort_px(true, CAMERA)).ravel()
+    assert float(error @ np.linalg.solve(found.cov_px2, error)) < 20.0
+
+
+def test_markers_behind_the_gear_are_cut() -> None:
+    pose = pose_of(0.0, -0.005, 0.06)
+    at: dict[MarkerName, Array] = {"small": corners("small", pose)}
+    free, hidden = np.zeros(SHAPE, dtype=bool), np.zeros(SHAPE, dtype=bool)
+    x, y = at["small"][0].astype(int)
+    hidden[: y + 30, : x + 30] = True
+    assert not is_cut(at, SHAPE)
+    assert not is_cut(at, SHAPE, free)
+    assert is_cut(at, SHAPE, hidden)
+    assert is_cut({"small": corners("small", BESIDE_HEIGHT)}, SHAPE, free)
+    assert not is_cut({}, SHAPE)
+
+
+def _pose(name: str) -> RigidPose:
+    """The true pose in units of the large marker's half side, own coordinates' axes."""
+    rvec, tvec = POSES[name]
+    R = np.asarray(cv2.Rodrigues(rvec)[0], dtype=float)
+    return RigidPose(R @ np.diag([1.0, -1.0, -1.0]), tvec / 0.075)
+
+
+@pytest.mark.parametrize("name", ["height", "width", "aside"])
+def test_the_lens_is_not_used_beyond_its_rim(name: str) -> None:
+    """Far outside a lens's polynomial folds back into the picture, where there is no edge."""
+    drawing = SETUP.patterns["large"].drawing
+    outline = outline_of(drawing)
+    found = fitted(picture(name), _pose(name), outline, 0.0 * outline.cell, CAMERA)
+    assert found is not None
+    assert found.shown == found.in_view
+    assert lattice_of(CAMERA).reach < 1.5
+
+
+def test_corners_that_the_lens_cannot_image_are_not_given() -> None:
+    """Of the large marker alone in view, and its far corners where the lens model has no
+    inverse."""
+    image, outline = picture("corner"), outline_of(SETUP.patterns["large"].drawing)
+    x = undistort(distort(np.array([[2.3, 0.6]]), CAMERA), CAMERA)
+    assert np.abs(x - (2.3, 0.6)).max() > 1e-2
+    found = fitted(image, _pose("corner"), outline, 0.0 * outline.cell, CAMERA)
+    assert found is not None
+    assert found.small == 0
+    assert cut_markers(image, both(POSES["corner"]), SETUP.patterns, CAMERA) == {}
+
+
+def test_a_prediction_may_be_off_in_range() -> None:
+    rvec, tvec = BESIDE_HEIGHT
+    for growth in (0.93, 1.07):
+        expected = both((rvec, tvec * (1.0, 1.0, growth)))
+        assert "small" in cut_markers(picture("height"), expected, SETUP.patterns, CAMERA)
+
+
+def test_two_fields_of_it_are_surer_than_one() -> None:
+    a = look("height")
+    assert a.small is not None
+    assert a.small.cov_px2 is not None
+    middle = between(a, replace(a, small=replace(a.small, corners_px=a.small.corners_px + 1.0)))
+    assert middle.small is not None
+    assert middle.small.cov_px2 is not None
+    assert np.allclose(middle.small.corners_px, a.small.corners_px + 0.5)
+    assert np.allclose(middle.small.cov_px2, a.small.cov_px2 / 2.0)
+
+
+def test_no_double_edges_are_looked_for_where_sides_are_outside() -> None:
+    """What is read there is the picture's rim. A whole marker's are found."""
+    image = np.full(SHAPE, 200.0)
+    image[100:300, 200:400] -= 80.0
+    image[106:306, 206:406] -= 80.0
+    at = np.array([[203.0, 103.0], [403.0, 103.0], [403.0, 303.0], [203.0, 303.0]])
+    double = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
+    whole = Detections(0, 0.0, small=Detection("small", at, 0.1, True))
+    assert with_ghosts(whole, double).ghost_px > 0.0
+    cut = replace(whole, small=Detection("small", at, 0.1, True, cov_px2=np.eye(8)))
+    assert with_ghosts(cut, double) is cut
