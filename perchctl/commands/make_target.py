@@ -16,9 +16,10 @@ from perchctl.commands.make_target_request import (
     requested_target,
 )
 from perchctl.commands.output import print_record
-from perchctl.errors import UsageError
+from perchctl.errors import PerchError, UsageError
 from perchctl.files import check_place, write_files
 from perchctl.profile import Profile, TargetConfig, find_calibration, load_profile
+from perchctl.target.blind import blind_lines, mounted
 from perchctl.target.boards import parse_board
 from perchctl.target.checks import check_target
 from perchctl.target.design import error_curve, make_design
@@ -52,7 +53,9 @@ def run(request: TargetRequest) -> int:
         outcome = _design(request, request.camera)
     else:
         profile = load_profile(request.profile or DEFAULT_PROFILE)
-        outcome = _target(request, profile, requested_target(request, profile))
+        target = requested_target(request, profile)
+        outcome = _target(request, profile, target)
+        outcome.lines.extend(_mounting(profile, target))
     write_files(outcome.files)
     if request.as_json:
         print_record(outcome.record)
@@ -108,6 +111,17 @@ def _target(request: TargetRequest, profile: Profile, target: TargetConfig) -> T
         "white_centre_ids": list(check.white_ids),
     }
     return TargetOutcome(files, lines, record)
+
+
+def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
+    """What the profile's camera sees of that target to the end; nothing without a
+    calibration, as a sheet needs none."""
+    name = profile.camera.calibration
+    try:
+        camera = load_calibration(name)
+    except PerchError:
+        return []
+    return [f"{name}: {text}" for text in blind_lines(mounted(target, camera, profile))]
 
 
 def _board(request: TargetRequest, notation: str) -> TargetOutcome:

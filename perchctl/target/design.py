@@ -15,6 +15,7 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.profile import Profile, TargetConfig
+from perchctl.target.blind import Mounted, mounted
 from perchctl.target.bound import PoseBound, pose_bound
 from perchctl.target.limits import Optics, smallest_side_px
 from perchctl.target.visible import FieldOfView, square_outline, turned_outline
@@ -66,6 +67,7 @@ class Design:
     optics: Optics
     ranges: Ranges
     gear: GearRanges
+    mount: Mounted
     standoff_m: float
     search_range_m: float | None  # camera to target at the highest search position
     search_height_m: float
@@ -145,7 +147,18 @@ def make_design(
     if ceiling_m is not None:
         search = ceiling_m - height - profile.camera.mount.position_m[2]
     warnings = _warnings(target, ranges, gear, standoff, height, ceiling_m, search)
-    return Design(target, camera, optics, ranges, gear, standoff, search, height, tuple(warnings))
+    return Design(
+        target=target,
+        camera=camera,
+        optics=optics,
+        ranges=ranges,
+        gear=gear,
+        mount=mounted(target, camera, profile),
+        standoff_m=standoff,
+        search_range_m=search,
+        search_height_m=height,
+        warnings=tuple(warnings),
+    )
 
 
 def _warnings(

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from perchctl.target.blind import blind_lines, blind_record
 from perchctl.target.design import (
     PAPER_CM,
     PAPER_FOCAL_PX,
@@ -39,6 +40,8 @@ def design_text(design: Design, curve: ErrorCurve, camera_name: str) -> str:
         f"at gear   whole large marker down to {_cm(design.gear.large_nearest_m)}, small down to "
         f"{_cm(design.gear.small_nearest_m)} between gear and target, the gear under its centre",
     ]
+    blind, *advice = blind_lines(design.mount)
+    lines += [f"mounting  {blind}", *(f"advice    {text}" for text in advice)]
     if design.search_range_m is not None:
         lines.append(
             f"search    target {_cm(design.search_range_m)} away at the highest search position "
@@ -63,6 +66,7 @@ def design_record(design: Design) -> dict[str, object]:
         "small_px": r.small_px,
         "gear_large_nearest_m": design.gear.large_nearest_m,
         "gear_small_nearest_m": design.gear.small_nearest_m,
+        "blind": blind_record(design.mount),
         "search_range_m": design.search_range_m,
         "warnings": list(design.warnings),
     }

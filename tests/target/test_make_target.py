@@ -200,3 +200,18 @@ def test_a_side_that_stands_elsewhere_in_the_file_is_not_changed_there() -> None
 def test_a_scaled_page_is_noticed() -> None:
     out, _ = call("-p", "m.yaml", "--measured-large", "145.5", "--measured-small", "24.25")
     assert "was the page scaled" in out
+
+
+def test_both_ways_say_from_where_on_the_mounting_is_blind() -> None:
+    out, _ = call("-p", "sim")
+    assert "example_640x480.yaml: never blind (by whole markers alone: blind from 20 mm" in out
+    out, _ = call("--camera", CAMERA)
+    assert "mounting  never blind" in out
+    out, _ = call("--camera", CAMERA, "--json")
+    assert json.loads(out)["blind"]["left_m"] == 0.0
+
+
+def test_a_sheet_needs_no_calibration() -> None:
+    Path("mine.yaml").write_text("extends: sim\ncamera: {calibration: none_yet.yaml}\n")
+    out, _ = call("-p", "mine.yaml")
+    assert "blind" not in out

@@ -31,7 +31,13 @@ from perchctl.vision.markers.overview import (
 )
 from perchctl.vision.markers.pattern import Pattern
 from perchctl.vision.markers.square import UNIT, within
-from perchctl.vision.markers.visible import RigidPose, Visible, corners_of, fitted
+from perchctl.vision.markers.visible import (
+    RigidPose,
+    Visible,
+    corners_of,
+    fitted,
+    foreseen,
+)
 from perchctl.vision.types import CameraModel, Detections, MarkerName
 
 MOST_AGE_S = 0.5
@@ -98,16 +104,38 @@ def cut_markers(
     near = _moved_near(start, texture, view)
     if near is None:
         return {}
-    tolerance = np.where(outline.small, *(patterns[n].rim.tolerance for n in ("small", "large")))
-    found = fitted(image, near, outline, tolerance * outline.cell, camera, covered)
+    found = fitted(image, near, outline, _print_sigma(patterns), camera, covered)
     if found is None or not _trusted(found):
         return {}
     like, gain = looks_like(found.pose.H, texture, view)
     if like < _MIN_LIKENESS or gain < _MIN_GAIN:
         return {}
-    name: MarkerName = "small" if found.small >= _SMALL_PLACES else "large"
+    name = _stands_for(found)
     corners = _corners(found, ratio if name == "small" else 1.0, camera)
     return {} if corners is None else {name: corners}
+
+
+def shows_enough(
+    pose: RigidPose, patterns: Mapping[MarkerName, Pattern], camera: CameraModel
+) -> bool:
+    """Whether what a picture taken in that pose shows of the target is enough to measure it."""
+    drawing = patterns["large"].drawing
+    found = foreseen(pose, outline_of(drawing), _print_sigma(patterns), camera)
+    if found is None or not _trusted(found):
+        return False
+    half = drawing.ratio if _stands_for(found) == "small" else 1.0
+    return _corners(found, half, camera) is not None
+
+
+def _print_sigma(patterns: Mapping[MarkerName, Pattern]) -> Array:
+    """By how much the line at each place of the outline may be printed off its place (n,)."""
+    outline = outline_of(patterns["large"].drawing)
+    small, large = (patterns[name].rim.tolerance for name in ("small", "large"))
+    return np.where(outline.small, small, large) * outline.cell
+
+
+def _stands_for(found: Visible) -> MarkerName:
+    return "small" if found.small >= _SMALL_PLACES else "large"
 
 
 def _start(

@@ -124,15 +124,19 @@ def fitted(
             break
     if found is None or moved_px > _SETTLED_PX or pose.t[2] <= 0.0:
         return None
-    shown = found.weight > 0.0
-    return Visible(
-        pose=pose,
-        cov=_covariance(found, places, outline, print_sigma),
-        in_view=len(shown),
-        shown=int(np.count_nonzero(shown)),
-        small=int(np.count_nonzero(shown & outline.small[places.index])),
-        residual_px=math.sqrt(found.variance),
-    )
+    return _visible(pose, found, places, outline, print_sigma)
+
+
+def foreseen(
+    pose: RigidPose, outline: Outline, print_sigma: Array, camera: CameraModel
+) -> Visible | None:
+    """What `fitted` would make of a picture without a flaw, taken in that pose."""
+    places = _in_view(pose, outline, _REACH_PX[0], camera.size_px[::-1], camera, None)
+    n = len(places.index)
+    if n < _LEAST_PLACES:
+        return None
+    found = _solved(places, np.zeros(n), np.ones(n, dtype=np.bool_), np.zeros(6))
+    return None if found is None else _visible(pose, found, places, outline, print_sigma)
 
 
 def _in_view(
@@ -255,6 +259,20 @@ def _covariance(found: _Round, places: _Places, outline: Outline, print_sigma: A
     prior = np.diag(np.append(_PRIOR, _SHIFT_PX**-2.0))
     cov = found.inverse @ (middle / variance**2 + prior) @ found.inverse
     return np.asarray(cov[:6, :6])
+
+
+def _visible(
+    pose: RigidPose, found: _Round, places: _Places, outline: Outline, print_sigma: Array
+) -> Visible:
+    shown = found.weight > 0.0
+    return Visible(
+        pose=pose,
+        cov=_covariance(found, places, outline, print_sigma),
+        in_view=len(shown),
+        shown=int(np.count_nonzero(shown)),
+        small=int(np.count_nonzero(shown & outline.small[places.index])),
+        residual_px=math.sqrt(found.variance),
+    )
 
 
 def corners_of(pose: RigidPose, half: float, camera: CameraModel) -> tuple[Array, Array] | None:
