@@ -1,8 +1,7 @@
 """Whether the spread that a picture's pose claims is what it errs by, by range and blur: the mean
 squared error in units of it, a degree of freedom; 1 is honest, less is modest.
 
-The sizes in the profile are those of the print; the noise of half of the pictures is low, of
-half of them high.
+The print counts as true; the noise of half of the pictures is low, of half of them high.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import cv2
 import numpy as np
 from checkout import Checkout, Stream
 from common import CAMERA, renderer, table
-from degradations import MEASURED, error, samples_between
+from degradations import TRUE, error, samples_between
 
 BINS_M = (0.04, 0.08, 0.16, 0.3, 0.6, 1.2)
 BLURS_PX = (0.5, 1.0, 1.8, 3.0)
@@ -34,7 +33,7 @@ def squared(
         for index, sample in enumerate(samples_between(low_m, high_m, count // 2, rng)):
             T = sample.T_at(0.0)
             picture = scene.render([T], blur_px, index)
-            seen = looker.look(Stream([(0.0, picture)], {"target": dict(MEASURED)}))
+            seen = looker.look(Stream([(0.0, picture)], {"target": dict(TRUE)}))
             if seen.e is None or seen.cov is None:
                 continue
             e = error(seen, T)

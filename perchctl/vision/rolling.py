@@ -17,6 +17,9 @@ from perchctl.vision.types import MARKERS, Detection, Detections
 
 UNKNOWN_READOUT_S = 0.012
 """One standard deviation of a camera's read-out time where nobody has said it."""
+FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
+"""Of a motion, along and across, as shares of it: it was measured from the frame before to this
+one, and changes."""
 
 
 def seen_at_once(
@@ -25,7 +28,8 @@ def seen_at_once(
     """The markers with their corners at the frame's own time, as far as their motion is known.
 
     `readout_s` is from a picture's first row to its last; where it is None the corners stay
-    where they are, with what a likely read-out would do to them for an error (`common_px`).
+    where they are, with what a likely read-out would do to them for an error (`common_px`);
+    else with what the motion's own error does.
     """
     seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
     if readout_s == 0.0:
@@ -43,7 +47,9 @@ def seen_at_once(
         if readout_s is None:
             out.append(replace(d, common_px=moved_px))
         else:
-            out.append(replace(d, corners_px=d.corners_px - moved_px))
+            sigma_px = float(np.hypot(d.sigma_px, TURN_SIGMA * np.abs(moved_px).max()))
+            back_px, along_px = d.corners_px - moved_px, FLOW_SIGMA * moved_px
+            out.append(replace(d, corners_px=back_px, sigma_px=sigma_px, common_px=along_px))
     return out
 
 

@@ -85,8 +85,8 @@ class TiltPrior:
 class Points:
     """object_m (n, 3) and image_px (n, 2) of a pinhole K; sigma_px (n,); whitening
     (2n, 2n) makes errors independent and of unit spread; shift (2n, k): one standard deviation
-    each of what moves corners together, whitened: the shift that all edges share, and
-    the detections' `common_px`."""
+    each of what moves corners together, whitened: the shift that all edges share, the
+    detections' `common_px`, and what shakes the rows of each."""
 
     object_m: Array
     image_px: Array
@@ -101,7 +101,7 @@ def make_points(
 ) -> Points:
     n = len(image_px)
     W = np.zeros((2 * n, 2 * n))
-    shift = np.zeros((2 * n, 2))
+    shift = np.zeros((2 * n, 2 + 2 * len(detections)))
     sigma_px = np.empty(n)
     for i, d in enumerate(detections):
         rows = slice(8 * i, 8 * i + 8)
@@ -121,6 +121,13 @@ def make_points(
             shift[rows, 0] = d.shift_sigma_px * moved.ravel()
         if d.common_px is not None:
             shift[rows, 1] = d.common_px.ravel()
+        if d.row_sigma_px > 0.0:
+            # As of a line: half to all of its rows alike, and a slant.
+            down = corners[:, 1] - corners[:, 1].mean()
+            down /= max(float(np.abs(down).max()), 1e-9)
+            along_x = slice(8 * i, 8 * i + 8, 2)
+            shift[along_x, 2 + 2 * i] = 0.5 * d.row_sigma_px
+            shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_sigma_px * down
     return Points(object_m, image_px, sigma_px, W, W @ shift, K)
 
 

@@ -77,6 +77,7 @@ class Detection:
     shift_sigma_px: float = 0.0  # of what moved all of a picture's edges alike, outwards
     common_px: Array | None = None  # (4, 2): one sigma of what moved all corners together
     cov_px2: Array | None = None
+    row_sigma_px: float = 0.0  # of corners in rows that shake along themselves, as analogue ones
 
 
 @dataclass(frozen=True)

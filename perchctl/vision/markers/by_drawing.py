@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,7 @@ from perchctl.vision.markers.square import doubled_area, mean_side_px, side_leng
 from perchctl.vision.types import CameraModel
 
 _MIN_SIGMA_PX = 0.015
+_BLUR_SIGMA = 0.012  # of the blur: no picture is its drawing with an even blur
 _MIN_PATTERN, _MIN_LIKENESS = 0.9, 0.9
 _MIN_STRENGTH, _MAX_STRENGTH = 0.6, 1.6
 _MAX_WORST_CELL = 0.3
@@ -51,7 +54,8 @@ def aligned(
         or not _same_square(start_px, found.corners_px)
     ):
         return None
-    return RefinedCorners(found.corners_px, max(found.sigma_px, _MIN_SIGMA_PX), True)
+    sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
+    return RefinedCorners(found.corners_px, sigma_px, True)
 
 
 def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:

@@ -25,8 +25,9 @@ NESTED_SIGMA_PX = 0.6  # a place taken over from the other marker measures nothi
 class RefinedCorners:
     """corners_px (4, 2), their spread, whether lines or the drawing were fitted, the spread
     of a shift that is common to all sides (outwards), the edges' blur, in px, the shift
-    that was taken out, and, where the corners follow from a part of the drawing, their
-    covariance (8, 8) in pixels of a pinhole, x and y of each corner by turns."""
+    that was taken out, where the corners follow from a part of the drawing their covariance
+    (8, 8) in pixels of a pinhole, x and y of each corner by turns, and the spread by rows that
+    shake along themselves."""
 
     corners_px: Array
     sigma_px: float
@@ -35,6 +36,7 @@ class RefinedCorners:
     blur_px: float = 0.0
     edge_shift: EdgeShift | None = None
     cov_px2: Array | None = None
+    row_sigma_px: float = 0.0
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:

@@ -238,4 +238,7 @@ def _detection(name: MarkerName, seen: _Seen) -> Detection | None:
     r = seen.get(name)
     if r is None:
         return None
-    return Detection(name, r.corners_px, r.sigma_px, r.refined, r.shift_sigma_px, cov_px2=r.cov_px2)
+    return Detection(
+        name, r.corners_px, r.sigma_px, r.refined, r.shift_sigma_px,
+        cov_px2=r.cov_px2, row_sigma_px=r.row_sigma_px,
+    )  # fmt: skip

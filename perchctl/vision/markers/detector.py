@@ -21,7 +21,7 @@ from perchctl.vision.markers.pattern import Pattern, Rim, pattern_of, rim_of_bit
 from perchctl.vision.types import MarkerName
 
 MIRROR_INDEX = 1
-_PRINT_M = 2e-5  # half a dot of a printer
+_PRINT_M = 1e-6  # of an edge: over its hundreds of dots what each errs by averages out
 _MIN_PERIMETER_PX = 19.2  # OpenCV's default rate, 0.03, of 640 px
 _LOOSE_PERIMETER_RATE = 0.05
 _LOOSE_ACCURACY_RATE = 0.1

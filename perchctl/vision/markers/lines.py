@@ -37,7 +37,14 @@ MIN_LINE_SIGMA_PX = 0.015
 _MIN_CELL_PX = 1.0  # smaller cells blend into one grey
 _MAX_RESIDUAL_PX = 0.6
 _MIN_INLIERS = 0.5
-_TAILS = 1.3  # what robust weights take away from a residual's square
+_TAILS = 1.7  # what robust weights take away from a residual's square, and from the samples
+_BEND, _BEND_BLURS = 0.6, 2.0  # what the next edge, a cell away, does to one; in units of blur
+_REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
+_CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
+_CLIPPED_SHARE = 0.05  # of the profiles
+_WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off an edge that is wide and not central
+_LEAST_ROWS = 2.0  # times the other sides' variance shows that rows shake
+_LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apart
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
 _SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
 _CLIPPED_PRIOR_PX = 0.4  # what clipping does
@@ -90,13 +97,35 @@ def refine_lines(
 ) -> list[RefinedCorners | None]:
     """The line fit alone, for m markers (m, 4, 2); None where its residual, inliers,
     contrast, blur or movement show that these are not a marker's sides. The shift of all
-    edges is measured unless it is known."""
+    edges is measured unless it is known. Wide edges are looked at twice, the second time
+    with the profiles centred on them."""
+    found = _refined_once(image, raw_px, rims, camera, known)
+    centred = raw_px.copy()
+    for i, each in enumerate(found):
+        if each is not None and each.blur_px > _WIDE_BLUR_PX:
+            centred[i] = each.corners_px
+    if np.abs(centred - raw_px).max(initial=0.0) < _CENTRED_PX:
+        return found
+    again = _refined_once(image, centred, rims, camera, known)
+    return [second or first for first, second in zip(found, again, strict=True)]
+
+
+def _refined_once(
+    image: NDArray[np.uint8],
+    raw_px: Array,
+    rims: Sequence[Rim],
+    camera: CameraModel,
+    known: EdgeShift | None,
+) -> list[RefinedCorners | None]:
     nothing: list[RefinedCorners | None] = [None] * len(raw_px)
     markers = markers_of(raw_px, rims, camera)
     if markers is None:
         return nothing
     measured = measure(image, markers, camera, with_inner=known is None)
     sides = measured.sides
+    if known is not None and (_clipped(sides) > _CLIPPED_SHARE).any():
+        # How far clipping moves edges changes with the light.
+        return _refined_once(image, raw_px, rims, camera, None)
     fit = _fit_lines(markers, sides)
     corners = _intersect(fit.lines)
     if not np.isfinite(corners).all():
@@ -108,6 +137,7 @@ def refine_lines(
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, fit, corners_px)
     sigma_px = _sigma_px(markers, sides, fit)
+    row_px = _row_px(markers, sides, fit)
     return [
         RefinedCorners(
             corners_px=corners_px[i],
@@ -116,6 +146,7 @@ def refine_lines(
             shift_sigma_px=applied.sigma_px,
             blur_px=float(sides.blur_px[4 * i : 4 * i + 4].max()),
             edge_shift=shift,
+            row_sigma_px=float(row_px[i]),
         )
         if accepted[i]
         else None
@@ -210,20 +241,41 @@ def _accepted(
     )
 
 
+def _clipped(sides: Samples) -> Array:
+    """Share of the profiles of the m markers that end in clipped white, (m,)."""
+    return (sides.grey[:, :, -1] > _CLIPPED_GREY).mean(axis=1).reshape(-1, 4) @ _QUARTERS
+
+
+def _samples(markers: Markers, sides: Samples) -> Array:
+    """How many independent ones each side's line rests on, (4m,)."""
+    return np.maximum(np.minimum(sides.weight.sum(axis=1), markers.sides_px.ravel()), 4.0)
+
+
 def _sigma_px(markers: Markers, sides: Samples, fit: _Lines) -> Array:
     """Spread of the corners of the m markers."""
     cell_px, residual_px = markers.cell_px, fit.residual_px
+    blur_px = np.maximum(sides.blur_px.reshape(-1, 4) @ _QUARTERS, 1e-3)
     # The end of a line fitted to n samples spreads twice as far as its middle.
-    samples = np.minimum(sides.weight.sum(axis=1), markers.sides_px.ravel())
-    samples = np.maximum(samples, 4.0)
-    sigma2 = (_TAILS * 4.0 * residual_px * residual_px / samples).reshape(-1, 4) @ _QUARTERS
-    # Cells of few pixels let the inner pattern's blur reach the border's edge; and edges
-    # are not where they were meant to be printed.
+    ends2 = _TAILS * 4.0 * residual_px * residual_px / _samples(markers, sides)
+    noise2 = np.maximum(ends2.reshape(-1, 4) @ _QUARTERS, MIN_LINE_SIGMA_PX**2)
+    # Cells of few pixels let the inner pattern's blur reach the border's edge.
+    bend_px = _BEND * blur_px * np.exp(-cell_px / (_BEND_BLURS * blur_px))
+    reach_px = _REACH * blur_px**3
+    clipped_px = np.where(_clipped(sides) > _CLIPPED_SHARE, _CLIPPED_SIGMA_PX, 0.0)
+    # Edges are not where they were meant to be printed.
     print_px = np.array([rim.tolerance for rim in markers.rims]) * cell_px
-    return np.asarray(
-        np.sqrt(
-            np.maximum(sigma2, MIN_LINE_SIGMA_PX**2)
-            + 0.25 * np.exp(cell_px * (-2.0 / 1.8))
-            + print_px * print_px
-        )
-    )
+    return np.asarray(np.sqrt(noise2 + bend_px**2 + reach_px**2 + clipped_px**2 + print_px**2))
+
+
+def _row_px(markers: Markers, sides: Samples, fit: _Lines) -> Array:
+    """Spread of the corners of the m markers by what shakes a picture's rows, each along
+    itself: it moves upright sides, both of a marker's alike, and lying ones not. As the
+    sides' residuals show it; 0 where the marker stands on a corner and nothing shows."""
+    ends2 = (_TAILS * 4.0 * fit.residual_px**2 / _samples(markers, sides)).reshape(-1, 4)
+    upright = (fit.lines[:, 0] ** 2).reshape(-1, 4)
+    off = upright - (upright @ _QUARTERS)[:, None]
+    aspect = (off * off) @ _QUARTERS
+    slope = ((ends2 * off) @ _QUARTERS) / np.maximum(aspect, 1e-9)
+    still = ends2 @ _QUARTERS - slope * (upright @ _QUARTERS)
+    shaken = (aspect > _LEAST_ASPECT) & (slope > (_LEAST_ROWS - 1.0) * np.maximum(still, 0.0))
+    return np.asarray(np.sqrt(np.where(shaken, np.maximum(slope, 0.0), 0.0)))
