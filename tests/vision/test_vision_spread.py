@@ -54,7 +54,8 @@ def test_bins_of_range_and_blur(build: Build, low_m: float, high_m: float, blur_
         return render(rvec, tvec, blur_px=blur_px, noise=5.0 + 3.0 * (k % 2), seed=k)
 
     mean = squared(build(target=TRUE_PRINT), low_m, high_m, picture, 16)
-    assert 0.5 < mean < 1.5
+    # Half to one and a half, as far as 16 pictures show it (to 0.18); once it was 0.1 to 4.
+    assert 0.35 < mean < 1.7
 
 
 def test_rows_that_shake(build: Build) -> None:
