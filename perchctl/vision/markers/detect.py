@@ -208,14 +208,15 @@ def _whole_or_partly(
         if r.refined and wholly_seen(r, image.shape, hidden):
             continue
         pattern, small = setup.patterns[name], seen.get("small")
-        start = r.corners_px
-        if name == "large" and small is not None and small.refined:
-            start = nested(small.corners_px, 1.0 / setup.ratio, camera)
+        starts = [r.corners_px]
+        if name == "large" and not r.refined and small is not None and small.refined:
+            starts.insert(0, nested(small.corners_px, 1.0 / setup.ratio, camera))
         known_by: KnownBy = "other" if len(seen) == 2 else "bits"
-        partly = seen_partly(image, start, pattern, camera, known_by, hidden)
+        tried = (seen_partly(image, s, pattern, camera, known_by, hidden) for s in starts)
+        partly = next((found for found in tried if found is not None), None)
         if partly is not None:
             fitted[name] = partly
-        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(hidden, r.corners_px):
+        elif not within(r.corners_px, image.shape, ROOM_PX) or hides(hidden, r.corners_px, 1.0):
             del fitted[name]
     return fitted
 

@@ -90,6 +90,7 @@ def around(
     start = nested(small.corners_px, 1.0 / pattern.drawing.ratio, camera)
     if not np.isfinite(start).all():
         return None
+    found: RefinedCorners | None = None
     if within(start, image.shape, ROOM_PX):
         # A small marker gives a rough place; the first fit is where to look closely.
         found = refine_lines(image, start[None], [pattern.rim], camera)[0]
@@ -102,6 +103,8 @@ def around(
             and cells_mostly_agree(image, found.corners_px, pattern)
         ):
             return found
+    if found is not None:
+        start = found.corners_px
     partly = seen_partly(image, start, pattern, camera, "other", hidden)
     return partly if partly and _centred(partly, small, pattern, camera) else None
 

@@ -17,10 +17,11 @@ from perchctl.geometry import Array
 from perchctl.vision.types import Frame
 
 Covered = NDArray[np.bool_]
+WITH_WHITE = 1.25
+"""Half sides from a marker's centre within which anything spoils its sides' measurement."""
 _FIELD_ROWS = 7  # of a field's picture, that a covered row has a part in
 _REDUCED, _SPREAD = 8, 2.0  # times smaller, and there the spread of what fills
 _TINY = 1e-4
-_QUIET = 1.25  # half sides around a marker within which anything spoils its sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,14 +62,14 @@ def filled(image: NDArray[np.uint8], hidden: Covered) -> NDArray[np.uint8]:
     return np.where(hidden, np.rint(smooth).astype(np.uint8), image)
 
 
-def hides(hidden: Covered | None, corners_px: Array) -> bool:
-    """Whether a part of the marker with these corners (4, 2), or of the white around it, is
-    hidden."""
+def hides(hidden: Covered | None, corners_px: Array, reach: float = WITH_WHITE) -> bool:
+    """Whether a part of the marker with these corners (4, 2) is hidden, as far as `reach` half
+    sides from its centre."""
     if hidden is None:
         return False
     h, w = hidden.shape
     centre = corners_px.mean(axis=0)
-    wide = centre + _QUIET * (corners_px - centre)
+    wide = centre + reach * (corners_px - centre)
     if not np.isfinite(wide).all():
         return False
     low = np.clip(np.floor(wide.min(axis=0)), 0, (w - 1, h - 1)).astype(int)

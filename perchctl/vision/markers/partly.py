@@ -46,12 +46,12 @@ _MAX_STEP = 0.5
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """A round's square H (3, 3), unit to pinhole px, how far it moved, the edges that it rests
-    on, the shift of all edges, and the normal matrix (9, 9)."""
+    on, by how much they are off then, px (rows, n), and the normal matrix (9, 9)."""
 
     H: Array
     moved_px: float
     seen: SeenEdges
-    shift_px: float
+    left_px: Array
     N: Array
 
 
@@ -119,7 +119,7 @@ def _prior_px(seen: SeenEdges) -> float:
 
 def _stepped(H: Array, seen: SeenEdges, known: EdgeShift | None) -> _Fit | None:
     """The square H one round on; None where the fit breaks down."""
-    N, g = _equations(seen, known or EdgeShift(0.0, _prior_px(seen)))
+    A, N, g = _equations(seen, known or EdgeShift(0.0, _prior_px(seen)))
     try:
         step = np.asarray(np.linalg.solve(N, g), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -129,12 +129,13 @@ def _stepped(H: Array, seen: SeenEdges, known: EdgeShift | None) -> _Fit | None:
         return None
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
     moved_px = float(np.abs(p[:6]).max() * seen.scale_px.mean())
-    return _Fit(H / H[2, 2], moved_px, seen, float(step[8]), N)
+    return _Fit(H / H[2, 2], moved_px, seen, seen.far_px - A @ step, N)
 
 
-def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array]:
-    """Normal equations (9, 9), (9,) of the square's increment, in the terms of
-    `corner_jacobian`, and of the shift of all edges, px; per px^2 of an edge's spread."""
+def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
+    """Changes (rows, n, 9) of the edges with the square's increment, in the terms of
+    `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9),
+    (9,), per px^2 of an edge's spread."""
     u, v = seen.own[..., 0], seen.own[..., 1]
     nx, ny = OUT[seen.side].T[..., None]
     across = nx * u + ny * v
@@ -151,7 +152,7 @@ def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array]:
     N[8, 8] += certain
     g[8] += certain * prior.shift_px
     N[range(8), range(8)] += 1e-6
-    return N, g
+    return A, N, g
 
 
 def _worth(seen: SeenEdges) -> Array:
@@ -163,7 +164,7 @@ def _worth(seen: SeenEdges) -> Array:
 def _corners(fit: _Fit, pattern: Pattern, camera: CameraModel) -> RefinedCorners | None:
     """Corners and covariance after the last round; None where they are not determined."""
     seen, N = fit.seen, fit.N
-    spread = _spread(seen, fit.shift_px)
+    spread = _spread(seen, fit.left_px)
     if spread is None:
         return None
     residual2, growth = spread
@@ -190,7 +191,7 @@ def _corners(fit: _Fit, pattern: Pattern, camera: CameraModel) -> RefinedCorners
     )
 
 
-def _spread(seen: SeenEdges, shift_px: float) -> tuple[float, float] | None:
+def _spread(seen: SeenEdges, left: Array) -> tuple[float, float] | None:
     """Mean square of what the fit leaves over within rows, px^2, and by how much rows contradict
     each other beyond it; None where these are no edges of a square."""
     w = seen.weight
@@ -198,7 +199,6 @@ def _spread(seen: SeenEdges, shift_px: float) -> tuple[float, float] | None:
     used = mass > 0.0
     if not used.any() or (seen.blur[used] > _MAX_BLUR).any():
         return None
-    left = seen.far_px + seen.inwards[:, None] * shift_px
     if float((w * left**2).sum() / w.sum()) > _MAX_RESIDUAL_PX**2:
         return None
     mean = (w * left).sum(axis=1) / np.maximum(mass, 1e-9)

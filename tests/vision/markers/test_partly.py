@@ -185,6 +185,17 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
     assert np.abs(again.large.corners_px - true).max() < 0.3
 
 
+def test_the_way_of_the_last_round_is_not_taken_for_spread() -> None:
+    """From wherever the fit starts, it claims the same."""
+    image, true = render(*POSE, noise=2.0), corners("large")
+    spreads = []
+    for off_px in (0.0, 0.5, 1.5, 3.0):
+        found = fit_partly(image, true + off_px, LARGE, CAMERA)
+        assert found is not None
+        spreads.append(found.sigma_px)
+    assert max(spreads) < 1.03 * min(spreads)
+
+
 def test_what_is_hidden_is_no_edge() -> None:
     """A bar along a whole side: without that side, the inner edge of its border is left."""
     image, true = render(*POSE, noise=2.0), corners("large")
