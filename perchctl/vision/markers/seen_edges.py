@@ -32,6 +32,7 @@ _INNER_CELL_PX = 6.0  # of a border whose inner edge is seen apart from the oute
 _TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # of the contrast: of black inside, of white outside
 _MIN_CONTRAST = 10.0
 _MIN_WEIGHT = 3.0  # of a side's profiles
+_FAR_PX = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +91,8 @@ def look(
         return None
     s = places(rows.lengths_px)
     origin, normal = side_profiles(rows.starts, rows.ends, s, camera)
+    if not (np.abs(origin) < _FAR_PX).all():
+        return None  # a lens model throws what is far outside anywhere, to no number too
     normal *= rows.sign[:, None, None]
     near_px = np.full(len(rows.at), min(max(0.85 * rows.cell_px, 1.5), 7.0))
     half_px = np.full(len(rows.at), min(max(1.5 * rows.cell_px, 1.75), 7.0))

@@ -18,6 +18,7 @@ from perchctl.vision.markers.detect import detect
 from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.outline import outline_of
 from perchctl.vision.markers.overview import lattice_of
+from perchctl.vision.markers.seen_edges import look as look_for_edges
 from perchctl.vision.markers.square import within
 from perchctl.vision.markers.visible import RigidPose, fitted
 from perchctl.vision.pose import square
@@ -268,3 +269,12 @@ def test_no_double_edges_are_looked_for_where_sides_are_outside() -> None:
     assert with_ghosts(whole, double).ghost_px > 0.0
     cut = replace(whole, small=Detection("small", at, 0.1, True, cov_px2=np.eye(8)))
     assert with_ghosts(cut, double) is cut
+
+
+@pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])
+def test_a_square_beyond_all_lenses_shows_no_edges(side_px: float) -> None:
+    """Where a lens model throws a near target's far corners overflows a picture's coordinates."""
+    square_px = np.array([[side_px, 0.0, 320.0], [0.0, side_px, 240.0], [0.0, 0.0, 1.0]])
+    assert (
+        look_for_edges(picture("height"), square_px, SETUP.patterns["large"], CAMERA, None) is None
+    )
