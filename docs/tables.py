@@ -90,7 +90,8 @@ MEANINGS = {
     "detector.window": "look around the last pose first",
     "detector.blurred": "look once more where blur may hide the target",
     "detector.cut": "measure by what is left of the drawing where the picture cuts both markers",
-    "detector.blurred_every": "... so in every Nth picture of a stream without it, not for a sharp one",
+    "detector.blurred_every": "... so in every Nth picture of a stream without it, "
+    "not for a sharp one",
     "detector.correction_bits_large": "wrong cells that are corrected",
     "detector.correction_bits_small": "wrong cells that are corrected",
     "pose.solver": "OpenCV's solver for the first guess",

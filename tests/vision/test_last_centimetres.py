@@ -73,7 +73,7 @@ def test_a_pose_heeds_the_covariance_of_its_corners() -> None:
         return estimate_pose([seen], 0.0, None, setup)
 
     heedless, heeding = pose(None), pose(cov)
-    assert heeding.sigma_m[1] > 20.0 * heedless.sigma_m[1]
-    assert heeding.sigma_m[1] > 5.0 * heeding.sigma_m[0]
+    assert heeding.sigma_m[1] > 5.0 * heedless.sigma_m[1]
+    assert heeding.sigma_m[1] > 3.0 * heeding.sigma_m[0]
     assert abs(heeding.e_m[1] + 0.01) < 3.0 * heeding.sigma_m[1]
-    assert abs(heedless.e_m[1] + 0.01) > 10.0 * heedless.sigma_m[1]
+    assert abs(heedless.e_m[1] + 0.01) > 4.0 * heedless.sigma_m[1]

@@ -89,7 +89,8 @@ def cut_markers(
 ) -> dict[MarkerName, RefinedCorners]:
     """The marker that what is in view of the target stands for, or none.
 
-    `expected` are corners (4, 2) px, of one marker at least.
+    `expected` are corners (4, 2) px, of one marker at least; `hidden` (h, w) is where the
+    vehicle's own gear covers the picture.
     """
     drawing = patterns["large"].drawing
     ratio, centre = drawing.ratio, drawing.centre

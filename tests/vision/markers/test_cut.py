@@ -148,7 +148,7 @@ def test_a_plain_square_in_the_small_marker_s_place_is_refused(name: str) -> Non
     rvec, tvec = POSES[name]
     square_px = project(square(0.025), rvec, tvec, CAMERA)
     cv2.fillConvexPoly(image, np.rint(square_px).astype(np.int32), 30)
-    assert nothing(look(name, cv2.GaussianBlur(image, (0, 0), 1.0)))
+    assert nothing(look(name, np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8)))
 
 
 def test_what_leaves_a_direction_open_is_refused() -> None:
