@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -35,6 +36,8 @@ RANGES_M = (0.05, 1.2)
 LEAST_SIDE_PX = 14.0  # a marker that should be found
 RATE_HZ, FRAMES = 25.0, 4
 SPEED_MPS, TURN_RADPS = 0.3, 0.5
+CUT_M, MOST_CUT = (0.2, 1.0), 0.05
+MASK = "gear.png"
 BLUR_PX, NOISE, EXPOSURE_S = 0.8, 3.0, 0.004
 TRUE = {"size_sigma": 0.0, "curl_per_m": 0.0}
 """`target`'s keys of a print that is as the profile has it."""
@@ -42,7 +45,8 @@ TRUE = {"size_sigma": 0.0, "curl_per_m": 0.0}
 
 @dataclass(frozen=True)
 class Degradation:
-    """`scene` goes into the renderer's scenario, `keys` into the profile."""
+    """`scene` goes into the renderer's scenario, `camera` and `target` into the profile; `cut`:
+    the large marker reaches out of the picture."""
 
     name: str
     moving: bool = False
@@ -50,6 +54,7 @@ class Degradation:
     spoil: spoilt.Spoil | None = None
     camera: dict[str, Any] = field(default_factory=dict)
     target: dict[str, Any] = field(default_factory=lambda: dict(TRUE))
+    cut: bool = False
 
 
 ROLLING = {"camera_readout_s": 0.02}
@@ -66,6 +71,8 @@ ROWS = (
     Degradation("vignette", spoil=spoilt.vignette),
     Degradation("highlight on a corner", spoil=spoilt.highlight),
     Degradation("own gear in view", spoil=spoilt.gear),
+    Degradation("own gear, masked", spoil=spoilt.known_gear, camera={"mask": MASK}),
+    Degradation("cut by up to 5 %", cut=True),
     Degradation("dark", spoil=spoilt.dark),
     Degradation("overexposed", spoil=spoilt.overexposed),
     Degradation("torn analogue", scene={"extra": {"analogue": 0.5}}),
@@ -91,7 +98,7 @@ class Figures:
 @dataclass(frozen=True, eq=False)
 class Sample:
     """A view of the target: at time 0, that of the frame that counts, it is at `e_m` in the
-    camera's level frame, and which markers are wholly in the picture then; how it moves."""
+    camera's level frame, and which markers are to be found then; how it moves."""
 
     e_m: Array
     yaw_rad: float
@@ -106,6 +113,7 @@ class Sample:
 
     @property
     def in_view(self) -> tuple[str, ...]:
+        """Those that are wholly in the picture."""
         return tuple(name for name in ("large", "small") if _shows(self.T_at(0.0), name))
 
 
@@ -131,6 +139,37 @@ def samples_between(
         if sample.in_view:
             done += 1
             yield sample
+
+
+def cut_samples(count: int, rng: np.random.Generator) -> Iterator[Sample]:
+    """The large marker's outermost corner beyond the picture's edge by up to 5 % of a side."""
+    for _ in range(count):
+        across, sign = int(rng.integers(2)), float(rng.choice((-1.0, 1.0)))
+        share, sample = math.inf, None
+        while (
+            sample is None
+            or abs(_beyond(sample, across) - share) > 1e-3
+            or (_beyond(sample, 1 - across) > 0.0)
+        ):
+            z = math.exp(rng.uniform(math.log(CUT_M[0]), math.log(CUT_M[1])))
+            yaw, roll, pitch = rng.uniform(-1, 1, 3) * (math.pi, 0.08, 0.08)
+            place, share = np.append(rng.uniform(-0.3, 0.3, 2) * z, z), rng.uniform(0.0, MOST_CUT)
+            low, high = 0.0, 1.5 * z
+            for _ in range(40):
+                place = place.copy()
+                place[across] = sign * 0.5 * (low + high)
+                sample = Sample(place, yaw, (roll, pitch), np.zeros(3), 0.0)
+                inside = _beyond(sample, across) < share
+                low, high = (0.5 * (low + high), high) if inside else (low, 0.5 * (low + high))
+        yield sample
+
+
+def _beyond(sample: Sample, axis: int) -> float:
+    """How far the large marker reaches out of the picture along an axis, in sides."""
+    corners = true_corners(sample.T_at(0.0), "large")
+    side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
+    along = corners[:, axis]
+    return max(float(along.max()) - (CAMERA.size_px[axis] - 1.0), -float(along.min())) / side
 
 
 def _shows(T: Array, marker: str) -> bool:
@@ -168,8 +207,9 @@ def error(seen: Seen, T: Array) -> Array:
     return np.append(off, wrap_rad(seen.e[3] - math.atan2(R[1, 0], R[0, 0])))  # type: ignore[index]
 
 
-def measure(row: Degradation, count: int, looker: Checkout) -> Figures:
-    """`count` samples, the same for every row that moves or stands as this one does."""
+def measure(row: Degradation, count: int, looker: Checkout, folder: Path) -> Figures:
+    """`count` samples, the same for every row that moves or stands as this one does. `folder`:
+    where the gear's mask is."""
     rng = np.random.default_rng(5)
     scene = renderer(
         seed=5, camera_rate_hz=RATE_HZ, camera_noise_sigma=NOISE, camera_defocus_px=BLUR_PX,
@@ -178,10 +218,14 @@ def measure(row: Degradation, count: int, looker: Checkout) -> Figures:
     shown: dict[str, list[bool]] = {"large": [], "small": [], "either": []}
     near: list[tuple[Array, float]] = []
     far: list[tuple[Array, float]] = []
-    for index, sample in enumerate(samples(count, rng)):
+    camera = row.camera
+    if "mask" in camera:
+        camera = camera | {"mask": str(folder / MASK)}
+    views = cut_samples(count, rng) if row.cut else samples(count, rng)
+    for index, sample in enumerate(views):
         pictures = frames(row, sample, scene, index, np.random.default_rng([6, index]))
-        seen = looker.look(Stream(pictures, {"camera": row.camera, "target": row.target}))
-        for name in sample.in_view:
+        seen = looker.look(Stream(pictures, {"camera": camera, "target": row.target}))
+        for name in ("large",) if row.cut else sample.in_view:
             shown[name].append(name in seen.markers)
         shown["either"].append(seen.e is not None)
         if seen.e is None or seen.cov is None:
@@ -231,11 +275,16 @@ def main() -> None:
     count = options.count or (16 if options.quick else 100)
     old = read(options.beside) if options.beside else {}
     rows, results = [], {}
-    with Checkout(options.checkout, (CAMERA.size_px, CAMERA.K, CAMERA.dist)) as looker:
+    with (
+        TemporaryDirectory() as name,
+        Checkout(options.checkout, (CAMERA.size_px, CAMERA.K, CAMERA.dist)) as looker,
+    ):
+        folder = Path(name)
+        cv2.imwrite(str(folder / MASK), spoilt.GEAR.astype(np.uint8) * 255)
         for row in ROWS:
             if options.only and options.only not in row.name:
                 continue
-            results[row.name] = figures = measure(row, count, looker)
+            results[row.name] = figures = measure(row, count, looker, folder)
             if row.name in old:
                 rows.append(cells(row.name, options.beside.stem, old[row.name]))
             rows.append(cells("" if row.name in old else row.name, "now", figures))

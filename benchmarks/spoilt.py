@@ -10,6 +10,7 @@ from functools import cache
 import cv2
 import numpy as np
 from common import CAMERA, Picture, marker_pose, true_corners
+from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project, undistort
@@ -48,31 +49,59 @@ def overexposed(picture: Picture, T: Array, rng: Rng) -> Picture:
 
 
 def highlight(picture: Picture, T: Array, rng: Rng) -> Picture:
-    """A lamp in a glossy print, over a corner of the marker that is seen."""
+    """Light that a glossy print throws back, far beyond white, over a corner of the marker that is
+    in the picture: a tenth to a quarter of a side in radius."""
     large = true_corners(T, "large")
     h, w = picture.shape
     whole = bool((large > 0).all() and (large < (w, h)).all())
     corners = large if whole else true_corners(T, "small")
     side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean())
     corner = corners[rng.integers(4)]
-    middle = corner + (corners.mean(axis=0) - corner) * rng.uniform(-0.05, 0.2)
+    centre = corner + (corners.mean(axis=0) - corner) * rng.uniform(-0.05, 0.15)
+    radius = side * rng.uniform(0.1, 0.25) * np.array([1.0, rng.uniform(0.6, 1.0)])
+    angle = rng.uniform(0.0, math.pi)
     x, y = _grid(picture)
-    radius = np.hypot(x - middle[0], y - middle[1]) / (side * rng.uniform(0.1, 0.25))
-    return _bytes(picture + GLARE * 0.5 * (1.0 - np.tanh((radius - 1.0) / 0.12)))
+    x, y = x - centre[0], y - centre[1]
+    u = (x * math.cos(angle) + y * math.sin(angle)) / radius[0]
+    v = (y * math.cos(angle) - x * math.sin(angle)) / radius[1]
+    return _bytes(picture + GLARE * 0.5 * (1.0 - np.tanh((np.hypot(u, v) - 1.0) / 0.12)))
+
+
+def gear_mask(rng: Rng) -> NDArray[np.bool_]:
+    """Where the vehicle itself is in the picture (h, w): a leg from one side, another one
+    from below, and a propeller guard's arc in a corner."""
+    w, h = CAMERA.size_px
+    drawn = np.zeros((h, w), np.uint8)
+    left = bool(rng.integers(2))
+    x0 = 0 if left else w - 1
+    reach = int(rng.uniform(0.3, 0.45) * w)
+    y0, y1 = int(rng.uniform(0.2, 0.8) * h), int(rng.uniform(0.3, 0.7) * h)
+    cv2.line(drawn, (x0, y0), (x0 + (reach if left else -reach), y1), 255, int(rng.uniform(14, 34)))
+    x2, x3 = int(rng.uniform(0.2, 0.8) * w), int(rng.uniform(0.3, 0.7) * w)
+    up = int(rng.uniform(0.25, 0.4) * h)
+    cv2.line(drawn, (x2, h - 1), (x3, h - 1 - up), 255, int(rng.uniform(14, 34)))
+    centre = (int(rng.choice((0, w))), 0)
+    cv2.circle(drawn, centre, int(rng.uniform(0.15, 0.25) * w), 255, 12)
+    return drawn > 0
+
+
+GEAR = gear_mask(np.random.default_rng(7))
+"""One vehicle's, for a camera that knows it."""
 
 
 def gear(picture: Picture, T: Array, rng: Rng) -> Picture:
-    """A leg of the vehicle from one side and another from below, dark."""
-    h, w = picture.shape
-    share = np.zeros(picture.shape, np.float32)
-    start = int(rng.choice((0, w - 1))), int(rng.uniform(0.2, 0.8) * h)
-    reach = rng.uniform(0.3, 0.45)
-    end = int(w * (reach if start[0] == 0 else 1.0 - reach)), int(rng.uniform(0.3, 0.7) * h)
-    cv2.line(share, start, end, 1.0, int(rng.uniform(12, 30)), cv2.LINE_AA)
-    x0, x1 = (int(rng.uniform(0.2, 0.8) * w) for _ in range(2))
-    top = int(h * rng.uniform(0.6, 0.75))
-    cv2.line(share, (x0, h - 1), (x1, top), 1.0, int(rng.uniform(12, 30)), cv2.LINE_AA)
-    share = np.asarray(cv2.GaussianBlur(share, (0, 0), 1.0))
+    """Legs and guards of a vehicle of its own in each picture."""
+    return _with_gear(picture, gear_mask(rng), rng)
+
+
+def known_gear(picture: Picture, T: Array, rng: Rng) -> Picture:
+    return _with_gear(picture, GEAR, rng)
+
+
+def _with_gear(picture: Picture, covered: NDArray[np.bool_], rng: Rng) -> Picture:
+    """Dark, with soft edges that are within the mask."""
+    inner = cv2.erode(covered.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float32)
+    share = cv2.GaussianBlur(inner, (0, 0), 0.8)
     own = GEAR_GREY + rng.normal(0.0, 2.0, picture.shape)
     return _bytes(picture * (1.0 - share) + own * share)
 
