@@ -35,7 +35,8 @@ VIEWS: dict[str, tuple[float, ...]] = {
     "near": (0.10, 0.005, -0.003, 0.04, 0.03, -1.0),
     "away": (0.5, 2.5, 2.0, 0.0, 0.0, 0.0),
 }
-STAGE_OF = {"far": "both", "both": "both", "near": "small", "away": "none"}
+# Of the large marker, "near" shows two thirds.
+STAGE_OF = {"far": "both", "both": "both", "near": "both", "away": "none"}
 
 
 def camera() -> CameraModel:

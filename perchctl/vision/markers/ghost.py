@@ -37,16 +37,19 @@ def with_ghosts(now: Detections, image: NDArray[np.uint8]) -> Detections:
     if velocity is not None and float(np.hypot(*velocity)) < SLOW_PX_S:
         return now
     seen = [d for name in MARKERS if (d := now.get(name)) is not None]
-    if any(d.cov_px2 is not None for d in seen):
-        return now  # sides that are outside of the picture show nothing
-    ghost_px = max((double_edge_px(image, d) for d in seen), default=0.0)
+    # Sides that are outside of the picture show nothing.
+    ghost_px = max((double_edge_px(image, d) for d in seen if d.cov_px2 is None), default=0.0)
     if ghost_px == 0.0:
         return now
-    # The middle of both steps is where the edge was at the middle moment, but an edge
-    # fit may hold to one of them.
-    wider = {d.marker: replace(d, sigma_px=float(np.hypot(d.sigma_px, ghost_px / 4.0)))
-             for d in seen}  # fmt: skip
+    wider = {d.marker: _wider(d, ghost_px / 4.0) for d in seen}
     return replace(now, large=wider.get("large"), small=wider.get("small"), ghost_px=ghost_px)
+
+
+def _wider(d: Detection, sigma_px: float) -> Detection:
+    """The middle of both steps is where the edge was at the middle moment, but an edge fit may
+    hold to one of them."""
+    cov_px2 = None if d.cov_px2 is None else d.cov_px2 + sigma_px**2 * np.eye(8)
+    return replace(d, sigma_px=float(np.hypot(d.sigma_px, sigma_px)), cov_px2=cov_px2)
 
 
 def double_edge_px(image: NDArray[np.uint8], marker: Detection) -> float:

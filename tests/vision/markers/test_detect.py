@@ -102,9 +102,25 @@ def test_foreign_markers_are_not_taken() -> None:
     assert found.small is None
 
 
-def test_a_measured_shift_of_all_edges_holds_for_some_more_pictures() -> None:
+def grown(grey: np.ndarray, clipped: bool) -> np.ndarray:
+    """White that has grown over black: by a tone curve, or by all that is lost above white."""
+    tone = grey * 1.7 if clipped else 240.0 * (grey / 205.0) ** 0.5
+    return np.clip(tone, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("clipped", "wanted"),
+    [
+        (False, [0, 1, 2, 3, 4, 0, 1]),
+        # By how much depends on the place's own light, that is not in the picture any more.
+        (True, [0] * 7),
+    ],
+)
+def test_a_measured_shift_of_all_edges_holds_for_some_more_pictures(
+    clipped: bool, wanted: list[int]
+) -> None:
     pose = pose_of(0.02, 0.01, 0.5, 0.6)
-    bright = np.clip(render(*pose, blur_px=0.9) * 1.7, 0, 255).astype(np.uint8)
+    bright = grown(render(*pose, blur_px=0.9).astype(np.float64), clipped)
     true = project(square(0.150), *pose, CAMERA)
     before, ages = None, []
     for k in range(7):
@@ -114,7 +130,7 @@ def test_a_measured_shift_of_all_edges_holds_for_some_more_pictures() -> None:
         assert before.large is not None
         assert np.abs(before.large.corners_px - true).max() < 0.08
         ages.append(before.edge_shift.age)
-    assert ages == [0, 1, 2, 3, 4, 0, 1]
+    assert ages == wanted
 
 
 def snapshot(value: Any) -> Any:
