@@ -41,6 +41,11 @@ LATE_S = 0.25
 """A loop, telemetry or vehicle that is later than this was starved of the processor."""
 
 
+def in_ci(test: Callable[..., None]) -> Callable[..., None]:
+    """Run by `.ci/run` behind the suite, which has no time for it."""
+    return pytest.mark.campaign(pytest.mark.guard(test))
+
+
 def say_fly(*arguments: str) -> tuple[list[str], dict[str, str]]:
     command = [sys.executable, "-m", "perchctl", "fly", "-p", SHORT, *arguments]
     clean = {k: v for k, v in os.environ.items() if k != "CFLIB_URI"}
@@ -191,6 +196,7 @@ def flying_until(phase: str, sim: SimProcess, folder: Path) -> Iterator[subproce
             process.kill()
 
 
+@in_ci
 def test_ctrl_c_in_flight_lands(tmp_path: Path) -> None:
     def once(folder: Path) -> tuple[int, str, dict[str, Any], FlightLog, bool]:
         with vehicle(folder) as own, flying_until("ALIGN", own.sim, folder) as process:
@@ -252,6 +258,7 @@ def test_kill_9_in_flight_leaves_a_log_and_a_vehicle_that_ends_by_itself(tmp_pat
     assert min(held) > 0.2  # until then it hovers
 
 
+@in_ci
 def test_a_terminal_that_is_closed_in_flight_lands(tmp_path: Path) -> None:
     """A hang-up, and from then on each write to the terminal fails."""
     with vehicle(tmp_path) as own:
@@ -290,6 +297,7 @@ def test_a_terminal_that_is_closed_in_flight_lands(tmp_path: Path) -> None:
     assert log.summary["cause"] == "operator"
 
 
+@in_ci
 def test_a_simulator_that_is_starved_is_named_for_the_abort(tmp_path: Path) -> None:
     """As on a busy computer: its process gets no time for a while."""
     command, environment = say_fly("--seed", str(SEED), "--log-dir", str(tmp_path))
