@@ -22,7 +22,7 @@ from common import (
 )
 
 from perchctl.geometry import Array
-from perchctl.pipeline import step
+from perchctl.pipeline import FieldState, pictures, step
 from perchctl.vision.markers.detect import detect
 from perchctl.vision.types import Attitude, Detections, Frame, PipelineOutput, PipelineState
 
@@ -66,7 +66,7 @@ def main() -> None:
     frames = list(sequence(120 if quick else 420))
     visible = {n: [in_view(true_corners(T, n)) for _, _, T in frames] for n in ("large", "small")}
     last: Detections | None = None
-    state = PipelineState()
+    state, stream = PipelineState(), FieldState()
     setup = setup_with()
     errors = []
 
@@ -80,8 +80,9 @@ def main() -> None:
         return {"large": seen.large, "small": seen.small}
 
     def whole(k: int, attitude: Attitude | None) -> dict[str, object]:
-        nonlocal state
-        state, output = step(state, frames[k][0], attitude, setup)
+        nonlocal state, stream
+        stream, (frame,) = pictures(stream, frames[k][0], setup)
+        state, output = step(state, frame, attitude, setup)
         return {"large": output.detections.large, "small": output.detections.small, "all": output}
 
     rows = []
@@ -93,7 +94,7 @@ def main() -> None:
         ("frame to target pose", lambda k: whole(k, frames[k][1])),
         ("the same without attitude", lambda k: whole(k, None)),
     ):
-        state = PipelineState()
+        state, stream = PipelineState(), FieldState()
         times, found = timed(len(frames), work)
         if work is plain:
             base = np.percentile(times, [50, 99])

@@ -30,6 +30,11 @@ R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
 """Maps target axes into OpenCV's marker axes (and back: it is its own inverse)."""
 
 
+def finite(values: Array) -> bool:
+    """Whether all values are (none so great that their sum is not)."""
+    return math.isfinite(values.sum())
+
+
 def wrap_rad(angle_rad: float) -> float:
     """The same angle in (-pi, pi]."""
     return -((-angle_rad + math.pi) % (2.0 * math.pi) - math.pi)

@@ -8,7 +8,9 @@ out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from perchctl.vision.merge import stage_of
 from perchctl.vision.places import seen_from, to_level, to_world
 from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners
+from perchctl.vision.solve import Candidate
 from perchctl.vision.strategies import Merged, MergeStrategy, Prior, make_strategy
 from perchctl.vision.tracks import TrackSetup, followed_on, make_track_setup
 from perchctl.vision.types import (
@@ -31,6 +34,7 @@ from perchctl.vision.types import (
     CameraModel,
     Detections,
     Frame,
+    PictureKind,
     PipelineOutput,
     PipelineState,
     Sighting,
@@ -132,22 +136,33 @@ def step(
     `pictures` makes of a stream's; one that was not looked at there is looked at here.
     """
     frame = looked_at(frame, pipeline.fields)
-    expected, _ = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
+    expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
     # A first picture is searched by all means.
     first = state.last is None and state.stranger is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
     detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, empty)
-    new, output = follow(state, detections, attitude, pipeline)
-    return new, replace(output, fields=frame.fields or "whole")
+    return _followed(state, detections, near, attitude, pipeline, frame.fields or "whole")
 
 
 def follow(
     state: PipelineState, detections: Detections, attitude: Attitude | None, pipeline: Pipeline
 ) -> tuple[PipelineState, PipelineOutput]:
     """`step` from the corners on: what a picture gave, at its time."""
+    _, near = expected_corners(state.sighting, detections.t_s, attitude, pipeline.pose)
+    return _followed(state, detections, near, attitude, pipeline)
+
+
+def _followed(
+    state: PipelineState,
+    detections: Detections,
+    near: Candidate | None,
+    attitude: Attitude | None,
+    pipeline: Pipeline,
+    fields: PictureKind = "whole",
+) -> tuple[PipelineState, PipelineOutput]:
+    """`near` is the pose that is expected."""
     sighting, t_s = state.sighting, detections.t_s
-    _, near = expected_corners(sighting, t_s, attitude, pipeline.pose)
-    normal = None if sighting is None else normal_cam(sighting.pose)
+    normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
     measured = pipeline.strategy.measure(detections, Prior(attitude, near, normal))
 
     in_world = pipeline.kalman.frame == "world" and attitude is not None
@@ -184,6 +199,7 @@ def follow(
         stage=stage_of(detections.large is not None, detections.small is not None),
         disagreeing_frames=disagreeing,
         lock_note=followed.note or (SEVERAL if detections.targets > 1 else ""),
+        fields=fields,
     )
     return replace(new, target=target or state.target), output
 
@@ -212,7 +228,9 @@ def estimate(
     tracks = {n: predicted(t, t_s, pipeline.tracks.world) for n, t in state.tracks.items()}
     merged = pipeline.strategy.merge(tracks, state.measured.fed)
     assert merged is not None
-    return _in_world(merged, target, t_s, attitude, pipeline)
+    sigma_yaw_rad = math.sqrt(max(merged.var_yaw_rad2, 0.0))
+    place = _in_world(merged, attitude, pipeline)
+    return replace(target, t_s=t_s, sigma_yaw_rad=sigma_yaw_rad, **place)
 
 
 def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
@@ -231,7 +249,11 @@ def _at_frame(state: PipelineState, t_s: float, pipeline: Pipeline) -> TargetEst
     measured = any(n in state.tracks and state.tracks[n].t_s == t_s for n in fed)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
-    base = TargetEstimate(
+    if attitude is not None and state.in_world:
+        place = _in_world(merged, attitude, pipeline)
+    else:
+        place = _level(merged, attitude, pipeline)
+    return TargetEstimate(
         t_s=t_s,
         measured_s=t_s if measured else never if before is None else before.measured_s,
         small_measured_s=t_s if small else never if before is None else before.small_measured_s,
@@ -239,40 +261,42 @@ def _at_frame(state: PipelineState, t_s: float, pipeline: Pipeline) -> TargetEst
         measured=measured,
         tracked=True,
         unseen=merged.unseen,
-        e_m=merged.vector[:3],
-        e_yaw_rad=float(merged.vector[3]),
-        velocity_mps=merged.velocity_mps,
-        sigma_m=_sigma(merged.cov_m2, merged.bias_m),
-        sigma_yaw_rad=float(np.sqrt(max(merged.var_yaw_rad2, 0.0))),
+        sigma_yaw_rad=math.sqrt(max(merged.var_yaw_rad2, 0.0)),
+        **place,
     )
-    if attitude is None:
-        return base
-    if state.in_world:
-        return _in_world(merged, base, t_s, attitude, pipeline)
-    world_m, world_yaw_rad = to_world(base.e_m, base.e_yaw_rad, attitude, pipeline.pose)
-    return replace(base, world_m=world_m, world_yaw_rad=world_yaw_rad)
 
 
-def _in_world(
-    merged: Merged,
-    base: TargetEstimate,
-    t_s: float,
-    attitude: Attitude,
-    pipeline: Pipeline,
-) -> TargetEstimate:
-    """`base` with place and motion of world tracks, as seen from the vehicle at `attitude`."""
+def _level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dict[str, Any]:
+    """Place and motion of tracks in the level frame, as a `TargetEstimate` has them."""
+    e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
+    world_m, world_yaw_rad = None, None
+    if attitude is not None:
+        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, pipeline.pose)
+    return {
+        "e_m": e_m,
+        "e_yaw_rad": e_yaw_rad,
+        "velocity_mps": merged.velocity_mps,
+        "sigma_m": _sigma(merged.cov_m2, merged.bias_m),
+        "world_m": world_m,
+        "world_yaw_rad": world_yaw_rad,
+    }
+
+
+def _in_world(merged: Merged, attitude: Attitude, pipeline: Pipeline) -> dict[str, Any]:
+    """The same of tracks in the world, as seen from the vehicle at `attitude`."""
     turn = rot_z(-attitude.yaw_rad)
     bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
-    target = replace(
-        base,
-        velocity_mps=turn @ merged.velocity_mps,
-        sigma_m=_sigma(turn @ merged.cov_m2 @ turn.T, bias_m),
-        sigma_yaw_rad=float(np.sqrt(max(merged.var_yaw_rad2, 0.0))),
-        world_m=merged.vector[:3],
-        world_yaw_rad=float(merged.vector[3]),
-        world_velocity_mps=merged.velocity_mps,
-    )
-    return _carried(target, t_s, attitude, pipeline)
+    world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
+    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)
+    return {
+        "e_m": e_m,
+        "e_yaw_rad": e_yaw_rad,
+        "velocity_mps": turn @ merged.velocity_mps,
+        "sigma_m": _sigma(turn @ merged.cov_m2 @ turn.T, bias_m),
+        "world_m": world_m,
+        "world_yaw_rad": world_yaw_rad,
+        "world_velocity_mps": merged.velocity_mps,
+    }
 
 
 def _carried(
@@ -286,5 +310,5 @@ def _carried(
 
 
 def _sigma(cov_m2: Array, bias_m: Array) -> Array:
-    variance = np.diag(cov_m2) + (bias_m**2).sum(axis=1)
+    variance = np.diagonal(cov_m2) + (bias_m * bias_m).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

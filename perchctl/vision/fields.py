@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.vision.types import Frame
+from perchctl.vision.types import Frame, PictureKind
 
 FieldsMode = Literal["auto", "top", "bottom", "progressive"]
 Grey = NDArray[np.uint8]
@@ -45,6 +45,7 @@ _GROUP = 8
 _STRONG = 5.0  # of the mean difference within a field, for one to count
 _LEAST_GREY = 8.0
 _FLOOR = 0.25  # grey^2 a pixel that noise may leave of strong differences
+_EVERY = 3
 _TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0  # a cubic's, half way
 
 _PERIODS_S = (1 / 30, 1 / 25)  # of NTSC and PAL frames
@@ -59,9 +60,11 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """What is known of a stream. `votes`: for the top field being the earlier one.
-    `top_first`: None until it is known. `previous`: the last picture, where it was combed."""
+    """What is known of a stream. `kind`: of the last frame that was looked at. `votes`: for the
+    top field being the earlier one. `top_first`: None until it is known. `previous`: the last
+    picture, where it was combed."""
 
+    kind: PictureKind | None = None
     votes: float = 0.0
     top_first: bool | None = None
     periods_s: tuple[float, ...] = ()
@@ -85,16 +88,20 @@ def combing(image: Grey) -> float:
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return 0.0
-    # Groups of rows side by side, so that the next row is `width` further along.
-    flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)
+    # Groups of rows side by side, so that the next row is `width` further along; every second
+    # group is enough.
+    flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)[::3]
     above2, above, row, below, below2 = (
         flat[:, k * width : (k + _GROUP - 4) * width] for k in range(5)
     )
-    other = cv2.absdiff(row, cv2.addWeighted(above, 0.5, below, 0.5, 0.0))
-    own = cv2.absdiff(row, cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0))
+    # In place: what a frame leaves in the processor's cache is what the next steps need.
+    other = cv2.addWeighted(above, 0.5, below, 0.5, 0.0)
+    own = cv2.addWeighted(above2, 0.5, below2, 0.5, 0.0)
+    cv2.absdiff(row, other, other)
+    cv2.absdiff(row, own, own)
     least = max(_STRONG * cv2.mean(own)[0], _LEAST_GREY)
     energy = [
-        cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO)[1], cv2.NORM_L2SQR)
+        cv2.norm(cv2.threshold(each, least, 0, cv2.THRESH_TOZERO, each)[1], cv2.NORM_L2SQR)
         for each in (other, own)
     ]
     return energy[0] / (energy[1] + _FLOOR * row.size)
@@ -145,9 +152,14 @@ def separated(
 
     The frame's time is the middle between its fields. `mode`: ``auto`` finds all by measure,
     ``top`` and ``bottom`` say that every frame is woven and which field is earlier,
-    ``progressive`` that none is.
+    ``progressive`` that none is. In a stream in which none was seen yet, every third frame
+    is looked at.
     """
+    if frame.fields is None and mode == "auto" and state.kind == "whole" and frame.index % _EVERY:
+        frame = replace(frame, fields="whole")
     frame = looked_at(frame, mode)
+    if state.kind != "woven":  # a stream of fields stays one
+        state = replace(state, kind=frame.fields)
     if frame.fields == "whole":
         return _timed(replace(state, previous=None), frame), (frame,)
     if mode in ("top", "bottom"):

@@ -15,37 +15,39 @@ size and its curl have moved each state. They change no gain, only what is claim
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import predict, update
 
-from perchctl.geometry import Array, wrap_rad
+from perchctl.geometry import Array, finite, wrap_rad
 from perchctl.profile import KalmanConfig
 from perchctl.vision.types import MarkerTrack
 
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
-MEASURED = [YAW, X, Y, Z]
-RATES = [YAW_RATE, VX, VY, VZ]
-POSITION = [X, Y, Z]
-VELOCITY = [VX, VY, VZ]
+MEASURED, RATES = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
+POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
 TILTS, PRINT = slice(0, 2), slice(2, 4)  # of the constant errors
 
 MAX_GAP_S = 1.0
 MAX_PREDICTION_S = 1.0
 """Beyond it the target is taken to stay where it was predicted."""
 
-H: Array = np.zeros((4, 8))
-H[range(4), MEASURED] = 1.0  # equation 2
+H: Array = np.eye(8)[MEASURED]  # equation 2
+_AXES: Array = np.eye(3)
+_STILL: Array = np.eye(8)
+_MOVES: Array = np.eye(8, k=1)
+_MOVES[RATES] = 0.0
 
 _CM = 0.01
 _DEG = math.radians(1.0)
-_LEAST_NOISE = np.array([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
+_LEAST_NOISE = np.diag([1e-4, 3e-5, 3e-5, 3e-5]) ** 2  # 0.006 deg, 0.03 mm: lens and print
+_YAW_FIRST = np.ix_([3, 0, 1, 2], [3, 0, 1, 2])
 _UNITS = np.array([_DEG, _DEG, _CM, _CM, _CM, _CM, _CM, _CM])  # of the paper, per state
 
 _PUSH_S = 0.1
 """How long an acceleration lasts: white noise of its square times this, (m/s^2)^2 s."""
-_WANDER = np.array([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
+_WANDER = np.diag([math.radians(0.1), 0.005, 0.005, 0.005]) ** 2
 """Of yaw, x, y and z of the state estimate: 0.1 deg and 5 mm in a second's random walk, as
 2 mm that are forgotten within 0.3 s look from one frame to the next."""
 _HEADING_RADPS2 = 0.1  # of the state estimate's heading
@@ -121,12 +123,9 @@ def make_filter(config: KalmanConfig, in_world: bool = False) -> FilterSetup:
 def pose_noise(cov: Array) -> Array | None:
     """R (4, 4) of a measured (yaw, x, y, z) from a pose's covariance of (x, y, z, yaw), None
     where that is not finite."""
-    if not np.isfinite(cov).all():
+    if not finite(cov):
         return None
-    order = [3, 0, 1, 2]
-    R = np.array(cov[np.ix_(order, order)])
-    R[range(4), range(4)] += _LEAST_NOISE
-    return R
+    return np.asarray(cov[_YAW_FIRST] + _LEAST_NOISE)
 
 
 def tilted(way_m: Array) -> Array:
@@ -137,9 +136,7 @@ def tilted(way_m: Array) -> Array:
 
 def transition(dt_s: float) -> Array:
     """F of equation 1, (8, 8)."""
-    F = np.eye(8)
-    F[MEASURED, RATES] = dt_s
-    return F
+    return _STILL + dt_s * _MOVES
 
 
 def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
@@ -147,18 +144,24 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
     noise = setup.process
     if noise is None:
         return setup.Q
-    density = np.zeros((4, 4))  # of yaw, x, y and z, as `MEASURED`
-    density[0, 0] = noise.heading_radps2**2
-    sideways = float(position_m @ position_m) * np.eye(3) - np.outer(position_m, position_m)
-    density[1:, 1:] = noise.acceleration_mps2**2 * np.eye(3) + noise.turn_radps2**2 * sideways
-    density *= _PUSH_S
-    Q = np.zeros((8, 8))
-    Q[np.ix_(MEASURED, MEASURED)] = density * dt_s**3 / 3.0
-    Q[np.ix_(MEASURED, RATES)] = Q[np.ix_(RATES, MEASURED)] = density * dt_s**2 / 2.0
-    Q[np.ix_(RATES, RATES)] = density * dt_s
+    pushed = _pushed(noise, position_m) * dt_s
+    Q = np.empty((8, 8))
+    Q[MEASURED, MEASURED] = pushed * (dt_s * dt_s / 3.0)
+    Q[MEASURED, RATES] = Q[RATES, MEASURED] = pushed * (dt_s / 2.0)
+    Q[RATES, RATES] = pushed
     if noise.wanders:
         Q[MEASURED, MEASURED] += _WANDER * dt_s
     return Q
+
+
+def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
+    """What a second adds to the rates of yaw, x, y and z, (4, 4)."""
+    turned2 = noise.turn_radps2**2
+    every_way = noise.acceleration_mps2**2 + turned2 * float(position_m @ position_m)
+    density = np.zeros((4, 4))
+    density[0, 0] = noise.heading_radps2**2
+    density[1:, 1:] = every_way * _AXES - turned2 * (position_m[:, None] * position_m)
+    return density * _PUSH_S
 
 
 def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
@@ -168,7 +171,7 @@ def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> Marker
     x[YAW] = wrap_rad(float(measured.z[0]))
     P = setup.P0.copy()
     if measured.R is not None:
-        P[np.ix_(MEASURED, MEASURED)] = measured.R
+        P[MEASURED, MEASURED] = measured.R
     bias = np.zeros((8, 4))
     if measured.bias is not None:
         bias[MEASURED] = measured.bias
@@ -193,14 +196,14 @@ def step_track(
     than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the
     track changes nothing. A gap beyond `MAX_GAP_S` in either direction starts afresh.
     """
-    if measured is not None and not np.isfinite(measured.z).all():
+    if measured is not None and not finite(measured.z):
         measured = None
     if not math.isfinite(t_s):
         return track
     if track is None:
         return None if measured is None else start_track(measured, t_s, setup)
     dt_s = t_s - track.t_s
-    if abs(dt_s) > MAX_GAP_S or not np.isfinite(track.x).all():
+    if abs(dt_s) > MAX_GAP_S or not finite(track.x):
         return None if measured is None else start_track(measured, t_s, setup)
     if dt_s <= 0.0:
         return track
@@ -215,8 +218,8 @@ def step_track(
     x[YAW] = wrap_rad(float(x[YAW]))
     bias = F @ track.bias
     if measured.bias is not None:
-        gain = np.linalg.solve(R, H @ P).T  # P H^T R^-1, with the P after the update
-        bias = bias + gain @ (measured.bias - H @ bias)
+        gain = np.linalg.solve(R, P[MEASURED]).T  # P H^T R^-1, with the P after the update
+        bias = bias + gain @ (measured.bias - bias[MEASURED])
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
 
 
@@ -225,7 +228,48 @@ def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
-    return replace(_moved(track, track.x, dt_s, setup), t_s=t_s)
+    return _moved(track, track.x, dt_s, t_s, track.unseen, setup)
+
+
+def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
+    """What a measurement at a later time should be, its R being what the track leaves open:
+    of `predicted` the part that is measured."""
+    dt_s, x = _ahead(track, t_s, setup)
+    P, noise = track.P, setup.process
+    R = P[MEASURED, MEASURED] + dt_s * (P[MEASURED, RATES] + P[RATES, MEASURED])
+    R += dt_s * dt_s * P[RATES, RATES]
+    if noise is None:
+        R += setup.Q[MEASURED, MEASURED] * (dt_s > 0.0)
+    else:
+        R += _pushed(noise, x[POSITION]) * (dt_s**3 / 3.0)
+        if noise.wanders:
+            R += _WANDER * dt_s
+    bias = track.bias[MEASURED] + dt_s * track.bias[RATES]
+    return Measurement(foreseen_z(track, t_s, setup), R, bias)
+
+
+def foreseen_z(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Array:
+    """The z (4,) of `foreseen` alone."""
+    dt_s, x = _ahead(track, t_s, setup)
+    z = x[MEASURED] + dt_s * x[RATES]
+    z[0] = wrap_rad(float(z[0]))
+    return np.asarray(z)
+
+
+def _ahead(track: MarkerTrack, t_s: float, setup: FilterSetup) -> tuple[float, Array]:
+    """How long to predict, and from which state."""
+    dt_s = max(min(t_s - track.t_s, MAX_PREDICTION_S), 0.0)
+    return dt_s, _drifting(track.x, setup) if dt_s > 0.0 else track.x
+
+
+def _drifting(x: Array, setup: FilterSetup) -> Array:
+    """The state, its speed being at most what the frame's drift is."""
+    speed_mps = math.hypot(*x[VELOCITY].tolist())
+    if speed_mps <= setup.drift_mps:
+        return x
+    x = x.copy()
+    x[VELOCITY] *= setup.drift_mps / speed_mps
+    return x
 
 
 def _coast(track: MarkerTrack, dt_s: float, t_s: float, setup: FilterSetup) -> MarkerTrack | None:
@@ -233,16 +277,15 @@ def _coast(track: MarkerTrack, dt_s: float, t_s: float, setup: FilterSetup) -> M
         return None
     x = track.x.copy()
     x[RATES] *= setup.alpha  # equation 3
-    return replace(_moved(track, x, dt_s, setup), t_s=t_s, unseen=track.unseen + 1)
+    return _moved(track, x, dt_s, t_s, track.unseen + 1, setup)
 
 
-def _moved(track: MarkerTrack, x: Array, dt_s: float, setup: FilterSetup) -> MarkerTrack:
-    """The track, its state being x, after `dt_s` without a measurement."""
-    speed_mps = float(np.linalg.norm(x[VELOCITY]))
-    if speed_mps > setup.drift_mps:
-        x = x.copy()
-        x[VELOCITY] *= setup.drift_mps / speed_mps
+def _moved(
+    track: MarkerTrack, x: Array, dt_s: float, t_s: float, unseen: int, setup: FilterSetup
+) -> MarkerTrack:
+    """The track, its state being x, after `dt_s` without a measurement: at `t_s`."""
+    x = _drifting(x, setup)
     F = transition(dt_s)
     x, P = predict(x, track.P, F=F, Q=process_noise(dt_s, x[POSITION], setup))
     x[YAW] = wrap_rad(float(x[YAW]))
-    return replace(track, x=x, P=P, bias=F @ track.bias)
+    return MarkerTrack(t_s=t_s, x=x, P=P, unseen=unseen, bias=F @ track.bias)

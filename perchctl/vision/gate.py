@@ -25,11 +25,10 @@ import numpy as np
 from perchctl.geometry import Array, wrap_rad
 from perchctl.vision.filter import (
     MAX_GAP_S,
-    MEASURED,
     FilterSetup,
-    H,
     Measurement,
-    predicted,
+    foreseen,
+    foreseen_z,
     start_track,
     step_track,
 )
@@ -46,6 +45,7 @@ _SAME_RANGE = 4.0  # standard deviations
 # What no covariance knows of: calibration, print, latency; beside it a share of the range.
 _LEAST_M, _LEAST_YAW_RAD = 0.01, math.radians(4.0)
 _SIDEWAYS, _ALONG = 0.015, 0.02
+_PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 # How a hovering vehicle moves relative to the target while its estimate jumps.
 _CALM_S, _CALM_MPS, _CALM_RADPS = 0.1, 0.3, 0.5
 
@@ -80,6 +80,8 @@ def judged(
     if stranger is not None and stranger.in_world != sight.in_world:
         stranger = None
     if lock is None or lock.in_world != sight.in_world or sight.t_s <= lock.track.t_s:
+        return Verdict(taken=True)
+    if stranger is None and _clearly(lock.track, sight, constants):
         return Verdict(taken=True)
     wanted = _expected(lock.track, sight.t_s, constants)
     fit = _misfit(wanted, sight, constants)
@@ -129,52 +131,69 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, afresh: bool) ->
 # --- how well a pose fits ----------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Fit:
-    """Squared distance in units of its spread; the same with what a vaguer claim costs; how far
-    away and how much farther up (m), and whether that alone is too much."""
+    """Squared distance in units of its spread S (4, 4); how far away and how much farther up
+    (m), and whether that alone is too much."""
 
     squared: float
-    cost: float
+    S: Array
     away_m: float
     farther_m: float
     another_range: bool
 
+    @property
+    def cost(self) -> float:
+        """The squared distance with what a vaguer claim costs."""
+        return self.squared + float(np.linalg.slogdet(self.S)[1])
 
-def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> MarkerTrack:
-    """The track at a later time, however late: what is not measured drifts."""
-    ahead = predicted(track, t_s, constants)
+
+def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> Measurement:
+    """What a measurement at a later time should be, however late: what is not measured
+    drifts."""
+    ahead = foreseen(track, t_s, constants)
     # The most that it drifts counts as three standard deviations.
     drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(t_s - track.t_s, 0.0)
-    wider = np.zeros((8, 8))
-    place = MEASURED[1:]
-    wider[place, place] = drift_m**2
-    return replace(ahead, P=ahead.P + wider)
+    assert ahead.R is not None
+    return replace(ahead, R=ahead.R + drift_m**2 * _PLACE)
 
 
-def _misfit(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> _Fit:
+def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
     measured = sight.measured
-    off = measured.z - H @ track.x
+    assert wanted.R is not None
+    assert wanted.bias is not None
+    off = measured.z - wanted.z
     off[0] = wrap_rad(float(off[0]))
-    bias = H @ track.bias
-    if measured.bias is not None:
-        bias = measured.bias - bias  # a constant error moves both
+    # A constant error moves both.
+    bias = wanted.bias if measured.bias is None else measured.bias - wanted.bias
     R = constants.R if measured.R is None else measured.R
-    S = H @ track.P @ H.T + R + bias @ bias.T + _unknown(float(np.linalg.norm(sight.pose.tvec_m)))
-    squared = float(off @ np.linalg.solve(S, off))
+    S = wanted.R + R + bias @ bias.T + np.diag(_unclaimed(_range_m(sight)) ** 2)
     return _Fit(
-        squared=squared,
-        cost=squared + float(np.linalg.slogdet(S)[1]),
+        squared=float(off @ np.linalg.solve(S, off)),
+        S=S,
         away_m=float(np.linalg.norm(off[1:])),
         farther_m=float(off[3]),
         another_range=bool(off[3] ** 2 > _SAME_RANGE**2 * S[3, 3]),
     )
 
 
-def _unknown(range_m: float) -> Array:
-    """Variances of (yaw, x, y, z) that no pose claims."""
+def _clearly(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
+    """Whether what no pose claims explains it all, as in most frames: no other spread can
+    make that too little."""
+    off = sight.measured.z - foreseen_z(track, sight.t_s, constants)
+    off[0] = wrap_rad(float(off[0]))
+    off /= _unclaimed(_range_m(sight))
+    return float(off @ off) <= _GATE
+
+
+def _range_m(sight: Sight) -> float:
+    return math.hypot(*sight.pose.tvec_m.tolist())
+
+
+def _unclaimed(range_m: float) -> Array:
+    """Spread of (yaw, x, y, z) that no pose claims."""
     sideways_m, along_m = _LEAST_M + _SIDEWAYS * range_m, _LEAST_M + _ALONG * range_m
-    return np.diag([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m]) ** 2
+    return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
 def _goes_on(lock: Lock, sight: Sight) -> bool:
@@ -182,12 +201,12 @@ def _goes_on(lock: Lock, sight: Sight) -> bool:
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False
-    range_m = float(np.linalg.norm(sight.pose.tvec_m))
+    range_m = _range_m(sight)
     off = np.array([wrap_rad(sight.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
     off[1:] = sight.pose.e_m - lock.pose.e_m
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
-    S = _unknown(range_m) + np.diag([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m]) ** 2
-    return float(off @ np.linalg.solve(S, off)) <= _GATE
+    moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
+    return float((off * off / (_unclaimed(range_m) ** 2 + moved * moved)).sum()) <= _GATE
 
 
 # --- strangers ---------------------------------------------------------------------

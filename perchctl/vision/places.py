@@ -16,9 +16,9 @@ def to_world(
 ) -> tuple[Array, float]:
     """Place (3,) and heading in the world of the state estimate, from those relative to the
     gear in the level frame."""
-    gear_level = level_rotation(attitude) @ setup.gear_body_m
-    position = np.asarray(attitude.position_m) + rot_z(attitude.yaw_rad) @ (e_m + gear_level)
-    return position, wrap_rad(e_yaw_rad + attitude.yaw_rad)
+    way_m = e_m + level_rotation(attitude) @ setup.gear_body_m
+    position_m = np.asarray(attitude.position_m) + rot_z(attitude.yaw_rad) @ way_m
+    return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
 
 
 def to_level(
@@ -38,23 +38,27 @@ def measurement(
     setup: PoseSetup,
 ) -> Measurement:
     """What a pose tells a track in the world (with an attitude), or in the level frame."""
-    turn, way = np.eye(3), pose.e_m
-    z = np.array([pose.e_yaw_rad, *pose.e_m])
+    z, turn = np.empty(4), None
+    z[0], z[1:], way_m = pose.e_yaw_rad, pose.e_m, pose.e_m
     if in_world:
         assert attitude is not None
-        position, yaw = to_world(pose.e_m, pose.e_yaw_rad, attitude, setup)
-        turn, way = rot_z(attitude.yaw_rad), pose.e_m + level_rotation(attitude) @ setup.gear_body_m
-        z = np.array([yaw, *position])
+        turn = np.eye(4)
+        turn[:3, :3] = rot_z(attitude.yaw_rad)
+        way_m = pose.e_m + level_rotation(attitude) @ setup.gear_body_m
+        z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
+        z[1:] = turn[:3, :3] @ way_m + attitude.position_m
     if constants.process is None or pose.cov is None:
         return Measurement(z)
-    turned, noise = np.eye(4), pose.cov.copy()
-    turned[:3, :3] = turn
+    noise = pose.cov.copy()
     noise[:3, :3] -= pose.print_m @ pose.print_m.T
     bias = np.zeros((4, 4))
-    bias[1:, PRINT] = turn @ pose.print_m
+    bias[1:, PRINT] = pose.print_m
     if attitude is not None:
-        bias[1:, TILTS] = turn @ tilted(way) * constants.tilt_sigma_rad
-    return Measurement(z, pose_noise(turned @ noise @ turned.T), bias)
+        bias[1:, TILTS] = tilted(way_m) * constants.tilt_sigma_rad
+    if turn is not None:
+        noise = turn @ noise @ turn.T
+        bias[1:] = turn[:3, :3] @ bias[1:]
+    return Measurement(z, pose_noise(noise), bias)
 
 
 def seen_from(bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: PoseSetup) -> Array:

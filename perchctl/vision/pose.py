@@ -13,12 +13,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import cv2
 import numpy as np
 
-from perchctl.geometry import R_MARKER_TARGET, Array, rotation_from_rpy, yaw_of
+from perchctl.geometry import R_MARKER_TARGET, Array, finite, rotation_from_rpy, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.solve import (
@@ -33,7 +34,7 @@ from perchctl.vision.solve import (
     mirror_solution,
     solve,
 )
-from perchctl.vision.types import Attitude, CameraModel, Detection, MarkerName, MarkerPose
+from perchctl.vision.types import MARKERS, Attitude, CameraModel, Detection, MarkerName, MarkerPose
 
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
@@ -64,6 +65,11 @@ class PoseSetup:
     readout_s: float | None = 0.0  # of the camera's shutter; None: not known
     size_sigma: float = 0.0  # of the printed sizes, a share of them
     curl_per_m: float = 0.0  # of the sheet: lift over the square of the way from its centre
+
+    @cached_property
+    def all_points(self) -> Array:
+        """Of both markers, the large one's first, (8, 3)."""
+        return np.concatenate([self.object_points[name] for name in MARKERS])
 
 
 def make_pose_setup(
@@ -108,7 +114,7 @@ def estimate_pose(
     attitude: Attitude | None,
     setup: PoseSetup,
     previous_normal_cam: Array | None = None,
-    start: MarkerPose | None = None,
+    start: Candidate | None = None,
 ) -> MarkerPose | None:
     """The pose from one marker's corners, or from both markers' corners at once.
 
@@ -138,23 +144,23 @@ def estimate_pose(
 def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
     """The corners through a pinhole, None where the lens cannot have imaged them."""
     if len(detections) > 1:
-        object_m = np.concatenate([setup.object_points[d.marker] for d in detections])
+        object_m = setup.all_points
         raw_px = np.concatenate([d.corners_px for d in detections])
     else:
         object_m, raw_px = setup.object_points[detections[0].marker], detections[0].corners_px
     image_px = undistort_px(raw_px, setup.camera)
-    if not np.isfinite(image_px).all():
+    if not finite(image_px):
         return None
     return make_points(detections, object_m, image_px, setup.camera.K)
 
 
 def _continued(
-    points: Points, start: MarkerPose | None, prior: TiltPrior, config: PoseConfig
+    points: Points, start: Candidate | None, prior: TiltPrior, config: PoseConfig
 ) -> Scored | None:
     """The solution next to a start, None where there is none that fits."""
     if start is None or not config.refine:
         return None
-    solution = gauss_newton(points, Candidate(start.rvec_rad, start.tvec_m))
+    solution = gauss_newton(points, start)
     if solution is None or not _fits(solution, config) or prior.contradicts(solution):
         return None
     return solution
@@ -184,8 +190,8 @@ def _level_pose(
     """The solution, relative to the gear in the level frame, with its covariance there."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body @ R_body_cam
-    cov, chi2, curl = covariance(points, solution)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
+    cov, chi2, curl = covariance(points, solution, R[:, 2])
     e_m = R_level_body @ (R_body_cam @ solution.tvec + t_body_cam_m - setup.gear_body_m)
     heading = R_level_cam @ R @ R_MARKER_TARGET
     G = np.zeros((4, 6))  # change of (e, e_yaw) with (rvec, tvec)
@@ -193,8 +199,9 @@ def _level_pose(
     G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
     cov_e = G @ cov @ G.T
     # A target that is larger by a share is farther away by that share of the way to it.
-    size_m = setup.size_sigma * (R_level_cam @ solution.tvec)
-    print_m = np.stack([size_m, setup.curl_per_m * (G[:3] @ curl)], axis=1)
+    print_m = np.empty((3, 2))
+    print_m[:, 0] = setup.size_sigma * (R_level_cam @ solution.tvec)
+    print_m[:, 1] = setup.curl_per_m * (R_level_cam @ curl[3:])
     cov_e[:3, :3] += print_m @ print_m.T
     variance = np.maximum(np.diagonal(cov_e), 0.0)
     return MarkerPose(

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from perchctl.geometry import Array
+from perchctl.geometry import Array, finite
 from perchctl.vision.types import Detection
 
 Solver = Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"]
@@ -37,6 +37,7 @@ _MIN_SCORE_SIGMA_PX = 0.05  # lens and print set a floor to what residuals can s
 _MAX_STEPS = 8
 _TRUST = 8.0  # degrees of freedom that the claimed spread is worth beside the residuals
 
+_SMALL_GAIN, _SMALL_STEP = 1.0, 0.005  # rad and m
 _BEFORE = np.array([3, 0, 1, 2])
 _START = np.arange(4)  # side k runs from corner k ...
 _END = np.array([1, 2, 3, 0])  # ... to corner k + 1
@@ -99,26 +100,22 @@ class Points:
 def make_points(
     detections: Sequence[Detection], object_m: Array, image_px: Array, K: Array
 ) -> Points:
-    n = len(image_px)
-    W = np.zeros((2 * n, 2 * n))
-    shift = np.zeros((2 * n, 2 + 2 * len(detections)))
-    sigma_px = np.empty(n)
+    n, m = len(image_px), len(detections)
+    W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
+    corners_px = image_px.reshape(m, 4, 2)
+    normals = _outward_normals(corners_px)
+    sigma_px = np.array([d.sigma_px for d in detections])
+    # A corner moves a pixel along the normals of both of its sides.
+    moved = (normals + normals.take(_BEFORE, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
-        rows = slice(8 * i, 8 * i + 8)
-        corners = image_px[4 * i : 4 * i + 4]
-        sigma_px[4 * i : 4 * i + 4] = d.sigma_px
-        nx, ny = _outward_normals(corners)
+        rows, corners = slice(8 * i, 8 * i + 8), corners_px[i]
+        shift[rows, 0] = d.shift_sigma_px * moved[i]
         if d.cov_px2 is not None:
             W[rows, rows] = _whitened(d.cov_px2)
         elif d.refined:
-            W[rows, rows] = _line_whitening(nx, ny, d.sigma_px)
+            W[_ROWS + 8 * i, _COLUMNS + 8 * i] = _of_lines(normals[i], d.sigma_px)
         else:
             W[range(8 * i, 8 * i + 8), range(8 * i, 8 * i + 8)] = 1.0 / d.sigma_px
-        if d.shift_sigma_px > 0.0:
-            # A corner moves a pixel along the normals of both of its sides.
-            moved = np.empty((4, 2))
-            moved[:, 0], moved[:, 1] = nx + nx[_BEFORE], ny + ny[_BEFORE]
-            shift[rows, 0] = d.shift_sigma_px * moved.ravel()
         if d.common_px is not None:
             shift[rows, 1] = d.common_px.ravel()
         if d.row_sigma_px > 0.0:
@@ -128,16 +125,19 @@ def make_points(
             along_x = slice(8 * i, 8 * i + 8, 2)
             shift[along_x, 2 + 2 * i] = 0.5 * d.row_sigma_px
             shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_sigma_px * down
-    return Points(object_m, image_px, sigma_px, W, W @ shift, K)
+    return Points(object_m, image_px, sigma_px.repeat(4), W, W @ shift, K)
 
 
-def _outward_normals(corners: Array) -> tuple[Array, Array]:
-    """Unit normals of the four sides, out of the square whichever way round it is."""
-    side = corners[_END] - corners
-    length = np.maximum(np.hypot(side[:, 0], side[:, 1]), 1e-9)
-    nx, ny = side[:, 1] / length, -side[:, 0] / length
-    turn = side[0, 0] * side[1, 1] - side[0, 1] * side[1, 0]
-    return (nx, ny) if turn > 0.0 else (-nx, -ny)
+def _outward_normals(corners: Array) -> Array:
+    """Unit normals (m, 4, 2) of the sides of m squares, whichever way round these are."""
+    side = corners.take(_END, axis=1) - corners
+    x, y = side[..., 0], side[..., 1]
+    length = np.maximum(np.hypot(x, y), 1e-9)
+    length = np.copysign(length, (x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1])[:, None])
+    normals = np.empty_like(side)
+    np.divide(y, length, out=normals[..., 0])
+    np.divide(x, -length, out=normals[..., 1])
+    return normals
 
 
 def _whitened(cov_px2: Array) -> Array:
@@ -148,13 +148,12 @@ def _whitened(cov_px2: Array) -> Array:
         return np.diag(1.0 / np.sqrt(np.maximum(np.diagonal(cov_px2), 1e-6)))
 
 
-def _line_whitening(nx: Array, ny: Array, sigma_px: float) -> Array:
-    """(8, 8): offset and tilt of each side from the corners' errors."""
-    W = np.zeros((8, 8))
-    offset, tilt = 1.0 / sigma_px, 1.0 / (math.sqrt(3.0) * sigma_px)
-    across = np.concatenate([nx, ny])
-    W[_ROWS, _COLUMNS] = np.concatenate([offset * across] * 2 + [-tilt * across, tilt * across])
-    return W
+def _of_lines(normals: Array, sigma_px: float) -> Array:
+    """Whitening of the corners of four fitted lines with normals (4, 2), by the offset and the
+    tilt of each, at `_ROWS` and `_COLUMNS`."""
+    across = normals.T.ravel() / sigma_px
+    tilt = across / math.sqrt(3.0)
+    return np.concatenate([across, across, -tilt, tilt])
 
 
 def solve(points: Points, solver: Solver, refine: bool, prior: TiltPrior) -> Scored | None:
@@ -195,8 +194,13 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
             step = np.linalg.solve(A.T @ A, g)
         except np.linalg.LinAlgError:
             return None
-        # What the step would still gain, in squared standard deviations.
-        if float(step @ g) < 1e-4 + 1e-6 * cost:
+        gain = float(step @ g)  # of the step, in squared standard deviations
+        if gain < _SMALL_GAIN and float(np.abs(step).max()) < _SMALL_STEP:
+            # Errors are linear in such a step.
+            error_px = scored.error_px - (scored.jacobian @ step).reshape(-1, 2)
+            rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]
+            return Scored(rvec, tvec, error_px, scored.jacobian)
+        if gain < 1e-4 + 1e-6 * cost:
             return scored
         candidate, before = Candidate(candidate.rvec - step[:3], candidate.tvec - step[3:]), cost
         if not _usable(candidate):
@@ -204,7 +208,7 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
     return None
 
 
-def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
+def covariance(points: Points, scored: Scored, normal_cam: Array) -> tuple[Array, float, Array]:
     """Of (rvec, tvec), (6, 6), the squared error per degree of freedom, and by how much the
     sheet's curl moves them, (6,), of a place r from its centre being r^2 off its plane.
 
@@ -221,9 +225,8 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
     growth = max((_TRUST + chi2) / (_TRUST + freedom), 0.7)
     common = inverse @ (A.T @ points.shift)
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
-    normal = cv2.Rodrigues(scored.rvec)[0][:, 2]
     lift = (points.object_m[:, :2] ** 2).sum(axis=1)
-    lifted = (scored.jacobian[:, 3:] @ normal) * lift.repeat(2)
+    lifted = (scored.jacobian[:, 3:] @ normal_cam) * lift.repeat(2)
     curl = inverse @ (A.T @ (points.whitening @ lifted))
     return inverse * growth + common @ common.T, chi2 / freedom, curl
 
@@ -273,7 +276,7 @@ def _closed_form(points: Points, solver: Solver) -> list[Candidate]:
 
 def _usable(candidate: Candidate) -> bool:
     rvec, tvec = candidate.rvec, candidate.tvec
-    return bool(np.isfinite(rvec).all() and np.isfinite(tvec).all() and tvec[2] > 0.0)
+    return bool(finite(rvec) and finite(tvec) and tvec[2] > 0.0)
 
 
 def _refined(points: Points, start: Candidate) -> Candidate:

@@ -15,7 +15,7 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.profile import MergeConfig
-from perchctl.vision.filter import POSITION, VELOCITY, YAW
+from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
 from perchctl.vision.merge import (
     better,
     choose_stage,
@@ -25,6 +25,7 @@ from perchctl.vision.merge import (
 )
 from perchctl.vision.pose import PoseSetup, estimate_pose, level_rotation
 from perchctl.vision.rolling import seen_at_once
+from perchctl.vision.solve import Candidate
 from perchctl.vision.types import (
     MARKERS,
     Attitude,
@@ -39,6 +40,7 @@ from perchctl.vision.types import (
 CONSISTENT_CHI2 = 4.0
 """Per degree of freedom: below it, both markers' corners fit one pose so well that the two
 cannot contradict (that takes four standard deviations)."""
+_PLACE_YAW = [X, Y, Z, YAW]
 _STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
 
 
@@ -65,7 +67,7 @@ class Prior:
     """
 
     attitude: Attitude | None
-    near: MarkerPose | None
+    near: Candidate | None
     normal_cam: Array | None
 
 
@@ -113,7 +115,7 @@ class Weights:
             return _alone(track, fed.get(name))
         large, small = used["large"], used["small"]
         weights = self.config.weights
-        order = [*POSITION, YAW]
+        order = _PLACE_YAW
         variance = merge_variance(np.diag(large.P)[order], np.diag(small.P)[order], weights)
         w = np.array([weights.x, weights.y, weights.z])
         return Merged(
@@ -147,7 +149,8 @@ class Joint:
         # The joint tilt is the surest: the single markers of its frame start from it.
         singles = {}
         if not enough or self.pose.config.each_marker:
-            singles = _singles(seen, t_s, prior, self.pose, joint or prior.near)
+            near = prior.near if joint is None else Candidate(joint.rvec_rad, joint.tvec_m)
+            singles = _singles(seen, t_s, prior, self.pose, near)
         if joint is None:
             contradicting = _contradict(singles, self.config)
             fed = _usable(singles, contradicting, prior, self.config, self.pose)
@@ -181,7 +184,7 @@ def _singles(
     t_s: float,
     prior: Prior,
     setup: PoseSetup,
-    start: MarkerPose | None,
+    start: Candidate | None,
 ) -> dict[str, MarkerPose]:
     found = (estimate_pose([d], t_s, prior.attitude, setup, prior.normal_cam, start) for d in seen)
     return {pose.source: pose for pose in found if pose is not None}
@@ -220,9 +223,9 @@ def _as_joint(fed: Mapping[str, MarkerPose]) -> dict[str, MarkerPose]:
 
 def _alone(track: MarkerTrack, pose: MarkerPose | None) -> Merged:
     return Merged(
-        vector=np.array([*track.x[POSITION], track.x[YAW]]),
+        vector=track.x[_PLACE_YAW],
         velocity_mps=track.x[VELOCITY],
-        cov_m2=track.P[np.ix_(POSITION, POSITION)],
+        cov_m2=track.P[POSITION, POSITION],
         bias_m=track.bias[POSITION],
         var_yaw_rad2=float(track.P[YAW, YAW]),
         unseen=track.unseen,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from perchctl.profile import KalmanConfig
-from perchctl.vision.filter import FilterSetup, make_filter, step_track
+from perchctl.vision.filter import FilterSetup, Measurement, make_filter, step_track
 from perchctl.vision.gate import Sight, Verdict, judged, locked, remembered
 from perchctl.vision.places import measurement
 from perchctl.vision.pose import PoseSetup
@@ -68,52 +69,46 @@ def followed_on(
     setup: TrackSetup,
 ) -> Followed:
     """What the gate lets through goes into the tracks."""
+    constants = setup.constants(in_world)
+    fed = {
+        name: measurement(pose, attitude, in_world, constants, setup.pose)
+        for name, pose in measured.fed.items()
+    }
+    old = state.tracks if state.in_world == in_world else {}
     if not setup.gate:
-        return Followed(measured, _stepped(state, measured, t_s, attitude, in_world, setup))
+        return Followed(measured, _stepped(old, fed, t_s, setup.names, constants))
     sight, verdict = None, Verdict(taken=True, stranger=state.stranger)
-    if measured.fed:
-        sight = _sight(measured, t_s, attitude, in_world, setup)
-        verdict = judged(state.lock, state.stranger, sight, setup.constants(in_world))
+    if fed:
+        sight = _sight(measured, fed, t_s, in_world)
+        verdict = judged(state.lock, state.stranger, sight, constants)
     if not verdict.taken:
-        measured = replace(measured, fed={})
-    if verdict.afresh:
-        state = replace(state, tracks={})
-    tracks = _stepped(state, measured, t_s, attitude, in_world, setup)
+        measured, fed = replace(measured, fed={}), {}
+    tracks = _stepped({} if verdict.afresh else old, fed, t_s, setup.names, constants)
     lock, stranger = remembered(state.lock, verdict.stranger, t_s)
     if sight is not None and verdict.taken and tracks:
-        surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
+        surest = next(iter(tracks.values()))
+        if len(tracks) > 1:
+            surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
         lock = locked(lock, surest, sight, verdict.afresh)
     return Followed(measured, tracks, lock, stranger, verdict.taken, verdict.text)
 
 
-def _sight(
-    measured: Measured, t_s: float, attitude: Attitude | None, in_world: bool, setup: TrackSetup
-) -> Sight:
+def _sight(measured: Measured, fed: Mapping[str, Measurement], t_s: float, in_world: bool) -> Sight:
     """What the gate has to judge: the surest pose of those that would be fed."""
-    pose = min(measured.fed.values(), key=lambda p: float(np.linalg.norm(p.sigma_m)))
-    z = measurement(pose, attitude, in_world, setup.constants(in_world), setup.pose)
+    name, pose = min(
+        measured.fed.items(), key=lambda each: float(each[1].sigma_m @ each[1].sigma_m)
+    )
     whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
-    return Sight(t_s, pose, z, in_world, whole)
+    return Sight(t_s, pose, fed[name], in_world, whole)
 
 
 def _stepped(
-    state: PipelineState,
-    measured: Measured,
+    old: Mapping[str, MarkerTrack],
+    fed: Mapping[str, Measurement],
     t_s: float,
-    attitude: Attitude | None,
-    in_world: bool,
-    setup: TrackSetup,
+    names: tuple[str, ...],
+    constants: FilterSetup,
 ) -> dict[str, MarkerTrack]:
     """All tracks one frame on."""
-    constants = setup.constants(in_world)
-    old = state.tracks if state.in_world == in_world else {}
-    stepped: dict[str, MarkerTrack] = {}
-    for name in setup.names:
-        pose = measured.fed.get(name)
-        z = None
-        if pose is not None:
-            z = measurement(pose, attitude, in_world, constants, setup.pose)
-        track = step_track(old.get(name), z, t_s, constants)
-        if track is not None:
-            stepped[name] = track
-    return stepped
+    tracks = {n: step_track(old.get(n), fed.get(n), t_s, constants) for n in names}
+    return {n: track for n, track in tracks.items() if track is not None}

@@ -24,6 +24,7 @@ from perchctl.vision.filter import (
     X,
     Y,
     Z,
+    foreseen,
     make_filter,
     predicted,
     start_track,
@@ -214,6 +215,29 @@ def test_what_is_not_measured_drifts_at_most(
     assert (np.diag(found.P)[POSITION] >= 1e-4 - 1e-12).all()
     if later_s <= 0.0 and not coasting:
         assert found is track
+
+
+@settings(max_examples=60)
+@given(
+    seed=st.integers(0, 9999), later_s=st.floats(-0.5, 3.0), world=st.sampled_from(["w", "l", "p"])
+)
+def test_what_is_foreseen_is_what_is_predicted_and_measured(
+    seed: int, later_s: float, kind: str
+) -> None:
+    """All of it: by the state's, the covariance's and the constant errors' measured parts."""
+    config = CONFIG if kind.startswith("paper") else KalmanConfig()
+    setup = make_filter(config, in_world=kind.endswith("world"))
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(8, 8))
+    track = MarkerTrack(
+        t_s=1.0, x=rng.normal(0.0, 0.5, 8), P=half @ half.T, bias=rng.normal(size=(8, 4))
+    )
+    wanted, found = predicted(track, 1.0 + later_s, setup), foreseen(track, 1.0 + later_s, setup)
+    assert found.R is not None
+    assert found.bias is not None
+    assert np.allclose(found.z, H @ wanted.x)
+    assert np.allclose(found.R, H @ wanted.P @ H.T)
+    assert np.allclose(found.bias, H @ wanted.bias)
 
 
 def test_a_measured_velocity_is_free() -> None:

@@ -32,6 +32,7 @@ from perchctl.profile import (
 )
 from perchctl.vision.pose import estimate_pose
 from perchctl.vision.predict import expected_corners
+from perchctl.vision.solve import Candidate
 from perchctl.vision.types import (
     Attitude,
     Frame,
@@ -310,10 +311,11 @@ def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
     attitude = fly(0)
     _, output = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
     joint = output.poses["joint"]
+    start = Candidate(joint.rvec_rad, joint.tvec_m)
     for name in ("large", "small"):
         detection = output.detections.get(name)  # type: ignore[arg-type]
         assert detection is not None
-        alone = estimate_pose([detection], attitude.t_s, attitude, setup.pose, None, joint)
+        alone = estimate_pose([detection], attitude.t_s, attitude, setup.pose, None, start)
         assert alone is not None
         assert np.array_equal(output.poses[name].e_m, alone.e_m)
     assert list(output.poses) == ["joint", "large", "small"]
@@ -398,8 +400,12 @@ def test_the_vehicles_motion_predicts_the_corners(build: Build) -> None:
         seen = later.detections.get(name)  # type: ignore[arg-type]
         assert seen is not None
         assert np.abs(expected[name] - seen.corners_px).max() < 1.0  # type: ignore[index]
-    assert np.allclose(near.tvec_m, later.poses["joint"].tvec_m, atol=0.002)
-    assert expected_corners(sight, now.t_s, None, setup.pose) == (None, sight.pose)
+    assert np.allclose(near.tvec, later.poses["joint"].tvec_m, atol=0.002)
+    corners, unmoved = expected_corners(sight, now.t_s, None, setup.pose)
+    assert corners is None
+    assert unmoved is not None
+    assert np.array_equal(unmoved.tvec, sight.pose.tvec_m)
+    assert np.array_equal(unmoved.rvec, sight.pose.rvec_rad)
     assert expected_corners(None, now.t_s, now, setup.pose) == (None, None)
     assert expected_corners(sight, then.t_s + 5.0, now, setup.pose) == (None, None)
 

@@ -27,6 +27,7 @@ from perchctl.vision.pose import (
     normal_cam,
     square,
 )
+from perchctl.vision.solve import Candidate
 from perchctl.vision.types import Attitude, Detection, MarkerPose
 from tests.helpers.target_picture import CAMERA, pose_of
 
@@ -342,5 +343,6 @@ def test_a_start_from_the_joint_pose_gives_the_markers_own_pose() -> None:
     joint = must(estimate_pose(both, 0.0, attitude, PLAIN))
     for one in both:
         alone = must(estimate_pose([one], 0.0, attitude, PLAIN))
-        started = must(estimate_pose([one], 0.0, attitude, PLAIN, start=joint))
+        start = Candidate(joint.rvec_rad, joint.tvec_m)
+        started = must(estimate_pose([one], 0.0, attitude, PLAIN, start=start))
         assert np.allclose(alone.e_m, started.e_m, atol=2e-5)

@@ -85,7 +85,7 @@ def detect(
     if frame.fields == "woven":
         return with_motion(between(*(looked(field) for field in halves(frame))), previous)
     result = with_motion(looked(frame), previous)
-    return with_ghosts(result, frame.image) if frame.fields == "whole" else result
+    return with_ghosts(result, previous, frame.image) if frame.fields == "whole" else result
 
 
 def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:

@@ -22,11 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array
+from perchctl.geometry import Array, finite
 from perchctl.vision.camera_model import distort
 from perchctl.vision.markers.corners import RAW_SIGMA_PX, RefinedCorners, refine_each
 from perchctl.vision.markers.pattern import Rim
-from perchctl.vision.markers.profiles import PROFILES
+from perchctl.vision.markers.profiles import PROFILES, Floats
 from perchctl.vision.markers.shift import Border, edge_shift
 from perchctl.vision.markers.sides import Markers, Measured, Samples, markers_of, measure
 from perchctl.vision.markers.square import BEFORE
@@ -49,6 +49,8 @@ _MIN_CONTRAST = 6.0  # grey levels between the flanks
 _SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
 _CLIPPED_PRIOR_PX = 0.4  # what clipping does
 _CLIPPED_GREY = 248.0
+_ONES: Array = np.ones(PROFILES)
+_ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
 _QUARTERS: Array = np.full(4, 0.25)
 
 
@@ -100,10 +102,12 @@ def refine_lines(
     edges is measured unless it is known. Wide edges are looked at twice, the second time
     with the profiles centred on them."""
     found = _refined_once(image, raw_px, rims, camera, known)
+    wide = {i: r for i, r in enumerate(found) if r is not None and r.blur_px > _WIDE_BLUR_PX}
+    if not wide:
+        return found
     centred = raw_px.copy()
-    for i, each in enumerate(found):
-        if each is not None and each.blur_px > _WIDE_BLUR_PX:
-            centred[i] = each.corners_px
+    for i, each in wide.items():
+        centred[i] = each.corners_px
     if np.abs(centred - raw_px).max(initial=0.0) < _CENTRED_PX:
         return found
     again = _refined_once(image, centred, rims, camera, known)
@@ -123,21 +127,26 @@ def _refined_once(
         return nothing
     measured = measure(image, markers, camera, with_inner=known is None)
     sides = measured.sides
-    if known is not None and (_clipped(sides) > _CLIPPED_SHARE).any():
+    clipped = _clipped(sides) > _CLIPPED_SHARE
+    if known is not None and clipped.any():
         # How far clipping moves edges changes with the light.
         return _refined_once(image, raw_px, rims, camera, None)
     fit = _fit_lines(markers, sides)
-    corners = _intersect(fit.lines)
-    if not np.isfinite(corners).all():
-        return nothing
-    shift = known if known is not None else _measured_shift(markers, measured, corners)
+    shift = known
+    if shift is None:
+        corners = _intersect(fit.lines)
+        if not finite(corners):
+            return nothing
+        shift = _measured_shift(markers, measured, corners)
     applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
-    if applied.shift_px != 0.0:
-        corners = _intersect(_moved_outwards(markers, fit, applied.shift_px))
+    corners = _intersect(_moved_outwards(markers, fit, applied.shift_px))
+    if not finite(corners):
+        return nothing
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, fit, corners_px)
-    sigma_px = _sigma_px(markers, sides, fit)
-    row_px = _row_px(markers, sides, fit)
+    ends2 = _ends_px2(markers, sides, fit)
+    sigma_px = _sigma_px(markers, sides, ends2, clipped)
+    row_px = _row_px(fit, ends2)
     return [
         RefinedCorners(
             corners_px=corners_px[i],
@@ -156,12 +165,12 @@ def _refined_once(
 
 def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
     """Total least squares on the points of each side."""
-    w = sides.weight / np.maximum(sides.weight.sum(axis=1), 1e-9)[:, None]
+    w = sides.weight / np.maximum(sides.weight @ _ONES, 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
-    cx, cy = (w * x).sum(axis=1), (w * y).sum(axis=1)
+    cx, cy = (w * x) @ _ONES, (w * y) @ _ONES
     dx, dy = x - cx[:, None], y - cy[:, None]
     wx = w * dx
-    sxx, sxy, syy = (wx * dx).sum(axis=1), (wx * dy).sum(axis=1), (w * dy * dy).sum(axis=1)
+    sxx, sxy, syy = (wx * dx) @ _ONES, (wx * dy) @ _ONES, (w * dy * dy) @ _ONES
     direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
     nx, ny = -np.sin(direction), np.cos(direction)
     residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
@@ -211,6 +220,8 @@ def _measured_shift(markers: Markers, measured: Measured, corners: Array) -> Edg
 
 def _moved_outwards(markers: Markers, fit: _Lines, shift_px: float) -> Array:
     """The lines (4m, 3) moved out of their markers."""
+    if shift_px == 0.0:
+        return fit.lines
     out = (markers.corners - markers.corners.mean(axis=1)[:, None]).reshape(-1, 2)
     lines = fit.lines.copy()
     # The line's normal may point either way.
@@ -223,9 +234,9 @@ def _accepted(
     markers: Markers, sides: Samples, fit: _Lines, corners_px: Array
 ) -> NDArray[np.bool_]:
     """Which of the m markers have lines for sides, near to where they were expected."""
-    inliers = np.count_nonzero(sides.weight, axis=1)
+    inliers = (sides.weight > 0.0) @ _ONES32
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
-    contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).mean(axis=1)
+    contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]) @ _ONES32 / PROFILES
     good = (
         (fit.residual_px < _MAX_RESIDUAL_PX)
         & (inliers >= _MIN_INLIERS * PROFILES)
@@ -243,39 +254,44 @@ def _accepted(
 
 def _clipped(sides: Samples) -> Array:
     """Share of the profiles of the m markers that end in clipped white, (m,)."""
-    return (sides.grey[:, :, -1] > _CLIPPED_GREY).mean(axis=1).reshape(-1, 4) @ _QUARTERS
+    ends = sides.grey[:, :, -1]
+    if ends.max() <= _CLIPPED_GREY:
+        return np.zeros(len(ends) // 4)
+    glaring = np.count_nonzero(ends > _CLIPPED_GREY, axis=1) / PROFILES
+    return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
 
 
-def _samples(markers: Markers, sides: Samples) -> Array:
-    """How many independent ones each side's line rests on, (4m,)."""
-    return np.maximum(np.minimum(sides.weight.sum(axis=1), markers.sides_px.ravel()), 4.0)
+def _ends_px2(markers: Markers, sides: Samples, fit: _Lines) -> Array:
+    """Variance of the ends of the sides of the m markers, (m, 4): a line fitted to n samples
+    spreads twice as far there as in its middle."""
+    independent = np.maximum(np.minimum(sides.weight @ _ONES, markers.sides_px.ravel()), 4.0)
+    return (_TAILS * 4.0 * fit.residual_px * fit.residual_px / independent).reshape(-1, 4)
 
 
-def _sigma_px(markers: Markers, sides: Samples, fit: _Lines) -> Array:
+def _sigma_px(
+    markers: Markers, sides: Samples, ends_px2: Array, clipped: NDArray[np.bool_]
+) -> Array:
     """Spread of the corners of the m markers."""
-    cell_px, residual_px = markers.cell_px, fit.residual_px
+    cell_px = markers.cell_px
     blur_px = np.maximum(sides.blur_px.reshape(-1, 4) @ _QUARTERS, 1e-3)
-    # The end of a line fitted to n samples spreads twice as far as its middle.
-    ends2 = _TAILS * 4.0 * residual_px * residual_px / _samples(markers, sides)
-    noise2 = np.maximum(ends2.reshape(-1, 4) @ _QUARTERS, MIN_LINE_SIGMA_PX**2)
+    noise2 = np.maximum(ends_px2 @ _QUARTERS, MIN_LINE_SIGMA_PX**2)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
     bend_px = _BEND * blur_px * np.exp(-cell_px / (_BEND_BLURS * blur_px))
     reach_px = _REACH * blur_px**3
-    clipped_px = np.where(_clipped(sides) > _CLIPPED_SHARE, _CLIPPED_SIGMA_PX, 0.0)
+    clipped_px = np.where(clipped, _CLIPPED_SIGMA_PX, 0.0)
     # Edges are not where they were meant to be printed.
     print_px = np.array([rim.tolerance for rim in markers.rims]) * cell_px
     return np.asarray(np.sqrt(noise2 + bend_px**2 + reach_px**2 + clipped_px**2 + print_px**2))
 
 
-def _row_px(markers: Markers, sides: Samples, fit: _Lines) -> Array:
+def _row_px(fit: _Lines, ends_px2: Array) -> Array:
     """Spread of the corners of the m markers by what shakes a picture's rows, each along
     itself: it moves upright sides, both of a marker's alike, and lying ones not. As the
     sides' residuals show it; 0 where the marker stands on a corner and nothing shows."""
-    ends2 = (_TAILS * 4.0 * fit.residual_px**2 / _samples(markers, sides)).reshape(-1, 4)
     upright = (fit.lines[:, 0] ** 2).reshape(-1, 4)
     off = upright - (upright @ _QUARTERS)[:, None]
     aspect = (off * off) @ _QUARTERS
-    slope = ((ends2 * off) @ _QUARTERS) / np.maximum(aspect, 1e-9)
-    still = ends2 @ _QUARTERS - slope * (upright @ _QUARTERS)
+    slope = ((ends_px2 * off) @ _QUARTERS) / np.maximum(aspect, 1e-9)
+    still = ends_px2 @ _QUARTERS - slope * (upright @ _QUARTERS)
     shaken = (aspect > _LEAST_ASPECT) & (slope > (_LEAST_ROWS - 1.0) * np.maximum(still, 0.0))
     return np.asarray(np.sqrt(np.where(shaken, np.maximum(slope, 0.0), 0.0)))

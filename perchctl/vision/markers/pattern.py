@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.markers.drawing import Drawing
-from perchctl.vision.markers.square import from_unit, mapped
+from perchctl.vision.markers.square import from_unit, mapped, within
 
 KnownBy = Literal["bits", "track", "other"]
 """By what it is known which marker it is: by its cells alone, by its place in the picture before,
@@ -202,33 +202,51 @@ def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> 
 def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array:
     """Correlation of the cells' grey values with the pattern for corners (4, 2) rolled on
     by 0 to 3, as `np.roll` does; (4,), 0 without contrast."""
-    return resemblances(image, corners_px[None], pattern)[0]
+    grey = _read(image, corners_px, pattern)
+    return np.zeros(4) if grey is None else _likeness(grey[None], pattern)[0]
 
 
 def resemblances(image: NDArray[np.uint8], quads_px: Array, pattern: Pattern) -> Array:
     """`resemblance` of many at a time: corners (m, 4, 2) to (m, 4)."""
-    grey, inside = _read(image, quads_px, pattern)
-    grey -= grey.mean(axis=1, keepdims=True)
-    spread = np.sqrt((grey * grey).sum(axis=1))
+    like = np.zeros((len(quads_px), 4))
+    inside, grey = _read_many(image, quads_px, pattern)
+    like[inside] = _likeness(grey, pattern)
+    return like
+
+
+def _likeness(grey: Array, pattern: Pattern) -> Array:
+    """Correlation (m, 4) of grey values (m, k) at the spots, 0 without contrast."""
+    grey = grey - grey.sum(axis=1, keepdims=True) / grey.shape[1]
+    spread = np.sqrt((grey * grey).sum(axis=1))[:, None]
+    like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)
     # Black and white each on about half of the spots are 2 spreads apart.
-    contrast = inside & (spread >= 0.5 * _MIN_CONTRAST * math.sqrt(grey.shape[1]))
-    like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)[:, None]
-    return np.asarray(np.where(contrast[:, None], like, 0.0))
+    contrast = spread >= 0.5 * _MIN_CONTRAST * math.sqrt(grey.shape[1])
+    return np.asarray(like * contrast)
 
 
 def _cell_means(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
     """Mean grey value of each cell that is read, None where one is outside of the picture."""
-    grey, inside = _read(image, corners_px[None], pattern)
-    if not inside[0]:
+    grey = _read(image, corners_px, pattern)
+    if grey is None:
         return None
-    return np.asarray(np.bincount(pattern.owner, weights=grey[0]) / pattern.spots_per_cell)
+    return np.asarray(np.bincount(pattern.owner, weights=grey) / pattern.spots_per_cell)
 
 
-def _read(
+def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Array | None:
+    """Grey values (k,) at the pattern's k spots, None where one is outside of the picture."""
+    at = mapped(from_unit(corners_px), pattern.spots)
+    # Spots are inside of the corners.
+    if not (within(corners_px, image.shape) or within(at, image.shape)):
+        return None
+    nearest = (at + 0.5).astype(np.intp)
+    return image[nearest[:, 1], nearest[:, 0]].astype(np.float64)
+
+
+def _read_many(
     image: NDArray[np.uint8], quads_px: Array, pattern: Pattern
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Grey values (m, k) at the pattern's k spots for corners (m, 4, 2), and whether all of
-    a marker's are in the picture (m,)."""
+) -> tuple[NDArray[np.bool_], Array]:
+    """Which of m squares (m, 4, 2) have all spots in the picture, and the grey values
+    (n, k) at the k spots of those."""
     h, w = image.shape
     H = np.array([from_unit(quad) for quad in quads_px])
     at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
@@ -236,8 +254,8 @@ def _read(
         at /= pattern.spots @ H[:, 2, :2, None] + H[:, 2, 2, None, None]
         low, high = at.min(axis=1), at.max(axis=1)
         inside = (low >= 0.0).all(axis=1) & (high <= (w - 1, h - 1)).all(axis=1)
-        nearest = np.where(inside[:, None, None], at + 0.5, 0.0).astype(np.intp)
-    return image[nearest[..., 1], nearest[..., 0]].astype(np.float64), inside
+    nearest = (at[inside] + 0.5).astype(np.intp)
+    return inside, image[nearest[..., 1], nearest[..., 0]].astype(np.float64)
 
 
 def _softened(drawing: Drawing, spots: Array) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array
+from perchctl.geometry import Array, finite
 from perchctl.vision.camera_model import undistort
 from perchctl.vision.markers.edges import Surroundings, locate
 from perchctl.vision.markers.pattern import Rim
@@ -94,7 +94,7 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
     turn = np.sign(doubled_area(raw_px))
-    if not (np.isfinite(corners).all() and turn.all() and sides_px.min() > 1e-6):
+    if not (finite(corners) and turn.all() and sides_px.min() > 1e-6):
         return None
     along = corners.take(NEXT, axis=1) - corners
     across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
@@ -157,7 +157,7 @@ def measure(
     edges = locate(grey, half_px, near_px, _surroundings(s, markers.rims, rows))
     points = undistort((origin + edges.offset_px[..., None] * normal).reshape(-1, 2), camera)
     points = points.reshape(-1, PROFILES, 2)
-    if not np.isfinite(points).all():
+    if not finite(points):
         points = np.nan_to_num(points)
 
     def part(chosen: slice) -> Samples:

@@ -73,11 +73,9 @@ def within(corners_px: Array, shape: tuple[int, ...], room_px: float = 0.0) -> b
     """Whether all corners (4, 2) are finite and inside a picture of that shape, at least
     `room_px` from its edge."""
     h, w = shape[:2]
-    return bool(
-        np.isfinite(corners_px).all()
-        and corners_px.min() >= room_px
-        and (corners_px.max(axis=0) <= (w - 1 - room_px, h - 1 - room_px)).all()
-    )
+    right, low = w - 1 - room_px, h - 1 - room_px
+    # False for NaN.
+    return all(room_px <= x <= right and room_px <= y <= low for x, y in corners_px.tolist())
 
 
 def nested(corners_px: Array, ratio: float, camera: CameraModel | None = None) -> Array:

@@ -258,17 +258,34 @@ def test_two_fields_of_it_are_surer_than_one() -> None:
     assert np.allclose(middle.small.cov_px2, a.small.cov_px2 / 2.0)
 
 
-def test_no_double_edges_are_looked_for_where_sides_are_outside() -> None:
-    """What is read there is the picture's rim. A whole marker's are found."""
+def double_edges() -> tuple[Detections, NDArray[np.uint8]]:
+    """A marker's square twice, 6 px apart."""
     image = np.full(SHAPE, 200.0)
     image[100:300, 200:400] -= 80.0
     image[106:306, 206:406] -= 80.0
     at = np.array([[203.0, 103.0], [403.0, 103.0], [403.0, 303.0], [203.0, 303.0]])
     double = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.uint8)
-    whole = Detections(0, 0.0, small=Detection("small", at, 0.1, True))
-    assert with_ghosts(whole, double).ghost_px > 0.0
-    cut = replace(whole, small=Detection("small", at, 0.1, True, cov_px2=np.eye(8)))
-    assert with_ghosts(cut, double) is cut
+    return Detections(0, 0.0, small=Detection("small", at, 0.1, True)), double
+
+
+def test_no_double_edges_are_looked_for_where_sides_are_outside() -> None:
+    """What is read there is the picture's rim. A whole marker's are found."""
+    whole, double = double_edges()
+    assert with_ghosts(whole, None, double).ghost_px > 0.0
+    assert whole.small is not None
+    cut = replace(whole, small=replace(whole.small, cov_px2=np.eye(8)))
+    assert with_ghosts(cut, None, double) is cut
+
+
+def test_a_stream_without_double_edges_is_looked_at_in_every_fourth_picture() -> None:
+    """One with them in each: every corner is to claim its spread."""
+    still, double = double_edges()
+    moving = replace(still, velocity_px_s=np.array([200.0, 0.0]))
+    for index in range(8):
+        now = replace(moving, frame_index=index)
+        before = replace(now, ghost_px=0.0)
+        assert (with_ghosts(now, before, double).ghost_px > 0.0) == (index % 4 == 0)
+        assert with_ghosts(now, replace(now, ghost_px=5.0), double).ghost_px > 0.0
 
 
 @pytest.mark.parametrize("side_px", [1e6, 1e8, 1e12])
