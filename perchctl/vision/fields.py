@@ -18,6 +18,7 @@ the mean is taken, which belongs to the middle moment in either order.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from statistics import median
 from typing import Literal
@@ -46,6 +47,7 @@ _STRONG = 5.0  # of the mean difference within a field, for one to count
 _LEAST_GREY = 8.0
 _FLOOR = 0.25  # grey^2 a pixel that noise may leave of strong differences
 _EVERY = 3
+_ALIAS_PX, _ALIAS_BLURS = 0.8, 2.45
 _TAPS = np.array([-1.0, 9.0, 9.0, -1.0], np.float32) / 16.0  # a cubic's, half way
 
 _PERIODS_S = (1 / 30, 1 / 25)  # of NTSC and PAL frames
@@ -125,6 +127,12 @@ def field_picture(image: Grey, first_row: int) -> Grey:
         picture[2::2] = between[: len(picture[2::2])]
         picture[0] = own[0]
     return picture
+
+
+def interpolated_sigma_px(blur_px: float) -> float:
+    """Spread of an edge along the rows of a field, by its blur in the whole picture: between
+    rows that are 2 px apart, a sharp edge is where it happens to be taken for."""
+    return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
 def looked_at(frame: Frame, mode: FieldsMode) -> Frame:

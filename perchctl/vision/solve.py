@@ -113,7 +113,8 @@ def make_points(
         if d.cov_px2 is not None:
             W[rows, rows] = _whitened(d.cov_px2)
         elif d.refined:
-            W[_ROWS + 8 * i, _COLUMNS + 8 * i] = _of_lines(normals[i], d.sigma_px)
+            spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
+            W[_ROWS + 8 * i, _COLUMNS + 8 * i] = _of_lines(normals[i], spread_px)
         else:
             W[range(8 * i, 8 * i + 8), range(8 * i, 8 * i + 8)] = 1.0 / d.sigma_px
         if d.common_px is not None:
@@ -148,10 +149,19 @@ def _whitened(cov_px2: Array) -> Array:
         return np.diag(1.0 / np.sqrt(np.maximum(np.diagonal(cov_px2), 1e-6)))
 
 
-def _of_lines(normals: Array, sigma_px: float) -> Array:
+def _lying_px(d: Detection, corners: Array) -> Array:
+    """Spread of the sides, (4,): the more of a side lies along the rows, the worse. Over
+    several rows errors of interpolation cancel out."""
+    way = corners.take(_END, axis=0) - corners
+    lying = np.abs(way[:, 0]) / np.maximum(np.hypot(way[:, 0], way[:, 1]), 1e-9)
+    rows = 0.5 * math.pi * np.abs(way[:, 1])
+    return np.asarray(np.hypot(d.sigma_px, d.lying_sigma_px * lying / np.hypot(1.0, rows)))
+
+
+def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
     """Whitening of the corners of four fitted lines with normals (4, 2), by the offset and the
-    tilt of each, at `_ROWS` and `_COLUMNS`."""
-    across = normals.T.ravel() / sigma_px
+    tilt of each, at `_ROWS` and `_COLUMNS`; `sigma_px` of all or of each, (4,)."""
+    across = (normals.T / sigma_px).ravel()
     tilt = across / math.sqrt(3.0)
     return np.concatenate([across, across, -tilt, tilt])
 

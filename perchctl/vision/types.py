@@ -78,6 +78,7 @@ class Detection:
     common_px: Array | None = None  # (4, 2): one sigma of what moved all corners together
     cov_px2: Array | None = None
     row_sigma_px: float = 0.0  # of corners in rows that shake along themselves, as analogue ones
+    lying_sigma_px: float = 0.0  # of a side along the rows, of which every second is interpolated
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,11 @@ from perchctl.vision.fields import (
     looked_at,
     separated,
 )
+from perchctl.vision.markers.detect import detect
+from perchctl.vision.pose import estimate_pose
 from perchctl.vision.types import CameraModel, Frame, PictureKind
 from tests.helpers.interlaced import Pass
+from tests.helpers.target_picture import CAMERA, pose_of, render
 
 SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
 PAL_S = 0.04
@@ -257,6 +260,31 @@ def test_whole_pictures_go_on_as_ever(build: Build) -> None:
         assert np.array_equal(one.target.e_m, other.target.e_m)
 
 
+@pytest.mark.parametrize("kind", ["top", "bottom"])
+def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
+    build: Build, kind: PictureKind
+) -> None:
+    """Between rows that are 2 px apart a sharp edge is taken for too high or too low."""
+    setup = build()
+    first_row = 0 if kind == "top" else 1
+    squares: dict[str, list[float]] = {"claimed": [], "as elsewhere": []}
+    for k in range(12):
+        T = pose_of(0.0, 0.0005 * k, 0.4)
+        image = render(*T, noise=2.0, seed=k)
+        field = Frame(0, 0.0, field_picture(image, first_row), fields=kind)
+        seen = detect(field, None, setup.detector, CAMERA).large
+        assert seen is not None
+        assert seen.lying_sigma_px > 0.0
+        for name, d in (("claimed", seen), ("as elsewhere", replace(seen, lying_sigma_px=0.0))):
+            pose = estimate_pose([d], 0.0, None, setup.pose)
+            assert pose is not None
+            assert pose.cov is not None
+            e = pose.tvec_m - T[1]
+            squares[name].append(float(e @ np.linalg.solve(pose.cov[:3, :3], e)) / 3.0)
+    assert 0.2 < np.mean(squares["claimed"]) < 2.0
+    assert np.mean(squares["as elsewhere"]) > 3.0
+
+
 # --- Blended -----------------------------------------------------------------------------
 
 
@@ -319,6 +347,6 @@ def shared_errors(folder: str, build: Build) -> Array:
 
 def test_shared_woven_pictures_are_as_good_as_whole_ones(build: Build) -> None:
     woven, whole = (shared_errors(folder, build) for folder in ("weave", "progressive"))
-    assert woven[2] < 2.0 * whole[2]
-    assert woven[2] < 0.05
+    assert whole[2] < 0.02  # as their README has it
+    assert woven[2] < 2.0 * 0.02
     assert woven[:2].max() < 0.03

@@ -219,7 +219,9 @@ def test_what_is_not_measured_drifts_at_most(
 
 @settings(max_examples=60)
 @given(
-    seed=st.integers(0, 9999), later_s=st.floats(-0.5, 3.0), world=st.sampled_from(["w", "l", "p"])
+    seed=st.integers(0, 9999),
+    later_s=st.floats(-0.5, 3.0),
+    kind=st.sampled_from(["world", "level", "paper", "paper world"]),
 )
 def test_what_is_foreseen_is_what_is_predicted_and_measured(
     seed: int, later_s: float, kind: str

@@ -37,6 +37,7 @@ def _middle(a: Detection, b: Detection) -> Detection:
         max(a.shift_sigma_px, b.shift_sigma_px),
         cov_px2=_mean_cov_px2(a, b),
         row_sigma_px=((a.row_sigma_px**2 + b.row_sigma_px**2) / 4.0) ** 0.5,
+        lying_sigma_px=((a.lying_sigma_px**2 + b.lying_sigma_px**2) / 4.0) ** 0.5,
     )
 
 

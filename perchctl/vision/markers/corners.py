@@ -6,6 +6,7 @@ corner is pulled inwards (0.15 to 0.55 px), which makes the target look far.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -26,8 +27,8 @@ class RefinedCorners:
     """corners_px (4, 2), their spread, whether lines or the drawing were fitted, the spread
     of a shift that is common to all sides (outwards), the edges' blur, in px, the shift
     that was taken out, where the corners follow from a part of the drawing their covariance
-    (8, 8) in pixels of a pinhole, x and y of each corner by turns, and the spread by rows that
-    shake along themselves."""
+    (8, 8) in pixels of a pinhole, x and y of each corner by turns, the spread by rows that
+    shake along themselves, and the blur of the sharpest side."""
 
     corners_px: Array
     sigma_px: float
@@ -37,6 +38,7 @@ class RefinedCorners:
     edge_shift: EdgeShift | None = None
     cov_px2: Array | None = None
     row_sigma_px: float = 0.0
+    least_blur_px: float = math.inf
 
 
 def refine_each(image: NDArray[np.uint8], raw_px: Array, cells: int) -> RefinedCorners:

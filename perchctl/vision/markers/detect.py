@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.fields import halves
+from perchctl.vision.fields import halves, interpolated_sigma_px
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.corners import RefinedCorners
@@ -45,6 +45,7 @@ from perchctl.vision.types import (
     EdgeShift,
     Frame,
     MarkerName,
+    PictureKind,
 )
 
 __all__ = ["DetectorSetup", "detect", "make_detector"]
@@ -131,8 +132,8 @@ def _looked(
     return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
-        large=_detection("large", seen),
-        small=_detection("small", seen),
+        large=_detection("large", seen, frame.fields),
+        small=_detection("small", seen, frame.fields),
         full_frame=found.full_frame,
         mirrored=found.mirrored and not seen,
         targets=found.targets,
@@ -235,11 +236,13 @@ def _in_blur(
     return improved(image, seen, setup.patterns, camera)
 
 
-def _detection(name: MarkerName, seen: _Seen) -> Detection | None:
+def _detection(name: MarkerName, seen: _Seen, fields: PictureKind | None) -> Detection | None:
     r = seen.get(name)
     if r is None:
         return None
+    interpolated = fields in ("top", "bottom")
     return Detection(
         name, r.corners_px, r.sigma_px, r.refined, r.shift_sigma_px,
         cov_px2=r.cov_px2, row_sigma_px=r.row_sigma_px,
+        lying_sigma_px=interpolated_sigma_px(r.least_blur_px) if interpolated else 0.0,
     )  # fmt: skip

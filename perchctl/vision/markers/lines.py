@@ -156,6 +156,7 @@ def _refined_once(
             blur_px=float(sides.blur_px[4 * i : 4 * i + 4].max()),
             edge_shift=shift,
             row_sigma_px=float(row_px[i]),
+            least_blur_px=float(sides.blur_px[4 * i : 4 * i + 4].min()),
         )
         if accepted[i]
         else None
