@@ -15,7 +15,7 @@ from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_place, same_file, write_files
-from perchctl.profile import Profile, find_profile, find_weights, load_profile
+from perchctl.profile import Profile, find_weights, load_profile
 from perchctl.profile.places import data_folder, user_config_folder
 from perchctl.weights.check import check
 from perchctl.weights.evidence import FITTED, Fitted, evidence, fit_all, on_other_data
@@ -43,7 +43,6 @@ class FitOptions:
     """The command line on top of the profile, checked."""
 
     profile: Profile
-    profile_path: Path
     data: tuple[Path, ...]
     lms: LmsOptions
     method: str = "closed_form"
@@ -102,7 +101,6 @@ def resolve(request: FitRequest) -> FitOptions:
     return FitOptions(
         # The weights file may not be there yet: this command makes it.
         profile=load_profile(request.profile, with_weights=False),
-        profile_path=find_profile(request.profile),
         data=data,
         lms=LmsOptions(
             request.step,
@@ -221,12 +219,9 @@ def _named_by(options: FitOptions) -> Path | None:
     if name is None:
         return None
     try:
-        return find_weights(name, options.profile_path)
+        return find_weights(name)
     except NotFound:
-        given = Path(name).expanduser()
-        if given.is_absolute():
-            return given
-        folder = options.profile_path.resolve().parent
-        if folder == data_folder("profiles").resolve():
-            folder = user_config_folder() / "weights"
-        return folder / name
+        missing = Path(name)
+        if missing.parent == data_folder("profiles").resolve():
+            return user_config_folder() / "weights" / missing.name
+        return missing

@@ -168,7 +168,7 @@ def weights_text(options: FlyOptions) -> str:
     numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
     if merge.weights_file is None:
         return f"weights {numbers} (of the profile)"
-    path = find_weights(merge.weights_file, options.profile_path)
+    path = find_weights(merge.weights_file)
     fitted = read_weights(path)
     origin = [fitted.date and f"of {fitted.date}", fitted.method]
     if fitted.data.sha256:
