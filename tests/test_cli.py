@@ -473,13 +473,6 @@ def test_a_pipe_gets_no_colour(repeated: tuple[Said, bytes], campaign: Said) -> 
         assert ESCAPE not in text
 
 
-def test_no_color_is_heeded() -> None:
-    forced = run_apart("--help", FORCE_COLOR="1")
-    assert ESCAPE in forced.stdout
-    plain = run_apart("--help", FORCE_COLOR="1", NO_COLOR="1")
-    assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", plain.stdout)
-
-
 def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str, tmp_path: Path) -> None:
     """cflib logs them to the terminal unless it is told not to: seen by a process of its own."""
     for uri, cause in (

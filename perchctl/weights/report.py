@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import textwrap
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -151,22 +152,22 @@ def positions_text(result: Result) -> str:
     lines = [
         f"positions{more}: as they are, and the merged pose's error there (weights fitted",
         "to the others; Tables I and II of the paper)",
-        f"{'':<8}"
-        + "".join(f"{head:>{width}}" for head, width in zip(heads, _WIDTHS, strict=True)),
+        _place_line("", heads),
     ]
     numbers = result.errors.positions
     for number, place, off in list(zip(numbers, shown, error * _SCALES, strict=True))[
         :MOST_POSITIONS
     ]:
         cells = [*(f"{v:.2f}" for v in place[:3]), f"{place[3]:.1f}", *(figure(v) for v in off)]
-        lines.append(
-            f"{int(number):<8}"
-            + "".join(f"{cell:>{width}}" for cell, width in zip(cells, _WIDTHS, strict=True))
-        )
+        lines.append(_place_line(str(int(number)), cells))
     return "\n".join(lines)
 
 
 _WIDTHS = (8, 8, 8, 11, 9, 8, 8, 12)
+
+
+def _place_line(name: str, cells: Sequence[str]) -> str:
+    return f"{name:<8}" + "".join(f"{c:>{width}}" for c, width in zip(cells, _WIDTHS, strict=True))
 
 
 def figure(value: float, sign: str = "", spread: float = 0.0) -> str:
