@@ -1,17 +1,16 @@
 """Ctrl-C while perchctl is still loading: one sentence and an exit code, no traceback.
 
 A KeyboardInterrupt would come up in the middle of some library's import, which prints it as
-ignored, or makes another error of it. Nothing is open yet: the process ends where it is.
+ignored, or makes another error of it. Nothing is open yet: the process ends where it is. This
+module itself loads as little as can be: until then Ctrl-C is Python's.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
+# The half of `signal` that is in the interpreter already; its other half are enumerations.
+import _signal as signal  # type: ignore[import-not-found]
 import os
-import signal
 import sys
-from types import FrameType
 
 EXIT_CODE = 130
 SENTENCE = "Ctrl-C"
@@ -31,12 +30,15 @@ def loaded() -> None:
 
 def failure_record(sentence: str, code: int) -> str:
     """What `--json` prints in place of a result."""
+    import json
+
     return json.dumps({"error": sentence, "exit_code": code})
 
 
-def _leave(_signal: int, _frame: FrameType | None) -> None:
-    with contextlib.suppress(OSError):
+def _leave(_signal: int, _frame: object) -> None:
+    try:
         os.write(2, f"perchctl: {SENTENCE}\n".encode())
         if "--json" in sys.argv[1:]:
             os.write(1, f"{failure_record(SENTENCE, EXIT_CODE)}\n".encode())
-    os._exit(EXIT_CODE)
+    finally:
+        os._exit(EXIT_CODE)
