@@ -135,6 +135,7 @@ def test_tab_offers_cameras_that_are_there_and_files_behind_a_colon(
     assert complete.sources("ca") == ["camera:2", "camera:10"]
     (tmp_path / "a.mp4").write_text("")
     assert complete.sources("video:") == ["video:a.mp4", "video:dev/"]
+    (tmp_path / "a.txt").write_text("")
     assert complete.sources("./a") == ["./a.mp4"]
     assert complete.sources("[") == []
 
