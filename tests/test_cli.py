@@ -229,12 +229,15 @@ def test_only_a_yes_is_consent(
     answer: str, asked: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A yes goes on, here to the missing camera."""
-    monkeypatch.setattr("builtins.input", lambda _prompt: answer)
+    monkeypatch.setattr("builtins.input", lambda: answer)
     monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
     with pytest.raises(SystemExit) as left:
         app(["fly", "--uri", NOWHERE, "--source", "camera:9"])
     assert left.value.code == (2 if asked else 20)
-    assert ("not confirmed" in capsys.readouterr().err) is asked
+    said = capsys.readouterr()
+    assert ("not confirmed" in said.err) is asked
+    assert "Is the space under the target clear?" in said.err
+    assert said.out == ""
 
 
 @pytest.mark.parametrize("where", ["a file", "a folder that may not be made"])

@@ -106,7 +106,13 @@ def ask_before_arming(uri: str) -> None:
     """Raises UsageError without a yes from the terminal."""
     if not sys.stdin.isatty():
         raise UsageError(f"about to arm {uri}, and there is nobody to ask: add --yes")
-    answer = input(f"About to arm and fly {uri}. Is the space under the target clear? [y/N] ")
+    # On stderr: stdout is for the result.
+    question = f"About to arm and fly {uri}. Is the space under the target clear? [y/N] "
+    print(question, end="", file=sys.stderr, flush=True)
+    try:
+        answer = input()
+    except EOFError:
+        answer = ""
     if answer.strip().lower() not in ("y", "yes"):
         raise UsageError("not confirmed: nothing was started")
 
