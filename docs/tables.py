@@ -307,6 +307,8 @@ def allowed(field: Any) -> str:
         count = len(get_args(kind))
         ordered = any(type(m).__name__ == "AfterValidator" for m in field.metadata)
         text = "lowest, highest" if ordered else f"{count} numbers"
+        for each in getattr(get_args(kind)[0], "__metadata__", ()):
+            text += f", each {_span(_bounds(each))}"
     elif get_origin(kind) is dict:
         text = "name: number"
     else:

@@ -5,9 +5,10 @@ at work. They are loaded when they are first used, so that the command line star
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
+
+TYPE_CHECKING = False  # typing's own takes longer to load than all of this
 
 if TYPE_CHECKING:
     from perchctl.calibration.files import load_calibration
@@ -48,7 +49,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module 'perchctl' has no attribute {name!r}")

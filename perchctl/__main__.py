@@ -1,7 +1,18 @@
-"""`python -m perchctl`: the same as the console script."""
+"""The console script `perchctl`, and `python -m perchctl`."""
 
 import sys
 
-from perchctl.cli import main
+from perchctl.startup import leave_at_ctrl_c
 
-sys.exit(main())
+
+def main() -> int | str | None:
+    """Run the command line; returns the exit code, or leaves with it."""
+    leave_at_ctrl_c()
+    from perchctl.cli import main as run  # takes a while
+
+    code: int | str | None = run()
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -36,7 +36,7 @@ CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
 # From the innermost room outwards. A module imports from its own room and from those
 # before it; rooms in one line do not know of each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("perchctl.errors",),
+    ("perchctl.errors", "perchctl.startup"),
     ("perchctl.geometry", "perchctl.files", "perchctl.vehicle"),
     ("perchctl.plot",),
     ("perchctl.profile",),
@@ -254,7 +254,7 @@ def test_no_clock_where_time_is_an_argument() -> None:
 def test_only_the_command_line_loads_typer_and_nothing_heavy() -> None:
     """`perchctl --help` stays quick: a subcommand loads libraries when it runs, and of
     perchctl only the command of its own name."""
-    allowed = ("perchctl.errors", "perchctl.cli")
+    allowed = ("perchctl.errors", "perchctl.startup", "perchctl.cli")
     heavy = ("numpy", "cv2", "cflib", "matplotlib", "mujoco", "filterpy", "pydantic", "scipy")
     for i in IMPORTS:
         if not is_under(i.importer, ("perchctl.cli",)):

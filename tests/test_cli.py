@@ -229,12 +229,15 @@ def test_only_a_yes_is_consent(
     answer: str, asked: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A yes goes on, here to the missing camera."""
-    monkeypatch.setattr("builtins.input", lambda _prompt: answer)
+    monkeypatch.setattr("builtins.input", lambda: answer)
     monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
     with pytest.raises(SystemExit) as left:
         app(["fly", "--uri", NOWHERE, "--source", "camera:9"])
     assert left.value.code == (2 if asked else 20)
-    assert ("not confirmed" in capsys.readouterr().err) is asked
+    said = capsys.readouterr()
+    assert ("not confirmed" in said.err) is asked
+    assert "Is the space under the target clear?" in said.err
+    assert said.out == ""
 
 
 @pytest.mark.parametrize("where", ["a file", "a folder that may not be made"])
@@ -471,13 +474,6 @@ def test_a_pipe_gets_no_colour(repeated: tuple[Said, bytes], campaign: Said) -> 
     assert re.search(r"perched +1\b", said.stdout)
     for text in (said.stdout, said.stderr, campaign.stdout, campaign.stderr):
         assert ESCAPE not in text
-
-
-def test_no_color_is_heeded() -> None:
-    forced = run_apart("--help", FORCE_COLOR="1")
-    assert ESCAPE in forced.stdout
-    plain = run_apart("--help", FORCE_COLOR="1", NO_COLOR="1")
-    assert not re.search(r"\x1b\[[0-9;]*3[0-7]m", plain.stdout)
 
 
 def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str, tmp_path: Path) -> None:

@@ -8,10 +8,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import find_calibration
+from perchctl.profile.plain_yaml import parse_yaml
 from perchctl.vision.types import CameraModel
 
 KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
@@ -68,9 +68,9 @@ def load_calibration(file: Path | str, size_px: tuple[int, int] | None = None) -
 
 def _mapping(path: Path, text: str) -> dict[Any, Any]:
     try:
-        raw = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InvalidValue(f"{path}: not YAML ({error.__class__.__name__})") from None
+        raw = parse_yaml(text)
+    except ValueError as error:
+        raise InvalidValue(f"{path}: {error}") from None
     if not isinstance(raw, dict):
         raise InvalidValue(
             f"{path}: must hold camera_info keys (image_width, camera_matrix, ...) or a Kalibr "

@@ -18,7 +18,7 @@ _MOST_MISSING = 8
 """Pictures without a board that are named one by one."""
 
 
-def calibration_record(result: Calibration, file: Path, picture: Path) -> dict[str, Any]:
+def calibration_record(result: Calibration, file: Path, picture: Path | None) -> dict[str, Any]:
     """The object of `calibrate --json`."""
     solution = result.solution
     names = PARAMETERS[result.camera.model]
@@ -58,7 +58,7 @@ def calibration_record(result: Calibration, file: Path, picture: Path) -> dict[s
         "warnings": list(result.warnings),
         "verdict": level(result),
         "file": str(file),
-        "report": str(picture),
+        "report": None if picture is None else str(picture),
     }
 
 

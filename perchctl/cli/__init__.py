@@ -14,9 +14,15 @@ from perchctl.cli.track import track
 __all__ = ["app", "main"]
 
 # In the order in which one uses them; so does the help list them.
-app.command("make-target")(make_target)
-app.command("calibrate")(calibrate)
-app.command("fit-weights")(fit_weights)
-app.command("track")(track)
-app.command("fly", epilog=EXIT_TABLE)(fly)
-app.command("simulate")(simulate)
+for _name, _command in (
+    ("make-target", make_target),
+    ("calibrate", calibrate),
+    ("fit-weights", fit_weights),
+    ("track", track),
+    ("fly", fly),
+    ("simulate", simulate),
+):
+    # The whole first sentence: of its own accord the list of the commands cuts it.
+    _summary = (_command.__doc__ or "").split("\n\n")[0]
+    _epilog = EXIT_TABLE if _command is fly else None
+    app.command(_name, short_help=_summary, epilog=_epilog)(_command)

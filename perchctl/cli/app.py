@@ -3,33 +3,65 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sys
 import warnings
-from collections.abc import Iterator
-from typing import Annotated, Any, TextIO
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, NoReturn, TextIO, TypeVar
 
 import typer
+from typer.core import TyperGroup
 
 from perchctl import __version__
-from perchctl.errors import EXIT_CODES, Interrupted, PerchError, ProfileNote
-
-EXIT_TABLE = "Exit codes:\n\n" + "\n\n".join(
-    f"{code:>3}  {meaning}" for code, meaning in sorted(EXIT_CODES.items())
+from perchctl.cli.complete import complete_profile
+from perchctl.errors import (
+    EXIT_CODES,
+    Interrupted,
+    InvalidValue,
+    PerchError,
+    ProfileNote,
+    UsageError,
 )
+from perchctl.startup import failure_record, loaded
 
+# \b keeps the lines of a paragraph as they are.
+EXIT_TABLE = "\b\nExit codes:\n" + "\n".join(
+    f"{code:>5}  {meaning}" for code, meaning in sorted(EXIT_CODES.items())
+)
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_BAD_PLACE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ENOTDIR)
+
+
+class _Commands(TyperGroup):
+    """Wrong usage is told by the object of `--json`, too."""
+
+    def invoke(self, ctx: Any) -> Any:
+        as_json = "--json" in ctx.args
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            tell = getattr(error, "format_message", None)
+            if as_json and tell is not None:
+                _print_failure(tell(), getattr(error, "exit_code", UsageError.exit_code))
+            raise
+
+
+# Without rich's panels: they cut what is longer than a cell, and leave a narrow one for it.
 app = typer.Typer(
     name="perchctl",
+    cls=_Commands,
     help="Hang a Crazyflie onto a ceiling by the sight of a printed target.",
-    no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 ProfileOption = Annotated[
-    str, typer.Option("--profile", "-p", help="Profile by name or path.", show_default=True)
+    str,
+    typer.Option(
+        "--profile", "-p", help="Profile by name or path.", autocompletion=complete_profile
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
 ViewOption = Annotated[
@@ -42,40 +74,106 @@ ViewPortOption = Annotated[
 
 
 def main() -> Any:
-    """Entry point of the console script."""
+    """Run the command line; returns the exit code."""
+    code: Any = 0
     try:
-        return app()
+        try:
+            app()
+        except SystemExit as end:
+            code = end.code
+        sys.stdout.flush()
     except KeyboardInterrupt:
         _complain("Ctrl-C")
         return Interrupted.exit_code
+    except BrokenPipeError:
+        _drop_stdout()
+        return PerchError.exit_code
+    except OSError as error:
+        sentence = _place_refused(error)
+        if sentence is None:
+            raise
+        _drop_stdout()
+        _complain(sentence)
+        return InvalidValue.exit_code
+    return code
+
+
+Request = TypeVar("Request")
+
+
+def perform(run: Callable[[Request], int], request: Request) -> NoReturn:
+    """Do the command's work, its libraries being loaded, and leave with its exit code."""
+    loaded()
+    code = run(request)
+    sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
+    raise typer.Exit(code)
 
 
 @contextlib.contextmanager
-def reported() -> Iterator[None]:
-    """Turns every failure into one sentence on stderr and its exit code, and each note on
-    the profile into one sentence."""
+def reported(as_json: bool = False) -> Iterator[None]:
+    """Turns every failure into one sentence on stderr, an object on stdout where one is
+    wanted, and its exit code, and each note on the profile into one sentence."""
     try:
         with _profile_notes():
             yield
     except typer.Exit:
         raise
     except PerchError as error:
-        _complain(str(error))
-        raise typer.Exit(error.exit_code) from None
+        _leave(str(error), error.exit_code, as_json)
     except KeyboardInterrupt:
-        _complain("Ctrl-C")
-        raise typer.Exit(Interrupted.exit_code) from None
+        _leave("Ctrl-C", Interrupted.exit_code, as_json)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_stdout()
         raise typer.Exit(PerchError.exit_code) from None
     except Exception as error:
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
-        _complain(
+        sentence = _place_refused(error)
+        if sentence is not None:
+            if not getattr(error, "filename", None):
+                _drop_stdout()
+            _leave(sentence, InvalidValue.exit_code, as_json)
+        _leave(
             f"unforeseen {type(error).__name__}: {error} "
-            f"(PERCHCTL_DEBUG=1 shows where; please report it)"
+            f"(PERCHCTL_DEBUG=1 shows where; please report it)",
+            PerchError.exit_code,
+            as_json,
         )
-        raise typer.Exit(PerchError.exit_code) from None
+
+
+def _leave(sentence: str, code: int, as_json: bool) -> NoReturn:
+    _complain(sentence)
+    if as_json:
+        _print_failure(sentence, code)
+    raise typer.Exit(code) from None
+
+
+def _print_failure(sentence: str, code: int) -> None:
+    try:
+        print(failure_record(sentence, code), flush=True)
+    except OSError:
+        _drop_stdout()
+
+
+def _drop_stdout() -> None:
+    """What is left in the buffer must not fail again at the program's end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _place_refused(error: Exception) -> str | None:
+    """The operating system's refusal of a place, of which nobody closer has told; a full disk
+    has the same exit code everywhere."""
+    if not isinstance(error, OSError):
+        return None
+    if error.errno in _NO_ROOM:
+        place = error.filename or "the result"
+        return f"{place} cannot be written: {error.strerror}: free some space"
+    if error.errno in _BAD_PLACE and error.filename:
+        name = str(error.filename)
+        shown = name if len(name) <= 200 else f"{name[:197]}..."
+        return f"{shown} cannot be used: {error.strerror}: choose another place"
+    return None
 
 
 @contextlib.contextmanager
@@ -116,11 +214,13 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+@app.callback(invoke_without_command=True)
 def _top(
+    context: typer.Context,
     version: Annotated[
         bool,
         typer.Option("--version", "-V", callback=_print_version, is_eager=True, help="Version."),
     ] = False,
 ) -> None:
-    pass
+    if context.invoked_subcommand is None:
+        print(context.get_help())

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import JsonOption, ViewOption, ViewPortOption, perform, reported
+from perchctl.cli.complete import complete_source
 
 
 # long: a list of options
@@ -15,7 +16,8 @@ def calibrate(
     source: Annotated[
         str | None,
         typer.Argument(
-            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path."
+            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path.",
+            autocompletion=complete_source,
         ),
     ] = None,
     board: Annotated[
@@ -79,7 +81,7 @@ def calibrate(
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
     by more than 5 times its view's spread; both are named. --check exits with 1 on a fail.
     """
-    with reported():
+    with reported(as_json):
         from perchctl.commands.calibrate import CalibrateRequest, run
 
         request = CalibrateRequest(
@@ -99,4 +101,4 @@ def calibrate(
             view=view,
             view_port=view_port,
         )
-        raise typer.Exit(run(request))
+        perform(run, request)

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ProfileOption, reported
+from perchctl.cli.app import JsonOption, ProfileOption, perform, reported
+from perchctl.cli.complete import complete_source
 
 
 # long: a list of options
@@ -29,7 +30,10 @@ def fit_weights(
         str, typer.Option("--truth", help="The actual pose: typed, mocap, estimate or sim.")
     ] = "typed",
     source: Annotated[
-        str | None, typer.Option("--source", help="Camera; else the profile's.")
+        str | None,
+        typer.Option(
+            "--source", help="Camera; else the profile's.", autocompletion=complete_source
+        ),
     ] = None,
     uri: Annotated[
         str | None, typer.Option("--uri", "-u", help="Vehicle, for --truth estimate.")
@@ -79,7 +83,7 @@ def fit_weights(
     columns may follow. All three poses are in one frame; --collect writes the target relative to
     the gear in the level frame.
     """
-    with reported():
+    with reported(as_json):
         from perchctl.commands.fit_weights import CollectRequest, FitRequest, run
 
         collecting = CollectRequest(
@@ -112,4 +116,4 @@ def fit_weights(
             anyway=anyway,
             as_json=as_json,
         )
-        raise typer.Exit(run(request))
+        perform(run, request)

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, perform, reported
+from perchctl.cli.complete import complete_source
 
 
 def fly(
@@ -24,7 +25,9 @@ def fly(
     source: Annotated[
         str | None,
         typer.Option(
-            "--source", help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:."
+            "--source",
+            help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:.",
+            autocompletion=complete_source,
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated scenario.")] = 0,
@@ -46,7 +49,7 @@ def fly(
     Without options it flies the simulated vehicle. Ctrl-C once lands, again after half
     a second cuts the motors.
     """
-    with reported():
+    with reported(as_json):
         from perchctl.commands.fly import FlyRequest, run
 
         request = FlyRequest(
@@ -61,4 +64,4 @@ def fly(
             view=view,
             view_port=view_port,
         )
-        raise typer.Exit(run(request))
+        perform(run, request)

@@ -7,14 +7,20 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, reported
+from perchctl.cli.app import JsonOption, perform, reported
+from perchctl.cli.complete import complete_profile
 
 
 # long: a list of options
 def make_target(
     profile: Annotated[
         str | None,
-        typer.Option("--profile", "-p", help="Profile with the target; sim if none is named."),
+        typer.Option(
+            "--profile",
+            "-p",
+            help="Profile with the target; sim if none is named.",
+            autocompletion=complete_profile,
+        ),
     ] = None,
     output: Annotated[
         Path | None,
@@ -89,7 +95,7 @@ def make_target(
     Without --camera, --board or --measured-*: a PDF of the profile's target, front and back,
     checked before it is written. With --camera: from where to where each marker is seen.
     """
-    with reported():
+    with reported(as_json):
         from perchctl.commands.make_target import TargetRequest, run
 
         request = TargetRequest(
@@ -117,4 +123,4 @@ def make_target(
             force=force,
             as_json=as_json,
         )
-        raise typer.Exit(run(request))
+        perform(run, request)

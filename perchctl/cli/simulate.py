@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ProfileOption, reported
+from perchctl.cli.app import JsonOption, ProfileOption, perform, reported
 
 
 def simulate(
@@ -35,7 +35,7 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Fly many seeded scenarios in lockstep, faster than real time, and count."""
-    with reported():
+    with reported(as_json):
         from perchctl.commands.simulate import SimulateRequest, run
 
         request = SimulateRequest(
@@ -49,4 +49,4 @@ def simulate(
             faults=faults,
             heat_map=heat_map,
         )
-        raise typer.Exit(run(request))
+        perform(run, request)

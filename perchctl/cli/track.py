@@ -7,14 +7,16 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, perform, reported
+from perchctl.cli.complete import complete_source
 
 
 def track(
     source: Annotated[
         str,
         typer.Argument(
-            help="camera:N, video:FILE, images:DIR (or a pattern), http://..., or a path."
+            help="camera:N, video:FILE, images:DIR (or a pattern), http://..., or a path.",
+            autocompletion=complete_source,
         ),
     ],
     profile: ProfileOption = "sim",
@@ -47,7 +49,7 @@ def track(
     yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
     along the camera's x, y, z.
     """
-    with reported():
+    with reported(as_json):
         from perchctl.commands.track import TrackRequest, run
 
         request = TrackRequest(
@@ -61,4 +63,4 @@ def track(
             view=view,
             view_port=view_port,
         )
-        raise typer.Exit(run(request))
+        perform(run, request)

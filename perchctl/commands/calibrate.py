@@ -18,13 +18,14 @@ from perchctl.calibration.report import (
 )
 from perchctl.calibration.seen import larger_than, seen_instead
 from perchctl.calibration.solve import AUTO, calibrate
-from perchctl.calibration.types import Grey, Rejection, View
+from perchctl.calibration.types import Calibration, Grey, Rejection, View
 from perchctl.calibration.writing import calibration_text, camera_text
 from perchctl.camera.files import VideoSource, image_files, read_grey
 from perchctl.camera.open import source_spec
 from perchctl.camera.source import check_size
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mask import write_mask
+from perchctl.commands.interrupt import drawn
 from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
@@ -112,19 +113,24 @@ def _calibrate(request: CalibrateRequest, source: str, board: Board) -> int:
     missing = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{missing}")
     result = calibrate(found.views, board.notation(), request.model, request.reject, found.missing)
-    from perchctl.calibration.plot import draw_calibration
-
     text = calibration_text(result, request.name, _now())
-    picture = _picture_of(output)
-    write_files({output: text.encode(), picture: draw_calibration(result)}, make_folders=True)
+    write_files({output: text.encode()}, make_folders=True)
     for line in calibration_lines(result):
         say(line)
-    say(f"wrote {output} and {picture}")
+    picture = drawn(lambda: _draw(result, _picture_of(output)))
+    say(f"wrote {output}" + ("" if picture is None else f" and {picture}"))
     if request.as_json:
         print_record(calibration_record(result, output, picture))
     else:
         print(output)
     return 0
+
+
+def _draw(result: Calibration, picture: Path) -> Path:
+    from perchctl.calibration.plot import draw_calibration
+
+    write_files({picture: draw_calibration(result)})
+    return picture
 
 
 def _check(request: CalibrateRequest, file: Path, source: str, board: Board) -> int:

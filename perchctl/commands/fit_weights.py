@@ -13,9 +13,9 @@ import numpy as np
 from perchctl.commands.fit_weights_request import CollectRequest, FitRequest
 from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
-from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
+from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_place, same_file, write_files
-from perchctl.profile import Profile, find_profile, find_weights, load_profile
+from perchctl.profile import Profile, find_weights, load_profile
 from perchctl.profile.places import data_folder, user_config_folder
 from perchctl.weights.check import check
 from perchctl.weights.evidence import FITTED, Fitted, evidence, fit_all, on_other_data
@@ -30,6 +30,7 @@ from perchctl.weights.fit import (
     sums_of,
 )
 from perchctl.weights.lms import LmsOptions
+from perchctl.weights.repeated import refuse_repeated
 from perchctl.weights.report import report_text
 from perchctl.weights.result import Result, file_content, weights_record
 from perchctl.weights.table import chunks_of, read_csv
@@ -43,7 +44,6 @@ class FitOptions:
     """The command line on top of the profile, checked."""
 
     profile: Profile
-    profile_path: Path
     data: tuple[Path, ...]
     lms: LmsOptions
     method: str = "closed_form"
@@ -57,8 +57,8 @@ class FitOptions:
 def run(request: FitRequest) -> int:
     """Collect, fit, print, draw, write; returns the exit code.
 
-    Errors: NotFound, InvalidValue, UsageError; PerchError when weights that are not
-    recommended were to be written; those of collecting.
+    Errors: NotFound, InvalidValue, UsageError; those of collecting. What goes wrong once the
+    weights are known is said beside them.
     """
     options = resolve(request)
     session = request.collecting.session
@@ -67,18 +67,21 @@ def run(request: FitRequest) -> int:
 
         collect(request.collecting, session)
     result = fit(options)
-    if options.plot is not None:
-        from perchctl.weights.plot import draw_weights
-
-        write_files({options.plot: draw_weights(result)})
+    if not options.as_json:
+        print(report_text(result), flush=True)
+    plot, file, problem = None, None, None
+    try:
+        plot = _draw(options, result)
+        file = _write(options, result)
+    except (PerchError, KeyboardInterrupt) as error:
+        problem = error if isinstance(error, PerchError) else Interrupted("Ctrl-C: nothing written")
+        say(str(problem))
+    code = 0 if problem is None else problem.exit_code
     if options.as_json:
-        print_record(weights_record(result))
-    else:
-        print(report_text(result))
-    if options.plot is not None:
-        say(f"plot: {options.plot}")
-    _write(options, result)
-    return 0
+        paths = {"weights_file": file and str(file), "plot": plot and str(plot)}
+        failure = {} if problem is None else {"error": str(problem), "exit_code": code}
+        print_record(weights_record(result) | paths | failure)
+    return code
 
 
 def resolve(request: FitRequest) -> FitOptions:
@@ -96,13 +99,17 @@ def resolve(request: FitRequest) -> FitOptions:
         if request.plot.suffix.lower() != ".png":
             raise InvalidValue(f"--plot {request.plot} must end in .png")
         check_place(request.plot)
+    twice = [path for k, path in enumerate(data) if any(same_file(path, o) for o in data[:k])]
+    if twice:
+        raise InvalidValue(
+            f"{twice[0]} is named twice: the same rows twice are no more evidence; name it once"
+        )
     for target in (request.output, request.plot):
         if target is not None and any(same_file(target, source) for source in data):
             raise UsageError(f"{target} is the data itself; write the result to another file")
     return FitOptions(
         # The weights file may not be there yet: this command makes it.
         profile=load_profile(request.profile, with_weights=False),
-        profile_path=find_profile(request.profile),
         data=data,
         lms=LmsOptions(
             request.step,
@@ -124,17 +131,17 @@ def fit(options: FitOptions) -> Result:
     with ExitStack() as stack:
         total = sum(chunks_of(path) for path in options.data)
         advance = stack.enter_context(count_bar("reading [MB]", total))
-        data = joined([_read(path, advance) for path in options.data])
+        parts = [_read(path, advance) for path in options.data]
+    tested = None if options.test is None else _read(options.test, lambda: None)
+    data = joined(parts)
+    refuse_repeated(parts, tested)
     errors = errors_of(data)
     sums = sums_of(errors)
     check_determined(errors, sums)
     with count_bar("fitting", None) as advance:
         fits, runs = fit_all(errors, sums, options.lms, advance)
     proof = evidence(errors, sums, fits)
-    other = None
-    if options.test is not None:
-        other_errors = errors_of(_read(options.test, lambda: None))
-        other = on_other_data(other_errors, fits)
+    other = None if tested is None else on_other_data(errors_of(tested), fits)
     return Result(
         errors=errors,
         sums=sums,
@@ -185,13 +192,29 @@ def _read(path: Path, advance: Callable[[], None]) -> Measurements:
     return data
 
 
-def _write(options: FitOptions, result: Result) -> None:
+def _draw(options: FitOptions, result: Result) -> Path | None:
+    if options.plot is None:
+        return None
+    from perchctl.weights.plot import draw_weights
+
+    write_files({options.plot: draw_weights(result)})
+    say(f"plot: {options.plot}")
+    return options.plot
+
+
+def _write(options: FitOptions, result: Result) -> Path | None:
+    """The weights file, where one is written. Raises PerchError where `-o` names one, and the
+    weights are not recommended."""
     target = options.output or _named_by(options)
+    recommended = any(result.proven)
     if target is None:
-        if any(result.proven):
-            say("no file written: name one with -o, or in the profile (merge.weights_file)")
-        return
-    if not any(result.proven) and not options.anyway:
+        say(
+            "no file written: name one with -o, or in the profile (merge.weights_file)"
+            if recommended
+            else "no file written: the weights are not recommended"
+        )
+        return None
+    if not recommended and not options.anyway:
         sentence = (
             f"{target} not written: on no axis do the weights beat the better single marker beyond "
             f"the interval; take more positions, or write them all the same with --anyway"
@@ -199,7 +222,7 @@ def _write(options: FitOptions, result: Result) -> None:
         if options.output is not None:
             raise PerchError(sentence)
         say(sentence)
-        return
+        return None
     date = datetime.now(UTC).isoformat(timespec="seconds")
     content = file_content(result, date)
     if options.anyway:
@@ -213,6 +236,7 @@ def _write(options: FitOptions, result: Result) -> None:
             f"profile {options.profile.name} merges by {options.profile.merge.method}: these "
             f"weights fly with merge.method: weights and merge.weights_file: {target.name}"
         )
+    return target
 
 
 def _named_by(options: FitOptions) -> Path | None:
@@ -221,12 +245,9 @@ def _named_by(options: FitOptions) -> Path | None:
     if name is None:
         return None
     try:
-        return find_weights(name, options.profile_path)
+        return find_weights(name)
     except NotFound:
-        given = Path(name).expanduser()
-        if given.is_absolute():
-            return given
-        folder = options.profile_path.resolve().parent
-        if folder == data_folder("profiles").resolve():
-            folder = user_config_folder() / "weights"
-        return folder / name
+        missing = Path(name)
+        if missing.parent == data_folder("profiles").resolve():
+            return user_config_folder() / "weights" / missing.name
+        return missing

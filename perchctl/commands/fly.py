@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import load_calibration
-from perchctl.commands.interrupt import signals_to_operator
+from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port
 from perchctl.display.page.flight import FlightPage, flight_page
 from perchctl.display.panel import make_reporter
 from perchctl.display.watch import DisplayWatcher
 from perchctl.errors import (
+    EXIT_CODES,
     AttemptsUsedUp,
     EmergencyStopped,
     Interrupted,
@@ -105,7 +106,13 @@ def ask_before_arming(uri: str) -> None:
     """Raises UsageError without a yes from the terminal."""
     if not sys.stdin.isatty():
         raise UsageError(f"about to arm {uri}, and there is nobody to ask: add --yes")
-    answer = input(f"About to arm and fly {uri}. Is the space under the target clear? [y/N] ")
+    # On stderr: stdout is for the result.
+    question = f"About to arm and fly {uri}. Is the space under the target clear? [y/N] "
+    print(question, end="", file=sys.stderr, flush=True)
+    try:
+        answer = input()
+    except EOFError:
+        answer = ""
     if answer.strip().lower() not in ("y", "yes"):
         raise UsageError("not confirmed: nothing was started")
 
@@ -168,7 +175,7 @@ def weights_text(options: FlyOptions) -> str:
     numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
     if merge.weights_file is None:
         return f"weights {numbers} (of the profile)"
-    path = find_weights(merge.weights_file, options.profile_path)
+    path = find_weights(merge.weights_file)
     fitted = read_weights(path)
     origin = [fitted.date and f"of {fitted.date}", fitted.method]
     if fitted.data.sha256:
@@ -189,23 +196,39 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
         merges = f"; merges with {weights_text(options)}"
         log.event(Event(time.monotonic(), EventKind.NOTE, merges.removeprefix("; ")))
     say(f"connecting to {options.uri}{merges}")
-    try:
-        result = _session(options, (log, DisplayWatcher(reporter)), port)
-    except BaseException as error:
-        log.abandon(str(error) or type(error).__name__)
-        raise
-    finally:
-        reporter.close()
-    perched = result.report.phase is Phase.PERCHED
-    summary = log.close(result.report, result.miss_m if perched else None)
-    assert summary is not None
-    plot = _plot(log.path, options.profile)
-    tell(summary_text(summary, log.path, plot))
+    with unheeded():  # once it has landed nothing is left to stop, but much to tell
+        try:
+            result = _session(options, (log, DisplayWatcher(reporter)), port)
+        except BaseException as error:
+            log.abandon(str(error) or type(error).__name__)
+            raise
+        finally:
+            reporter.close()
+        perched = result.report.phase is Phase.PERCHED
+        summary = log.close(result.report, result.miss_m if perched else None)
+        assert summary is not None
+        tell(summary_text(summary, log.path))
     code = exit_code(result.report.outcome, summary)
+    plot = drawn(lambda: _plot(log.path, options.profile))
+    if plot is not None:
+        tell(f"plot:      {plot}")
     if as_json:
-        lost = {"lost_records": summary.lost_records, "log_problem": summary.log_problem}
-        print_record(summary.as_record() | lost | {"exit_code": code, "log": str(log.path)})
+        print_record(flight_record(summary, code, log.path, plot))
     return code
+
+
+def flight_record(
+    summary: FlightSummary, code: int, log: Path, plot: Path | None
+) -> dict[str, Any]:
+    """The one object of `--json`; `error` is None where the flight and its log are good."""
+    return summary.as_record() | {
+        "lost_records": summary.lost_records,
+        "log_problem": summary.log_problem,
+        "error": None if code == 0 else f"{EXIT_CODES[code]}: {summary.reason}".rstrip(": "),
+        "exit_code": code,
+        "log": str(log),
+        "plot": None if plot is None else str(plot),
+    }
 
 
 def exit_code(outcome: Outcome, summary: FlightSummary) -> int:

@@ -8,8 +8,10 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import FrameType
 
+from perchctl.commands.output import say
 from perchctl.flight.operator import OperatorSwitch
 
 Handler = Callable[[int, FrameType | None], None]
@@ -91,6 +93,28 @@ def _listen(reader: socket.socket, switch: OperatorSwitch, report: Callable[[str
         if switch.listening and any(number in _SUSPENDING for number in numbers):
             # Not from this thread: a terminal that stands still would hold up the signals.
             threading.Thread(target=report, args=(_NO_SUSPENDING,), daemon=True).start()
+
+
+def drawn(draw: Callable[[], Path | None]) -> Path | None:
+    """What `draw` returns, the path of a picture or None; None too where Ctrl-C or SIGTERM
+    ends it: a picture comes after the result, and does not take its place."""
+    try:
+        with signals_to(_interrupt):
+            return draw()
+    except KeyboardInterrupt:
+        say("Ctrl-C: the plot is not drawn; the result stands")
+        return None
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def unheeded() -> Iterator[None]:
+    """Ctrl-C and SIGTERM do nothing, but for what a block within makes of them."""
+    with signals_to(lambda _signal, _frame: None):
+        yield
 
 
 class Stopper:

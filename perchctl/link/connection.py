@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -158,6 +159,11 @@ def plain_cause(message: str) -> str:
         missing = "Cannot find" in message
         what = "no Crazyradio is plugged in, or " if missing else ""
         return f"{what}there is no permission to use it ({line}).\n{UDEV_HELP}"
+    if "Could not open usb" in message:
+        return (
+            f"no Crazyflie is plugged in by USB and switched on, or there is no permission to use "
+            f"it ({line}).\n{UDEV_HELP}"
+        )
     if "Connection refused" in message:
         return "nothing listens there (connection refused)"
     if "No driver found" in message:
@@ -184,7 +190,15 @@ def _keep_radio_patient() -> None:
 
 
 def _hush_cflib() -> None:
-    """cflib logs tracebacks of what it reports by callback as well; one sentence is enough."""
+    """cflib logs tracebacks of what it reports by callback as well; one sentence is enough.
+    And some of its modules print, on stdout, which is for the result: that is logged, too."""
     logger = logging.getLogger("cflib")
     logger.addHandler(logging.NullHandler())
     logger.propagate = bool(os.environ.get("PERCHCTL_DEBUG"))
+
+    def log(*words: object, **_how: object) -> None:
+        logger.info(" ".join(map(str, words)))
+
+    for name, module in list(sys.modules.items()):
+        if name.startswith(("cflib.crtp", "cflib.cpx")):
+            vars(module).setdefault("print", log)

@@ -28,7 +28,7 @@ then run:
   sudo groupadd -f plugdev
   sudo usermod -a -G plugdev $USER
   sudo udevadm control --reload-rules && sudo udevadm trigger
-log in again, and plug the radio in again."""
+log in again, and plug the radio or the vehicle in again."""
 
 
 def check_uri(uri: str) -> str:

@@ -81,9 +81,7 @@ def summary_of(log: FlightLog) -> FlightSummary:
     )
 
 
-def summary_text(
-    flight: FlightSummary | FlightLog, log_path: Path | None = None, plot_path: Path | None = None
-) -> str:
+def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None) -> str:
     """A few lines, no colour, no line break at the end."""
     faults = []
     if isinstance(flight, FlightLog):
@@ -111,8 +109,6 @@ def summary_text(
     lines += faults
     if log_path is not None:
         lines.append(f"log:       {log_path}")
-    if plot_path is not None:
-        lines.append(f"plot:      {plot_path}")
     return "\n".join(lines)
 
 

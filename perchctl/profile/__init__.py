@@ -1,8 +1,9 @@
 """Profiles: one YAML file says everything a flight depends on.
 
 schema: the models, each key with its bounds (vision and mission hold the larger sections).
-load: reading, `extends`, the files a profile names. old_keys: what earlier versions called
-them. places: where shipped and the user's files are. dictionaries: ArUco's ids.
+load: reading, `extends`, the files a profile names. plain_yaml: what of YAML is read.
+old_keys: what earlier versions called them. places: where shipped and the user's files are.
+dictionaries: ArUco's ids.
 """
 
 from perchctl.profile.load import (

@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import ValuesView
+from typing import Annotated, Any, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+)
 
 Vector3 = tuple[float, float, float]
+
+FARTHEST_ON_BODY_M = 0.3
+"""No part of a vehicle that weighs 42 g is farther from its centre, on any axis."""
+_OnBody = Annotated[float, Field(ge=-FARTHEST_ON_BODY_M, le=FARTHEST_ON_BODY_M)]
+BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
@@ -20,3 +33,26 @@ Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
 
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_truth_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """YAML's yes, no, on and off would be read as 1 and 0."""
+        kind = cls.model_fields[info.field_name or ""].annotation
+        if _is_of_numbers(kind) and _holds_truth(value):
+            raise ValueError(
+                "found true or false, which is how YAML reads yes, no, on and off; a number is "
+                "needed"
+            )
+        return value
+
+
+def _is_of_numbers(kind: Any) -> bool:
+    return kind in (int, float) or any(map(_is_of_numbers, get_args(kind)))
+
+
+def _holds_truth(value: Any) -> bool:
+    parts = value.values() if isinstance(value, dict) else value
+    if isinstance(parts, (list, tuple, ValuesView)):
+        return any(map(_holds_truth, parts))
+    return isinstance(value, bool)

@@ -10,19 +10,31 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote
 from perchctl.profile.old_keys import with_present_keys
-from perchctl.profile.places import data_file, data_folder, listing, user_config_folder
+from perchctl.profile.places import data_file, data_folder, listing
+from perchctl.profile.plain_yaml import clipped, parse_yaml
 from perchctl.profile.schema import Profile
 from perchctl.profile.vision import FittedWeights
+
+_NAMED_FILES = (
+    ("merge", "weights_file", "weights"),
+    ("camera", "calibration", "calib"),
+    ("camera", "mask", None),
+)
+"""Section and key of what names a file, and the data folder that may hold it by its name."""
+
+
+def is_path(name: str) -> bool:
+    """Whether a profile is named by its file, not by its name alone."""
+    return "/" in name or name.endswith((".yaml", ".yml"))
 
 
 def find_profile(name: str) -> Path:
     """The file of a profile given by path or by name; NotFound names the choices."""
-    if "/" in name or name.endswith((".yaml", ".yml")):
+    if is_path(name):
         path = Path(name).expanduser()
         if path.is_file():
             return path
@@ -47,23 +59,20 @@ def load_profile(name: str, *, with_weights: bool = True) -> Profile:
         raise InvalidValue(_one_sentence(path, error)) from None
     if profile.merge.weights_file is None or not with_weights:
         return profile
-    fitted = read_weights(find_weights(profile.merge.weights_file, path))
+    fitted = read_weights(find_weights(profile.merge.weights_file))
     merge = profile.merge.model_copy(update={"weights": fitted.weights})
     return profile.model_copy(update={"merge": merge})
 
 
-def find_weights(name: str, profile_path: Path) -> Path:
-    """A weights file by its whole path, beside the profile, or in the user's folder."""
-    given = Path(name).expanduser()
-    for candidate in (given, profile_path.parent / name):
-        if candidate.is_absolute() and candidate.is_file():
-            return candidate
-    beside = profile_path.resolve().parent / name
-    found = beside if beside.is_file() else data_file("weights", name)
+def find_weights(name: str) -> Path:
+    """The weights file that a loaded profile names: a whole path, or a name in the user's
+    folder."""
+    given = Path(name)
+    found = given if given.is_file() else data_file("weights", name)
     if found is None:
         raise NotFound(
-            f"{profile_path}: merge.weights_file: {name} is neither beside the profile nor in "
-            f"{user_config_folder() / 'weights'}; perchctl fit-weights makes one, or remove the key"
+            f"merge.weights_file: {name} does not exist; perchctl fit-weights makes it, or remove "
+            f"the key"
         )
     return found
 
@@ -78,8 +87,8 @@ def read_weights(path: Path) -> FittedWeights:
 
 
 def find_calibration(name: str) -> Path:
-    """A calibration file by path, or by name from `calib/`. (`load_profile` has found one
-    that stands beside its profile already.)"""
+    """A calibration file by path, or by name from `calib/`. (A loaded profile names its own by
+    the whole path.)"""
     given = Path(name).expanduser()
     if given.is_file():
         return given
@@ -100,15 +109,24 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
     values = _with_present_keys(_read_yaml(path), path)
-    for section, key in (("merge", "weights_file"), ("camera", "calibration"), ("camera", "mask")):
-        _place_beside(values, path, section, key)
+    if not values:
+        raise InvalidValue(
+            f"{path}: the profile is empty, and would fly what nobody chose: begin with a line "
+            f"such as extends: sim, and give the keys that differ"
+        )
+    for section, key, kind in _NAMED_FILES:
+        _place_beside(values, path, section, key, kind)
     base_name = values.pop("extends", None)
     if base_name is None:
         return values
     if not isinstance(base_name, str):
         raise InvalidValue(f"{path}: extends: must be the name or path of a profile")
-    beside = path.parent / base_name
-    base = beside if beside.is_file() else find_profile(base_name)
+    beside = path.parent / Path(base_name).expanduser()
+    by_path = beside.is_file() or is_path(base_name)
+    try:
+        base = find_profile(str(beside.absolute()) if by_path else base_name)
+    except NotFound as error:
+        raise NotFound(f"{path}: extends: {error}") from None
     return _merged(_resolved(base, (*seen, path)), values)
 
 
@@ -122,26 +140,29 @@ def _with_present_keys(values: dict[str, Any], path: Path) -> dict[str, Any]:
     return values
 
 
-def _place_beside(values: dict[str, Any], path: Path, section: str, key: str) -> None:
-    """A file named by a profile is beside that profile, whichever other extends it."""
+def _place_beside(
+    values: dict[str, Any], path: Path, section: str, key: str, kind: str | None
+) -> None:
+    """A file named by a profile is meant from that profile's folder, whichever other extends
+    it and wherever perchctl is called. A name of `kind` may be one from the data folders."""
     part = values.get(section)
     name = part.get(key) if isinstance(part, dict) else None
-    if isinstance(name, str) and (beside := path.resolve().parent / name).is_file():
+    if not isinstance(name, str):
+        return
+    beside = path.resolve().parent / Path(name).expanduser()
+    if beside.is_file() or not (kind and data_file(kind, name)):
         values[section] = {**part, key: str(beside)}  # type: ignore[dict-item]
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise InvalidValue(f"{path}: line {line}: not YAML: {error.problem}") from None
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InvalidValue(
-            f"{path}: not a text file in YAML ({error.__class__.__name__})"
-        ) from None
+        values = parse_yaml(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError:
+        raise InvalidValue(f"{path}: not a text file in UTF-8") from None
     except OSError as error:
         raise NotFound(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise InvalidValue(f"{path}: {error}") from None
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -158,17 +179,26 @@ def _merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
+_MOST_OF_A_FAULT = 1000
+_BOUNDS = ("less_than_equal", "greater_than_equal")
+
+
 def _one_sentence(path: Path, error: ValidationError) -> str:
     faults = error.errors(include_url=False)
     first = faults[0]
-    key = ".".join(str(part) for part in first["loc"]) or "profile"
+    key = clipped(".".join(str(part) for part in first["loc"]) or "profile")
     if first["type"] == "extra_forbidden":
         text = f"this key is unknown; allowed here are {', '.join(_keys_at(first['loc'][:-1]))}"
     elif first["type"] == "value_error":
-        text = str(first["ctx"]["error"])
+        text = clipped(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
+    elif first["type"] == "model_type":
+        found = clipped(repr(first["input"]))
+        text = f"must hold keys and values, found {found}; give some, or remove it"
     else:
-        text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {first['input']!r}"
-        if key.endswith("_m") and first["type"] == "less_than_equal":
+        found = clipped(repr(first["input"]))
+        text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
+        names = [part for part in first["loc"] if isinstance(part, str)]
+        if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:
             text += " (metres: were millimetres or centimetres meant?)"
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     return f"{path}: {key}: {text}{more}"

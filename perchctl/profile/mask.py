@@ -16,11 +16,11 @@ _WHITE = 127
 
 
 def find_mask(name: str) -> Path:
-    """The file of a mask. (`load_profile` has found one that stands beside its profile.)"""
-    path = Path(name).expanduser()
+    """The file of a mask, which a loaded profile names by the whole path."""
+    path = Path(name)
     if not path.is_file():
         raise NotFound(
-            f"camera.mask: {name} is neither beside the profile nor a path; "
+            f"camera.mask: {name} does not exist; "
             f"perchctl calibrate SOURCE --mask {path.name} makes one, or remove the key"
         )
     return path

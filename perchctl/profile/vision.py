@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
-from perchctl.profile.base import Section, Vector3
+from perchctl.profile.base import BodyVector3, Section, Vector3
 from perchctl.profile.dictionaries import check_marker_id
 
 
@@ -21,13 +22,34 @@ class Mounting(Section):
     image's right to the vehicle's left.
     """
 
-    position_m: Vector3 = (0.0, 0.0, 0.01)
+    position_m: BodyVector3 = (0.0, 0.0, 0.01)
     rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+
+    @field_validator("rpy_deg")
+    @classmethod
+    def _in_degrees(cls, rpy_deg: Vector3) -> Vector3:
+        """Refuses turns that are all eighths of a circle, written in radians."""
+        turned = [(angle, _eighths(abs(angle))) for angle in rpy_deg if angle]
+        if turned and all(eighths for _, eighths in turned):
+            angle, eighths = turned[0]
+            raise ValueError(
+                f"found {angle:g}, which is {45 * eighths} degrees in radians; angles are in "
+                f"degrees here: write {math.copysign(45 * eighths, angle):g}"
+            )
+        return rpy_deg
 
     @property
     def T_body_cam(self) -> Array:
         roll, pitch, yaw = (float(a) for a in np.radians(self.rpy_deg))
         return make_T(rotation_from_rpy(roll, pitch, yaw), self.position_m)
+
+
+def _eighths(angle: float) -> int:
+    """The number of eighths of a circle that the angle is in radians, rounded to two decimals
+    or more; 0 where it is no such angle."""
+    return next(
+        (k for k in range(1, 9) for d in range(2, 17) if angle == round(k * math.pi / 4, d)), 0
+    )
 
 
 class CameraConfig(Section):
@@ -43,7 +65,7 @@ class CameraConfig(Section):
 
 
 class VehicleConfig(Section):
-    gear_body_m: Vector3 = (0.0, 0.0, 0.03)
+    gear_body_m: BodyVector3 = (0.0, 0.0, 0.03)
 
 
 class MarkerConfig(Section):
@@ -69,6 +91,15 @@ class TargetConfig(Section):
     small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
     size_sigma: float = Field(0.005, ge=0, le=0.1)
     curl_per_m: float = Field(0.03, ge=0, le=10)
+
+    @model_validator(mode="after")
+    def _markers_differ(self) -> TargetConfig:
+        if (self.large.dictionary, self.large.id) == (self.small.dictionary, self.small.id):
+            raise ValueError(
+                f"large and small are the same marker, {self.large.dictionary}/{self.large.id}, "
+                f"which cannot be told apart: give one of them another id"
+            )
+        return self
 
     @model_validator(mode="after")
     def _small_inside_large(self) -> TargetConfig:

@@ -129,8 +129,6 @@ def _with_side(path: Path, text: str, name: str, marker: MarkerConfig) -> str:
         root: Any = yaml.compose(text)
     except yaml.YAMLError:
         raise InvalidValue(f"{path}: not YAML, so it cannot be changed") from None
-    if root is None:
-        return f"{text}target:\n  {name}: {_flow(marker)}\n"
     if not isinstance(root, yaml.MappingNode):
         raise InvalidValue(f"{path}: must hold keys and values")
     section = _child(root, "target")

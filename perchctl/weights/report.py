@@ -1,8 +1,14 @@
-"""The report of a fit: weights, errors, verdict, and tables in the paper's form."""
+"""The report of a fit, for a terminal of 80 columns: the verdict first, notes last.
+
+Lengths are in micrometres and angles in thousandths of a degree, as that is what good corners
+come to.
+"""
 
 from __future__ import annotations
 
 import math
+import textwrap
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,124 +17,117 @@ from perchctl.weights.evidence import LABELS, SINGLE, Evidence, gain_over
 from perchctl.weights.result import Result
 from perchctl.weights.types import AXES, PAPER_WEIGHTS, YAW, wrap
 
-COLUMNS = 5
-"""Positions side by side in a table, as in the paper's Table I."""
-_SCALES = np.array([1e3, 1e3, 1e3, 180.0 / math.pi])
-_UNITS = ("mm", "mm", "mm", "deg")
+WIDTH = 80
+MOST_POSITIONS = 20
+_LABEL = 20
+_CELL = 15
+_SCALES = np.array([1e6, 1e6, 1e6, 180e3 / math.pi])
+_UNITS = ("um", "um", "um", "mdeg")
 
 
 def report_text(result: Result) -> str:
-    """Weights, errors, verdict, bias, outliers, tables, notes."""
-    errors, evidence = result.errors, result.evidence
-    data = f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions"
-    if errors.single_rows:
-        data += f" ({errors.single_rows} more rows without both markers do not count)"
+    """Verdict, errors, gains, weights, offsets, positions, notes."""
     parts = [
-        data,
-        _weights_text(result),
-        _lms_text(result),
-        _errors_text("RMS error on positions left out of the fit, and its 95 % interval", evidence),
+        _data_text(result),
+        verdict(result),
+        _errors_text("RMS error on positions left out of the fit, 95 % interval", result.evidence),
+        _gains_text(result, result.evidence, ""),
     ]
     if result.other is not None:
         parts.append(_errors_text(f"RMS error on {result.other_name}", result.other))
-    parts += [verdict(result), _bias_text(result), table_one(result), table_two(result)]
-    parts += [f"note: {note}" for note in result.notes]
+        parts.append(_gains_text(result, result.other, f" on {result.other_name}"))
+    parts += [_weights_text(result), _bias_text(result), positions_text(result)]
+    if result.notes:
+        parts.append("\n".join(_wrapped(f"note: {note}") for note in result.notes))
     return "\n\n".join(parts)
 
 
-def _weights_text(result: Result) -> str:
-    lines = [_line("weights of the large marker", [f"{axis:<22}" for axis in AXES])]
-    for name, fit in result.fits.items():
-        cells = [
-            f"{w:.3f} [{low:+.3f}, {high:+.3f}]"
-            for w, low, high in zip(fit.weights, fit.low, fit.high, strict=True)
-        ]
-        lines.append(_line(LABELS[name], cells))
-    lines.append(_line(LABELS["paper"], [f"{w:.3f}{'':17}" for w in PAPER_WEIGHTS]))
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def _lms_text(result: Result) -> str:
-    run = result.runs["lms"]
-    away = np.abs(run.weights - result.fits["closed_form"].raw).max()
-    return (
-        f"LMS took {run.passes} passes ({int(run.rows[-1])} rows); in their second half its "
-        f"weights moved by at most {run.moved.max():.4f}, and it ends {away:.4f} from the closed "
-        f"form"
-    )
-
-
-def _errors_text(title: str, evidence: Evidence) -> str:
-    lines = [title, _head()]
-    for name, method in evidence.methods.items():
-        cells = [
-            f"{v * k:.3g} [{low * k:.3g}, {high * k:.3g}]"
-            for v, low, high, k in zip(method.rms, method.low, method.high, _SCALES, strict=True)
-        ]
-        lines.append(_line(LABELS[name], cells))
-    return "\n".join(lines)
+def _data_text(result: Result) -> str:
+    errors = result.errors
+    text = f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions"
+    if errors.single_rows:
+        text += f" ({errors.single_rows} more rows without both markers do not count)"
+    return _wrapped(text)
 
 
 def verdict(result: Result) -> str:
-    """Against what the weights win, and which are recommended."""
-    lines = [
-        f"gain of {LABELS[result.chosen]} in RMS error, with its 95 % interval (* beyond it)",
-        _head(),
-        *_gains(result.evidence, result.chosen),
-    ]
-    if result.other is not None:
-        lines += [f"on {result.other_name}", *_gains(result.other, result.chosen)]
-    for k, axis in enumerate(AXES):
-        better = SINGLE[int(result.evidence.better[k])]
-        lines.append(
-            f"{axis}: recommended is {result.recommended[k]:.3f}, which beats the {better} marker"
-            if result.proven[k]
-            else f"{axis}: no weight is proven to beat the {better} marker alone"
-        )
+    """What to fly with, and why, in a line for each axis."""
+    better = [SINGLE[int(k)] for k in result.evidence.better]
     if not any(result.proven):
-        lines.append(
-            "these weights are not recommended: on no axis do they beat the better single marker "
-            "beyond the interval"
+        return _wrapped(
+            "not recommended: on no axis do these weights beat the better single marker beyond "
+            "the 95 % interval; take more positions, or fly merge.method: joint"
         )
+    lines = [f"recommended weights of the large marker ({LABELS[result.chosen]})"]
+    for axis, name, proven, weight in zip(
+        AXES, better, result.proven, result.recommended, strict=True
+    ):
+        why = (
+            f"beats the {name} marker alone beyond the 95 % interval"
+            if proven
+            else f"the {name} marker alone: no weight is proven to beat it"
+        )
+        lines.append(f"  {axis:<4} {weight:.3f}  {why}")
     return "\n".join(lines)
 
 
-def _gains(evidence: Evidence, chosen: str) -> list[str]:
-    lines = []
+def _errors_text(title: str, evidence: Evidence) -> str:
+    lines = [_wrapped(title), _head()]
+    for name, method in evidence.methods.items():
+        halves = method.high - method.rms
+        lines.append(_line(LABELS[name], _scaled(method.rms, halves)))
+    return "\n".join(lines)
+
+
+def _gains_text(result: Result, evidence: Evidence, where: str) -> str:
+    """By how much the chosen weights' error is below that of other ways."""
+    lines = [
+        _wrapped(
+            f"gain of {LABELS[result.chosen]} in RMS error{where} over (* beyond its interval)"
+        ),
+        _head(),
+    ]
     for other in ("large", "small", "paper", "joint"):
         if other not in evidence.methods:
             continue
-        gain, low, high = gain_over(evidence, chosen, other)
+        gain, low, high = gain_over(evidence, result.chosen, other)
         cells = [
-            f"{g * k:+.3g} [{lo * k:+.3g}, {hi * k:+.3g}]" + ("*" if lo > 0.0 or hi < 0.0 else " ")
-            for g, lo, hi, k in zip(gain, low, high, _SCALES, strict=True)
+            cell + ("*" if lo > 0.0 or hi < 0.0 else " ")
+            for cell, lo, hi in zip(_scaled(gain, high - gain, sign="+"), low, high, strict=True)
         ]
-        lines.append(_line(f"over {LABELS[other]}", cells))
-    return lines
+        lines.append(_line(LABELS[other], cells).rstrip())
+    return "\n".join(lines)
 
 
-def _head() -> str:
-    return _line("", [f"{axis} [{unit}]" for axis, unit in zip(AXES, _UNITS, strict=True)])
-
-
-def _line(label: str, cells: list[str]) -> str:
-    return f"{label:<26}" + "".join(f"{cell:>28}" for cell in cells)
+def _weights_text(result: Result) -> str:
+    """The large marker's, by all methods, and how LMS got there."""
+    lines = [_line("fitted weights", list(AXES))]
+    for name, fit in result.fits.items():
+        halves = (fit.high - fit.low) / 2.0
+        cells = [f"{w:.3f} +-{half:.3f}" for w, half in zip(fit.weights, halves, strict=True)]
+        lines.append(_line(LABELS[name], cells))
+    lines.append(_line(LABELS["paper"], [f"{w:.3f}{'':8}" for w in PAPER_WEIGHTS]).rstrip())
+    run = result.runs["lms"]
+    away = np.abs(run.weights - result.fits["closed_form"].raw).max()
+    lines.append(
+        _wrapped(
+            f"LMS took {run.passes} passes ({int(run.rows[-1])} rows); in their second half its "
+            f"weights moved by at most {run.moved.max():.4f}, and it ends {away:.4f} from the "
+            f"closed form"
+        )
+    )
+    return "\n".join(lines)
 
 
 def _bias_text(result: Result) -> str:
-    lines = ["constant offsets (no weight can mend them: calibration, mounting or print can)"]
+    lines = [
+        _wrapped("constant offsets (no weight can mend them: calibration, mounting or print can)"),
+        _head(),
+    ]
     for name, bias in result.bias.items():
-        cells = [
-            f"{axis} {mean * k:+.3f} +- {half * k:.3f} {unit}"
-            for axis, mean, half, k, unit in zip(
-                AXES, bias.mean, bias.half_width, _SCALES, _UNITS, strict=True
-            )
-        ]
-        lines.append(f"  {name}: " + ", ".join(cells))
-    outliers = ", ".join(
-        f"{axis} {k}" for axis, k in zip(AXES, result.errors.outliers, strict=True)
-    )
-    lines.append(f"outliers left out: {outliers}")
+        lines.append(_line(f"{name} marker", _scaled(bias.mean, bias.half_width, sign="+")))
+    cells = [f"{int(count)}{'':6}" for count in result.errors.outliers]
+    lines.append(_line("outliers left out", cells).rstrip())
     return "\n".join(lines)
 
 
@@ -140,47 +139,64 @@ def estimated(result: Result) -> Array:
     return result.errors.actual + error
 
 
-def table_one(result: Result) -> str:
-    """The paper's Table I: relative positions in centimetres."""
-    actual = result.errors.actual[:, :3] * 100.0
-    found = estimated(result)[:, :3] * 100.0
-
-    def triple(v: Array, digits: int) -> str:
-        return "(" + ", ".join(_plain(float(c), digits) for c in v) + ")"
-
-    rows = (
-        ("Actual Position", [triple(v, 2) for v in actual]),
-        ("Estimated Position", [triple(v, 3) for v in found]),
-        ("Est. Position Error", [triple(v, 4) for v in found - actual]),
-    )
-    return _table("TABLE I  Relative position in centimetres", rows)
-
-
-def table_two(result: Result) -> str:
-    """The paper's Table II: relative heading in degrees."""
-    actual = np.degrees(wrap(result.errors.actual[:, YAW]))
-    found = np.degrees(wrap(estimated(result)[:, YAW]))
-    error = np.degrees(wrap(np.radians(found - actual)))
-    rows = (
-        ("Actual Heading Angle", [_plain(float(v), 1) for v in actual]),
-        ("Estimated Heading Angle", [_plain(float(v), 3) for v in found]),
-        ("Est. Heading Angle Error", [_plain(float(v), 4) for v in error]),
-    )
-    return _table("TABLE II  Relative heading angle in degrees", rows)
-
-
-def _plain(value: float, digits: int) -> str:
-    """Without the sign of a zero."""
-    return f"{round(value, digits) + 0.0:.{digits}f}"
-
-
-def _table(title: str, rows: tuple[tuple[str, list[str]], ...], most: int = 20) -> str:
-    count = len(rows[0][1])
-    lines = [title + (f" (the first {most} of {count} positions)" if count > most else "")]
-    for start in range(0, min(count, most), COLUMNS):
-        blocks = [cells[start : min(start + COLUMNS, most)] for _, cells in rows]
-        widths = [max(len(block[i]) for block in blocks) for i in range(len(blocks[0]))]
-        for (label, _), block in zip(rows, blocks, strict=True):
-            cells = (f"{cell:>{width}}" for cell, width in zip(block, widths, strict=True))
-            lines.append(f"| {label:<24} | " + " | ".join(cells) + " |")
+def positions_text(result: Result) -> str:
+    """The paper's tables I and II in one: a line for each position."""
+    actual = result.errors.actual
+    error = estimated(result) - actual
+    error[:, YAW] = wrap(error[:, YAW])
+    shown = np.column_stack([actual[:, :3] * 100.0, np.degrees(wrap(actual[:, YAW]))])
+    count = len(actual)
+    more = f" (the first {MOST_POSITIONS} of {count})" if count > MOST_POSITIONS else ""
+    columns = ("x [cm]", "y [cm]", "z [cm]", "yaw [deg]")
+    heads = (*columns, *(f"{axis} [{unit}]" for axis, unit in zip(AXES, _UNITS, strict=True)))
+    lines = [
+        f"positions{more}: as they are, and the merged pose's error there (weights fitted",
+        "to the others; Tables I and II of the paper)",
+        _place_line("", heads),
+    ]
+    numbers = result.errors.positions
+    for number, place, off in list(zip(numbers, shown, error * _SCALES, strict=True))[
+        :MOST_POSITIONS
+    ]:
+        cells = [*(f"{v:.2f}" for v in place[:3]), f"{place[3]:.1f}", *(figure(v) for v in off)]
+        lines.append(_place_line(str(int(number)), cells))
     return "\n".join(lines)
+
+
+_WIDTHS = (8, 8, 8, 11, 9, 8, 8, 12)
+
+
+def _place_line(name: str, cells: Sequence[str]) -> str:
+    return f"{name:<8}" + "".join(f"{c:>{width}}" for c, width in zip(cells, _WIDTHS, strict=True))
+
+
+def figure(value: float, sign: str = "", spread: float = 0.0) -> str:
+    """To three digits of the larger one, but no finer than hundredths; beyond 100 000 in
+    thousands (k). No exponent, and no zero with a minus."""
+    size = max(abs(value), abs(spread))
+    if size >= 99_950:
+        return f"{value / 1e3:{sign}.0f}k"
+    digits = 2 if size < 9.995 else 1 if size < 99.95 else 0
+    return f"{round(value, digits) + 0.0:{sign}.{digits}f}"
+
+
+def _scaled(values: Array, halves: Array, sign: str = "") -> list[str]:
+    cells = []
+    for value, half in zip(values * _SCALES, halves * _SCALES, strict=True):
+        v, h = float(value), float(half)
+        cells.append(f"{figure(v, sign, h)} +-{figure(h, '', v)}")
+    return cells
+
+
+def _head() -> str:
+    cells = [f"{axis} [{unit}]" for axis, unit in zip(AXES, _UNITS, strict=True)]
+    return _line("", cells)
+
+
+def _line(label: str, cells: list[str]) -> str:
+    room = _CELL - 1
+    return f"{label:<{_LABEL}}" + "".join(f" {cell:>{room}}" for cell in cells)
+
+
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)

@@ -76,6 +76,23 @@ def test_pictures_become_a_file_and_a_report(calibrated: Result, rendered: Rende
     assert "GOOD TO FLY" in calibrated.stderr
 
 
+def test_ctrl_c_in_the_drawing_leaves_the_calibration(
+    rendered: Rendered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is on the disk by then; only its picture is given up."""
+    output = tmp_path / "camera.yaml"
+
+    def draw(_result: object) -> bytes:
+        assert load_calibration(output).size_px == (480, 360)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("perchctl.calibration.plot.draw_calibration", draw)
+    result = calibrate(f"images:{rendered[0]}", "-b", BOARD, "-o", str(output), "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["report"] is None
+    assert "the plot is not drawn" in result.stderr
+
+
 def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
     calibrated: Result, rendered: Rendered, tmp_path: Path
 ) -> None:

@@ -121,7 +121,7 @@ def test_words_after_a_flight(tmp_path: Path) -> None:
         fell=True,
         phases=(PhaseSpan("APPROACH", 0.0, 3.0), PhaseSpan("LANDED", 3.0, 3.0)),
     )
-    text = summary_text(flight, tmp_path / "f.jsonl", tmp_path / "f.png")
+    text = summary_text(flight, tmp_path / "f.jsonl")
     assert text.splitlines() == [
         "LANDED: target not found in the allowed attempts [target not found]",
         "flight:    21.4 s, 1 attempt",
@@ -130,7 +130,6 @@ def test_words_after_a_flight(tmp_path: Path) -> None:
         "vehicle:   locked by its supervisor: inspect and restart it",
         "vehicle:   fell",
         f"log:       {tmp_path / 'f.jsonl'}",
-        f"plot:      {tmp_path / 'f.png'}",
     ]
 
 

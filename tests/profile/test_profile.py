@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 import perchctl
 from perchctl.calibration.files import load_calibration
-from perchctl.errors import InvalidValue, NotFound, ProfileNote
+from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.profile.places import listing
 
@@ -69,6 +69,24 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("kalman: {alpha: .nan}", ["kalman.alpha", "finite"]),
         ("simulation: {ceiling_z_m: [2.6, 1.8]}", ["simulation.ceiling_z_m", "2.6", "1.8"]),
         ("planner: {search: {max_height_m: 9}}", ["planner.search.max_height_m"]),
+        ("vehicle: {gear_body_m: [0, 0, 3]}", ["vehicle.gear_body_m.2", "0.3, found 3 (metres"]),
+        ("camera: {mount: {position_m: [-30, 0, 0]}}", ["camera.mount.position_m.0", "-30"]),
+        ("camera: {mount: {rpy_deg: [0, 0, 1.5708]}}",
+         ["camera.mount.rpy_deg", "found 1.5708", "90 degrees in radians", "write 90"]),
+        ("camera: {mount: {rpy_deg: [3.14, 0, -0.785]}}", ["found 3.14", "write 180"]),
+        ("target: {small: {dictionary: DICT_4X4_1000, id: 997, side_m: 0.025}}",
+         ["target", "the same marker", "DICT_4X4_1000/997", "another id"]),
+        ("kalman: {k1: 1}\nmerge: {}\nkalman: {k2: 1}", ["line 3", "kalman", "line 1", "keep one"]),
+        ("kalman: {k1: 1,\n  k1: 2}", ["line 2", "k1 is there twice"]),
+        ("planner: {takeoff_height_m: yes}", ["planner.takeoff_height_m", "yes", "a number"]),
+        ("planner: {approach_xy_m: [off, 1]}", ["planner.approach_xy_m", "a number"]),
+        ("link: {parameters: {a.b: on}}", ["link.parameters", "a number"]),
+        ("", ["empty", "extends: sim"]),
+        ("# only a remark\n", ["empty"]),
+        ("camera:\nkalman: {}", ["camera", "must hold keys", "None"]),
+        ("date: 2024-13-45", ["month"]),
+        ("kalman: &a [*a]", ["line 1", "alias"]),
+        ("[" * 3000, ["nested too deeply"]),
         ("- a list", ["keys and values"]),
         ("kalman: {alpha: 0.85", ["line", "YAML"]),
     ],
@@ -77,6 +95,51 @@ def test_faults_are_one_sentence(tmp_path: Path, text: str, expected: list[str])
     message = _refusal(tmp_path, text)
     for word in expected:
         assert word in message
+
+
+@pytest.mark.parametrize("angles", ["[0.3, -1.57, 90.2]", "[0, 0, 1.56]", "[0, 180, -45]"])
+def test_a_measured_turn_is_not_taken_for_radians(tmp_path: Path, angles: str) -> None:
+    (tmp_path / "mine.yaml").write_text(f"camera: {{mount: {{rpy_deg: {angles}}}}}")
+    load_profile(str(tmp_path / "mine.yaml"))
+
+
+def test_truths_are_read_where_a_key_is_one(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("camera: {mirrored: yes}\nlog: {plot: off}\n")
+    mine = load_profile(str(tmp_path / "mine.yaml"))
+    assert mine.camera.mirrored
+    assert not mine.log.plot
+
+
+def bomb(levels: int) -> str:
+    """YAML whose last list, `a<levels>`, stands for 10 ** levels values."""
+    lines = [f"a0: &a0 [{', '.join(['x'] * 10)}]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, levels)]
+    return "\n".join(lines) + "\n"
+
+
+def test_aliases_that_unfold_to_millions_are_refused_shortly(tmp_path: Path) -> None:
+    assert len(bomb(8)) < 500
+    message = _refusal(tmp_path, bomb(8))
+    assert "more than 20000 values" in message
+    assert len(message) < 300 + len(str(tmp_path))
+    with pytest.raises(InvalidValue, match="more than 20000 values"):
+        load_calibration(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("text", [bomb(3) + "kalman: *a2", "description: [" + "x" * 99999 + "]",
+                                  "x" * 99 + ": 1"])  # fmt: skip
+def test_no_fault_is_longer_than_a_few_lines(tmp_path: Path, text: str) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(PerchError) as caught:
+        load_profile(str(tmp_path / "mine.yaml"))
+    assert len(str(caught.value)) < 500 + 2 * len(str(tmp_path))
+
+
+def test_a_few_aliases_are_what_they_are(tmp_path: Path) -> None:
+    text = "vehicle: {gear_body_m: &here [0.01, 0, 0.02]}\ncamera: {mount: {position_m: *here}}\n"
+    (tmp_path / "mine.yaml").write_text(text)
+    mine = load_profile(str(tmp_path / "mine.yaml"))
+    assert mine.vehicle.gear_body_m == mine.camera.mount.position_m == (0.01, 0, 0.02)
 
 
 def test_missing_profile_names_the_choices(tmp_path: Path) -> None:
@@ -152,6 +215,33 @@ def test_a_calibration_is_found_beside_the_profile_that_names_it(tmp_path: Path)
     (tmp_path / "mine.yaml").write_text("extends: base/base.yaml\n")
     mine = load_profile(str(tmp_path / "mine.yaml"))
     assert Path(mine.camera.calibration) == (tmp_path / "base" / "lens.yaml").resolve()
+
+
+def test_a_profile_s_paths_are_from_its_folder_and_from_nowhere_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files of those names in the folder where perchctl is called are other files."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    for folder in (there / "lens", here / "lens"):
+        folder.mkdir(parents=True)
+    (there / "base.yaml").write_text(
+        "camera: {calibration: lens/mine.yaml, mask: gear.png}\nmerge: {weights_file: w.yaml}\n"
+    )
+    (here / "heir.yaml").write_text("extends: ../there/base.yaml\n")
+    text = find_calibration("example_640x480").read_text(encoding="utf-8")
+    for name in ("lens/mine.yaml", "gear.png", "w.yaml"):
+        (here / name).write_text(text, encoding="utf-8")
+    monkeypatch.chdir(here)
+    heir = load_profile("heir.yaml", with_weights=False)
+    assert heir.camera.calibration == str(there / "lens/mine.yaml")
+    assert heir.camera.mask == str(there / "gear.png")
+    assert heir.merge.weights_file == str(there / "w.yaml")
+    with pytest.raises(NotFound, match=r"there/lens/mine\.yaml not found"):
+        find_calibration(heir.camera.calibration)
+    (here / "none.yaml").write_text("extends: base.yaml\n")
+    monkeypatch.chdir(there)
+    with pytest.raises(NotFound, match=r"here/none\.yaml: extends: profile file"):
+        load_profile("../here/none.yaml")
 
 
 # --- every key is read by something ------------------------------------------------------

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +25,7 @@ from perchctl.geometry import rot_z
 from perchctl.profile import find_calibration, load_profile
 from perchctl.weights import truth
 from perchctl.weights.collect import MarkerReader, SessionFile, collecting_pipeline, fault_of
+from perchctl.weights.report import figure
 from perchctl.weights.table import HEADER, NEEDED, read_csv
 from tests.helpers.weights_data import BEST, independent, known, write
 
@@ -38,8 +41,9 @@ def session(tmp_path: Path) -> Path:
     return write(independent(1), tmp_path / "session.csv")
 
 
-def test_one_object_with_every_method(session: Path) -> None:
-    done = run(session, "--json", "--test", session)
+def test_one_object_with_every_method(session: Path, tmp_path: Path) -> None:
+    other = write(independent(2), tmp_path / "other.csv")
+    done = run(session, "--json", "--test", other)
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     for name in ("lms", "closed_form", "inverse_variance"):
@@ -61,8 +65,7 @@ def test_weights_go_to_a_file_and_from_there_into_a_flight(session: Path, tmp_pa
     out, plot = tmp_path / "w.yaml", tmp_path / "w.png"
     first = run(session, "-o", out, "--plot", plot)
     assert first.exit_code == 0, first.output
-    assert "TABLE I" in first.stdout
-    assert "TABLE II" in first.stdout
+    assert "Tables I and II" in first.stdout
     assert cv2.imread(str(plot)).shape[0] > 500
     written = yaml.safe_load(out.read_text())
     assert len(written["data"]["sha256"]) == 64
@@ -82,7 +85,7 @@ def test_weights_go_to_a_file_and_from_there_into_a_flight(session: Path, tmp_pa
 def test_the_profile_s_own_file_is_where_they_go(session: Path, tmp_path: Path) -> None:
     profile = tmp_path / "mine.yaml"
     profile.write_text("extends: paper\nmerge: {weights_file: fitted.yaml}\n", encoding="utf-8")
-    with pytest.raises(Exception, match=r"weights_file: fitted\.yaml is neither beside"):
+    with pytest.raises(Exception, match=r"weights_file: /.*/fitted\.yaml does not exist"):
         load_profile(str(profile))
     assert run(session, "-p", profile).exit_code == 0
     (tmp_path / "heir.yaml").write_text(f"extends: {profile}\n", encoding="utf-8")
@@ -115,6 +118,101 @@ def test_weights_that_do_not_help_are_not_written(tmp_path: Path) -> None:
     assert not (tmp_path / "w.yaml").exists()
     assert run(data, "-o", tmp_path / "w.yaml", "--anyway").exit_code == 0
     assert json.loads(run(data, "--json").stdout)["recommended"] is None
+    told = run(data, "-o", tmp_path / "v.yaml", "--json")
+    assert told.exit_code == json.loads(told.stdout)["exit_code"] == 1
+    assert "not written" in json.loads(told.stdout)["error"]
+
+
+# -- the report --------------------------------------------------------------
+
+
+def test_the_report_fits_a_terminal_with_the_verdict_first_and_notes_last(tmp_path: Path) -> None:
+    """80 columns, also of data that are off by half a metre; micrometres, no exponents."""
+    for name, data in (("good", known(1)), ("wild", independent(3, small=(0.5,) * 4, positions=4))):
+        path = write(data, tmp_path / f"{name}.csv")
+        other = write(independent(8), tmp_path / "other.csv")
+        text = run(path, "--test", other).stdout
+        lines = text.splitlines()
+        assert max(len(line) for line in lines if str(tmp_path) not in line) <= 80
+        assert "[um]" in text
+        assert "[mm]" not in text
+        assert not re.search(r"\de[+-]\d|(?<!\+)-0\.00\b", text)
+        paragraphs = text.split("\n\n")
+        assert "recommended" in paragraphs[1]
+        notes = [k for k, part in enumerate(paragraphs) if part.startswith("note:")]
+        assert notes in ([], [len(paragraphs) - 1])
+    assert paragraphs[1].startswith("not recommended")
+    assert notes  # of few positions
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-0.0643, "-0.06"), (-0.001, "0.00"), (8.126, "8.13"), (99.96, "100"), (5.16e5, "516k")],
+)
+def test_figures_have_three_digits_and_no_exponent(value: float, text: str) -> None:
+    assert figure(value) == text
+
+
+def test_what_is_not_written_is_said(session: Path, tmp_path: Path) -> None:
+    assert "no file written: name one with -o" in run(session).stderr
+    bad = write(independent(3, small=(0.5,) * 4), tmp_path / "s.csv")
+    assert "no file written: the weights are not recommended" in run(bad).stderr
+    out, plot = tmp_path / "w.yaml", tmp_path / "w.png"
+    found = json.loads(run(session, "--json", "-o", out, "--plot", plot).stdout)
+    assert (found["weights_file"], found["plot"]) == (str(out), str(plot))
+    found = json.loads(run(session, "--json").stdout)
+    assert (found["weights_file"], found["plot"]) == (None, None)
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_ctrl_c_in_the_drawing_leaves_the_result(
+    as_json: bool, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def draw(_result: object) -> bytes:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("perchctl.weights.plot.draw_weights", draw)
+    done = run(session, "--plot", tmp_path / "w.png", *(["--json"] if as_json else []))
+    assert done.exit_code == 130
+    if as_json:
+        found = json.loads(done.stdout)
+        assert (found["plot"], found["exit_code"]) == (None, 130)
+        assert found["recommended"]
+    else:
+        assert "recommended weights" in done.stdout
+
+
+# -- the same rows twice -------------------------------------------------------
+
+
+def test_the_same_rows_twice_are_refused(session: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.csv"
+    text = session.read_text()
+    header, rows = text.split("\n", 1)
+    for arguments, content, said in (
+        ((session, session), text, "named twice"),
+        ((session, copy), text, "hold the same data"),
+        ((session, copy), text.rsplit("\n", 2)[0] + "\n", "line 2: this row stands in line 2 of"),
+        ((copy,), f"{header}\n{rows}{rows}", "line 1002: this row stands in line 2 of"),
+        ((session, "--test", copy), text, "--test judges by other data"),
+        ((session, "--test", copy), f"{header}\n{rows[rows.index(chr(10)) + 1 :]}", "--test"),
+    ):
+        copy.write_text(content)
+        done = run(*arguments)
+        assert done.exit_code == 30, said
+        assert said in done.stderr
+        assert done.stderr.count("\n") == 1
+        assert not done.stdout
+
+
+def test_rows_without_times_may_be_equal(tmp_path: Path) -> None:
+    """Rounded measurements of a camera at rest: no evidence twice, as far as one can say."""
+    data = independent(4, per=20)
+    rounded = [np.round(pose, 3) for pose in (data.large, data.small, data.actual)]
+    for t_s, code in ((data.t_s * 0.0, 0), (np.repeat(data.t_s[::2], 2), 30)):
+        large, small, actual = (np.repeat(pose[::2], 2, axis=0) for pose in rounded)
+        twice = replace(data, t_s=t_s, large=large, small=small, actual=actual)
+        assert run(write(twice, tmp_path / "r.csv")).exit_code == code
 
 
 # -- bad input ---------------------------------------------------------------

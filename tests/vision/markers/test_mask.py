@@ -171,7 +171,7 @@ WHITE, BLACK = np.full((H, W), 255, np.uint8), np.zeros((H, W), np.uint8)
 @pytest.mark.parametrize(
     ("image", "error", "told"),
     [
-        (None, NotFound, "neither beside the profile nor a path"),
+        (None, NotFound, "does not exist"),
         (WHITE[:240, :320], InvalidValue, "320x240 px, but the calibration was made at 640x480"),
         (WHITE, InvalidValue, "covers 100 % of the picture, at most 75 %"),
         (BLACK, InvalidValue, "covers nothing"),

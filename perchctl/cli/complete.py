@@ -1,0 +1,15 @@
+"""What options offer to a shell at Tab."""
+
+from __future__ import annotations
+
+
+def complete_profile(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import profiles
+
+    return profiles(incomplete)
+
+
+def complete_source(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import sources
+
+    return sources(incomplete)

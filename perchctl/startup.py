@@ -1,0 +1,44 @@
+"""Ctrl-C while perchctl is still loading: one sentence and an exit code, no traceback.
+
+A KeyboardInterrupt would come up in the middle of some library's import, which prints it as
+ignored, or makes another error of it. Nothing is open yet: the process ends where it is. This
+module itself loads as little as can be: until then Ctrl-C is Python's.
+"""
+
+from __future__ import annotations
+
+# The half of `signal` that is in the interpreter already; its other half are enumerations.
+import _signal as signal  # type: ignore[import-not-found]
+import os
+import sys
+
+EXIT_CODE = 130
+SENTENCE = "Ctrl-C"
+
+
+def leave_at_ctrl_c() -> None:
+    """From now on, unless Ctrl-C is ignored or somebody else's already."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _leave)
+
+
+def loaded() -> None:
+    """From now on Ctrl-C is a KeyboardInterrupt again."""
+    if signal.getsignal(signal.SIGINT) is _leave:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def failure_record(sentence: str, code: int) -> str:
+    """What `--json` prints in place of a result."""
+    import json
+
+    return json.dumps({"error": sentence, "exit_code": code})
+
+
+def _leave(_signal: int, _frame: object) -> None:
+    try:
+        os.write(2, f"perchctl: {SENTENCE}\n".encode())
+        if "--json" in sys.argv[1:]:
+            os.write(1, f"{failure_record(SENTENCE, EXIT_CODE)}\n".encode())
+    finally:
+        os._exit(EXIT_CODE)
