@@ -22,6 +22,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "mujoco": ("perchctl.sim",),
     "matplotlib": ("*.plot",),
     "motioncapture": ("perchctl.weights.truth",),
+    "av": ("perchctl.track.files",),
 }
 
 # Time is an argument here.

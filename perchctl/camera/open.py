@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from perchctl.camera.device import DeviceSource
-from perchctl.camera.files import IMAGE_SUFFIXES, ImagesSource, VideoSource
+from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
 from perchctl.errors import InvalidValue, NotFound, TimedOut
@@ -48,12 +48,18 @@ def is_live(spec: str) -> bool:
     return scheme_of(spec) not in RECORDED
 
 
+def of_pictures(spec: str) -> bool:
+    """Whether the source is files of pictures, which may or may not belong together."""
+    return scheme_of(spec) == "images"
+
+
 def open_source(
     spec: str,
     latency_s: float,
     size_px: tuple[int, int] | None,
     clock: Clock,
     timeout_s: float = FIRST_FRAME_WITHIN_S,
+    pictures_hz: float = DEFAULT_RATE_HZ,
 ) -> FrameSource:
     """Open the source and wait for its first frame.
 
@@ -64,6 +70,7 @@ def open_source(
         size_px: wanted width and height (requested of ``camera:N`` only).
         clock: the loop's clock, s.
         timeout_s: how long the first frame of a live source may take.
+        pictures_hz: as if taken at this rate (``images:`` only).
 
     Raises:
         NotFound: no such camera, file or stream. InvalidValue: unknown scheme or
@@ -73,7 +80,7 @@ def open_source(
     if scheme == "video" and rest:
         return VideoSource(Path(rest).expanduser(), latency_s)
     if scheme == "images" and rest:
-        return ImagesSource(str(Path(rest).expanduser()), latency_s)
+        return ImagesSource(str(Path(rest).expanduser()), latency_s, pictures_hz)
     if scheme == "camera":
         if not (rest.isascii() and rest.isdigit()):
             raise InvalidValue(f"camera source {spec!r} lacks a camera number, as in camera:0")

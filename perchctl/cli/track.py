@@ -27,7 +27,13 @@ def track(
         ),
     ] = None,
     stills: Annotated[
-        bool, typer.Option("--stills", help="Each picture alone: no window, no filter.")
+        bool,
+        typer.Option(
+            "--stills", help="Each picture alone, no window, no filter: as files of pictures are."
+        ),
+    ] = False,
+    video: Annotated[
+        bool, typer.Option("--video", help="The files are one video's pictures, at 30 Hz.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
     csv: Annotated[
@@ -45,7 +51,7 @@ def track(
     tvec. A JSON line holds frame, t_s, stage (large, both, small, none), large and small (null,
     or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px) and target (null, or rvec_rad,
     tvec_m, yaw_rad, sigma_m, sigma_yaw_rad). With both markers in sight target is their joint
-    pose; without --stills it is filtered, and goes on for a few frames after stage none.
+    pose; but for stills it is filtered, and goes on for a few frames after stage none.
     yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
     along the camera's x, y, z.
     """
@@ -57,6 +63,7 @@ def track(
             profile=profile,
             calibration=calibration,
             stills=stills,
+            video=video,
             as_json=as_json,
             csv=csv,
             overlay=overlay,

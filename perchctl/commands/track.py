@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import TextIO
 
 from perchctl.calibration.files import assumed_size, load_calibration, load_sized
-from perchctl.camera.files import ImagesSource, Recording
+from perchctl.camera.files import DEFAULT_RATE_HZ, ImagesSource, Recording
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.mjpeg import without_password
-from perchctl.camera.open import open_source, source_spec
+from perchctl.camera.open import of_pictures, open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
@@ -42,6 +42,8 @@ from perchctl.track.tracker import (
 )
 from perchctl.vision.types import Frame
 
+STILLS_HZ = 1.0
+"""Of files of pictures that do not belong together: so each can be looked at, in the video too."""
 POLL_S = 0.002
 OPEN_PAGE_WITHIN_S = 60.0
 """How long a recording waits, on a terminal, for somebody to open the page."""
@@ -55,6 +57,7 @@ class TrackRequest:
     profile: str = "sim"
     calibration: Path | None = None
     stills: bool = False
+    video: bool = False
     as_json: bool = False
     csv: Path | None = None
     overlay: Path | None = None
@@ -64,7 +67,8 @@ class TrackRequest:
 
 @dataclass(frozen=True)
 class TrackOptions:
-    """The command line on top of the profile, checked. `source` as `open_source` takes it."""
+    """The command line on top of the profile, checked. `source` as `open_source` takes it;
+    `stills`: each of its pictures for itself."""
 
     source: str
     profile: Profile
@@ -85,6 +89,7 @@ def resolve(request: TrackRequest) -> TrackOptions:
     UsageError."""
     profile = load_profile(request.profile)
     source = source_spec(request.source)
+    stills = _are_stills(request, source)
     for path, suffix in ((request.csv, ".csv"), (request.overlay, ".mp4")):
         if path is not None:
             check_output(path, suffix)
@@ -103,7 +108,18 @@ def resolve(request: TrackRequest) -> TrackOptions:
         csv=request.csv,
         overlay=request.overlay,
     )
-    return TrackOptions(source, profile, calibration, request.stills, outputs, port)
+    return TrackOptions(source, profile, calibration, stills, outputs, port)
+
+
+def _are_stills(request: TrackRequest, source: str) -> bool:
+    """Files of pictures need not belong together, unless the user says so."""
+    if request.video and request.stills:
+        raise UsageError("--stills and --video contradict each other: give one of them")
+    if request.video and not of_pictures(source):
+        raise UsageError(
+            f"--video is for files of pictures, and {source} gives a video anyway: leave it out"
+        )
+    return request.stills or (of_pictures(source) and not request.video)
 
 
 def track(
@@ -184,7 +200,8 @@ def _open(
     options: TrackOptions, size_px: tuple[int, int] | None, now: Callable[[], float]
 ) -> _Input:
     config = options.profile.camera
-    raw = open_source(options.source, config.latency_s, size_px, now)
+    pictures_hz = STILLS_HZ if options.stills else DEFAULT_RATE_HZ
+    raw = open_source(options.source, config.latency_s, size_px, now, pictures_hz=pictures_hz)
     source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
     paths = raw.paths if isinstance(raw, ImagesSource) else None
     if isinstance(raw, Recording):
@@ -222,7 +239,6 @@ class _Run:
             setup,
             live=source.live,
             stills=options.stills,
-            recorded_stills=self.input.paths is not None,
             disagreement_frames=options.profile.merge.disagreement_frames,
         )
         self._axis_m = AXES_OF_SIDE * options.profile.target.large.side_m

@@ -25,7 +25,9 @@ from perchctl.mission.watch import Event, EventKind
 PERIOD_S = 0.1
 CLOSE_TIMEOUT_S = 1.0
 EVENTS_KEPT = 1000
-WIDTH = 80
+WIDTH = 78
+"""Of 80: a terminal echoes ^C behind the panel, and where that wraps, the next picture of the
+panel is drawn a line too low, with a piece of the last one left above it."""
 
 _STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
 
@@ -92,23 +94,26 @@ class Reporter:
         self._closing = threading.Event()
         self._lines: deque[str] = deque(maxlen=EVENTS_KEPT)
         self._status: FlightStatus | None = None
+        self._drawn: FlightStatus | None = None
         self._start_s: float | None = None
         self._next_s = -float("inf")
-        self._phase = ""
+        self._phase = self._shown = ""  # as a line told it, and as the panel has it
         self._thread = threading.Thread(target=self._draw, name="display", daemon=True)
         self._thread.start()
 
     def update(self, status: FlightStatus) -> None:
-        """Show this moment, unless the last one shown is less than 0.1 s old."""
+        """Show this moment: at once if the phase is a new one, or 0.1 s after the last one that
+        was shown, or as the last one of all."""
         if self.problem is not None:
             return
+        self._status = status
         if status.phase != self._phase:  # a change without an event
             self._line(status.t_s, f"{status.phase}: {status.reason}")
             self._phase = status.phase
-        elif status.t_s < self._next_s:
+        elif status.phase == self._shown and status.t_s < self._next_s:
             return
+        self._shown = status.phase
         self._next_s = status.t_s + PERIOD_S
-        self._status = status
         self._wake.set()
 
     def event(self, event: Event) -> None:
@@ -152,8 +157,9 @@ class Reporter:
     def _draw_once(self) -> None:
         while self._lines:
             self._surface.line(self._lines.popleft())
-        status, self._status = self._status, None
-        if status is not None:
+        status = self._status
+        if status is not None and status is not self._drawn:
+            self._drawn = status
             self._surface.show(status)
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
+from perchctl.log.frames import Frames, frames_of
 from perchctl.log.read import FlightLog
 from perchctl.log.summary import FlightSummary, summary_of
 from perchctl.plot import (
@@ -29,9 +32,11 @@ from perchctl.plot import (
 )
 
 SHADES = ("#EEF3F8", "#FFFFFF")
-SIZE_IN = (11.0, 13.5)
+SIZE_IN = (11.0, 17.0)
+TITLE_COLUMNS = 110
+LAST_S, AFTER_S, LEAST_SPAN_MM = 5.0, 0.5, 5.0
 NAME_GAP = 0.02
-"""Share of the flight between the names of two phases, so that they do not overlap."""
+"""Share of the time axis between the names of two phases, so that they do not overlap."""
 
 AXES = (("x", "m", 100.0, "x [cm]"), ("y", "m", 100.0, "y [cm]"), ("z", "m", 100.0, "z [cm]"))
 YAW = ("yaw", "rad", 180.0 / math.pi, "yaw [deg]")
@@ -39,7 +44,8 @@ YAW = ("yaw", "rad", 180.0 / math.pi, "yaw [deg]")
 
 def plot_flight(log: FlightLog, png_path: Path | str) -> None:
     """Draw the flight into a PNG: errors, detections against the filtered track (as
-    the paper's figure 6), height, thrust and battery, over the named phases.
+    the paper's figure 6), where frames were lost, height, thrust and battery, over the
+    named phases; and the last seconds with the target in millimetres.
 
     Raises InvalidValue for a log without ticks or a file that cannot be written, NotFound
     for a missing folder.
@@ -47,25 +53,30 @@ def plot_flight(log: FlightLog, png_path: Path | str) -> None:
     if not log.records:
         raise InvalidValue(f"{log.path}: the log holds no ticks, there is nothing to plot")
     figure = new_figure(*SIZE_IN)
-    axes = figure.subplots(7, 1, sharex=True, height_ratios=(1.7, 1, 1, 1, 1, 1.1, 1.1))
+    *axes, last_ax = figure.subplots(9, 1, height_ratios=(1.7, 1, 1, 1, 1, 0.25, 1.1, 1.1, 2.0))
     t_s = log.column("t_s") - log.start_s
     _plot_errors(axes[0], log, t_s)
     for ax, (name, unit, scale, label) in zip(axes[1:5], (*AXES, YAW), strict=True):
         _plot_raw_and_filtered(ax, log, t_s, f"{name}_{unit}", scale, label)
     axes[1].legend(handles=_track_legend(), loc="best", ncols=5, fontsize=8)
-    _plot_height(axes[5], log, t_s)
-    _plot_power(axes[6], log, t_s)
+    frames = frames_of(log)
+    _plot_frames(axes[5], frames)
+    _plot_height(axes[6], log, t_s)
+    _plot_power(axes[7], log, t_s)
+    _plot_last_seconds(last_ax, log, t_s, frames)
+    whole_s = (float(t_s[0]), float(max(t_s[-1], t_s[0] + 1e-3)))
     for ax in axes:
+        ax.set_xlim(whole_s)
+        ax.tick_params(labelbottom=ax is axes[-1])
+    for ax in (*axes, last_ax):
         _shade_phases(ax, log)
         ax.grid(True, color=GRID, linewidth=0.6)
         ax.set_axisbelow(True)
-        ax.margins(x=0.0)
-    _name_phases(axes[0], log)
-    if t_s[-1] > t_s[0]:
-        axes[-1].set_xlim(t_s[0], t_s[-1])
-    axes[-1].set_xlabel("time [s]")
-    figure.align_ylabels(axes)
-    figure.suptitle(title_of(log, summary_of(log)), fontsize=12)
+    _name_phases(axes[0], log, whole_s)
+    for ax in (axes[-1], last_ax):
+        ax.set_xlabel("time [s]")
+    figure.align_ylabels([*axes, last_ax])
+    figure.suptitle(fill(title_of(log, summary_of(log)), TITLE_COLUMNS), fontsize=12)
     save_png(figure, Path(png_path))
 
 
@@ -163,22 +174,90 @@ def _plot_power(ax: Axes, log: FlightLog, t_s: Array) -> None:
     ax.legend(handles=lines, loc="best", ncols=2, fontsize=8)
 
 
+def _plot_frames(ax: Axes, frames: Frames) -> None:
+    """Where the pipeline had nothing to measure: no frame, or none with the target."""
+    _mark_lost(ax, frames, 0.0, 1.0)
+    ax.set_yticks([])
+    ax.set_ylabel("lost", rotation=0, ha="right", va="center")
+    handles = [
+        Rectangle((0, 0), 1, 1, color=VERMILLION, label=f"no frame ({_times(len(frames.gaps_s))})"),
+        Line2D([], [], color=GREY, label=f"frame without target ({len(frames.unseen_s)})"),
+    ]
+    ax.legend(handles=handles, loc="lower right", ncols=2, fontsize=8, bbox_to_anchor=(1.0, 0.9))
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times" if count else "never"
+
+
+def _mark_lost(ax: Axes, frames: Frames, low: float, high: float) -> None:
+    """Between two shares of the panel's height."""
+    upright = ax.get_xaxis_transform()
+    ax.vlines(frames.unseen_s, low, high, transform=upright, color=GREY, linewidth=0.8)
+    for start_s, end_s in frames.gaps_s:
+        ax.axvspan(start_s, end_s, low, high, color=VERMILLION, linewidth=0.0)
+
+
+def _plot_last_seconds(ax: Axes, log: FlightLog, t_s: Array, frames: Frames) -> None:
+    """What the contact was made with: x and y in millimetres up to the moment in which the
+    target was seen last, z on a scale of its own."""
+    tracked = np.isfinite(_while_tracked(log, log.column("ex_m")))
+    end_s = float(frames.seen_s[-1]) if frames.seen_s.size else float(t_s[-1])
+    shown_s = (end_s - LAST_S, end_s + AFTER_S)
+    inside = (t_s >= shown_s[0]) & (t_s <= shown_s[1])
+    frame_s = log.column("frame_t_s") - log.start_s
+    lines: list[Line2D] = []
+    span_mm = [LEAST_SPAN_MM]
+    for name, colour in (("x", BLUE), ("y", ORANGE)):
+        for source, marker in (("j", "s"), ("l", "o"), ("s", "^")):
+            raw_mm = 1e3 * log.column(f"{source}{name}_m")
+            ax.plot(frame_s, raw_mm, marker, markersize=3, color=colour, fillstyle="none")
+        e_mm = 1e3 * _while_tracked(log, log.column(f"e{name}_m"))
+        lines += ax.plot(t_s, e_mm, color=colour, linewidth=1.4, label=f"$e_{name}$ [mm]")
+        span_mm.append(float(np.nanmax(np.abs(e_mm[inside & tracked]), initial=0.0)))
+    miss_mm = 1e3 * log.column("true_miss_m")
+    if np.isfinite(miss_mm[inside]).any():
+        lines += ax.plot(
+            t_s, miss_mm, color=GREY, linestyle=":", linewidth=1.6, label="true miss [mm]"
+        )
+        span_mm.append(float(np.nanmax(miss_mm[inside])))
+    z_ax = ax.twinx()
+    z_mm = 1e3 * _while_tracked(log, log.column("ez_m"))
+    lines += z_ax.plot(t_s, z_mm, color=BLACK, linewidth=1.1, linestyle="--",
+                       label="$e_z$ [mm], right")  # fmt: skip
+    _mark_lost(ax, frames, 0.0, 0.05)
+    ax.axhline(0.0, color=GREY, linewidth=0.8)
+    ax.set_xlim(shown_s)
+    ax.set_ylim(-1.2 * max(span_mm), 1.2 * max(span_mm))
+    z_ax.set_ylim(0.0, 1.05 * float(np.nanmax(z_mm[inside & tracked], initial=LEAST_SPAN_MM)))
+    _align_zeros(ax, z_ax)
+    ax.set_ylabel("last 5 s with\nthe target [mm]")
+    z_ax.set_ylabel("height to go [mm]")
+    ax.legend(handles=lines, loc="upper right", ncols=4, fontsize=8)
+    _name_phases(ax, log, shown_s)
+
+
 def _shade_phases(ax: Axes, log: FlightLog) -> None:
+    first_s, last_s = ax.get_xlim()
     for i, span in enumerate(log.phases):
         start, end = span.start_s - log.start_s, span.end_s - log.start_s
+        if end < first_s or start > last_s:
+            continue
         if end > start:
             ax.axvspan(start, end, facecolor=SHADES[i % 2], edgecolor="none", zorder=-2)
         if i:
             ax.axvline(start, color=GREY, linewidth=0.6, zorder=-1)
 
 
-def _name_phases(ax: Axes, log: FlightLog) -> None:
-    """Names above the top panel, slanted; where phases crowd, some go unnamed."""
-    whole_s = max(1e-9, log.phases[-1].end_s - log.start_s)
-    gap_s = NAME_GAP * whole_s
+def _name_phases(ax: Axes, log: FlightLog, shown_s: tuple[float, float]) -> None:
+    """Names above a panel, slanted; where phases crowd, some go unnamed."""
+    gap_s = NAME_GAP * (shown_s[1] - shown_s[0])
     named_s = -math.inf
     for i, span in enumerate(log.phases):
-        start_s, end_s = span.start_s - log.start_s, span.end_s - log.start_s
+        start_s = max(span.start_s - log.start_s, shown_s[0])
+        end_s = min(span.end_s - log.start_s, shown_s[1])
+        if end_s < start_s:
+            continue
         at_s = max((start_s + end_s) / 2, named_s + gap_s)
         if at_s > end_s + 2 * gap_s and i < len(log.phases) - 1:
             continue

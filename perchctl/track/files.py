@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
-import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 
-import cv2
+import numpy as np
 
 from perchctl.display.page.sketch import Sketch, draw
 from perchctl.errors import InvalidValue
@@ -14,8 +16,8 @@ from perchctl.files import PartFile, cannot_be_written, check_place
 from perchctl.track.result import CSV_COLUMNS, Tracked, csv_row
 from perchctl.vision.types import CameraModel
 
-LIVE_RATE_HZ = 30.0
-_LONGEST_STILL_S = 10.0  # a live source's pause is kept in the video up to this
+_TICKS_HZ = 90_000  # of the video's times
+_H264 = {"preset": "veryfast", "crf": "20", "bf": "0"}  # no frames out of order: times begin at 0
 
 
 def check_output(path: Path, suffix: str) -> None:
@@ -36,7 +38,7 @@ class _ResultFile:
     def close(self, keep: bool) -> None:
         """Errors: InvalidValue for a file that cannot be completed; it is then removed."""
         try:
-            self._end()
+            self._end(keep)
             if keep:
                 self._file.sync()
                 self._file.keep()
@@ -46,7 +48,8 @@ class _ResultFile:
         finally:
             self._file.drop()
 
-    def _end(self) -> None:
+    def _end(self, keep: bool) -> None:
+        """Write what is left, if it is wanted, and close. Raises OSError."""
         raise NotImplementedError
 
 
@@ -68,51 +71,73 @@ class CsvFile(_ResultFile):
         except OSError as error:
             raise cannot_be_written(self._path, error) from None
 
-    def _end(self) -> None:
+    def _end(self, keep: bool) -> None:
         self._stream.close()
 
 
 class OverlayFile(_ResultFile):
-    """The pictures with what was found, as MPEG-4 video.
+    """The pictures with what was found, as H.264 in MP4, which browsers play.
+
+    Each picture is shown from its own time on until the next one's, however irregular they are.
 
     Args:
-        rate_hz: of a recording, each of whose frames is written once. None for a live
-            source: frames are then repeated so that the video runs as fast as it was seen.
+        rate_hz: about how many pictures a second; the last one is shown for one of them.
+
+    Errors: InvalidValue where it cannot be written, also from `add`.
     """
 
-    def __init__(self, path: Path, camera: CameraModel, rate_hz: float | None) -> None:
+    def __init__(self, path: Path, camera: CameraModel, rate_hz: float) -> None:
+        import av  # late: most runs write no video
+
         super().__init__(path, ".mp4")
-        self._camera = camera
-        self._live = rate_hz is None
-        self._rate_hz = rate_hz or LIVE_RATE_HZ
-        self._start_s: float | None = None
-        self._written = 0
-        fourcc = cv2.VideoWriter.fourcc(*"mp4v")
-        self._video = cv2.VideoWriter(
-            str(self._file.part), fourcc, self._rate_hz, camera.size_px, True
-        )
-        if not self._video.isOpened():
+        self._camera, self._start_s, self._last = camera, 0.0, -1
+        try:
+            with _as_os_error():
+                # The index in front, so that a browser plays it before it has all of it.
+                self._video = av.open(str(self._file.part), "w", options={"movflags": "faststart"})
+                rate = Fraction(rate_hz).limit_denominator(1001)
+                self._stream = self._video.add_stream("libx264", rate, options=_H264)
+                # Players want even sizes: an odd one gets a line more.
+                self._stream.width, self._stream.height = (n + n % 2 for n in camera.size_px)
+                self._stream.pix_fmt = "yuv420p"
+                self._stream.codec_context.time_base = Fraction(1, _TICKS_HZ)
+                self._video.start_encoding()
+        except OSError as error:
             self._file.drop()
-            raise InvalidValue(
-                f"{path} cannot be written as an MPEG-4 video; is the disk writable?"
-            )
+            raise cannot_be_written(path, error) from None
 
     def add(self, t_s: float, sketch: Sketch) -> None:
+        from av import VideoFrame
+
         picture = draw(sketch, self._camera)
-        for _ in range(self._due(t_s)):
-            self._video.write(picture)
-            self._written += 1
-
-    def _end(self) -> None:
-        self._video.release()
-
-    def _due(self, t_s: float) -> int:
-        if not self._live:
-            return 1
-        if self._start_s is None:
+        more_x, more_y = (size % 2 for size in self._camera.size_px)
+        picture = np.pad(picture, ((0, more_y), (0, more_x), (0, 0)), mode="edge")
+        frame = VideoFrame.from_ndarray(picture, format="bgr24")
+        if self._last < 0:
             self._start_s = t_s
-        due = math.floor((t_s - self._start_s) * self._rate_hz) + 1 - self._written
-        longest = round(_LONGEST_STILL_S * self._rate_hz)
-        if due > longest:
-            self._start_s += (due - longest) / self._rate_hz
-        return min(max(due, 0), longest)
+        # A time that does not rise, as of a clock that was set, counts as the next tick.
+        self._last = max(round((t_s - self._start_s) * _TICKS_HZ), self._last + 1)
+        frame.pts, frame.time_base = self._last, Fraction(1, _TICKS_HZ)
+        try:
+            with _as_os_error():
+                self._video.mux(self._stream.encode(frame))
+        except OSError as error:
+            raise cannot_be_written(self._path, error) from None
+
+    def _end(self, keep: bool) -> None:
+        with _as_os_error():
+            try:
+                if keep:
+                    self._video.mux(self._stream.encode(None))
+            finally:
+                self._video.close()
+
+
+@contextmanager
+def _as_os_error() -> Iterator[None]:
+    from av import FFmpegError
+
+    try:
+        yield
+    except FFmpegError as error:
+        raise OSError(error.errno, error.strerror) from None

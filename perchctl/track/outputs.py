@@ -12,6 +12,8 @@ from perchctl.track.files import CsvFile, OverlayFile
 from perchctl.track.result import Tracked, text_line, text_rows, track_record
 from perchctl.vision.types import CameraModel
 
+LIVE_RATE_HZ = 30.0
+
 
 @dataclass(frozen=True)
 class OutputOptions:
@@ -41,7 +43,7 @@ class Outputs:
             if options.csv:
                 self._csv = CsvFile(options.csv)
             if options.overlay:
-                self._overlay = OverlayFile(options.overlay, camera, rate_hz)
+                self._overlay = OverlayFile(options.overlay, camera, rate_hz or LIVE_RATE_HZ)
         except BaseException:
             self.close(keep=False)
             raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -27,9 +28,17 @@ from perchctl.target.print_check import (
     size_ratio,
     verdict,
 )
+from perchctl.track.jumps import JUMPS, jumped, pose_in
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
 from perchctl.vision.fields import BLENDED, INTERLACED
-from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
+from perchctl.vision.types import (
+    MARKERS,
+    CameraModel,
+    Frame,
+    MarkerPose,
+    PipelineOutput,
+    PipelineState,
+)
 
 MOST_NOTES = 20
 FOLD_RATIOS = 500  # frames whose size ratios are kept one by one
@@ -58,7 +67,6 @@ class Tracker:
     setup: Pipeline
     live: bool
     stills: bool = False
-    recorded_stills: bool = False  # pictures of a folder may be alike
     disagreement_frames: int = 15
     notes: tuple[str, ...] = ()
     output: PipelineOutput | None = None
@@ -68,6 +76,7 @@ class Tracker:
     _fields: FieldState = field(default_factory=FieldState)
     _health: HealthState = field(default_factory=HealthState)
     _last: Tracked | None = None
+    _pose: MarkerPose | None = None  # the newest that a picture showed
     _interlaced: bool = False
 
     def results(self, frame: Frame, name: str | int) -> Iterator[Tracked]:
@@ -106,6 +115,10 @@ class Tracker:
             self.notes += (BLENDED,)
         if output.lock_note:
             self.notes += (output.lock_note,)
+        pose = pose_in(output)
+        if not self.stills and jumped(self._pose, pose):
+            self.notes += (JUMPS,)
+        self._pose = pose or self._pose
         if output.detections.mirrored:
             self.notes += (MIRRORED,)
         if output.disagreeing_frames >= (1 if self.stills else self.disagreement_frames):
@@ -113,7 +126,7 @@ class Tracker:
         return self._last
 
     def _assess(self, frame: Frame) -> Verdict:
-        alike_is_frozen = self.live or not (self.stills or self.recorded_stills)
+        alike_is_frozen = self.live or not self.stills
         self._health, judged = assess(self._health, frame, alike_is_frozen)
         return judged
 
@@ -132,13 +145,13 @@ class Tally:
         self.frames += 1
         self.large += tracked.large is not None
         self.small += tracked.small is not None
-        self.notes.update(notes)
+        self.notes.update({_kind(note) for note in notes})
 
     def text(self, now_s: float) -> str:
         took_s = max(now_s - self.started_s, 1e-6)
         share = 100.0 / max(self.frames, 1)
         plural = "frame" if self.frames == 1 else "frames"
-        counted = "".join(f"; {note.partition(':')[0]} in {n}" for note, n in self.notes.items())
+        counted = "".join(f"; {note} in {n}" for note, n in self.notes.items())
         return (
             f"{self.frames} {plural} in {took_s:.1f} s ({self.frames / took_s:.0f} a second): "
             f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{counted}"
@@ -195,7 +208,7 @@ class Notes:
 
     def changes(self, frame: str | int, notes: tuple[str, ...]) -> None:
         for note in notes:
-            if note in self._before:
+            if _kind(note) in self._before:
                 continue
             where = frame if isinstance(frame, str) else f"frame {frame}"
             self._left -= 1
@@ -203,13 +216,18 @@ class Notes:
                 self._say(f"{where}: {note}")
             if self._left == 0:
                 self._say("more of this kind is only counted from here on")
-        self._before = frozenset(notes)
+        self._before = frozenset(map(_kind, notes))
         self._silent = False
 
     def silence(self, silent: bool, source: str) -> None:
         if silent and not self._silent:
             self._say(f"{source} delivers no frame; waiting for it (Ctrl-C ends)")
         self._silent = self._silent or silent
+
+
+def _kind(note: str) -> str:
+    """The note without what differs from frame to frame."""
+    return re.split("[:,]", note, maxsplit=1)[0]
 
 
 def sketch_of(frame: Frame, tracked: Tracked, axis_m: float) -> Sketch:

@@ -46,6 +46,7 @@ _SAME_RANGE = 4.0  # standard deviations
 _LEAST_M, _LEAST_YAW_RAD = 0.01, math.radians(4.0)
 _SIDEWAYS, _ALONG = 0.015, 0.02
 _PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
+_TURNED_RAD = math.radians(15.0)  # worth a word
 # How a hovering vehicle moves relative to the target while its estimate jumps.
 _CALM_S, _CALM_MPS, _CALM_RADPS = 0.1, 0.3, 0.5
 
@@ -133,12 +134,13 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, afresh: bool) ->
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Squared distance in units of its spread S (4, 4); how far away and how much farther up
-    (m), and whether that alone is too much."""
+    """Squared distance in units of its spread S (4, 4); how far away (m), how far turned, and
+    how much farther up (m), and whether that alone is too much."""
 
     squared: float
     S: Array
     away_m: float
+    turned_rad: float
     farther_m: float
     another_range: bool
 
@@ -172,6 +174,7 @@ def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
         squared=float(off @ np.linalg.solve(S, off)),
         S=S,
         away_m=float(np.linalg.norm(off[1:])),
+        turned_rad=abs(float(off[0])),
         farther_m=float(off[3]),
         another_range=bool(off[3] ** 2 > _SAME_RANGE**2 * S[3, 3]),
     )
@@ -219,6 +222,8 @@ def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: Filter
         whole = before.whole + int(sight.whole)
         return replace(before, track=track, frames=before.frames + 1, whole=whole)
     where = f"{fit.away_m:.2f} m away from it"
+    if fit.turned_rad > _TURNED_RAD:
+        where += f" and turned by {math.degrees(fit.turned_rad):.0f} deg"
     if fit.another_range:
         where = f"{abs(fit.farther_m):.2f} m {'above' if fit.farther_m > 0.0 else 'below'} it"
         where += ", or of another size"

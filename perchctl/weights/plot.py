@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from perchctl.plot import (
     BLACK,
@@ -44,6 +46,12 @@ _BARS = {
     "closed_form": (BLACK, "closed\nform"),
     "inverse_variance": (VERMILLION, "inverse\nvariance"),
 }
+_TICKS = (
+    (0.8, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)),
+    (2.0, (1.0, 2.0, 5.0)),
+    (math.inf, (1.0,)),
+)
+"""Of a decade: those that do not crowd on an axis of up to so many decades."""
 MOST_POINTS = 2000
 MOST_POSITIONS = 200
 
@@ -111,6 +119,7 @@ def _learning(ax: Axes, result: Result, k: int) -> None:
     ax.axhline(closed, color=BLACK, linestyle="--", linewidth=1.0, label="closed form")
     ax.axhline(PAPER_WEIGHTS[k], color=PURPLE, linestyle=":", linewidth=1.2, label="the paper's")
     ax.set_xscale("log")
+    _plain_ticks(ax.xaxis, (1, last + 1))
     ax.set_xlabel("rows run through")
     ax.set_title(f"{NAMES[k]}: learning curve", fontsize=10)
 
@@ -130,9 +139,20 @@ def _by_position(ax: Axes, result: Result, k: int) -> None:
             color=colour, markersize=5, fillstyle="none" if name == "chosen" else "full",
         )  # fmt: skip
     ax.set_yscale("log")
+    _plain_ticks(ax.yaxis, ax.get_ylim())
+    ax.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
     ax.set_xlabel("position")
     ax.set_ylabel(f"RMS error [{_UNITS[k]}]")
     ax.set_title(f"{NAMES[k]}: error by position", fontsize=10)
+
+
+def _plain_ticks(axis: Axis, shown: tuple[float, float]) -> None:
+    """A few ticks of a logarithmic axis, as plain numbers."""
+    decades = math.log10(max(shown) / max(min(shown), 1e-300))
+    subs = next(subs for most, subs in _TICKS if decades <= most)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.10g}"))
+    axis.set_minor_locator(NullLocator())
 
 
 def _weights(ax: Axes, result: Result, k: int) -> None:
@@ -142,8 +162,8 @@ def _weights(ax: Axes, result: Result, k: int) -> None:
         if math.isfinite(low) and math.isfinite(high):
             ax.plot([i, i], [low, high], color=colour, linewidth=2.0)
         ax.plot([i], [fit.raw[k]], marker="o", color=colour, markersize=6)
-        ax.annotate(f"{fit.weights[k]:.3f}", (i, fit.raw[k]), xytext=(7, 0), fontsize=8,
-                    textcoords="offset points", va="center")  # fmt: skip
+        ax.annotate(f"{fit.weights[k]:.3f}", (i, fit.raw[k]), xytext=(6, 2), fontsize=8,
+                    textcoords="offset points", va="bottom")  # fmt: skip
     ax.axhline(PAPER_WEIGHTS[k], color=PURPLE, linestyle=":", linewidth=1.2)
     for edge in (0.0, 1.0):
         ax.axhline(edge, color=GREY, linewidth=0.8)

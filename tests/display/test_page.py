@@ -5,9 +5,11 @@ from __future__ import annotations
 import http.client
 import io
 import json
+import re
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -361,6 +363,24 @@ def test_a_flight_is_shown_with_phase_battery_and_picture(page: LivePage) -> Non
     drawn = np.asarray(decoded).astype(int)
     assert np.abs(drawn[150, 250:350] - 90).max() > 50
     assert flight.problem is None
+
+
+@pytest.mark.parametrize("phase", [Phase.PERCHED, Phase.LANDED, Phase.ABORTED])
+def test_a_flight_that_is_over_asks_for_no_landing(page: LivePage, phase: Phase) -> None:
+    flight = FlightPage(page, 0.15)
+    assert stop(page.url, page.token) == 200
+    flight.tick(tick(2.0))
+    assert json.loads(ask(page.url, "/state")[1])["stop"] == "requested"
+    last = tick(3.0)
+    flight.tick(replace(last, state=replace(last.state, phase=phase)))
+    assert json.loads(ask(page.url, "/state")[1])["stop"] == "over"
+
+
+def test_the_page_has_a_word_for_each_state_of_stop(page: LivePage) -> None:
+    html = ask(page.url)[1].decode()
+    table = html.partition("const STOP = {")[2].partition("};")[0]
+    names = re.findall(r"^  (\w+): \[", table, re.MULTILINE)
+    assert names == ["ready", "requested", "over", "gone"]
 
 
 def test_a_page_that_fails_is_no_reason_to_land(page: LivePage) -> None:

@@ -97,6 +97,35 @@ def test_no_more_than_ten_pictures_a_second() -> None:
     assert surface.closed == 1
 
 
+@pytest.mark.parametrize("last", ["PERCHED", "LANDED", "ABORTED"])
+def test_the_panel_ends_with_the_flight_s_last_moment(last: str) -> None:
+    """The loop tells the event first, and then the tick, which may be the last one."""
+    surface = Recorder()
+    reporter = Reporter(surface)
+    reporter.update(replace(STATUS, t_s=100.0, phase="ASCEND"))
+    reporter.event(entered(100.02, Phase(last), "over"))
+    reporter.update(replace(STATUS, t_s=100.02, phase=last))
+    reporter.close()
+    assert surface.shown[-1].phase == last
+
+
+def test_a_new_phase_is_shown_without_waiting() -> None:
+    shown = threading.Event()
+
+    class Watched(Recorder):
+        def show(self, status: FlightStatus) -> None:
+            super().show(status)
+            if status.phase == "ABORTED":
+                shown.set()
+
+    reporter = Reporter(Watched())
+    reporter.update(replace(STATUS, t_s=100.0, phase="ASCEND"))
+    reporter.event(entered(100.02, Phase.ABORTED, "Ctrl-C twice"))
+    reporter.update(replace(STATUS, t_s=100.02, phase="ABORTED"))
+    assert shown.wait(5.0)
+    reporter.close()
+
+
 def test_the_panel_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
@@ -151,7 +180,7 @@ def test_the_panel_fits_into_80_columns(status: FlightStatus) -> None:
         console.print(panel(status))
     lines = capture.get().splitlines()
     assert len(lines) == 8
-    assert max(Text(line).cell_len for line in lines) <= 80
+    assert max(Text(line.rstrip()).cell_len for line in lines) + len("^C") <= 80
     for name, _ in status_rows(status):
         assert sum(f" {name} " in line for line in lines) == 1, name
 

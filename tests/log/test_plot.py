@@ -35,25 +35,55 @@ def picture(log: FlightLog, path: Path) -> Array:
     return image.astype(np.float64)
 
 
+@pytest.fixture(scope="module")
+def plain(log: FlightLog, tmp_path_factory: pytest.TempPathFactory) -> Array:
+    return picture(log, tmp_path_factory.mktemp("plain") / "f.png")
+
+
 def share_of(image: Array, hex_colour: str) -> float:
     """Share of the pixels that have that colour (BGR image)."""
     rgb = [int(hex_colour[i : i + 2], 16) for i in (1, 3, 5)]
     return float((np.abs(image - np.array(rgb[::-1])).max(axis=2) < 12).mean())
 
 
-def test_the_picture_holds_the_flight(log: FlightLog, tmp_path: Path) -> None:
-    image = picture(log, tmp_path / "f.png")
-    assert image.shape[0] > 1200
+def test_the_picture_holds_the_flight(plain: Array) -> None:
+    assert plain.shape[0] > 1200
     for colour in ("#56B4E9", "#E69F00", "#0072B2", "#CC79A7", "#009E73", "#D55E00"):
-        assert share_of(image, colour) > 2e-4, colour
+        assert share_of(plain, colour) > 2e-4, colour
 
 
-def test_raw_points_come_from_the_detections(log: FlightLog, tmp_path: Path) -> None:
+def test_raw_points_come_from_the_detections(log: FlightLog, plain: Array, tmp_path: Path) -> None:
     """Without the small marker's poses its colour is left in the legend only."""
     blind = [r | dict.fromkeys(("sx_m", "sy_m", "sz_m", "syaw_rad")) for r in log.records]
     without = FlightLog(log.path, log.header, blind, log.events, log.summary, False)
-    full = share_of(picture(log, tmp_path / "a.png"), "#E69F00")
-    assert share_of(picture(without, tmp_path / "b.png"), "#E69F00") < full / 5
+    upper = slice(0, int(0.75 * len(plain)))  # below it is a line of that colour
+    full = share_of(plain[upper], "#E69F00")
+    assert share_of(picture(without, tmp_path / "b.png")[upper], "#E69F00") < full / 5
+
+
+def test_the_last_seconds_are_in_millimetres(log: FlightLog, plain: Array, tmp_path: Path) -> None:
+    """A millimetre is seen in the last panel, and not in those of the whole flight."""
+    start_s = log.records[-1]["t_s"] - 8.0
+    moved = [
+        r | {"ex_m": r["ex_m"] + 0.001} if r["ex_m"] is not None and r["t_s"] > start_s else r
+        for r in log.records
+    ]
+    other = FlightLog(log.path, log.header, moved, log.events, log.summary, False)
+    changed = plain != picture(other, tmp_path / "b.png")
+    rows = changed.any(axis=2).sum(axis=1)
+    last = int(0.8 * len(rows))
+    assert rows[last:].sum() > 1000
+    assert rows[last:].sum() > 5 * rows[:last].sum()
+
+
+def test_lost_frames_are_marked(log: FlightLog, plain: Array, tmp_path: Path) -> None:
+    """A camera that is gone for a second shows as a bar of the whole strip's height."""
+    gone = [
+        r | {"frame_t_s": None} if 6.0 < r["t_s"] - log.start_s < 7.0 else r for r in log.records
+    ]
+    other = FlightLog(log.path, log.header, gone, log.events, log.summary, False)
+    more = share_of(picture(other, tmp_path / "a.png"), "#D55E00")
+    assert more > share_of(plain, "#D55E00") + 4e-4
 
 
 @pytest.mark.parametrize("count", [1, 2, 60])

@@ -162,11 +162,35 @@ def test_the_filter_bridges_a_lost_frame(tmp_path: Path) -> None:
     images[5] = picture(VIEWS["away"])
     for i, image in enumerate(images):
         cv2.imwrite(str(tmp_path / f"{i}.png"), image)
-    lost = track(tmp_path)[5]
+    lost = track(tmp_path, video=True)[5]
     assert lost["stage"] == "none"
     assert lost["large"] is None
     assert np.abs(np.array(lost["target"]["tvec_m"]) - true_pose(moving(5))[1]).max() < 0.02
-    assert track(tmp_path, stills=True)[5]["target"] is None
+    assert track(tmp_path)[5]["target"] is None
+
+
+def test_files_of_pictures_are_stills_unless_the_user_says_otherwise(
+    pictures: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Filtered as one movement at 30 Hz, unrelated pictures drag each other along."""
+    both, far = (true_pose(VIEWS[name])[1] for name in ("both", "far"))
+    for source in (str(pictures), f"images:{pictures}", str(pictures / "*.png")):
+        away, first, second, _ = track(source)
+        assert away["target"] is None
+        assert np.abs(np.array(first["target"]["tvec_m"]) - both).max() < 0.0005
+        assert np.abs(np.array(second["target"]["tvec_m"]) - far).max() < 0.003
+    assert "jumps" not in capsys.readouterr().err
+    lines = track(pictures, video=True)
+    assert np.abs(np.array(lines[2]["target"]["tvec_m"]) - far).max() > 0.05
+    assert [line["t_s"] for line in lines] == pytest.approx([k / 30.0 for k in range(len(VIEWS))])
+    said = capsys.readouterr().err
+    assert "far.png: the target jumps from one picture to the next" in said
+    assert "jumps from one picture to the next in 2" in said.splitlines()[-1]
+
+
+def test_one_movement_is_no_jump(video: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    track(video)
+    assert "jumps" not in capsys.readouterr().err
 
 
 def test_rendered_scenes_with_exact_truth(tmp_path: Path) -> None:
@@ -568,6 +592,9 @@ def command(*words: str) -> tuple[int, str, str]:
         (["PICTURES", "--overlay", "x.avi"], 30, "must end in .mp4"),
         (["PICTURES", "--csv", "no/such/x.csv"], 20, "folder no/such"),
         (["PICTURES", "--view-port", "99999"], 2, "65535"),
+        (["PICTURES", "--video", "--stills"], 2, "contradict each other"),
+        (["camera:0", "--video"], 2, "camera:0 gives a video anyway"),
+        (["video:x.mp4", "--video"], 2, "--video is for files of pictures"),
     ],
 )
 def test_bad_input_is_one_sentence(

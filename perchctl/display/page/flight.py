@@ -12,6 +12,7 @@ from perchctl.display.page.live import LivePage, State
 from perchctl.display.page.sketch import Sketch
 from perchctl.display.status import status_rows
 from perchctl.display.watch import status_of
+from perchctl.mission.planner import is_over
 from perchctl.mission.watch import Event, Tick
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput
 
@@ -88,7 +89,8 @@ def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Ske
 
 
 def flight_state(tick: Tick) -> State:
-    """The tick for the page: phase, battery and the rows of the terminal's panel."""
+    """The tick for the page: phase, battery, the rows of the terminal's panel, and whether the
+    flight is over."""
     status = status_of(tick)
     volts = status.battery_v
     return {
@@ -97,6 +99,7 @@ def flight_state(tick: Tick) -> State:
         "battery_v": volts if math.isfinite(volts) else None,
         "rows": [list(row) for row in status_rows(status)],
         "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
+        "over": is_over(tick.state),
     }
 
 

@@ -101,14 +101,19 @@ class LivePage:
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> State:
-        """What the page polls: `describe`'s keys (rows, note, phase, battery), and title,
-        rate_hz, stop (``none``, ``ready``, ``requested``)."""
+        """What the page polls: `describe`'s keys (rows, note, phase, battery, over), and title,
+        rate_hz, stop (``none``, ``ready``, ``requested``, ``over``)."""
         try:
             described = self._describe()
         except Exception as error:
             self.remember(error)
             described = {}
-        stop = "none" if self._on_stop is None else "requested" if self._stop_requested else "ready"
+        if self._on_stop is None:
+            stop = "none"
+        elif described.get("over"):
+            stop = "over"
+        else:
+            stop = "requested" if self._stop_requested else "ready"
         fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
         return described | fixed | {"page_problem": self.problem}
 

@@ -17,6 +17,7 @@ _OUTLINE = {"large": (0, 200, 255), "small": (255, 200, 0)}
 _AXES = ((60, 60, 255), (60, 220, 60), (255, 120, 60))
 _TEXT, _SHADOW = (255, 255, 255), (0, 0, 0)
 _SUBPIXEL_BITS = 4
+_LEAST_TEXT_SCALE = 0.75  # of what a picture of 480 lines has
 _FAR_PX = 8000.0  # beyond this a line's end shows nothing, and would overflow
 
 
@@ -74,15 +75,28 @@ def _draw_axes(
 
 
 def _draw_text(picture: NDArray[np.uint8], lines: tuple[str, ...]) -> None:
-    scale = max(picture.shape[0] / 480.0, 0.5)
-    step = round(17 * scale)
-    y = picture.shape[0] - step * len(lines) + round(9 * scale)
+    """White letters with a dark rim, in the lower left corner.
+
+    The rim is grown from the letters: the font's glyphs are wider where they are thicker, and
+    the same text drawn thick would not lie under the thin one.
+    """
+    if not lines:
+        return
+    height, width = picture.shape[:2]
+    scale = max(height / 480.0, _LEAST_TEXT_SCALE)
+    margin, row = round(6 * scale), round(17 * scale)
+    band = picture[max(0, height - row * len(lines) - margin) :]
+    letters = np.zeros(band.shape[:2], np.uint8)
+    face, y = cv2.FONT_HERSHEY_SIMPLEX, band.shape[0] - row * (len(lines) - 1) - round(8 * scale)
     for line in lines:
-        for colour, width in ((_SHADOW, 3), (_TEXT, 1)):
-            where = (round(6 * scale), y)
-            font = cv2.FONT_HERSHEY_SIMPLEX
-            cv2.putText(picture, line, where, font, 0.45 * scale, colour, width, cv2.LINE_AA)
-        y += step
+        wide_px = cv2.getTextSize(line, face, 0.45 * scale, 1)[0][0]
+        fitting = 0.45 * scale * min(1.0, (width - 2 * margin) / max(wide_px, 1))
+        cv2.putText(letters, line, (margin, y), face, fitting, (255,), 1, cv2.LINE_AA)
+        y += row
+    rim = cv2.dilate(letters, np.ones((3, 3), np.uint8), iterations=max(1, round(scale)))
+    for mask, colour in ((rim, _SHADOW), (letters, _TEXT)):
+        share = mask[:, :, None] / 255.0
+        band[:] = np.rint(band * (1.0 - share) + np.array(colour) * share)
 
 
 def _fixed(points_px: Array) -> NDArray[np.int32]:
