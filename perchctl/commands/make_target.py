@@ -12,6 +12,7 @@ from perchctl.commands.make_target_measured import write_measured
 from perchctl.commands.make_target_request import (
     TargetOutcome,
     TargetRequest,
+    check_request,
     check_within,
     requested_target,
 )
@@ -44,7 +45,7 @@ def run(request: TargetRequest) -> int:
 
     Raises NotFound, InvalidValue, UsageError; then nothing has been written.
     """
-    _check_request(request)
+    check_request(request)
     if request.board is not None:
         outcome = _board(request, request.board)
     elif request.measured_large is not None or request.measured_small is not None:
@@ -62,30 +63,6 @@ def run(request: TargetRequest) -> int:
     else:
         print("\n".join(outcome.lines))
     return 0
-
-
-def _check_request(request: TargetRequest) -> None:
-    """Raises UsageError for options that do not go together."""
-    measured = request.measured_large is not None or request.measured_small is not None
-    tasks = [
-        name
-        for name, given in (
-            ("--board", request.board is not None),
-            ("--camera", request.camera is not None),
-            ("--measured-large and --measured-small", measured),
-        )
-        if given
-    ]
-    if len(tasks) > 1:
-        raise UsageError(f"{tasks[0]} and {tasks[1]} are different tasks: give one of them")
-    if request.camera is None:
-        for name, given in (
-            ("--ceiling", request.ceiling_m is not None),
-            ("--suggest", request.suggest),
-            ("--plot", request.plot is not None),
-        ):
-            if given:
-                raise UsageError(f"{name} needs --camera with a calibration file")
 
 
 def _target(request: TargetRequest, profile: Profile, target: TargetConfig) -> TargetOutcome:
