@@ -13,9 +13,10 @@ from perchctl.cli.app import JsonOption, ViewOption, ViewPortOption, reported
 # long: a list of options
 def calibrate(
     source: Annotated[
-        str | None,
+        list[str] | None,
         typer.Argument(
-            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path."
+            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path; or many "
+            "picture files."
         ),
     ] = None,
     board: Annotated[
@@ -83,7 +84,7 @@ def calibrate(
         from perchctl.commands.calibrate import CalibrateRequest, run
 
         request = CalibrateRequest(
-            source=source,
+            sources=tuple(source or ()),
             board=board,
             output=output,
             name=name,

@@ -169,6 +169,31 @@ def test_two_views_only(rendered: Rendered, tmp_path: Path) -> None:
     assert "add 3" in sentence
 
 
+def test_pictures_named_one_by_one_are_the_folder_s(
+    calibrated: Result, rendered: Rendered, tmp_path: Path
+) -> None:
+    """As a shell hands over board*.png; one of them named twice is one picture."""
+    words = [str(p) for p in sorted(rendered[0].iterdir())]
+    result = calibrate(*words, words[3], "-b", BOARD, "-o", f"{tmp_path}/o.yaml", "--json")
+    assert result.exit_code == 0, result.output
+    told, folder = json.loads(result.stdout), json.loads(calibrated.stdout)
+    assert {k: told[k] for k in ("fx", "views_used", "rms_px")} == {
+        k: folder[k] for k in ("fx", "views_used", "rms_px")
+    }
+
+
+def test_many_sources_must_all_be_pictures(rendered: Rendered, tmp_path: Path) -> None:
+    one, two = (f"{rendered[0]}/board_0{k}.png" for k in (0, 1))
+    output = ("-o", f"{tmp_path}/o.yaml")
+    assert "does not exist" in refused(calibrate(one, f"{tmp_path}/no.png", *output), 20)
+    for other in (str(rendered[0]), "camera:0"):
+        said = refused(calibrate(one, two, other, *output), 20 if ":" in other else 2)
+        assert other in said
+    said = refused(calibrate(one, two, "-b", "chessboard:9x6:25mm", *output), 30)
+    assert "none of 2 pictures of" in said
+    assert "and 1 more shows" in said
+
+
 def test_usage() -> None:
     refused(calibrate(), 2)
     refused(calibrate("camera:0", "--convert", "x.yaml"), 2)
