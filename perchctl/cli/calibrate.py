@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import CamOption, JsonOption, ViewOption, ViewPortOption, reported
 
 
 # long: a list of options
@@ -53,6 +53,7 @@ def calibrate(
         Path | None,
         typer.Option("--convert", help="Read an OpenCV, Kalibr or ROS file and write --output."),
     ] = None,
+    cam: CamOption = None,
     mask: Annotated[
         Path | None,
         typer.Option(
@@ -92,6 +93,7 @@ def calibrate(
             force=force,
             check=check,
             convert=convert,
+            cam=cam,
             mask=mask,
             reject=reject,
             plain_corners=plain_corners,

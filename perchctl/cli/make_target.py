@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, reported
+from perchctl.cli.app import CamOption, JsonOption, reported
 
 
 # long: a list of options
@@ -58,6 +58,7 @@ def make_target(
         str | None,
         typer.Option("--camera", help="Design: ranges of the target for this calibration file."),
     ] = None,
+    cam: CamOption = None,
     ceiling: Annotated[
         float | None, typer.Option("--ceiling", help="Height of the ceiling over the floor, m.")
     ] = None,
@@ -107,6 +108,7 @@ def make_target(
             svg=svg,
             board=board,
             camera=camera,
+            cam=cam,
             ceiling_m=ceiling,
             blur_px=blur,
             noise=noise,

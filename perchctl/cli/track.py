@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import CamOption, ProfileOption, ViewOption, ViewPortOption, reported
 
 
 def track(
@@ -24,6 +24,7 @@ def track(
             "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
         ),
     ] = None,
+    cam: CamOption = None,
     stills: Annotated[
         bool, typer.Option("--stills", help="Each picture alone: no window, no filter.")
     ] = False,
@@ -54,6 +55,7 @@ def track(
             source=source,
             profile=profile,
             calibration=calibration,
+            cam=cam,
             stills=stills,
             as_json=as_json,
             csv=csv,

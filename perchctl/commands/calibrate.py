@@ -46,6 +46,7 @@ class CalibrateRequest:
     force: bool = False
     check: Path | None = None
     convert: Path | None = None
+    cam: str | None = None
     mask: Path | None = None
     reject: bool = True
     plain_corners: bool = False
@@ -76,6 +77,8 @@ def run(request: CalibrateRequest) -> int:
         if request.sources or not (request.check is request.mask is None):
             raise UsageError("--convert takes a file and no source, --check or --mask")
         return _convert(request, request.convert)
+    if request.cam is not None and request.check is None:
+        raise UsageError("--cam names a camera of the file of --check or --convert: give one")
     if not request.sources:
         raise UsageError(
             "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N or http://..."
@@ -126,10 +129,10 @@ def _calibrate(request: CalibrateRequest, source: Source, board: Board) -> int:
 
 def _check(request: CalibrateRequest, file: Path, source: Source, board: Board) -> int:
     """Judge an existing calibration by new pictures."""
-    camera = load_sized(file)
+    camera = load_sized(file, request.cam)
     found = _find_views(request, source, board)
     if camera is None:
-        camera = load_calibration(file, found.size_px)
+        camera = load_calibration(file, found.size_px, request.cam)
         say(assumed_size(file, found.size_px))
     check_size(found.size_px, camera, str(source))
     result = check(camera, found.views)
@@ -147,7 +150,7 @@ def _check(request: CalibrateRequest, file: Path, source: Source, board: Board) 
 
 def _convert(request: CalibrateRequest, file: Path) -> int:
     """Another program's calibration (OpenCV, Kalibr, ROS) as perchctl's file."""
-    camera = load_calibration(file)
+    camera = load_calibration(file, cam=request.cam)
     output = _output(request, camera.size_px)
     check_place(output, replace=request.force, make_folders=True)
     if same_file(output, file):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of, load_calibration
 from perchctl.commands.make_target_measured import write_measured
 from perchctl.commands.make_target_request import (
     TargetOutcome,
@@ -93,11 +93,11 @@ def _target(request: TargetRequest, profile: Profile, target: TargetConfig) -> T
 def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
     """What the profile's camera sees of that target to the end; nothing without a
     calibration, as a sheet needs none."""
-    name = profile.camera.calibration
     try:
-        camera = load_calibration(name)
+        camera = camera_of(profile.camera)
     except PerchError:
         return []
+    name = profile.camera.calibration
     return [f"{name}: {text}" for text in blind_lines(mounted(target, camera, profile))]
 
 
@@ -151,7 +151,7 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
         check_within("--ceiling", request.ceiling_m, 0.3, 50.0, "m")
     profile = load_profile(request.profile or DEFAULT_PROFILE)
     path = find_calibration(camera_name)
-    camera = load_calibration(path)
+    camera = load_calibration(path, cam=request.cam)
     plot = request.plot or Path(DEFAULT_PLOT)
     check_place(plot)
     optics = Optics(request.blur_px, request.noise)

@@ -27,6 +27,7 @@ _MARKERS = {
     "small_dict": "--small-dict",
 }
 _DESIGN = {
+    "cam": "--cam",
     "ceiling_m": "--ceiling",
     "blur_px": "--blur",
     "noise": "--noise",
@@ -55,6 +56,7 @@ class TargetRequest:
     svg: bool = False
     board: str | None = None
     camera: str | None = None
+    cam: str | None = None
     ceiling_m: float | None = None
     blur_px: float = 1.0
     noise: float = 5.0
