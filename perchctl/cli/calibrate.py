@@ -24,10 +24,18 @@ def calibrate(
         typer.Option(
             "--board",
             "-b",
-            help="chessboard:9x6:25mm (inner corners) or charuco:10x7:25mm:18mm:DICT_5X5_100 "
-            "(squares; :legacy behind it for OpenCV's old layout).",
+            help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
+            "(squares; :legacy behind it for OpenCV's old layout), aprilgrid:6x6:22mm:0.3 (tags, "
+            "gap as a share of a tag), or Kalibr's .yaml of a board.",
         ),
     ] = "charuco:10x7:25mm:18mm:DICT_5X5_100",
+    measured_width: Annotated[
+        str | None,
+        typer.Option("--measured-width", help="Width of the board's black area as printed, mm."),
+    ] = None,
+    measured_height: Annotated[
+        str | None, typer.Option("--measured-height", help="Its height as printed, mm.")
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -87,6 +95,8 @@ def calibrate(
         request = CalibrateRequest(
             sources=tuple(source or ()),
             board=board,
+            measured_width=measured_width,
+            measured_height=measured_height,
             output=output,
             name=name,
             model=model,

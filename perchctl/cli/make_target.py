@@ -51,7 +51,8 @@ def make_target(
         typer.Option(
             "--board",
             help="Print a calibration board instead: charuco:10x7:25mm:18mm:DICT_5X5_100 "
-            "(squares) or chessboard:9x6:25mm (inner corners).",
+            "(squares), chessboard:9x6:25mm (inner corners), aprilgrid:6x6:22mm:0.3 (tags, gap "
+            "as a share of a tag), or Kalibr's .yaml of a board.",
         ),
     ] = None,
     camera: Annotated[

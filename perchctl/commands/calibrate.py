@@ -21,6 +21,7 @@ from perchctl.calibration.solve import AUTO, calibrate
 from perchctl.calibration.types import Rejection, View
 from perchctl.calibration.writing import calibration_text, camera_text
 from perchctl.camera.source import check_size
+from perchctl.commands.calibrate_board import board_of
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mask import write_mask
 from perchctl.commands.calibrate_source import Source, source_of
@@ -29,7 +30,7 @@ from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_place, same_file, write_files
-from perchctl.target.boards import Board, parse_board
+from perchctl.target.boards import Board
 
 FOLDER = Path("calib")
 
@@ -40,6 +41,8 @@ class CalibrateRequest:
 
     sources: tuple[str, ...] = ()
     board: str = "charuco:10x7:25mm:18mm:DICT_5X5_100"
+    measured_width: str | None = None
+    measured_height: str | None = None
     output: Path | None = None
     name: str = "camera"
     model: str = AUTO
@@ -88,8 +91,10 @@ def run(request: CalibrateRequest) -> int:
         if request.check is not None or request.output is not None:
             raise UsageError("--mask names its file itself, and takes no --output or --check")
         return write_mask(source, request.mask, request.force, request.as_json)
-    board = parse_board(request.board)
+    board, notes = board_of(request.board, request.measured_width, request.measured_height)
     _check_request(request)
+    for note in notes:
+        say(note)
     if request.check is not None:
         return _check(request, request.check, source, board)
     return _calibrate(request, source, board)

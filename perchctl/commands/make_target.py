@@ -104,6 +104,8 @@ def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
 def _board(request: TargetRequest, notation: str) -> TargetOutcome:
     """The sheet of a calibration board."""
     board = parse_board(notation)
+    if board.scale != (1.0, 1.0):
+        raise UsageError(f"--board {notation}: a board is printed as meant; leave out :measured=")
     page = board_page(board, parse_page(request.page))
     files = _sheet_files(request, "board.pdf", [page], f"perchctl {board.notation()}")
     lines = [

@@ -11,9 +11,20 @@ from perchctl.calibration.saddle import fit_saddles
 from perchctl.calibration.types import Grey, View
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
-from tests.helpers.boards import CHARUCO, CHESSBOARD, BoardRenderer, draw_camera
+from tests.helpers.boards import (
+    APRILGRID,
+    CHARUCO,
+    CHESSBOARD,
+    BoardRenderer,
+    draw_camera,
+)
 
 CAMERA = draw_camera(np.random.default_rng(1), (480, 360))
+
+
+@pytest.fixture(scope="module")
+def tag_renderer() -> BoardRenderer:
+    return BoardRenderer(CAMERA, APRILGRID)
 
 
 def crossing(
@@ -102,3 +113,66 @@ def test_a_large_picture_keeps_the_places_of_its_pixels() -> None:
     there = project(CHARUCO.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
     expected = (there + 0.5) * 4 - 0.5
     assert np.abs((view.corners_px - expected).mean(axis=0)).max() < 0.1
+
+
+def _tag_errors(
+    renderer: BoardRenderer, pose: Array, refine: bool = True, blur_px: float = 0.7
+) -> Array:
+    """Of the corners found of an aprilgrid, which all know where they belong, (n, 2)."""
+    picture = renderer.render(pose, np.random.default_rng(0), blur_px, noise=2.0)
+    view = find_board(picture, APRILGRID, refine=refine)
+    assert isinstance(view, View)
+    there = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)
+    return np.asarray(view.corners_px - there[view.ids])
+
+
+def _turned(degrees: float, z_m: float) -> Array:
+    """An aprilgrid in the middle, tilted by 25 deg and turned about the view."""
+    tilt, roll = (np.radians([25.0, 0, 0]), np.radians([0, 0, degrees]))
+    R = cv2.Rodrigues(tilt)[0] @ cv2.Rodrigues(roll)[0]
+    t = np.array([0.0, 0.0, z_m]) - R @ APRILGRID.corners_m().mean(axis=0)
+    return np.concatenate([cv2.Rodrigues(R)[0].ravel(), t])
+
+
+@pytest.mark.parametrize("degrees", [0, 45, 100, 180, 270])
+@pytest.mark.parametrize(("z_m", "blur_px"), [(0.3, 0.7), (0.35, 1.1), (0.45, 0.7)])
+def test_an_aprilgrid_s_corners_are_as_exact_as_a_charuco_board_s(
+    tag_renderer: BoardRenderer, degrees: float, z_m: float, blur_px: float
+) -> None:
+    """However it is turned, and where the tags (15 to 25 px) hang together by the squares."""
+    errors = _tag_errors(tag_renderer, _turned(degrees, z_m), blur_px=blur_px)
+    assert len(errors) > 0.7 * 144
+    assert np.sqrt((errors**2).sum(axis=1).mean()) < 0.08
+    assert np.linalg.norm(errors, axis=1).max() < 0.5
+    assert np.abs(errors.mean(axis=0)).max() < 0.02
+
+
+def test_the_fit_beats_kalibr_s_window(tag_renderer: BoardRenderer) -> None:
+    pose = _turned(20, 0.3)
+    fitted, plain = (
+        np.sqrt((_tag_errors(tag_renderer, pose, refine) ** 2).sum(axis=1).mean())
+        for refine in (True, False)
+    )
+    assert fitted < 0.5 * plain
+
+
+def test_a_partly_seen_aprilgrid_is_used(tag_renderer: BoardRenderer) -> None:
+    errors = _tag_errors(tag_renderer, np.array([0.2, 0.3, 0.0, -0.02, -0.03, 0.15]))
+    assert 24 < len(errors) < 120
+    assert np.sqrt((errors**2).sum(axis=1).mean()) < 0.08
+
+
+def test_a_tag_of_something_else_is_none_of_the_board_s(tag_renderer: BoardRenderer) -> None:
+    """One that is there twice, and one that lies in another's place."""
+    pose = _turned(0, 0.45)
+    picture = tag_renderer.render(pose, np.random.default_rng(0), noise=2.0)
+    stranger = np.full((50, 50), 225, np.uint8)
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    for tag, (x, y) in ((3, (5, 5)), (7, (5, 300))):
+        stranger[5:45, 5:45] = tags.generateImageMarker(tag, 40, borderBits=2)
+        picture[y : y + 50, x : x + 50] = stranger
+    view = find_board(picture, APRILGRID)
+    assert isinstance(view, View)
+    there = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
+    assert len(view) > 100
+    assert np.abs(view.corners_px - there).max() < 0.5
