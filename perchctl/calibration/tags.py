@@ -20,11 +20,9 @@ from perchctl.target.boards import TAG_DICTIONARY, Board
 _SEARCH_PX = 1600
 _MOST_ENLARGED = 2.0
 """Where tags are small, twice the size finds half as many again."""
-_DARKER_SHARE = 0.08
-_DARKER_LEAST, _DARKER_MOST = 5.0, 15.0
-"""By how much of the picture's contrast, and between which grey levels, a pixel is darker than
-those around it to count as black: enough to cut the squares off at the corners, where it is
-grey."""
+_DARKER = (15.0, 7.0)
+"""By so many grey levels a pixel is darker than those around it to count as black. Many cut the
+squares off at the corners, where it is grey; few are for a picture of little contrast."""
 _OFF_PLANE = 0.3
 """Of a tag's side: so far a lens may bend the board's plane, or the tag is another's."""
 _NEAREST, _FEWEST = 4, 2
@@ -60,8 +58,19 @@ def detect_tags(image: Grey, count: int) -> dict[int, Array]:
     if scale > 1.0:
         resized = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         large = np.asarray(resized, np.uint8)
-    dark, light = np.percentile(image[::4, ::4], (1, 99))
-    darker = float(np.clip(_DARKER_SHARE * (light - dark), _DARKER_LEAST, _DARKER_MOST))
+    found: dict[int, Array] = {}
+    for darker in _DARKER:
+        corners, ids, _ = _detector(darker).detectMarkers(large)
+        for number, quad in zip([] if ids is None else ids.ravel(), corners, strict=True):
+            if number < count:
+                four: Array = np.asarray(quad, dtype=np.float64).reshape(4, 2)
+                found.setdefault(int(number), (four + 0.5) / scale - 0.5)
+        if 2 * len(found) >= count:
+            break
+    return found
+
+
+def _detector(darker: float) -> cv2.aruco.ArucoDetector:
     detector = cv2.aruco.ArucoDetector(predefined(TAG_DICTIONARY))
     finding = detector.getDetectorParameters()
     finding.markerBorderBits = TAG_BORDER_CELLS
@@ -74,14 +83,7 @@ def detect_tags(image: Grey, count: int) -> dict[int, Array]:
     finding.errorCorrectionRate = 1.0
     finding.maxErroneousBitsInBorderRate = 0.5
     detector.setDetectorParameters(finding)
-    corners, ids, _ = detector.detectMarkers(large)
-    numbers = [] if ids is None else [int(i) for i in np.asarray(ids).ravel()]
-    # One seen twice is, once at least, not of this board.
-    return {
-        number: (np.asarray(quad, dtype=np.float64).reshape(4, 2) + 0.5) / scale - 0.5
-        for number, quad in zip(numbers, corners, strict=True)
-        if number < count and numbers.count(number) == 1
-    }
+    return detector
 
 
 def _on_one_plane(seen: dict[int, Array], on_board: dict[int, Array]) -> dict[int, Array]:
