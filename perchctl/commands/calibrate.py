@@ -76,6 +76,9 @@ def run(request: CalibrateRequest) -> int:
 
     Errors: NotFound, InvalidValue, UsageError, TimedOut (a silent camera).
     """
+    measured = request.measured_width is not None or request.measured_height is not None
+    if measured and not (request.convert is request.mask is None):
+        raise UsageError("--measured-* are a board's sides, and --convert and --mask look for none")
     if request.convert is not None:
         if request.sources or not (request.check is request.mask is None):
             raise UsageError("--convert takes a file and no source, --check or --mask")

@@ -268,6 +268,9 @@ def test_usage() -> None:
     refused(calibrate(), 2)
     refused(calibrate("camera:0", "--convert", "x.yaml"), 2)
     refused(calibrate("images:/nowhere"), 20)
+    sides = ("--measured-width", "249", "--measured-height", "174")
+    assert "look for none" in refused(calibrate("--convert", "x.yaml", *sides), 2)
+    assert "look for none" in refused(calibrate("images:.", "--mask", "x.png", *sides), 2)
     refused(calibrate("images:.", "-b", "chess:9x6"), 30)
     refused(calibrate("images:.", "--model", "cubic"), 30)
 
