@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -26,14 +26,17 @@ Progress = Callable[[int, int | None], None]
 
 
 def views_of_images(
-    where: str, board: Board, refine: bool = True, progress: Progress = lambda done, total: None
+    where: str | Sequence[Path],
+    board: Board,
+    refine: bool = True,
+    progress: Progress = lambda done, total: None,
 ) -> tuple[list[View], list[Rejection]]:
-    """Every picture of a folder or glob: the views, and those without a board.
+    """Every picture of a folder or glob (or those given): the views, and those without a board.
 
     Raises:
         NotFound: no pictures. InvalidValue: an unreadable one, or unequal sizes.
     """
-    paths = image_files(str(Path(where).expanduser()))
+    paths = image_files(where)
     names = _names(paths)
 
     def look(job: tuple[str, Path]) -> tuple[str, tuple[int, int], View | str]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, perform, reported
+from perchctl.cli.app import CamOption, ProfileOption, ViewOption, ViewPortOption, perform, reported
 from perchctl.cli.complete import complete_source
 
 
@@ -26,6 +26,7 @@ def track(
             "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
         ),
     ] = None,
+    cam: CamOption = None,
     stills: Annotated[
         bool,
         typer.Option(
@@ -62,6 +63,7 @@ def track(
             source=source,
             profile=profile,
             calibration=calibration,
+            cam=cam,
             stills=stills,
             video=video,
             as_json=as_json,

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from perchctl.calibration.guided import Moment, capture
+from perchctl.calibration.preview import Flat, LensPreview
 from perchctl.calibration.types import Grey, View
 from perchctl.camera.open import open_source
 from perchctl.commands.interrupt import Stopper
@@ -51,14 +52,17 @@ def captured_views(
         stop = stack.enter_context(Stopper().installed())
         camera = _any_camera(source.size_px or _SIZE_UNTIL_KNOWN_PX)
         page = stack.enter_context(live_page(camera, "perchctl calibrate", port))
+        preview = LensPreview()
         bars = stack.enter_context(coverage_bars())
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 
         def show(moment: Moment) -> None:
             bars(moment.covered, moment.taken, moment.advice)
             if page is not None:
-                page.show(moment.index, _sketch(moment))
-                page.tell(lambda: _page_state(moment))
+                preview.offer(moment.views)
+                flat = preview.flat
+                page.show(moment.index, sketch_of(moment, flat))
+                page.tell(lambda: page_state(moment, flat))
 
         views, pictures = capture(source, board, show, stopped=stop.requested.is_set)
     if pictures_folder is not None and pictures:
@@ -110,20 +114,25 @@ def _any_camera(size_px: tuple[int, int]) -> CameraModel:
     return CameraModel(size_px, K, np.zeros(5))
 
 
-def _sketch(moment: Moment) -> Sketch:
+def sketch_of(moment: Moment, flat: Flat | None) -> Sketch:
     outlines: tuple[tuple[str, Any], ...] = ()
     if len(moment.corners_px) >= 3:
         hull = cv2.convexHull(moment.corners_px.astype(np.float32)).reshape(-1, 2)
         outlines = (("small" if moment.shot else "large", hull.astype(np.float64)),)
-    return Sketch(moment.image, outlines, None, (moment.advice,))
+    places_px = None if flat is None else flat.places_px
+    return Sketch(moment.image, outlines, None, (moment.advice,), places_px)
 
 
-def _page_state(moment: Moment) -> dict[str, Any]:
+def page_state(moment: Moment, flat: Flat | None) -> dict[str, Any]:
     rows = [
         [name, "#" * round(20 * share) + "." * (20 - round(20 * share)) + f" {100 * share:.0f} %"]
         for name, share in moment.covered.items()
     ]
-    return {"rows": [*rows, ["views", str(moment.taken)]], "phase": moment.advice}
+    rows.append(["views", str(moment.taken)])
+    if flat is not None:
+        by = f"by {flat.views} views"
+        rows.append(["lens", f"{by}: undistorted below, what is straight must look straight"])
+    return {"rows": rows, "phase": moment.advice}
 
 
 def _keep(pictures: list[Grey], folder: Path) -> None:

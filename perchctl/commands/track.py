@@ -56,6 +56,7 @@ class TrackRequest:
     source: str
     profile: str = "sim"
     calibration: Path | None = None
+    cam: str | None = None
     stills: bool = False
     video: bool = False
     as_json: bool = False
@@ -73,6 +74,7 @@ class TrackOptions:
     source: str
     profile: Profile
     calibration: Path
+    cam: str | None
     stills: bool
     outputs: OutputOptions
     page_port: int | None
@@ -98,8 +100,9 @@ def resolve(request: TrackRequest) -> TrackOptions:
                 raise UsageError(f"{path} is the source itself; write the result to another file")
     if request.calibration is None:
         calibration = find_calibration(profile.camera.calibration)
+        cam = request.cam or profile.camera.cam
     else:
-        calibration = find_calibration(str(request.calibration))
+        calibration, cam = find_calibration(str(request.calibration)), request.cam
     port = page_port(request.view, request.view_port)
     elsewhere = request.csv or request.overlay or port is not None
     outputs = OutputOptions(
@@ -108,7 +111,7 @@ def resolve(request: TrackRequest) -> TrackOptions:
         csv=request.csv,
         overlay=request.overlay,
     )
-    return TrackOptions(source, profile, calibration, stills, outputs, port)
+    return TrackOptions(source, profile, calibration, cam, stills, outputs, port)
 
 
 def _are_stills(request: TrackRequest, source: str) -> bool:
@@ -220,12 +223,12 @@ class _Run:
         stop: Stopper,
         stack: contextlib.ExitStack,
     ) -> None:
-        camera = load_sized(options.calibration)
+        camera = load_sized(options.calibration, options.cam)
         self.input = _open(options, None if camera is None else camera.size_px, now)
         source = self.input.source
         stack.callback(source.close)
         if camera is None:
-            camera = load_calibration(options.calibration, source.size_px)
+            camera = load_calibration(options.calibration, source.size_px, options.cam)
             say(assumed_size(options.calibration, camera.size_px))
         self.camera = camera
         check_size(source.size_px, camera, self.input.file_name(0))
