@@ -18,7 +18,14 @@ from perchctl.vision.markers.by_drawing import aligned
 from perchctl.vision.markers.corners import RefinedCorners
 from perchctl.vision.markers.detector import DetectorSetup, loose_detector
 from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern, resemblance, resemblances
-from perchctl.vision.markers.square import mapped, mean_side_px, side_lengths_px, to_unit, within
+from perchctl.vision.markers.square import (
+    from_unit,
+    mapped,
+    mean_side_px,
+    side_lengths_px,
+    to_unit,
+    within,
+)
 from perchctl.vision.types import MARKERS, CameraModel, MarkerName
 
 _BLURS_PX, _BLUR_PX = (1.5, 3.0), 2.0  # to start with
@@ -46,8 +53,11 @@ def expected_in_blur(
     expected: Mapping[MarkerName, Array],
     patterns: Mapping[MarkerName, Pattern],
     camera: CameraModel,
+    turn: int | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """The first of the markers that is near to where it is expected (4, 2) px."""
+    """The first of the markers that is near to where it is expected (4, 2) px. Fits that begin
+    with little and with much blur take turns; without a `turn`, both are tried."""
+    blurs_px = _BLURS_PX if turn is None else (_BLURS_PX[turn % len(_BLURS_PX)],)
     for name in MARKERS:
         corners = expected.get(name)
         if corners is None or not within(corners, image.shape):
@@ -57,7 +67,7 @@ def expected_in_blur(
         start = _shifted(image, corners, patterns[name])
         if resemblance(image, start, patterns[name])[0] < _NEAR_RESEMBLANCE:
             continue
-        for blur_px in _BLURS_PX:
+        for blur_px in blurs_px:
             seen = aligned(image, start, patterns[name], camera, blur_px=blur_px)
             if seen is not None:
                 return {name: seen}
@@ -87,12 +97,12 @@ def _candidates(
     if len(quads) == 0:
         return []
     found = []
+    squares = np.array([from_unit(quad) for quad in quads])
     for name in MARKERS:
-        for quad, of_turns in zip(quads, resemblances(image, quads, patterns[name]), strict=True):
-            turn = int(np.argmax(of_turns))
-            if of_turns[turn] > _MIN_RESEMBLANCE:
-                rolled = np.roll(quad, turn, axis=0)
-                found.append(_Candidate(name, rolled, float(of_turns[turn])))
+        like = resemblances(image, squares, patterns[name])
+        for i in np.flatnonzero(like.max(axis=1) > _MIN_RESEMBLANCE):
+            turn = int(like[i].argmax())
+            found.append(_Candidate(name, np.roll(quads[i], turn, axis=0), float(like[i, turn])))
     return found
 
 

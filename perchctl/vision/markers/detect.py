@@ -74,6 +74,7 @@ def detect(
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     look = _look(empty_frames, bool(expected), setup)
+    turn = empty_frames // 2 if empty_frames is not None and look == "near" else None
     lately = measured_lately(previous, frame.t_s)
     shift = known_from(None if previous is None else previous.edge_shift)
 
@@ -81,7 +82,7 @@ def detect(
         hidden = hidden_in(picture, setup.mask)
         if hidden is not None:
             picture = replace(picture, image=filled(picture.image, hidden))
-        return _looked(picture, hidden, expected, setup, camera, shift, look, lately)
+        return _looked(picture, hidden, expected, setup, camera, shift, look, lately, turn)
 
     if frame.fields == "woven":
         return with_motion(between(*(looked(field) for field in halves(frame))), previous)
@@ -113,9 +114,10 @@ def _looked(
     shift: EdgeShift | None,
     look: Look,
     lately: bool,
+    turn: int | None,
 ) -> Detections:
     """What is in a picture of one moment; `hidden` (h, w) is where that is not seen, `lately`
-    whether the target was measured a moment ago."""
+    whether the target was measured a moment ago, `turn` of the fits to a blurred one."""
     image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
     seen = _followed(image, hidden, expected, setup, camera, shift)
@@ -128,7 +130,7 @@ def _looked(
         if len(found.corners_px) >= len(seen):
             seen = _refined(image, hidden, found, setup, camera)
     if not seen and look != "sharp" and setup.blurred and setup.by_lines:
-        seen = _in_blur(image, expected, setup, camera)
+        seen = _in_blur(image, expected, setup, camera, turn)
     return Detections(
         frame_index=frame.index,
         t_s=frame.t_s,
@@ -227,10 +229,11 @@ def _in_blur(
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     camera: CameraModel,
+    turn: int | None,
 ) -> _Seen:
     """What only the drawing shows: near to where it is expected, or anywhere."""
     if expected:
-        seen = expected_in_blur(image, expected, setup.patterns, camera)
+        seen = expected_in_blur(image, expected, setup.patterns, camera, turn)
     else:
         seen = hidden_in_blur(image, setup, camera)
     return improved(image, seen, setup.patterns, camera)

@@ -206,10 +206,10 @@ def resemblance(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     return np.zeros(4) if grey is None else _likeness(grey[None], pattern)[0]
 
 
-def resemblances(image: NDArray[np.uint8], quads_px: Array, pattern: Pattern) -> Array:
-    """`resemblance` of many at a time: corners (m, 4, 2) to (m, 4)."""
-    like = np.zeros((len(quads_px), 4))
-    inside, grey = _read_many(image, quads_px, pattern)
+def resemblances(image: NDArray[np.uint8], squares: Array, pattern: Pattern) -> Array:
+    """`resemblance` of many at a time: homographies (m, 3, 3) of the unit square to (m, 4)."""
+    like = np.zeros((len(squares), 4))
+    inside, grey = _read_many(image, squares, pattern)
     like[inside] = _likeness(grey, pattern)
     return like
 
@@ -243,12 +243,11 @@ def _read(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> Arra
 
 
 def _read_many(
-    image: NDArray[np.uint8], quads_px: Array, pattern: Pattern
+    image: NDArray[np.uint8], H: Array, pattern: Pattern
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Which of m squares (m, 4, 2) have all spots in the picture, and the grey values
+    """Which of m squares (m, 3, 3) have all spots in the picture, and the grey values
     (n, k) at the k spots of those."""
     h, w = image.shape
-    H = np.array([from_unit(quad) for quad in quads_px])
     at = pattern.spots @ H[:, :2, :2].transpose(0, 2, 1) + H[:, None, :2, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         at /= pattern.spots @ H[:, 2, :2, None] + H[:, 2, 2, None, None]
