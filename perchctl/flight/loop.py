@@ -248,17 +248,24 @@ def _report(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) ->
         phase=state.phase,
         outcome=state.outcome or Outcome.SAFETY,
         reason=_reason(state, obs, passed),
-        attempts=state.attempts + int(state.phase is Phase.PERCHED),
+        attempts=_attempts(state),
         duration_s=obs.t_s - state.started_s,
         locked=obs.telemetry.has(LOCKED),
         history=passed,
     )
 
 
+def _attempts(state: PlannerState) -> int:
+    """The failed ones, and the one that hangs; a hold that is noticed once they are used up
+    has been counted as failed."""
+    hangs = state.phase is Phase.PERCHED and state.outcome is not Outcome.ATTEMPTS_USED_UP
+    return state.attempts + int(hangs)
+
+
 def _reason(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) -> str:
     """Why it ended so, with what led to the landing where there was one."""
     why = next((e.reason for e in reversed(passed) if e.phase is Phase.LANDING), "")
-    if state.phase is Phase.LANDED:
+    if state.phase in (Phase.LANDED, Phase.PERCHED):
         return f"{why}; {state.reason}" if why else state.reason
     if state.row != "landing-timeout":
         return state.reason

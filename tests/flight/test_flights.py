@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.commands.fly import EXIT_CODE_OF
+from perchctl.errors import EXIT_CODES
 from perchctl.flight.campaign import fly_seed, run_campaign
 from perchctl.flight.results import FlightResult, campaign_summary
 from perchctl.geometry import rot_z
@@ -146,6 +147,19 @@ def test_a_first_contact_that_does_not_hold_is_tried_again(mode: str) -> None:
     assert way[8:] == ["ESTIMATE", "ALIGN", "ASCEND", "PERCH", "COMPLETE", "PERCHED"]
 
 
+def test_what_hangs_when_the_attempts_are_used_up_is_not_said_to_have_landed() -> None:
+    """The magnet holds, but the one attempt was given up before that was seen."""
+    flown = fly_short({"planner.attempts": 1, "planner.complete.release_timeout_s": 0.3})
+    assert flown.flight.hanging
+    assert flown.way[-3:] == ["RECOVER", "LANDING", "PERCHED"]
+    assert flown.report.outcome is Outcome.ATTEMPTS_USED_UP
+    assert flown.report.reason == (
+        "all perching attempts are used up; the magnet holds: hanging with the motors off"
+    )
+    assert flown.report.attempts == 1
+    assert "left hanging" in EXIT_CODES[EXIT_CODE_OF[flown.report.outcome]]
+
+
 def test_a_magnet_that_never_holds_lands_after_the_attempts() -> None:
     flown = fly_short({"planner.attempts": 2}, magnet_force_n=SLIPPERY_N)
     assert is_landed(flown, Outcome.ATTEMPTS_USED_UP), flown
@@ -229,8 +243,8 @@ def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     assert flown.way[-3:] == [phase.value, "LANDING", end]
     assert report.outcome is Outcome.OPERATOR
     assert EXIT_CODE_OF[report.outcome] == 130
-    words = "the magnet holds" if flown.flight.hanging else "the operator asked to land"
-    assert words in report.reason
+    words = "the magnet holds" if flown.flight.hanging else "motors off"
+    assert report.reason.startswith(f"the operator asked to land; {words}")
     assert not flown.flight.locked
     assert not flown.flight.fell
     assert flown.z_m < ON_THE_FLOOR_M or flown.flight.hanging
