@@ -26,6 +26,7 @@ from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
 from perchctl.cli.app import reported
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
+from perchctl.flight.session import PLAIN_SEED
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.handle import SimProcess
 from tests.helpers.flights import ROOT, SEED, SHORT
@@ -262,7 +263,7 @@ def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
 def test_dry_run_as_json_holds_the_whole_profile() -> None:
     plan = json.loads(run("fly", "-p", SHORT, "--dry-run", "--json").stdout)
     assert plan["uri"] == "sim://"
-    assert plan["seed"] == 0
+    assert plan["seed"] == PLAIN_SEED
     assert plan["profile"]["simulation"]["camera_rate_hz"] == 20
     assert plan["profile"]["kalman"]["n_max"] == 8
     assert Path(plan["calibration_file"]).is_file()

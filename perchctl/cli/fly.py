@@ -27,7 +27,7 @@ def fly(
             "--source", help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated scenario.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated scenario.")] = 11,
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Folder for the flight log and its plot.")
     ] = None,

@@ -26,7 +26,13 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.session import FlyOptions, SessionResult, check_options, fly_session
+from perchctl.flight.session import (
+    PLAIN_SEED,
+    FlyOptions,
+    SessionResult,
+    check_options,
+    fly_session,
+)
 from perchctl.log.read import read_log
 from perchctl.log.summary import FlightSummary, summary_text
 from perchctl.log.watch import LogWatcher
@@ -59,7 +65,7 @@ class FlyRequest:
     profile: str = "sim"
     uri: str | None = None
     source: str | None = None
-    seed: int = 0
+    seed: int = PLAIN_SEED
     log_dir: Path | None = None
     dry_run: bool = False
     yes: bool = False

@@ -67,6 +67,11 @@ def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
 
 def event_text(event: Event) -> str:
     """An event as one line."""
+    text = _what_happened(event)
+    return f"{text} (simulated: {event.simulated})" if event.simulated else text
+
+
+def _what_happened(event: Event) -> str:
     match event.kind:
         case EventKind.PHASE:
             return f"{event.phase.value if event.phase else '?'}: {event.reason}"

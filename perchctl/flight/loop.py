@@ -41,6 +41,9 @@ HUNG_S = 0.25
 
 @dataclass(frozen=True, eq=False)
 class FlightParts:
+    """The edges. `simulated` says what the scenario of a simulated flight did that explains
+    an event."""
+
     link: Link
     source: FrameSource
     clock: Clock
@@ -48,6 +51,7 @@ class FlightParts:
     pipeline: Pipeline
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
+    simulated: Callable[[Event], str] = lambda event: ""
 
 
 def fly(parts: FlightParts) -> FlightReport:
@@ -146,6 +150,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
         for text in senses.take_remarks():
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
         for event in events:
+            event = replace(event, simulated=parts.simulated(event))
             if event.kind is EventKind.PHASE:
                 passed.append(event)
             for watcher in parts.watchers:
