@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Iterator
@@ -48,6 +49,9 @@ def main() -> Any:
     except KeyboardInterrupt:
         _complain("Ctrl-C")
         return Interrupted.exit_code
+    finally:
+        # A key that is still held down must not end what is over with a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @contextlib.contextmanager
@@ -71,8 +75,9 @@ def reported() -> Iterator[None]:
     except Exception as error:
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
+        where = " ".join(["", *getattr(error, "__notes__", ())])
         _complain(
-            f"unforeseen {type(error).__name__}: {error} "
+            f"unforeseen {type(error).__name__}: {error}{where} "
             f"(PERCHCTL_DEBUG=1 shows where; please report it)"
         )
         raise typer.Exit(PerchError.exit_code) from None

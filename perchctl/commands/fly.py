@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import load_calibration
+from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.interrupt import signals_to_operator
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port
@@ -33,13 +34,11 @@ from perchctl.flight.session import (
     check_options,
     fly_session,
 )
-from perchctl.log.read import read_log
 from perchctl.log.summary import FlightSummary, summary_text
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import Event, EventKind, Watcher
 from perchctl.profile import (
-    Profile,
     find_calibration,
     find_profile,
     find_weights,
@@ -205,7 +204,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
     perched = result.report.phase is Phase.PERCHED
     summary = log.close(result.report, result.miss_m if perched else None)
     assert summary is not None
-    plot = _plot(log.path, options.profile)
+    plot = plot_of(log.path, options.profile)
     tell(summary_text(summary, log.path, plot))
     code = exit_code(result.report.outcome, summary)
     if as_json:
@@ -245,18 +244,3 @@ def live_page(
         switch.land,
         say,
     )
-
-
-def _plot(path: Path, profile: Profile) -> Path | None:
-    """The flight's picture; a plot that fails is a warning, the flight is over."""
-    if not profile.log.plot:
-        return None
-    from perchctl.log.plot import plot_flight
-
-    picture = path.with_suffix(".png")
-    try:
-        plot_flight(read_log(path), picture)
-    except Exception as error:
-        say(f"the plot could not be drawn: {error}")
-        return None
-    return picture

@@ -71,6 +71,11 @@ def event_text(event: Event) -> str:
     return f"{text} (simulated: {event.simulated})" if event.simulated else text
 
 
+def timed_text(event: Event, start_s: float) -> str:
+    """The line with the time since the start."""
+    return f"[{event.t_s - start_s:7.2f} s] {event_text(event)}"
+
+
 def _what_happened(event: Event) -> str:
     match event.kind:
         case EventKind.PHASE:
