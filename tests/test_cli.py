@@ -488,16 +488,15 @@ def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Pat
 def test_one_seed_as_json_is_its_flight_logged_where_the_profile_says(tmp_path: Path) -> None:
     profile = tmp_path / "mine.yaml"
     profile.write_text(
-        f"extends: {SHORT}\nlog: {{directory: here, plot: false}}\n"
-        "simulation: {ceiling_z_m: [0.9, 0.9]}\nplanner: {takeoff_height_m: 0.4}\n"
+        f"extends: {SHORT}\nplanner: {{perching_time_s: 0.3}}\n"
+        "log: {directory: here, plot: false}\n"
     )
     said = run("simulate", "-p", str(profile), "--only", "5", "--json")
     record = json.loads(said.stdout)
-    assert (said.code, record["seed"], record["outcome"]) == (0, 5, "perched")
+    assert (said.code, record["seed"], record["outcome"]) == (0, 5, "landed")
+    assert record["reason"] == "the perching time is over; motors off"
     assert (record["log"], record["plot"]) == ("here/flight_seed5.jsonl", None)
-    assert read_log(tmp_path / record["log"]).summary["miss_m"] == pytest.approx(  # type: ignore[index]
-        record["miss_m"], abs=1e-6
-    )
+    assert read_log(tmp_path / record["log"]).header["seed"] == 5
 
 
 @pytest.mark.parametrize(
