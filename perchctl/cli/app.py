@@ -75,9 +75,8 @@ def reported() -> Iterator[None]:
     except Exception as error:
         if os.environ.get("PERCHCTL_DEBUG"):
             raise
-        where = " ".join(["", *getattr(error, "__notes__", ())])
         _complain(
-            f"unforeseen {type(error).__name__}: {error}{where} "
+            f"unforeseen {type(error).__name__}: {error} "
             f"(PERCHCTL_DEBUG=1 shows where; please report it)"
         )
         raise typer.Exit(PerchError.exit_code) from None

@@ -6,9 +6,16 @@ from importlib.util import find_spec
 
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.output import print_record
-from perchctl.commands.simulate_request import SimulateRequest, fly_each, stop_once, tell_logs
-from perchctl.errors import UsageError
+from perchctl.commands.simulate_request import (
+    SimulateRequest,
+    and_problem,
+    fly_each,
+    stop_once,
+    tell_logs,
+)
+from perchctl.errors import PerchError, UsageError
 from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
+from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.write import make_log_folder
 from perchctl.profile import load_profile
 
@@ -25,16 +32,15 @@ def run(request: SimulateRequest) -> int:
         raise UsageError(
             "the simulator is not installed (mujoco is missing): pip install 'perchctl[sim]'"
         )
+    with uninterrupted():  # a library that is half loaded fails with words of its own
+        from perchctl.commands.simulate_faults import run_faults
+        from perchctl.commands.simulate_only import run_only
     if request.log_dir is not None:
         make_log_folder(request.log_dir)
     with signals_to(stop_once()):
         if request.faults is not None:
-            from perchctl.commands.simulate_faults import run_faults
-
             return run_faults(request)
         if request.only is not None:
-            from perchctl.commands.simulate_only import run_only
-
             return run_only(request)
         return _campaign(request)
 
@@ -44,10 +50,10 @@ def _campaign(request: SimulateRequest) -> int:
 
     profile = load_profile(request.profile)
 
-    def report(results: list[FlightResult]) -> None:
+    def report(results: list[FlightResult], problem: PerchError | None) -> None:
         if request.as_json:
-            print_record(campaign_summary(results))
-        elif results:
+            print_record(and_problem(campaign_summary(results), problem))
+        else:
             print(campaign_table(results), flush=True)
         tell_logs(results, request.log_dir)
 

@@ -7,7 +7,8 @@ from dataclasses import asdict, replace
 
 from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.output import print_record, say
-from perchctl.commands.simulate_request import SimulateRequest, fly_each, tell_logs
+from perchctl.commands.simulate_request import SimulateRequest, and_problem, fly_each, tell_logs
+from perchctl.errors import PerchError
 from perchctl.faults.campaign import run_fault_campaign
 from perchctl.faults.catalogue import FAULTS, selected
 from perchctl.faults.result import FaultResult
@@ -27,17 +28,17 @@ def run_faults(request: SimulateRequest) -> int:
     if request.only is not None:
         request = replace(request, log_dir=request.log_folder(profile))
 
-    def report(results: list[FaultResult]) -> None:
+    def report(results: list[FaultResult], problem: PerchError | None) -> None:
         if request.only is not None:
             for result in results:
                 _tell(result, profile, request.as_json)
             return
         if request.as_json:
-            print_record(fault_summary(results))
-        elif results:
+            print_record(and_problem(fault_summary(results), problem))
+        else:
             print(fault_table(results), flush=True)
         tell_logs(results, request.log_dir)
-        if request.heat_map is not None and results:
+        if request.heat_map is not None:
             from perchctl.faults.plot import plot_heat_map
 
             plot_heat_map(results, request.heat_map)

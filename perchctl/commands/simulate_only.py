@@ -9,6 +9,7 @@ from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.output import print_record
 from perchctl.commands.simulate_request import SimulateRequest, fly_each
 from perchctl.display.status import timed_text
+from perchctl.errors import PerchError
 from perchctl.flight.campaign import LoggedFlight, fly_all, fly_logged
 from perchctl.log.summary import summary_text
 from perchctl.profile import Profile, load_profile
@@ -19,7 +20,7 @@ def run_only(request: SimulateRequest) -> int:
     profile = load_profile(request.profile)
     fly = partial(fly_logged, profile, request.log_folder(profile))
 
-    def report(flown: list[LoggedFlight]) -> None:
+    def report(flown: list[LoggedFlight], _problem: PerchError | None) -> None:
         for flight in flown:
             _tell(flight, profile, request.as_json)
 

@@ -10,11 +10,11 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from perchctl.commands.output import say
 from perchctl.commands.progress import Ended, progress_bar
-from perchctl.errors import Interrupted, InvalidValue, UsageError
+from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.profile import Profile
 
 AGAIN_S = 0.5
@@ -94,19 +94,20 @@ def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) 
 def fly_each(
     campaign: Callable[[Executor, Callable[[R], None]], object],
     request: SimulateRequest,
-    report: Callable[[list[R]], None],
+    report: Callable[[list[R], PerchError | None], None],
 ) -> int:
     """Flies the request's seeds in processes of their own, and reports those that were flown,
     however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
 
-    `campaign` is given who flies, and whom to tell of each result. Errors: its own, after the
-    report of what was flown before.
+    `campaign` is given who flies, and whom to tell of each result; `report` also why not all
+    were flown. Errors: PerchError where none was.
     """
     from perchctl.flight.campaign import job_processes
 
     seeds = request.seeds
     results: list[R] = []
     jobs = min(request.jobs or 1, len(seeds))
+    problem: PerchError | None = None
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
@@ -114,16 +115,27 @@ def fly_each(
             job_processes(jobs) as executor,
         ):
             campaign(executor, noting(results, advance))
-    except Exception:
-        if results:
-            report(_in_order(results))
-            say(f"{len(results)} of {len(seeds)} flights were flown")
-        raise
-    report(_in_order(results))
-    if len(results) == len(seeds):
+    except PerchError as error:
+        problem = error
+    flown = f"{len(results)} of {len(seeds)} flights were flown"
+    if problem is None and len(results) < len(seeds):
+        problem = Interrupted(f"stopped: {flown}")
+    elif problem is not None:
+        problem.args = (f"{problem}; {flown}",)
+    if problem is not None and not results:
+        raise problem
+    report(sorted(results, key=lambda result: result.seed), problem)
+    if problem is None:
         return 0
-    say(f"stopped: {len(results)} of {len(seeds)} flights were flown")
-    return Interrupted.exit_code
+    say(str(problem))
+    return problem.exit_code
+
+
+def and_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
+    """The one object of `--json`, with why not all were flown."""
+    if problem is None:
+        return dict(record)
+    return {**record, "error": str(problem), "exit_code": problem.exit_code}
 
 
 def noting(results: list[R], advance: Callable[[R], None]) -> Callable[[R], None]:
@@ -134,10 +146,6 @@ def noting(results: list[R], advance: Callable[[R], None]) -> Callable[[R], None
         advance(result)
 
     return note
-
-
-def _in_order(results: list[R]) -> list[R]:
-    return sorted(results, key=lambda result: result.seed)
 
 
 def tell_logs(results: Sequence[Seeded], log_dir: Path | None) -> None:

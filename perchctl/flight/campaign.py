@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +25,7 @@ import cv2
 from perchctl.errors import PerchError
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.flight.results import FlightEnd, FlightResult
+from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.summary import FlightSummary
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Phase
@@ -149,12 +149,18 @@ def _result(future: Future[R], seed: int) -> R:
         return future.result()
     except BrokenExecutor:
         raise PerchError(
-            "a process that flew was ended from outside: where memory is short, fly fewer at a "
-            "time (--jobs)"
+            "a process that flew was ended from outside (where memory is short, fly fewer at a "
+            "time: --jobs)"
         ) from None
-    except Exception as error:
-        error.add_note(f"in the flight of seed {seed}")
+    except PerchError:
         raise
+    except Exception as error:
+        if os.environ.get("PERCHCTL_DEBUG"):
+            raise
+        raise PerchError(
+            f"unforeseen {type(error).__name__} in the flight of seed {seed}: {error} "
+            f"(PERCHCTL_DEBUG=1 shows where; please report it)"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -184,14 +190,3 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, name="parent", daemon=True).start()
-
-
-@contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Ctrl-C and SIGTERM wait until after the block; processes started within never see them."""
-    signals = {signal.SIGINT, signal.SIGTERM}
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -9,14 +9,24 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.simulate_request import AGAIN_S, SimulateRequest, stop_once, tell_logs
-from perchctl.errors import PerchError
+from perchctl.commands.interrupt import signals_to
+from perchctl.commands.simulate_request import (
+    AGAIN_S,
+    SimulateRequest,
+    and_problem,
+    fly_each,
+    stop_once,
+    tell_logs,
+)
+from perchctl.errors import Interrupted, PerchError
+from perchctl.flight.uninterrupted import uninterrupted
 from tests.helpers.flights import ROOT
 from tests.helpers.jobs import (
     Ended,
@@ -30,13 +40,38 @@ from tests.helpers.jobs import (
 AT_ONCE_S = 3.0
 
 
+class Reported:
+    """What a campaign said, and why not all were flown."""
+
+    def __init__(self) -> None:
+        self.flights: list[Ended] = []
+        self.problem: PerchError | None = None
+
+    def __call__(self, flights: list[Ended], problem: PerchError | None) -> None:
+        self.flights, self.problem = flights, problem
+
+
 def test_what_is_flown_never_sees_a_signal(capsys: pytest.CaptureFixture[str]) -> None:
-    reported: list[Ended] = []
-    assert campaign(ends_at_once, SimulateRequest(flights=2), reported.extend) == 0
-    assert [(flight.seed, flight.deaf) for flight in reported] == [(0, True), (1, True)]
-    assert reported[0].pid != os.getpid()
+    reported = Reported()
+    assert campaign(ends_at_once, SimulateRequest(flights=2), reported) == 0
+    assert [(flight.seed, flight.deaf) for flight in reported.flights] == [(0, True), (1, True)]
+    assert reported.flights[0].pid != os.getpid()
+    assert reported.problem is None
     assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
     assert capsys.readouterr().err == ""
+
+
+def test_a_signal_waits_for_what_must_not_be_left_halfway() -> None:
+    done: list[str] = []
+
+    def load() -> None:
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            done.append("loaded")
+
+    with pytest.raises(KeyboardInterrupt):
+        load()
+    assert done == ["loaded"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -44,7 +79,7 @@ def test_a_signal_ends_the_flights_where_they_are(
     number: signal.Signals, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What was flown by then is reported; a key that is held down is one press."""
-    reported: list[Ended] = []
+    reported = Reported()
     pressed_s: list[float] = []
 
     def press(_result: Ended) -> None:
@@ -55,15 +90,24 @@ def test_a_signal_ends_the_flights_where_they_are(
             signal.raise_signal(number)
 
     request = SimulateRequest(flights=6, jobs=2)
-    assert campaign(ends_first_only, request, reported.extend, press) == 130
+    assert campaign(ends_first_only, request, reported, press) == 130
     assert time.monotonic() - pressed_s[0] < AT_ONCE_S
-    assert [flight.seed for flight in reported] == [0]
+    assert [flight.seed for flight in reported.flights] == [0]
     assert multiprocessing.active_children() == []
-    assert "1 of 6 flights" in capsys.readouterr().err
+    assert capsys.readouterr().err == "perchctl: stopped: 1 of 6 flights were flown\n"
+
+
+def test_with_nothing_flown_there_is_nothing_to_report() -> None:
+    def flown(_executor: object, _note: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    with signals_to(stop_once()), pytest.raises(Interrupted, match="0 of 10 flights were flown"):
+        fly_each(flown, SimulateRequest(), Reported())
 
 
 def test_a_second_press_ends_the_program_at_once() -> None:
-    now_s, left = [0.0], []
+    now_s = [0.0]
+    left: list[int] = []
     press = stop_once(lambda: now_s[0], left.append)
     with pytest.raises(KeyboardInterrupt):
         press(signal.SIGINT, None)
@@ -75,19 +119,26 @@ def test_a_second_press_ends_the_program_at_once() -> None:
     assert left == [130]
 
 
-@pytest.mark.parametrize("fly", [fails_later, is_killed_later])
+@pytest.mark.parametrize(
+    ("fly", "words"),
+    [
+        (fails_later, "unforeseen ZeroDivisionError in the flight of seed 1: no such luck"),
+        (is_killed_later, "ended from outside"),
+    ],
+)
 def test_a_flight_that_fails_loses_none_of_the_others(
-    fly: object, capsys: pytest.CaptureFixture[str]
+    fly: Callable[[int], Ended], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reported: list[Ended] = []
-    with pytest.raises((ZeroDivisionError, PerchError)) as raised:
-        campaign(fly, SimulateRequest(flights=3), reported.extend)  # type: ignore[arg-type]
-    if fly is fails_later:
-        assert raised.value.__notes__ == ["in the flight of seed 1"]
-    else:
-        assert "ended from outside" in str(raised.value)
-    assert [flight.seed for flight in reported] == [0]
-    assert "1 of 3 flights" in capsys.readouterr().err
+    reported = Reported()
+    assert campaign(fly, SimulateRequest(flights=3), reported) == 1
+    assert [flight.seed for flight in reported.flights] == [0]
+    assert reported.problem is not None
+    assert and_problem({"flights": 1}, reported.problem) == {
+        "flights": 1, "error": str(reported.problem), "exit_code": 1,
+    }  # fmt: skip
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.endswith("; 1 of 3 flights were flown\n")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
@@ -115,7 +166,7 @@ def test_a_program_that_is_ended_leaves_nothing_behind(number: signal.Signals) -
     assert ended
     if number == signal.SIGTERM:
         assert program.returncode == 130
-        assert out.split() == ["report", "1"]
+        assert out == "report 1 stopped: 1 of 6 flights were flown\n"
         assert err == "perchctl: stopped: 1 of 6 flights were flown\n"
 
 

@@ -13,6 +13,7 @@ from functools import partial
 
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.simulate_request import SimulateRequest, fly_each, stop_once
+from perchctl.errors import PerchError
 from perchctl.flight.campaign import fly_all
 
 FOR_EVER_S = 60.0
@@ -54,7 +55,7 @@ def is_killed_later(seed: int) -> Ended:
 def campaign(
     fly: Callable[[int], Ended],
     request: SimulateRequest,
-    report: Callable[[list[Ended]], None],
+    report: Callable[[list[Ended], PerchError | None], None],
     on_result: Callable[[Ended], None] = lambda result: None,
 ) -> int:
     """As `perchctl simulate` has it."""
@@ -76,7 +77,7 @@ if __name__ == "__main__":
         campaign(
             ends_first_only,
             SimulateRequest(flights=6, jobs=2),
-            lambda flown: say("report", len(flown)),
+            lambda flown, problem: say("report", len(flown), problem),
             lambda result: say(result.pid),
         )
     )
