@@ -16,7 +16,7 @@ from perchctl.commands.simulate_request import SimulateRequest, fly_each, stop_o
 from perchctl.errors import PerchError
 from perchctl.flight.campaign import fly_all
 
-FOR_EVER_S = 60.0
+FOR_EVER_S = 300.0
 
 
 @dataclass(frozen=True)
