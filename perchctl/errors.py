@@ -47,7 +47,7 @@ class TargetNotFound(PerchError):
 
 class AttemptsUsedUp(PerchError):
     exit_code = 51
-    meaning = "attempts or perching time used up, landed"
+    meaning = "attempts or perching time used up, landed or left hanging"
 
 
 class SafetyAbort(PerchError):
@@ -67,7 +67,7 @@ class LogIncomplete(PerchError):
 
 class Interrupted(PerchError):
     exit_code = 130
-    meaning = "Ctrl-C, landed (in the air) or left (on the ground)"
+    meaning = "Ctrl-C, landed (in the air) or left (on the ground, at the ceiling)"
 
 
 class ProfileNote(UserWarning):

@@ -26,6 +26,8 @@ from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
 from perchctl.cli.app import reported
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
+from perchctl.flight.session import PLAIN_SEED
+from perchctl.log.read import read_log
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.handle import SimProcess
 from tests.helpers.flights import ROOT, SEED, SHORT
@@ -265,7 +267,7 @@ def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
 def test_dry_run_as_json_holds_the_whole_profile() -> None:
     plan = json.loads(run("fly", "-p", SHORT, "--dry-run", "--json").stdout)
     assert plan["uri"] == "sim://"
-    assert plan["seed"] == 0
+    assert plan["seed"] == PLAIN_SEED
     assert plan["profile"]["simulation"]["camera_rate_hz"] == 20
     assert plan["profile"]["kalman"]["n_max"] == 8
     assert Path(plan["calibration_file"]).is_file()
@@ -422,13 +424,19 @@ def test_a_note_stands_before_the_sentence_of_a_failure(
 
 
 @pytest.fixture(scope="module")
-def campaign() -> Said:
-    """Two seeds, two at a time."""
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The campaign's."""
+    return tmp_path_factory.mktemp("campaign") / "logs"
+
+
+@pytest.fixture(scope="module")
+def campaign(logs: Path) -> Said:
+    """Two seeds, two at a time, with their logs."""
     arguments = ("-p", SHORT, "-n", "2", "--seed", str(SEED), "--jobs", "2", "--json")
-    return run_apart("simulate", *arguments)
+    return run_apart("simulate", *arguments, "--log-dir", str(logs))
 
 
-def test_simulate_prints_one_object(campaign: Said) -> None:
+def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     assert campaign.code == 0
     said = json.loads(campaign.stdout)
     assert set(said) == {
@@ -441,37 +449,90 @@ def test_simulate_prints_one_object(campaign: Said) -> None:
     ]  # fmt: skip
     assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
     assert said["realtime_factor"] > 0
-    assert sorted(said["worst_seeds"]) == [SEED, SEED + 1]
+    assert said["worst_seeds"] == []
+    assert campaign.complaint == f"the flights' logs are in {logs}"
 
 
 @pytest.fixture(scope="module")
-def repeated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, bytes]:
-    """The one flight of the seed, printed for people, with its log."""
-    folder = tmp_path_factory.mktemp("only")
+def repeated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, Path]:
+    """The one flight of the seed, told for people, with its log."""
+    folder = tmp_path_factory.mktemp("only") / "made"
     arguments = ("-p", SHORT, "--only", str(SEED), "--log-dir", str(folder))
-    said = run_apart("simulate", *arguments, PYTHONHASHSEED="7")
-    return said, (folder / f"flight_seed{SEED}.jsonl").read_bytes()
+    return run_apart("simulate", *arguments, PYTHONHASHSEED="7"), folder
 
 
-def test_one_seed_repeats_its_flight(
-    campaign: Said, repeated: tuple[Said, bytes], tmp_path: Path
+def test_one_seed_is_the_flight_that_it_was_in_the_campaign(
+    campaign: Said, repeated: tuple[Said, Path], logs: Path
 ) -> None:
-    """The same miss alone as beside another, and the same log from another process."""
-    arguments = ("-p", SHORT, "--json", "--only")
-    here = run("simulate", *arguments, str(SEED), "--log-dir", str(tmp_path))
-    misses = [json.loads(here.stdout)["miss_m"]["max"]]
-    misses.append(json.loads(run("simulate", *arguments, str(SEED + 1)).stdout)["miss_m"]["max"])
-    both = json.loads(campaign.stdout)
-    assert both["miss_m"]["max"] == max(misses)
-    assert both["miss_m"]["median"] == pytest.approx(sum(misses) / 2, abs=2e-6)
-    assert both["worst_seeds"][0] == SEED + misses.index(max(misses))
-    assert (tmp_path / f"flight_seed{SEED}.jsonl").read_bytes() == repeated[1]
+    """The same log, from another process."""
+    name = f"flight_seed{SEED}.jsonl"
+    assert (repeated[1] / name).read_bytes() == (logs / name).read_bytes()
+    assert sorted(path.name for path in logs.iterdir()) == [name, f"flight_seed{SEED + 1}.jsonl"]
+    misses = [read_log(path).summary["miss_m"] for path in logs.iterdir()]  # type: ignore[index]
+    assert json.loads(campaign.stdout)["miss_m"]["max"] == pytest.approx(max(misses), abs=1e-6)
 
 
-def test_a_pipe_gets_no_colour(repeated: tuple[Said, bytes], campaign: Said) -> None:
-    said, _ = repeated
+def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Path]) -> None:
+    said, folder = repeated
     assert said.code == 0
-    assert re.search(r"perched +1\b", said.stdout)
+    assert said.stderr == ""
+    lines = said.stdout.splitlines()
+    assert lines[0] == "[   0.00 s] APPROACH: start"
+    assert re.fullmatch(r"\[ +\d+\.\d\d s\] COMPLETE: contact proven by .*", lines[6])
+    assert lines[8] == "PERCHED: hanging still with the motors off"
+    words = dict(line.split(":", 1) for line in lines[9:])
+    assert set(words) == {"miss", "flight", "phases", "battery", "log", "plot"}
+    assert "ALIGN 0.4 s > ASCEND" in words["phases"]
+    assert Path(words["log"].strip()) == folder / f"flight_seed{SEED}.jsonl"
+    assert Path(words["plot"].strip()) == folder / f"flight_seed{SEED}.png"
+    assert {path.suffix for path in folder.iterdir()} == {".jsonl", ".png"}
+
+
+def test_one_seed_as_json_is_its_flight_logged_where_the_profile_says(tmp_path: Path) -> None:
+    profile = tmp_path / "mine.yaml"
+    profile.write_text(
+        f"extends: {SHORT}\nplanner: {{perching_time_s: 0.3}}\n"
+        "log: {directory: here, plot: false}\n"
+    )
+    said = run("simulate", "-p", str(profile), "--only", "5", "--json")
+    record = json.loads(said.stdout)
+    assert (said.code, record["seed"], record["outcome"]) == (0, 5, "landed")
+    assert record["reason"] == "the perching time is over; motors off"
+    assert (record["log"], record["plot"]) == ("here/flight_seed5.jsonl", None)
+    assert read_log(tmp_path / record["log"]).header["seed"] == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("--only 3 -n 5", ["--only 3", "-n 5 does not apply", "leave it out"]),
+        ("--only 3 --seed 7", ["--seed 7 does not apply"]),
+        ("--only 3 --jobs 2 --seed 0", ["--seed 0 and --jobs 2 do not apply", "leave them out"]),
+        ("--only 3 --faults all --heat-map m.png", ["--heat-map m.png does not apply"]),
+        ("--faults list --log-dir x", ["flies nothing", "--log-dir x does not apply"]),
+        ("--heat-map m.png", ["--faults"]),
+    ],
+)
+def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str]) -> None:
+    said = run("simulate", *arguments.split())
+    assert said.code == 2
+    for word in words:
+        assert word in said.complaint
+    assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize("where", ["afile", "afile/logs"])
+@pytest.mark.parametrize("command", ["simulate --only 1", "simulate", "fly"])
+def test_a_file_in_the_place_of_the_logs_is_named_with_what_to_do(command: str, where: str) -> None:
+    Path("afile").touch()
+    said = run(*command.split(), "--log-dir", where)
+    assert said.code == 30
+    assert where in said.complaint
+    assert "name another folder with --log-dir" in said.complaint
+
+
+def test_a_pipe_gets_no_colour(repeated: tuple[Said, Path], campaign: Said) -> None:
+    said, _ = repeated
     for text in (said.stdout, said.stderr, campaign.stdout, campaign.stderr):
         assert ESCAPE not in text
 

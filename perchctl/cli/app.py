@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -99,6 +100,9 @@ def main() -> Any:
         _drop_stdout()
         _complain(sentence)
         return InvalidValue.exit_code
+    finally:
+        # A key that is still held down must not end what is over with a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     return code
 
 

@@ -30,7 +30,7 @@ def fly(
             autocompletion=complete_source,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated scenario.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated scenario.")] = 11,
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Folder for the flight log and its plot.")
     ] = None,

@@ -11,11 +11,21 @@ from perchctl.cli.app import JsonOption, ProfileOption, perform, reported
 
 
 def simulate(
-    flights: Annotated[int, typer.Option("-n", "--flights", min=1, help="How many.")] = 10,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the first flight.")] = 0,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Flights at a time.")] = 1,
+    flights: Annotated[
+        int | None,
+        typer.Option("-n", "--flights", min=1, help="How many; 10 by default."),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, help="Of the first flight; 0 by default."),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", "-j", min=1, help="Flights at a time; 1 by default."),
+    ] = None,
     only: Annotated[
-        int | None, typer.Option("--only", min=0, help="Repeat the one flight of this seed.")
+        int | None,
+        typer.Option("--only", min=0, help="One flight, of this seed, told in full and logged."),
     ] = None,
     profile: ProfileOption = "sim",
     faults: Annotated[
@@ -30,7 +40,7 @@ def simulate(
         Path | None, typer.Option("--heat-map", help="PNG of faults against phases.")
     ] = None,
     log_dir: Annotated[
-        Path | None, typer.Option("--log-dir", help="Folder for the flights' logs.")
+        Path | None, typer.Option("--log-dir", help="Log the flights, into this folder.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -27,14 +27,18 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.session import FlyOptions, SessionResult, check_options, fly_session
-from perchctl.log.read import read_log
+from perchctl.flight.session import (
+    PLAIN_SEED,
+    FlyOptions,
+    SessionResult,
+    check_options,
+    fly_session,
+)
 from perchctl.log.summary import FlightSummary, summary_text
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import Event, EventKind, Watcher
 from perchctl.profile import (
-    Profile,
     find_calibration,
     find_profile,
     find_weights,
@@ -60,7 +64,7 @@ class FlyRequest:
     profile: str = "sim"
     uri: str | None = None
     source: str | None = None
-    seed: int = 0
+    seed: int = PLAIN_SEED
     log_dir: Path | None = None
     dry_run: bool = False
     yes: bool = False
@@ -210,7 +214,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
         assert summary is not None
         tell(summary_text(summary, log.path))
     code = exit_code(result.report.outcome, summary)
-    plot = drawn(lambda: _plot(log.path, options.profile))
+    plot = drawn(lambda: plot_of(log.path, options.profile))
     if plot is not None:
         tell(f"plot:      {plot}")
     if as_json:
@@ -263,18 +267,3 @@ def live_page(
         switch.land,
         say,
     )
-
-
-def _plot(path: Path, profile: Profile) -> Path | None:
-    """The flight's picture; a plot that fails is a warning, the flight is over."""
-    if not profile.log.plot:
-        return None
-    from perchctl.log.plot import plot_flight
-
-    picture = path.with_suffix(".png")
-    try:
-        plot_flight(read_log(path), picture)
-    except Exception as error:
-        say(f"the plot could not be drawn: {error}")
-        return None
-    return picture

@@ -14,11 +14,25 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
+    Task,
     TextColumn,
-    TimeRemainingColumn,
 )
+from rich.text import Text
 
 _REFRESH_HZ = 4
+
+
+class TimeLeft(ProgressColumn):
+    """From the first one that is done; rich's own looks at the last 30 s only, in which no
+    flight may have ended."""
+
+    def render(self, task: Task) -> Text:
+        if not task.completed or task.total is None or task.elapsed is None:
+            return Text("")
+        left_s = round(task.elapsed / task.completed * (task.total - task.completed))
+        minutes, seconds = divmod(left_s, 60)
+        hours, minutes = divmod(minutes, 60)
+        return Text(f"{hours}:{minutes:02}:{seconds:02} left")
 
 
 class Ended(Protocol):
@@ -32,7 +46,7 @@ class Ended(Protocol):
 def progress_bar(total: int, stream: TextIO | None = None) -> Iterator[Callable[[Ended], None]]:
     """Yields the function to call with each finished flight."""
     ends: dict[str, int] = {}
-    columns = (TimeRemainingColumn(), TextColumn("{task.description}"))
+    columns = (TimeLeft(), TextColumn("{task.description}"))
     with _bar("flights", *columns, total=total, stream=stream) as update:
 
         def advance(result: Ended) -> None:
@@ -48,7 +62,7 @@ def count_bar(
     what: str, total: int | None, wanted: bool = True, stream: TextIO | None = None
 ) -> Iterator[Callable[[], None]]:
     """Yields the function to call for each one done; `total` None is an unknown number."""
-    with _bar(what, TimeRemainingColumn(), total=total, stream=stream, wanted=wanted) as update:
+    with _bar(what, TimeLeft(), total=total, stream=stream, wanted=wanted) as update:
         yield lambda: update(advance=1)
 
 

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
+from perchctl.commands.interrupt import signals_to
 from perchctl.commands.output import print_record
-from perchctl.commands.progress import progress_bar
-from perchctl.commands.simulate_request import SimulateRequest, exit_code, flying, noting
-from perchctl.errors import UsageError
+from perchctl.commands.simulate_request import (
+    SimulateRequest,
+    and_problem,
+    fly_each,
+    stop_once,
+    tell_logs,
+)
+from perchctl.errors import PerchError, UsageError
 from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
+from perchctl.flight.uninterrupted import uninterrupted
+from perchctl.log.write import make_log_folder
 from perchctl.profile import load_profile
 
 __all__ = ["SimulateRequest", "run"]
@@ -17,26 +27,40 @@ def run(request: SimulateRequest) -> int:
 
     Errors: NotFound, InvalidValue, UsageError.
     """
-    try:
-        from perchctl.flight.campaign import run_campaign
-    except ImportError as error:
+    request.check()
+    if find_spec("mujoco") is None:
         raise UsageError(
-            f"the simulator is not installed ({error.name} is missing): pip install 'perchctl[sim]'"
-        ) from None
-    if request.faults is not None:
+            "the simulator is not installed (mujoco is missing): pip install 'perchctl[sim]'"
+        )
+    with uninterrupted():  # a library that is half loaded fails with words of its own
         from perchctl.commands.simulate_faults import run_faults
+        from perchctl.commands.simulate_only import run_only
+    if request.log_dir is not None:
+        make_log_folder(request.log_dir)
+    with signals_to(stop_once()):
+        if request.faults is not None:
+            return run_faults(request)
+        if request.only is not None:
+            return run_only(request)
+        return _campaign(request)
 
-        return run_faults(request)
-    if request.heat_map is not None:
-        raise UsageError("--heat-map is drawn of faults: name them with --faults")
-    profile, seeds = load_profile(request.profile), request.seeds
-    results: list[FlightResult] = []
-    with progress_bar(len(seeds)) as advance, flying(len(seeds), request.jobs) as executor:
-        on_result = noting(results, advance)
-        run_campaign(profile, seeds, executor, on_result, request.log_dir)
-    results.sort(key=lambda result: result.seed)
-    if request.as_json:
-        print_record(campaign_summary(results))
-    else:
-        print(campaign_table(results))
-    return exit_code(len(results), len(seeds))
+
+def _campaign(request: SimulateRequest) -> int:
+    from perchctl.flight.campaign import run_campaign
+
+    profile = load_profile(request.profile)
+
+    def report(results: list[FlightResult], problem: PerchError | None) -> None:
+        if request.as_json:
+            print_record(and_problem(campaign_summary(results), problem))
+        else:
+            print(campaign_table(results), flush=True)
+        tell_logs(results, request.log_dir)
+
+    return fly_each(
+        lambda executor, note: run_campaign(
+            profile, request.seeds, executor, note, request.log_dir
+        ),
+        request,
+        report,
+    )

@@ -2,46 +2,74 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+import contextlib
+from dataclasses import asdict, replace
 
+from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.output import print_record, say
-from perchctl.commands.progress import progress_bar
-from perchctl.commands.simulate_request import SimulateRequest, exit_code, flying, noting
+from perchctl.commands.simulate_request import SimulateRequest, and_problem, fly_each, tell_logs
+from perchctl.errors import PerchError
 from perchctl.faults.campaign import run_fault_campaign
 from perchctl.faults.catalogue import FAULTS, selected
 from perchctl.faults.result import FaultResult
 from perchctl.faults.summary import fault_summary, fault_table
 from perchctl.flight.results import aligned
-from perchctl.profile import load_profile
+from perchctl.log.jsonl import to_plain
+from perchctl.profile import Profile, load_profile
 
 
 def run_faults(request: SimulateRequest) -> int:
     """Fly the seeds with their faults and print. Errors: NotFound, InvalidValue, UsageError."""
     if request.faults == "list":
-        print("\n".join(aligned([(fault.name, fault.what) for fault in FAULTS])))
+        _list(request.as_json)
         return 0
     names = tuple(fault.name for fault in selected(request.faults or "all"))
-    profile, seeds = load_profile(request.profile), request.seeds
-    results: list[FaultResult] = []
-    with progress_bar(len(seeds)) as advance, flying(len(seeds), request.jobs) as executor:
-        on_result = noting(results, advance)
-        run_fault_campaign(profile, seeds, names, executor, on_result, request.log_dir)
-    results.sort(key=lambda result: result.seed)
-    if request.heat_map is not None:
-        from perchctl.faults.plot import plot_heat_map
+    profile = load_profile(request.profile)
+    if request.only is not None:
+        request = replace(request, log_dir=request.log_folder(profile))
 
-        plot_heat_map(results, request.heat_map)
-        say(f"{request.heat_map} is drawn")
-    if request.as_json:
-        print_record(fault_summary(results))
-    else:
-        print(fault_table(results))
+    def report(results: list[FaultResult], problem: PerchError | None) -> None:
         if request.only is not None:
             for result in results:
-                print("\n" + _told(result))
-    return exit_code(len(results), len(seeds))
+                _tell(result, profile, request.as_json)
+            return
+        if request.as_json:
+            print_record(and_problem(fault_summary(results), problem))
+        else:
+            print(fault_table(results), flush=True)
+        tell_logs(results, request.log_dir)
+        if request.heat_map is not None:
+            from perchctl.faults.plot import plot_heat_map
+
+            plot_heat_map(results, request.heat_map)
+            say(f"{request.heat_map} is drawn")
+
+    return fly_each(
+        lambda executor, note: run_fault_campaign(
+            profile, request.seeds, names, executor, note, request.log_dir
+        ),
+        request,
+        report,
+    )
 
 
-def _told(result: FaultResult) -> str:
+def _list(as_json: bool) -> None:
+    if as_json:
+        print_record({"faults": {fault.name: fault.what for fault in FAULTS}})
+    else:
+        print("\n".join(aligned([(fault.name, fault.what) for fault in FAULTS])))
+
+
+def _tell(result: FaultResult, profile: Profile, as_json: bool) -> None:
     """All that is known of one flight."""
-    return "\n".join(f"{name:<18} {value}" for name, value in asdict(result).items())
+    told = asdict(result)
+    if not as_json:
+        print("\n".join(f"{name:<18} {value}" for name, value in told.items()), flush=True)
+    assert result.log is not None
+    plot = None
+    with contextlib.suppress(KeyboardInterrupt):
+        plot = plot_of(result.log, profile)
+    if as_json:
+        print_record(to_plain({**told, "plot": plot}))
+    elif plot is not None:
+        print(f"{'plot':<18} {plot}")

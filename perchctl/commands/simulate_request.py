@@ -1,20 +1,37 @@
-"""What `perchctl simulate` shares between plain campaigns and those with faults."""
+"""What `perchctl simulate` shares between plain flights and those with faults."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import Any, Protocol, TypeVar
 
-from perchctl.commands.interrupt import signals_to
 from perchctl.commands.output import say
-from perchctl.errors import Interrupted
+from perchctl.commands.progress import Ended, progress_bar
+from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
+from perchctl.profile import Profile
 
-R = TypeVar("R")
+AGAIN_S = 0.5
+"""A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
+
+
+class Seeded(Ended, Protocol):
+    """A flight's result, of whatever campaign."""
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def log_problem(self) -> str | None: ...
+
+
+R = TypeVar("R", bound=Seeded)
 
 
 @dataclass(frozen=True)
@@ -22,9 +39,9 @@ class SimulateRequest:
     """The command line as it was given; None is not given."""
 
     profile: str = "sim"
-    flights: int = 10
-    seed: int = 0
-    jobs: int = 1
+    flights: int | None = None
+    seed: int | None = None
+    jobs: int | None = None
     only: int | None = None
     log_dir: Path | None = None
     as_json: bool = False
@@ -35,7 +52,90 @@ class SimulateRequest:
     def seeds(self) -> list[int]:
         if self.only is not None:
             return [self.only]
-        return list(range(self.seed, self.seed + self.flights))
+        first = self.seed or 0
+        return list(range(first, first + (10 if self.flights is None else self.flights)))
+
+    def log_folder(self, profile: Profile) -> Path:
+        """Of one flight, which is always logged."""
+        return self.log_dir or Path(profile.log.directory)
+
+    def check(self) -> None:
+        """Errors: UsageError for an option that does not apply to what is asked for,
+        InvalidValue for a place that nothing can be written to."""
+        if self.heat_map is not None and self.faults is None:
+            raise UsageError("--heat-map is drawn of faults: name them with --faults")
+        many: dict[str, int | Path | None] = {
+            "-n": self.flights,
+            "--seed": self.seed,
+            "--jobs": self.jobs,
+            "--heat-map": self.heat_map,
+        }
+        if self.faults == "list":
+            others = {"--only": self.only, "--log-dir": self.log_dir}
+            _refuse("--faults list flies nothing", {**many, **others}, "")
+        elif self.only is not None:
+            one = f"--only {self.only} repeats the one flight of seed {self.only}"
+            _refuse(one, many, ", or --only")
+        if self.heat_map is not None and (
+            self.heat_map.is_dir() or not self.heat_map.parent.is_dir()
+        ):
+            raise InvalidValue(f"--heat-map {self.heat_map}: name a PNG file in an existing folder")
+
+
+def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) -> None:
+    given = [f"{name} {value}" for name, value in options.items() if value is not None]
+    if given:
+        does, it = ("does", "it") if len(given) == 1 else ("do", "them")
+        raise UsageError(
+            f"{asked}: {' and '.join(given)} {does} not apply; leave {it} out{instead}"
+        )
+
+
+def fly_each(
+    campaign: Callable[[Executor, Callable[[R], None]], object],
+    request: SimulateRequest,
+    report: Callable[[list[R], PerchError | None], None],
+) -> int:
+    """Flies the request's seeds in processes of their own, and reports those that were flown,
+    however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
+
+    `campaign` is given who flies, and whom to tell of each result; `report` also why not all
+    were flown. Errors: PerchError where none was.
+    """
+    from perchctl.flight.campaign import job_processes
+
+    seeds = request.seeds
+    results: list[R] = []
+    jobs = min(request.jobs or 1, len(seeds))
+    problem: PerchError | None = None
+    try:
+        with (
+            contextlib.suppress(KeyboardInterrupt),
+            progress_bar(len(seeds)) as advance,
+            job_processes(jobs) as executor,
+        ):
+            campaign(executor, noting(results, advance))
+    except PerchError as error:
+        problem = error
+    flown = f"{len(results)} of {len(seeds)} flights were flown"
+    if problem is None and len(results) < len(seeds):
+        problem = Interrupted(f"stopped: {flown}")
+    elif problem is not None:
+        problem.args = (f"{problem}; {flown}",)
+    if problem is not None and not results:
+        raise problem
+    report(sorted(results, key=lambda result: result.seed), problem)
+    if problem is None:
+        return 0
+    say(str(problem))
+    return problem.exit_code
+
+
+def and_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[str, Any]:
+    """The one object of `--json`, with why not all were flown."""
+    if problem is None:
+        return dict(record)
+    return {**record, "error": str(problem), "exit_code": problem.exit_code}
 
 
 def noting(results: list[R], advance: Callable[[R], None]) -> Callable[[R], None]:
@@ -48,38 +148,28 @@ def noting(results: list[R], advance: Callable[[R], None]) -> Callable[[R], None
     return note
 
 
-@contextlib.contextmanager
-def flying(flights: int, jobs: int) -> Iterator[Executor | None]:
-    """Yields the executor of more than one flight. Ctrl-C and SIGTERM end the block early,
-    and nothing else: what was flown by then is there.
-
-    More than one flight is always flown by processes of their own, which are ended where
-    they are; a flight of this process would be landed first.
-    """
-    from perchctl.flight.campaign import job_processes
-
-    with signals_to(_stop()), contextlib.suppress(KeyboardInterrupt):
-        if flights == 1:
-            yield None
-        else:
-            with job_processes(min(jobs, flights)) as executor:
-                yield executor
+def tell_logs(results: Sequence[Seeded], log_dir: Path | None) -> None:
+    """Where the logs are, and what they lack."""
+    if log_dir is None or not results:
+        return
+    say(f"the flights' logs are in {log_dir}")
+    problems = [result.log_problem for result in results if result.log_problem is not None]
+    if problems:
+        say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")
 
 
-def _stop() -> Callable[[int, FrameType | None], None]:
-    """The first signal ends the flights; while they are ended, further ones do nothing."""
-    pressed: list[int] = []
+def stop_once(
+    clock: Callable[[], float] = time.monotonic, leave: Callable[[int], object] = os._exit
+) -> Callable[[int, FrameType | None], None]:
+    """A handler: the first signal raises KeyboardInterrupt, a further one ends the program
+    where it is."""
+    first_s: list[float] = []
 
-    def press(number: int, _frame: FrameType | None) -> None:
-        pressed.append(number)
-        if len(pressed) == 1:
+    def press(_number: int, _frame: FrameType | None) -> None:
+        if not first_s:
+            first_s.append(clock())
             raise KeyboardInterrupt
+        if clock() - first_s[0] >= AGAIN_S:
+            leave(Interrupted.exit_code)
 
     return press
-
-
-def exit_code(flown: int, wanted: int) -> int:
-    if flown == wanted:
-        return 0
-    say(f"stopped: {flown} of {wanted} flights were flown")
-    return Interrupted.exit_code

@@ -67,6 +67,16 @@ def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
 
 def event_text(event: Event) -> str:
     """An event as one line."""
+    text = _what_happened(event)
+    return f"{text} (simulated: {event.simulated})" if event.simulated else text
+
+
+def timed_text(event: Event, start_s: float) -> str:
+    """The line with the time since the start."""
+    return f"[{event.t_s - start_s:7.2f} s] {event_text(event)}"
+
+
+def _what_happened(event: Event) -> str:
     match event.kind:
         case EventKind.PHASE:
             return f"{event.phase.value if event.phase else '?'}: {event.reason}"

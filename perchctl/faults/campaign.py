@@ -28,4 +28,5 @@ def run_fault_campaign(
 def _fly_logged(
     profile: Profile, faults: tuple[str, ...], log_dir: Path | None, seed: int
 ) -> FaultResult:
-    return fly_fault_seed(profile, seed, faults, log_of(seed, log_dir))
+    log = None if log_dir is None else log_of(seed, log_dir)
+    return fly_fault_seed(profile, seed, faults, log)

@@ -193,6 +193,7 @@ class FaultyFlight:
         )
         if self._log is not None:
             self._log.close(report, result.miss_m, "fell" in result.flags)
+            result = replace(result, log=self._log.path, log_problem=self._log.problem)
         return result
 
     def _for_log(self) -> tuple[tuple[float, float, float], float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from perchctl.faults.oracle import Flag
@@ -22,6 +23,7 @@ class FaultResult:
         begin_s: when the fault began; None when the flight was over before.
         drop_m: the deepest fall until caught, in the simulation's truth; `slip_ratio`: the
             magnet's hold over the weight, where that was a slip from the magnet.
+        log, log_problem: the flight's log, and what it lacks; None without.
     """
 
     seed: int
@@ -42,6 +44,8 @@ class FaultResult:
     slip_ratio: float | None = None
     wall_s: float = 0.0
     way: tuple[str, ...] = field(default=())
+    log: Path | None = None
+    log_problem: str | None = None
 
     @property
     def outcome(self) -> str:

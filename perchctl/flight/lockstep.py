@@ -16,6 +16,7 @@ from perchctl.profile import Profile
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.scenario import Scenario
+from perchctl.sim.told import Teller
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vehicle import LOCKED
 from perchctl.vision.types import Frame
@@ -129,6 +130,7 @@ def fly_lockstep(
     *,
     scenario: Scenario | None = None,
     operator_at: dict[Phase, Operator] | None = None,
+    watchers: tuple[Watcher, ...] = (),
 ) -> LockstepFlight:
     """Fly one seed of the profile's scenario to its end, faster than real time.
 
@@ -136,13 +138,16 @@ def fly_lockstep(
         log: a file to log to, or a watcher that is left open.
         scenario: flown instead of the seed's own.
         operator_at: the operator's command, given as soon as a phase is reached.
+        watchers: others that look on.
 
     Errors: NotFound, InvalidValue (calibration, log file).
     """
     scenario = draw_scenario(profile, seed) if scenario is None else scenario
     if isinstance(log, (Path, str)):
         watcher = LogWatcher.lockstep(Path(log), profile, scenario.seed)
-        flight = fly_lockstep(profile, log=watcher, scenario=scenario, operator_at=operator_at)
+        flight = fly_lockstep(
+            profile, log=watcher, scenario=scenario, operator_at=operator_at, watchers=watchers
+        )
         watcher.close(flight.report, flight.perched_miss_m, flight.fell)
         return flight
     camera = camera_of(profile.camera)
@@ -151,15 +156,17 @@ def fly_lockstep(
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, profile.camera.latency_s)
     truth = Truth(vehicle)
-    watchers: tuple[Watcher, ...] = (truth,)
+    watchers = (truth, *watchers)
     if log is not None:
         log.truth = truth.for_log
-        watchers = (truth, log)
+        watchers = (*watchers, log)
     operator = _OperatorAt(operator_at or {})
+    tell = Teller(scenario)
     pipeline = make_pipeline(profile, camera)
     parts = FlightParts(
-        link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read
-    )
+        link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
+        lambda event: tell(event, event.t_s),  # the clock is the simulation's
+    )  # fmt: skip
     link.connect()
     report = fly(parts)
     link.close()

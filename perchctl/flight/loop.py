@@ -41,6 +41,9 @@ HUNG_S = 0.25
 
 @dataclass(frozen=True, eq=False)
 class FlightParts:
+    """The edges. `simulated` says what the scenario of a simulated flight did that explains
+    an event."""
+
     link: Link
     source: FrameSource
     clock: Clock
@@ -48,6 +51,7 @@ class FlightParts:
     pipeline: Pipeline
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
+    simulated: Callable[[Event], str] = lambda event: ""
 
 
 def fly(parts: FlightParts) -> FlightReport:
@@ -146,6 +150,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
         for text in senses.take_remarks():
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
         for event in events:
+            event = replace(event, simulated=parts.simulated(event))
             if event.kind is EventKind.PHASE:
                 passed.append(event)
             for watcher in parts.watchers:
@@ -248,17 +253,24 @@ def _report(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) ->
         phase=state.phase,
         outcome=state.outcome or Outcome.SAFETY,
         reason=_reason(state, obs, passed),
-        attempts=state.attempts + int(state.phase is Phase.PERCHED),
+        attempts=_attempts(state),
         duration_s=obs.t_s - state.started_s,
         locked=obs.telemetry.has(LOCKED),
         history=passed,
     )
 
 
+def _attempts(state: PlannerState) -> int:
+    """The failed ones, and the one that hangs; a hold that is noticed once they are used up
+    has been counted as failed."""
+    hangs = state.phase is Phase.PERCHED and state.outcome is not Outcome.ATTEMPTS_USED_UP
+    return state.attempts + int(hangs)
+
+
 def _reason(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) -> str:
     """Why it ended so, with what led to the landing where there was one."""
     why = next((e.reason for e in reversed(passed) if e.phase is Phase.LANDING), "")
-    if state.phase is Phase.LANDED:
+    if state.phase in (Phase.LANDED, Phase.PERCHED):
         return f"{why}; {state.reason}" if why else state.reason
     if state.row != "landing-timeout":
         return state.reason

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -25,6 +26,7 @@ class FlightResult:
         locked: the supervisor had locked the vehicle at the end.
         fell: it hit the floor other than by landing.
         realtime_factor: loop time over wall time.
+        log, log_problem: the flight's log, and what it lacks; None without.
     """
 
     seed: int
@@ -36,6 +38,12 @@ class FlightResult:
     locked: bool
     fell: bool
     realtime_factor: float
+    log: Path | None = None
+    log_problem: str | None = None
+
+    @property
+    def is_bad(self) -> bool:
+        return self.outcome != "perched" or self.locked or self.fell
 
 
 def campaign_summary(
@@ -46,7 +54,7 @@ def campaign_summary(
     `miss_m` is taken over the perched flights (None without any; p95 by linear
     interpolation). `realtime_factor` is flight time over `wall_s`, or over the
     sum of the flights' own wall times without it. `worst_seeds` names at most
-    `worst` flights: those that did not perch first, then the largest misses.
+    `worst` flights, all of them bad.
     """
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
     flown_s = sum(r.time_s for r in results)
@@ -67,9 +75,14 @@ def campaign_summary(
     }
 
 
-def worst_first(results: Sequence[FlightResult]) -> list[FlightResult]:
-    """Not perched first (aborted before landed), then the largest misses, then by seed."""
-    return sorted(results, key=lambda r: (-ENDS.index(r.outcome), -(r.miss_m or 0.0), r.seed))
+def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
+    """The bad flights: aborted before landed before perched, then by seed."""
+    bad = [r for r in results if r.is_bad]
+    return sorted(bad, key=lambda r: (-ENDS.index(r.outcome), r.seed))
+
+
+def _miss_m(result: FlightResult) -> float:
+    return result.miss_m or 0.0
 
 
 def _rounded(value: Any) -> float:
@@ -82,12 +95,16 @@ def campaign_table(
     """The campaign's figures and its worst flights as plain text."""
     figures = campaign_summary(results, wall_s, worst)
     lines = [f"{name:<18}{text}" for name, text in campaign_rows(figures, results)]
-    if results:
-        lines += ["", "worst flights"]
+    bad = worst_first(results)
+    if bad:
+        shown = "" if len(bad) <= worst else f", {worst} of {len(bad)}"
+        lines += ["", f"worst flights{shown}"]
         lines += aligned(
             [("seed", "outcome", "miss [mm]", "time [s]", "attempts", "reason")]
-            + [_cells(r) for r in worst_first(results)[:worst]]
+            + [_cells(r) for r in bad[:worst]]
         )
+    elif results:
+        lines += ["", "worst flights: none is bad, all perched, none locked or fell"]
     return "\n".join(lines)
 
 
@@ -120,7 +137,8 @@ def campaign_rows(
     miss = figures["miss_m"]
     if miss["max"] is not None:
         text = ", ".join(f"{k} {miss[k] * 1e3:.1f}" for k in ("median", "p95", "max"))
-        rows.append(("miss [mm]", text))
+        farthest = max((r for r in results if r.outcome == "perched"), key=_miss_m)
+        rows.append(("miss [mm]", f"{text} (seed {farthest.seed})"))
     if results:
         times = [r.time_s for r in results]
         attempts = [r.attempts for r in results]
@@ -128,6 +146,4 @@ def campaign_rows(
         rows.append(("attempts", f"mean {np.mean(attempts):.2f}, max {max(attempts)}"))
     if figures["realtime_factor"] is not None:
         rows.append(("real-time factor", f"{figures['realtime_factor']:.1f}"))
-    if figures["worst_seeds"]:
-        rows.append(("worst seeds", ", ".join(map(str, figures["worst_seeds"]))))
     return rows

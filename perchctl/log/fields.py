@@ -113,6 +113,7 @@ EVENT_FIELDS: dict[str, str] = {
     "row": "row of the mission's table that was taken",
     "severity": "continue, hold, back off, land or stop",
     "reason": "why",
+    "simulated": "what the simulated scenario did that led to it",
 }
 
 
@@ -125,6 +126,7 @@ def event_record(event: Event) -> dict[str, Any]:
         "row": event.row or None,
         "severity": event.severity.name.lower().replace("_", " "),
         "reason": event.reason,
+        "simulated": event.simulated or None,
     }
 
 

@@ -34,6 +34,7 @@ RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 3.0
 MOST_BEHIND = 1500
 """Records that may wait for the disk, half a minute of a flight; more are dropped."""
+_ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
 
 
 def make_header(
@@ -106,8 +107,8 @@ class FlightLogWriter:
         file at once. Raises InvalidValue when the file cannot be created: that is before the
         flight, where refusing costs nothing.
         """
+        make_log_folder(path.parent)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             free, fd = _create(path)
         except OSError as error:
             raise InvalidValue(_cannot_start(path, error)) from None
@@ -216,6 +217,15 @@ class FlightLogWriter:
             self.problem = problem
 
 
+def make_log_folder(directory: Path) -> None:
+    """Where it is missing. Errors: InvalidValue."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = "it is a file" if directory.is_file() else error.strerror or str(error)
+        raise InvalidValue(f"{directory} cannot hold flight logs ({why}): {_ELSEWHERE}") from None
+
+
 def _create(path: Path) -> tuple[Path, int]:
     """A file that did not exist before, by `path`'s name or the next free one."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
@@ -239,6 +249,6 @@ def _explain(error: Exception) -> str:
 
 def _cannot_start(path: Path, error: OSError) -> str:
     return (
-        f"{path}: the flight log cannot be created ({error.strerror or error}); free the place "
-        f"or name another folder in the profile (log.directory)"
+        f"{path}: the flight log cannot be created ({error.strerror or error}): free the place, "
+        f"or {_ELSEWHERE}"
     )

@@ -27,6 +27,7 @@ LITTLE_LEFT = 0.93
 """A hover thrust above this part of the largest: full thrust is no sign of pressing then."""
 PROVABLE = 0.99
 """Of the thrust that presses: so much at most is asked of a contact."""
+NO_PICTURE = "no picture for"
 STILL_MOTORS_THRUST = 5000
 """At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
@@ -307,7 +308,7 @@ def hold_reason(c: Context) -> str:
     if c.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {c.obs.loop_late_s:.1f} s late"
     if c.state.phase in _CAMERA_PHASES and c.obs.camera_age_s > safety.camera_hold_s:
-        return c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s"
+        return c.obs.camera_problem or f"{NO_PICTURE} {c.obs.camera_age_s:.1f} s"
     return ""
 
 

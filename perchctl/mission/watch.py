@@ -26,6 +26,7 @@ class Event:
         row: the row of the mission's table that was taken; empty at the start and for
             what is no transition.
         reason: why, in a sentence without its end.
+        simulated: what the simulated scenario did that led to it, empty where nothing is known.
     """
 
     t_s: float
@@ -34,6 +35,7 @@ class Event:
     phase: Phase | None = None
     row: str = ""
     severity: Severity = Severity.CONTINUE
+    simulated: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,21 @@ class Watcher(Protocol):
 
     @property
     def problem(self) -> str | None: ...
+
+
+class EventKeeper:
+    """Keeps what happened, to be told afterwards."""
+
+    problem: str | None = None
+
+    def __init__(self) -> None:
+        self.seen: list[Event] = []
+
+    def tick(self, tick: Tick) -> None:
+        return None
+
+    def event(self, event: Event) -> None:
+        self.seen.append(event)
 
 
 @dataclass(frozen=True)

@@ -181,11 +181,12 @@ def simulate(*arguments: str) -> Any:
     return CliRunner().invoke(app, ["simulate", "-p", SHORT, *arguments])
 
 
-def test_the_command_prints_one_object_and_repeats_a_seed(tmp_path: Path) -> None:
-    options = ["--faults", "low-bare-ceiling,hang-up", "--only", str(SEED)]
-    done = simulate(
-        *options, "--json", "--log-dir", str(tmp_path), "--heat-map", str(tmp_path / "map.png")
-    )
+LOW = ("--faults", "low-bare-ceiling,hang-up")
+
+
+def test_the_command_prints_one_object_and_draws(tmp_path: Path) -> None:
+    options = (*LOW, "-n", "1", "--seed", str(SEED), "--json", "--log-dir", str(tmp_path))
+    done = simulate(*options, "--heat-map", str(tmp_path / "map.png"))
     assert done.exit_code == 0
     said = json.loads(done.stdout)
     assert {"flights", "perched", "landed", "aborted", *FLAGS, "unavoidable", "worst_seeds"} <= set(
@@ -196,11 +197,24 @@ def test_the_command_prints_one_object_and_repeats_a_seed(tmp_path: Path) -> Non
     assert (tmp_path / f"flight_seed{SEED}.jsonl").exists()
 
 
+def test_one_seed_is_told_with_its_fault_log_and_plot(tmp_path: Path) -> None:
+    done = simulate(*LOW, "--only", str(SEED), "--json", "--log-dir", str(tmp_path))
+    assert done.exit_code == 0
+    said = json.loads(done.stdout)
+    assert (said["seed"], said["fault"]) == (SEED, "low-bare-ceiling")
+    assert said["way"][0] == "APPROACH"
+    for key, suffix in (("log", ".jsonl"), ("plot", ".png")):
+        assert said[key] == str(tmp_path / f"flight_seed{SEED}{suffix}")
+        assert Path(said[key]).exists()
+
+
 def test_the_command_lists_and_refuses() -> None:
     listed = simulate("--faults", "list")
     assert listed.exit_code == 0
     assert all(f"{fault.name} " in listed.stdout for fault in FAULTS)
+    told = json.loads(simulate("--faults", "list", "--json").stdout)
+    assert told["faults"] == {fault.name: fault.what for fault in FAULTS}
     refused = simulate("--faults", "hanged")
     assert refused.exit_code == 2
     assert "--faults list" in refused.stderr
-    assert simulate("--heat-map", "x.png").exit_code == 2
+    assert simulate("--faults", "all", "--heat-map", "nowhere/x.png").exit_code == 30

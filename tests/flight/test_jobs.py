@@ -3,62 +3,179 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import select
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.simulate_request import exit_code, flying, noting
-from perchctl.flight.campaign import fly_all, job_processes
+from perchctl.commands.interrupt import signals_to
+from perchctl.commands.simulate_request import (
+    AGAIN_S,
+    SimulateRequest,
+    and_problem,
+    fly_each,
+    stop_once,
+    tell_logs,
+)
+from perchctl.errors import Interrupted, PerchError
+from perchctl.flight.uninterrupted import uninterrupted
+from tests.helpers.flights import ROOT
+from tests.helpers.jobs import (
+    Ended,
+    campaign,
+    ends_at_once,
+    ends_first_only,
+    fails_later,
+    is_killed_later,
+)
 
-AT_ONCE_S = 5.0
+AT_ONCE_S = 20.0
+"""Beside the time for which the flights would go on; on a busy machine, too."""
 
 
-def sleeps(seconds: float) -> float:
-    time.sleep(seconds)
-    return seconds
+class Reported:
+    """What a campaign said, and why not all were flown."""
+
+    def __init__(self) -> None:
+        self.flights: list[Ended] = []
+        self.problem: PerchError | None = None
+
+    def __call__(self, flights: list[Ended], problem: PerchError | None) -> None:
+        self.flights, self.problem = flights, problem
 
 
-def interrupts_are_blocked(_seed: int) -> bool:
-    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+def test_what_is_flown_never_sees_a_signal(capsys: pytest.CaptureFixture[str]) -> None:
+    reported = Reported()
+    assert campaign(ends_at_once, SimulateRequest(flights=2), reported) == 0
+    assert [(flight.seed, flight.deaf) for flight in reported.flights] == [(0, True), (1, True)]
+    assert reported.flights[0].pid != os.getpid()
+    assert reported.problem is None
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    assert capsys.readouterr().err == ""
 
 
-def test_what_is_flown_never_sees_ctrl_c() -> None:
-    with job_processes(1) as executor:
-        assert fly_all(interrupts_are_blocked, [0, 1], executor) == [True, True]
-    assert not interrupts_are_blocked(0)
+def test_a_signal_waits_for_what_must_not_be_left_halfway() -> None:
+    done: list[str] = []
+
+    def load() -> None:
+        with uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            done.append("loaded")
+
+    with pytest.raises(KeyboardInterrupt):
+        load()
+    assert done == ["loaded"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_flights_where_they_are(number: signal.Signals) -> None:
-    """What was flown by then is there; a second signal on the way out does nothing."""
-    results: list[float] = []
-    moved: list[float] = []
+def test_a_signal_ends_the_flights_where_they_are(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What was flown by then is reported; a key that is held down is one press."""
+    reported = Reported()
+    pressed_s: list[float] = []
 
-    def note(result: float) -> None:
-        noting(results, moved.append)(result)
-        signal.raise_signal(number)
-        signal.raise_signal(number)
+    def press(_result: Ended) -> None:
+        pressed_s.append(time.monotonic())
+        try:
+            signal.raise_signal(number)
+        finally:
+            signal.raise_signal(number)
 
-    with flying(3, 2) as executor:
-        fly_all(sleeps, [0.0, 60.0, 60.0], executor, note)  # type: ignore[arg-type]
-        pytest.fail("it went on")
-    began_s = time.monotonic()
-    assert results == moved == [0.0]
+    request = SimulateRequest(flights=6, jobs=2)
+    assert campaign(ends_first_only, request, reported, press) == 130
+    assert time.monotonic() - pressed_s[0] < AT_ONCE_S
+    assert [flight.seed for flight in reported.flights] == [0]
     assert multiprocessing.active_children() == []
-    assert time.monotonic() - began_s < AT_ONCE_S
+    assert capsys.readouterr().err == "perchctl: stopped: 1 of 6 flights were flown\n"
 
 
-def test_one_flight_is_flown_here() -> None:
-    with flying(1, 4) as executor:
-        assert executor is None
-        assert fly_all(float, [3], executor) == [3.0]
+def test_with_nothing_flown_there_is_nothing_to_report() -> None:
+    def flown(_executor: object, _note: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    with signals_to(stop_once()), pytest.raises(Interrupted, match="0 of 10 flights were flown"):
+        fly_each(flown, SimulateRequest(), Reported())
 
 
-def test_the_exit_says_whether_all_were_flown(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code(7, 7) == 0
-    assert capsys.readouterr().err == ""
-    assert exit_code(3, 7) == 130
-    assert "3 of 7 flights" in capsys.readouterr().err
+def test_a_second_press_ends_the_program_at_once() -> None:
+    now_s = [0.0]
+    left: list[int] = []
+    press = stop_once(lambda: now_s[0], left.append)
+    with pytest.raises(KeyboardInterrupt):
+        press(signal.SIGINT, None)
+    now_s[0] = 0.5 * AGAIN_S
+    press(signal.SIGINT, None)
+    assert left == []
+    now_s[0] = AGAIN_S
+    press(signal.SIGINT, None)
+    assert left == [130]
+
+
+@pytest.mark.parametrize(
+    ("fly", "words"),
+    [
+        (fails_later, "unforeseen ZeroDivisionError in the flight of seed 1: no such luck"),
+        (is_killed_later, "ended from outside"),
+    ],
+)
+def test_a_flight_that_fails_loses_none_of_the_others(
+    fly: Callable[[int], Ended], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reported = Reported()
+    assert campaign(fly, SimulateRequest(flights=3), reported) == 1
+    assert [flight.seed for flight in reported.flights] == [0]
+    assert reported.problem is not None
+    assert and_problem({"flights": 1}, reported.problem) == {
+        "flights": 1, "error": str(reported.problem), "exit_code": 1,
+    }  # fmt: skip
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.endswith("; 1 of 3 flights were flown\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_program_that_is_ended_leaves_nothing_behind(number: signal.Signals) -> None:
+    """No process that flies on, and, where it could, no warning of semaphores; a terminal
+    sends its signals to the children, too."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.helpers.jobs"],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as program:
+        assert program.stdout is not None
+        child = os.pidfd_open(int(program.stdout.readline()))
+        if number == signal.SIGKILL:
+            program.kill()
+        else:
+            os.killpg(program.pid, number)
+        ended, _, _ = select.select([child], [], [], AT_ONCE_S)
+        os.close(child)
+        out, err = program.communicate(timeout=AT_ONCE_S)
+    assert ended
+    if number == signal.SIGTERM:
+        assert program.returncode == 130
+        assert out == "report 1 stopped: 1 of 6 flights were flown\n"
+        assert err == "perchctl: stopped: 1 of 6 flights were flown\n"
+
+
+def test_logs_that_lack_something_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tell_logs([Ended(0), Ended(1, log_problem="no space left")], tmp_path)
+    assert capsys.readouterr().err.splitlines() == [
+        f"perchctl: the flights' logs are in {tmp_path}",
+        "perchctl: 1 of 2 logs are incomplete: no space left",
+    ]

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.progress import Task, TaskID
 
-from perchctl.commands.progress import progress_bar
+from perchctl.commands.progress import TimeLeft, progress_bar
 from perchctl.flight.results import (
     ENDS,
     FlightResult,
@@ -58,7 +59,7 @@ def test_a_campaign_of_three() -> None:
         "fell": 1,
         "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
         "realtime_factor": 5.0,
-        "worst_seeds": [3, 2, 1],
+        "worst_seeds": [3, 2],
     }
     without_wall = campaign_summary([PERCHED, LANDED, ABORTED])
     assert without_wall["realtime_factor"] == pytest.approx(60.0 / (4.0 + 6.0 + 4.0))
@@ -86,25 +87,36 @@ def test_figures_of_any_campaign(results: list[FlightResult]) -> None:
     order = worst_first(results)
     ends = [ENDS.index(r.outcome) for r in order]
     assert ends == sorted(ends, reverse=True)
+    assert all(r.outcome != "perched" or r.locked or r.fell for r in order)
+    assert len(order) == sum(r.outcome != "perched" or r.locked or r.fell for r in results)
     assert figures["worst_seeds"] == [r.seed for r in order[:5]]
     text = campaign_table(results)
     assert all(len(line) == len(line.rstrip()) for line in text.splitlines())
 
 
-def test_worst_are_the_largest_misses_when_all_perched() -> None:
+def test_good_flights_are_no_worst_ones_but_the_largest_miss_has_its_seed() -> None:
     misses = [0.003, 0.009, 0.001, 0.007]
     results = [replace(PERCHED, seed=i, miss_m=m) for i, m in enumerate(misses)]
-    assert campaign_summary(results, worst=3)["worst_seeds"] == [1, 3, 0]
+    assert campaign_summary(results)["worst_seeds"] == []
+    text = campaign_table(results)
+    assert text.endswith("worst flights: none is bad, all perched, none locked or fell")
+    assert "max 9.0 (seed 1)\n" in text
+
+
+def test_more_bad_flights_than_are_shown_are_counted() -> None:
+    lines = campaign_table([replace(LANDED, seed=i) for i in range(7)]).splitlines()
+    assert "worst flights, 5 of 7" in lines
+    assert [line.split()[0] for line in lines[-5:]] == list("01234")
 
 
 def test_table_says_what_happened() -> None:
     lines = campaign_table([PERCHED, LANDED, ABORTED], wall_s=12.0).splitlines()
     said = {line.split("  ")[0]: line for line in lines if line}
     assert said["perched"].endswith("1 (33.3 %)")
-    assert said["miss [mm]"].endswith("median 4.0, p95 4.0, max 4.0")
+    assert said["miss [mm]"].endswith("median 4.0, p95 4.0, max 4.0 (seed 1)")
     assert said["flight time [s]"].endswith("median 20.0, max 30.0")
     assert said["attempts"].endswith("mean 0.67, max 1")
-    assert said["worst seeds"].endswith("3, 2, 1")
+    assert [line.split()[0] for line in lines[-2:]] == ["3", "2"]
     assert "aborted, locked, fell" in said["3"]
 
 
@@ -174,7 +186,19 @@ def test_progress(monkeypatch: pytest.MonkeyPatch) -> None:
             advance(LANDED)
     assert plain.getvalue() == ""
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
-    assert re.search(r"flights .* 2/2 .* 1 perched, 1 landed", text)
+    assert re.search(r"flights .* 2/2 .* left 1 perched, 1 landed", text)
+
+
+def test_the_time_left_is_known_from_the_first_flight_on() -> None:
+    now_s = [0.0]
+    task = Task(TaskID(0), "", 20, 0, _get_time=lambda: now_s[0])
+    task.start_time = 0.0
+    now_s[0] = 90.0
+    assert TimeLeft().render(task).plain == ""
+    task.completed = 1
+    assert TimeLeft().render(task).plain == "0:28:30 left"
+    task.completed = 20
+    assert TimeLeft().render(task).plain == "0:00:00 left"
 
 
 def test_rounding_keeps_a_micrometre() -> None:

@@ -1,0 +1,24 @@
+"""The picture of a flight beside its log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from perchctl.commands.output import say
+from perchctl.log.read import read_log
+from perchctl.profile import Profile
+
+
+def plot_of(log_path: Path, profile: Profile) -> Path | None:
+    """Draws it where the profile asks for it; one that fails is a warning, the flight is over."""
+    if not profile.log.plot:
+        return None
+    from perchctl.log.plot import plot_flight
+
+    picture = log_path.with_suffix(".png")
+    try:
+        plot_flight(read_log(log_path), picture)
+    except Exception as error:
+        say(f"the plot could not be drawn: {error}")
+        return None
+    return picture

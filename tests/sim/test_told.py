@@ -1,0 +1,74 @@
+"""What the scenario did is told with the event that it led to, and with no other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.display.status import event_text
+from perchctl.flight.lockstep import fly_lockstep
+from perchctl.log.read import read_log
+from perchctl.mission.state import Phase, Severity
+from perchctl.mission.watch import Event, EventKeeper, EventKind
+from perchctl.sim.draw import draw_scenario
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.told import Teller
+from tests.helpers.flights import SEED, short_profile
+
+BURST = Scenario(camera_rate_hz=30.0, camera_burst=(10.0, 15))
+WEAK = Scenario(mass_kg=0.04, first_contact_force_n=0.2 * 0.04 * 9.81)
+
+
+def phase(row: str, t_s: float = 0.0) -> Event:
+    return Event(t_s, EventKind.PHASE, "why", Phase.RECOVER, row, Severity.BACK_OFF)
+
+
+def hold(reason: str) -> Event:
+    return Event(0.0, EventKind.HOLD, reason, Phase.ASCEND, severity=Severity.HOLD)
+
+
+@pytest.mark.parametrize("row", ["estimate-lost", "align-lost", "ascend-lost", "camera-gone"])
+def test_lost_frames_are_told_with_what_they_led_to(row: str) -> None:
+    tell = Teller(BURST)
+    assert tell(phase(row), 10.6) == "15 frames lost"
+    assert tell(phase(row), 9.9) == tell(phase(row), 12.0) == ""
+    assert Teller(Scenario())(phase(row), 10.6) == ""
+
+
+def test_a_hold_for_want_of_pictures_is_told_and_no_other() -> None:
+    tell = Teller(BURST)
+    assert tell(hold("no picture for 0.5 s"), 10.6) == "15 frames lost"
+    assert tell(hold("telemetry is 0.5 s old"), 10.6) == ""
+    assert tell(phase("slipped"), 10.6) == ""
+
+
+def test_the_first_slip_is_told_where_the_first_contact_is_weak() -> None:
+    tell = Teller(WEAK)
+    assert tell(phase("slipped"), 5.0) == "the first contact holds 20 % of the weight"
+    assert tell(phase("slipped"), 9.0) == ""
+    assert Teller(BURST)(phase("slipped"), 5.0) == ""
+
+
+def test_a_target_that_is_not_there_is_told() -> None:
+    assert Teller(Scenario(no_target=True))(phase("searched-out"), 9.0) == "there is no target"
+    assert Teller(Scenario())(phase("searched-out"), 9.0) == ""
+
+
+def test_a_flight_says_it_in_its_events_and_in_its_log(tmp_path: Path) -> None:
+    """The ascent lasts from 4.4 to 10 s."""
+    profile = short_profile({"planner.attempts": 1})
+    scenario = replace(draw_scenario(profile, SEED), camera_burst=(6.0, 14))
+    keeper, log = EventKeeper(), tmp_path / "f.jsonl"
+    flight = fly_lockstep(profile, SEED, log, scenario=scenario, watchers=(keeper,))
+    told = [event for event in keeper.seen if event.simulated]
+    assert [event_text(event) for event in told] == [
+        "RECOVER: target lost in ascent (simulated: 14 frames lost)"
+    ]
+    assert [e.get("simulated") for e in read_log(log).events if e.get("simulated")] == [
+        "14 frames lost"
+    ]
+    assert [event for event in flight.report.history if event.simulated] == told
