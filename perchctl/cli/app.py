@@ -32,6 +32,7 @@ ProfileOption = Annotated[
     str, typer.Option("--profile", "-p", help="Profile by name or path.", show_default=True)
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a live page on 127.0.0.1 and print its address.")
 ]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import ForceOption, JsonOption, ViewOption, ViewPortOption, reported
 
 
 # long: a list of options
@@ -43,7 +43,7 @@ def calibrate(
             "--model", help="auto (the recommended), plumb_bob, rational_polynomial or fisheye."
         ),
     ] = "auto",
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    force: ForceOption = False,
     check: Annotated[
         Path | None,
         typer.Option("--check", help="Judge this calibration by the source's pictures instead."),

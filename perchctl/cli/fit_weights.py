@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ProfileOption, reported
+from perchctl.cli.app import ForceOption, JsonOption, ProfileOption, reported
 
 
 # long: a list of options
@@ -70,6 +70,7 @@ def fit_weights(
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Write weights that are not recommended, too.")
     ] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fit the merge weights to poses whose truth is known, and verify that they help.
@@ -110,6 +111,7 @@ def fit_weights(
             output=output,
             plot=plot,
             anyway=anyway,
+            force=force,
             as_json=as_json,
         )
         raise typer.Exit(run(request))

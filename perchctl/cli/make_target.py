@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, reported
+from perchctl.cli.app import ForceOption, JsonOption, reported
 
 
 # long: a list of options
@@ -66,7 +66,8 @@ def make_target(
         float, typer.Option("--noise", help="Sigma of the picture's noise, grey levels of 255.")
     ] = 5.0,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="The design's picture (design.png).")
+        Path | None,
+        typer.Option("--plot", help="The design's picture (design.png or suggestion.png)."),
     ] = None,
     suggest: Annotated[
         bool, typer.Option("--suggest", help="Propose sizes and ids for --camera.")
@@ -79,9 +80,7 @@ def make_target(
         str | None,
         typer.Option("--measured-small", help="Side of the small black square as printed, mm."),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Let --measured-* change an existing profile.")
-    ] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print the target (or a board), true to size; design it; write measured sizes.

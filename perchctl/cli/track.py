@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import ForceOption, ProfileOption, ViewOption, ViewPortOption, reported
 
 
 def track(
@@ -34,6 +34,7 @@ def track(
     overlay: Annotated[
         Path | None, typer.Option("--overlay", help="Write the pictures with results as .mp4.")
     ] = None,
+    force: ForceOption = False,
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
 ) -> None:
@@ -58,6 +59,7 @@ def track(
             as_json=as_json,
             csv=csv,
             overlay=overlay,
+            force=force,
             view=view,
             view_port=view_port,
         )

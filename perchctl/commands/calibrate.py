@@ -29,10 +29,11 @@ from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_place, same_file, write_files
+from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target.boards import Board, parse_board
 
 FOLDER = Path("calib")
+SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
 _SAMPLES = 4
 """Pictures that are searched for another board when none shows the named one."""
 _SAMPLE_EVERY = 30  # frames of a video
@@ -116,7 +117,7 @@ def _calibrate(request: CalibrateRequest, source: str, board: Board) -> int:
 
     text = calibration_text(result, request.name, _now())
     picture = _picture_of(output)
-    write_files({output: text.encode(), picture: draw_calibration(result)}, make_folders=True)
+    write_files({output: text.encode(), picture: draw_calibration(result)})
     for line in calibration_lines(result):
         say(line)
     say(f"wrote {output} and {picture}")
@@ -152,12 +153,12 @@ def _convert(request: CalibrateRequest, file: Path) -> int:
     """Another program's calibration (OpenCV, Kalibr, ROS) as perchctl's file."""
     camera = load_calibration(file)
     output = _output(request, camera.size_px)
-    check_place(output, replace=request.force, make_folders=True)
     if same_file(output, file):
         raise UsageError(f"{output} is the file to convert; name another with --output")
+    check_output(output, SUFFIXES, request.force, CONTENT)
     notes = {"date": _now(), "converted_from": file.name}
     text = camera_text(camera, request.name, notes)
-    write_files({output: text.encode()}, make_folders=True)
+    write_files({output: text.encode()})
     say(f"wrote {output} ({camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px)")
     if request.as_json:
         print_record(camera_record(camera) | {"file": str(output)})
@@ -178,8 +179,8 @@ def _picture_of(output: Path) -> Path:
 
 
 def _check_output(output: Path, force: bool) -> None:
-    for path in (output, _picture_of(output)):
-        check_place(path, replace=force, make_folders=True)
+    check_output(output, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
+    check_place(_picture_of(output), force)
 
 
 def _now() -> str:

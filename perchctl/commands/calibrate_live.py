@@ -129,5 +129,5 @@ def _page_state(moment: Moment) -> dict[str, Any]:
 def _keep(pictures: list[Grey], folder: Path) -> None:
     encoded = [cv2.imencode(".png", picture)[1].tobytes() for picture in pictures]
     files = {folder / f"view_{i:03d}.png": png for i, png in enumerate(encoded, start=1)}
-    write_files(files, make_folders=True)
+    write_files(files)
     say(f"kept {len(pictures)} pictures in {folder}")

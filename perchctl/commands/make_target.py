@@ -17,7 +17,7 @@ from perchctl.commands.make_target_request import (
 )
 from perchctl.commands.output import print_record
 from perchctl.errors import PerchError, UsageError
-from perchctl.files import check_place, write_files
+from perchctl.files import check_output, check_place, write_files
 from perchctl.profile import Profile, TargetConfig, find_calibration, load_profile
 from perchctl.target.blind import blind_lines, mounted
 from perchctl.target.boards import parse_board
@@ -34,7 +34,7 @@ from perchctl.target.svg import svg_bytes
 
 __all__ = ["TargetRequest", "run"]
 
-DEFAULT_PLOT = "design.png"
+DESIGN_PLOT, SUGGESTION_PLOT = Path("design.png"), Path("suggestion.png")
 DEFAULT_PROFILE = "sim"
 BLUR_LIMIT_PX, NOISE_LIMIT = 20.0, 60.0
 
@@ -56,6 +56,8 @@ def run(request: TargetRequest) -> int:
         target = requested_target(request, profile)
         outcome = _target(request, profile, target)
         outcome.lines.extend(_mounting(profile, target))
+    for path in outcome.files:
+        check_place(path, request.force)
     write_files(outcome.files)
     if request.as_json:
         print_record(outcome.record)
@@ -175,8 +177,8 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
     profile = load_profile(request.profile or DEFAULT_PROFILE)
     path = find_calibration(camera_name)
     camera = load_calibration(path)
-    plot = request.plot or Path(DEFAULT_PLOT)
-    check_place(plot)
+    plot = request.plot or (SUGGESTION_PLOT if request.suggest else DESIGN_PLOT)
+    check_output(plot, (".png",), request.force)
     optics = Optics(request.blur_px, request.noise)
     lines: list[str] = []
     record: dict[str, Any] = {}

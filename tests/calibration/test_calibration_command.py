@@ -126,7 +126,9 @@ def test_pictures_of_two_sizes(rendered: Rendered, tmp_path: Path) -> None:
     for i, path in enumerate(sorted(rendered[0].iterdir())[:4]):
         picture = cv2.imread(str(path))
         cv2.imwrite(str(tmp_path / path.name), picture[: 300 if i == 2 else 360])
-    sentence = refused(calibrate(f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o")), 30)
+    sentence = refused(
+        calibrate(f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o.yaml")), 30
+    )
     assert "480x300" in sentence
     assert "480x360" in sentence
 
@@ -152,7 +154,9 @@ def test_the_wrong_board_says_what_was_seen(
 def test_the_wrong_chessboard_says_what_was_seen(
     chessboard_folder: Path, tmp_path: Path, named: str
 ) -> None:
-    result = calibrate(f"{chessboard_folder}/left0[13].jpg", "-b", named, "-o", f"{tmp_path}/o")
+    result = calibrate(
+        f"{chessboard_folder}/left0[13].jpg", "-b", named, "-o", f"{tmp_path}/o.yaml"
+    )
     assert "chessboard:9x6:25mm" in refused(result, 30)
 
 
