@@ -66,6 +66,9 @@ def calibrate(
     plain_corners: Annotated[
         bool, typer.Option("--plain-corners", help="OpenCV's corners, not the fitted ones.")
     ] = False,
+    skip_broken: Annotated[
+        bool, typer.Option("--skip-broken", help="Leave out pictures that cannot be read.")
+    ] = False,
     keep_pictures: Annotated[
         Path | None,
         typer.Option("--keep-pictures", help="Folder for the pictures taken of a live camera."),
@@ -94,6 +97,7 @@ def calibrate(
             mask=mask,
             reject=reject,
             plain_corners=plain_corners,
+            skip_broken=skip_broken,
             keep_pictures=keep_pictures,
             as_json=as_json,
             view=view,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from perchctl.calibration.seen import larger_than, seen_instead
 from perchctl.calibration.solve import AUTO, calibrate
 from perchctl.calibration.types import Grey, Rejection, View
 from perchctl.calibration.writing import calibration_text, camera_text
-from perchctl.camera.files import VideoSource, image_files, read_grey
+from perchctl.camera.files import BrokenPicture, VideoSource, image_files, read_grey
 from perchctl.camera.open import source_spec
 from perchctl.camera.source import check_size
 from perchctl.commands.calibrate_live import captured_views
@@ -54,6 +55,7 @@ class CalibrateRequest:
     mask: Path | None = None
     reject: bool = True
     plain_corners: bool = False
+    skip_broken: bool = False
     keep_pictures: Path | None = None
     as_json: bool = False
     view: bool = False
@@ -198,7 +200,7 @@ def _find_views(request: CalibrateRequest, source: str, board: Board) -> _Found:
     refine = not request.plain_corners
     with search_bar("searching the board") as progress:
         if scheme == "images":
-            views, missing = views_of_images(rest, board, refine, progress)
+            views, missing = views_of_images(rest, board, refine, progress, request.skip_broken)
         else:
             views, missing = views_of_video(Path(rest).expanduser(), board, refine, progress)
     if not views:
@@ -221,7 +223,11 @@ def _samples(scheme: str, rest: str) -> list[Grey]:
     if scheme == "images":
         paths = image_files(str(Path(rest).expanduser()))
         step = max(1, len(paths) // _SAMPLES)
-        return [read_grey(p) for p in paths[::step][:_SAMPLES]]
+        samples: list[Grey] = []
+        for path in paths[::step][:_SAMPLES]:
+            with contextlib.suppress(BrokenPicture):  # which has been told
+                samples.append(read_grey(path))
+        return samples
     source = VideoSource(Path(rest).expanduser())
     frames: list[Grey] = []
     while (frame := source.poll(0.0)) is not None and len(frames) < _SAMPLES:

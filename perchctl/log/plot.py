@@ -41,8 +41,7 @@ def plot_flight(log: FlightLog, png_path: Path | str) -> None:
     """Draw the flight into a PNG: errors, detections against the filtered track (as
     the paper's figure 6), height, thrust and battery, over the named phases.
 
-    Raises InvalidValue for a log without ticks or a file that cannot be written, NotFound
-    for a missing folder.
+    Raises InvalidValue for a log without ticks or a file that cannot be written.
     """
     if not log.records:
         raise InvalidValue(f"{log.path}: the log holds no ticks, there is nothing to plot")

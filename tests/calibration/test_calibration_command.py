@@ -113,13 +113,34 @@ def test_an_existing_file_needs_force(rendered: Rendered, tmp_path: Path) -> Non
     assert output.read_text() == "mine"
 
 
-def test_a_picture_file_is_spoilt(rendered: Rendered, tmp_path: Path) -> None:
-    for path in sorted(rendered[0].iterdir())[:4]:
+def test_broken_pictures_are_all_named_and_left_out_when_asked(
+    rendered: Rendered, tmp_path: Path
+) -> None:
+    words = (f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o.yaml"))
+    for path in sorted(rendered[0].iterdir())[:6]:
         (tmp_path / path.name).write_bytes(path.read_bytes())
+    whole = (tmp_path / "board_00.png").read_bytes()
     (tmp_path / "board_99.png").write_bytes(b"no picture")
-    result = calibrate(f"images:{tmp_path}", "-b", BOARD, "-o", str(tmp_path / "o.yaml"))
-    assert "board_99.png cannot be read" in refused(result, 30)
+    (tmp_path / "board_02b.png").write_bytes(whole[: len(whole) // 2])
+    sentence = refused(calibrate(*words), 30)
+    assert "2 of 8 pictures cannot be used" in sentence
+    assert "board_99.png cannot be read as a picture" in sentence
+    assert "board_02b.png is cut off" in sentence
+    assert "--skip-broken" in sentence
     assert not (tmp_path / "o.yaml").exists()
+    left = calibrate(*words, "--skip-broken", "--json")
+    assert left.exit_code == 0, left.output
+    assert "left out board_02b.png: is cut off" in left.stderr
+    told = json.loads(left.stdout)
+    assert told["views_used"] == 6
+    named = [picture["name"] for picture in told["pictures_without_board"]]
+    assert named == ["board_02b.png", "board_99.png"]
+
+
+def test_only_broken_pictures_are_refused_in_any_case(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"")
+    result = calibrate(f"images:{tmp_path}", "-o", f"{tmp_path}/o.yaml", "--skip-broken")
+    assert "none of the 1 pictures can be used: a.png cannot be read" in refused(result, 30)
 
 
 def test_pictures_of_two_sizes(rendered: Rendered, tmp_path: Path) -> None:
