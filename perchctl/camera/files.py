@@ -139,7 +139,7 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     except OSError as error:
         raise BrokenPicture(path, f"cannot be read: {error.strerror or error}") from None
     if is_cut_off(data):
-        raise BrokenPicture(path, "is cut off: the end of the picture is missing")
+        raise BrokenPicture(path, "is cut off")
     # An empty array is an error of OpenCV's.
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     if image is None:

@@ -71,7 +71,10 @@ def calibrate(
     ] = False,
     keep_pictures: Annotated[
         Path | None,
-        typer.Option("--keep-pictures", help="Folder for the pictures taken of a live camera."),
+        typer.Option(
+            "--keep-pictures",
+            help="Folder for a live camera's pictures. Default: beside the output.",
+        ),
     ] = None,
     as_json: JsonOption = False,
     view: ViewOption = False,

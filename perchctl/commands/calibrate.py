@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import itertools
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +24,7 @@ from perchctl.calibration.solve import AUTO, calibrate
 from perchctl.calibration.types import Grey, Rejection, View
 from perchctl.calibration.writing import calibration_text, camera_text
 from perchctl.camera.files import BrokenPicture, VideoSource, image_files, read_grey
-from perchctl.camera.open import source_spec
+from perchctl.camera.open import open_source, source_spec
 from perchctl.camera.source import check_size
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mask import write_mask
@@ -104,6 +106,8 @@ def _check_request(request: CalibrateRequest) -> None:
         raise InvalidValue(f"lens model {request.model!r} is unknown; allowed are {allowed}")
     if request.output is not None:
         _check_output(request.output, request.force)
+    if request.keep_pictures is not None:
+        check_place(request.keep_pictures / "view_001.png", force=True)
     if not request.name.strip() or "/" in request.name:
         raise UsageError(f"--name {request.name!r} cannot name a file; use a word such as camera")
 
@@ -180,6 +184,19 @@ def _picture_of(output: Path) -> Path:
     return output.with_suffix(".png")
 
 
+def _pictures_folder(request: CalibrateRequest, size_px: tuple[int, int]) -> Path | None:
+    """Where a live camera's pictures go; raises what `_check_output` does, before a person
+    has worked for them."""
+    if request.check is not None:
+        return request.keep_pictures
+    output = _output(request, size_px)
+    _check_output(output, request.force)
+    if request.keep_pictures is not None:
+        return request.keep_pictures
+    names = (f"{output.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
+    return next(folder for name in names if not (folder := output.with_name(name)).exists())
+
+
 def _check_output(output: Path, force: bool) -> None:
     check_output(output, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
     check_place(_picture_of(output), force)
@@ -195,8 +212,7 @@ def _now() -> str:
 def _find_views(request: CalibrateRequest, source: str, board: Board) -> _Found:
     scheme, _, rest = source.partition(":")
     if scheme not in ("images", "video"):
-        port = page_port(request.view, request.view_port)
-        return _Found(captured_views(source, board, request.keep_pictures, port), [])
+        return _Found(_live_views(request, source, board), [])
     refine = not request.plain_corners
     with search_bar("searching the board") as progress:
         if scheme == "images":
@@ -216,6 +232,17 @@ def _find_views(request: CalibrateRequest, source: str, board: Board) -> _Found:
             f"the pictures show a larger board than {board.notation()}: use --board {whole}"
         )
     return _Found(views, missing)
+
+
+def _live_views(request: CalibrateRequest, source: str, board: Board) -> list[View]:
+    frames = open_source(source, 0.0, None, time.monotonic)
+    try:
+        assert frames.size_px is not None  # the first frame is there
+        pictures = _pictures_folder(request, frames.size_px)
+        port = page_port(request.view, request.view_port)
+        return captured_views(frames, board, pictures, port)
+    finally:
+        frames.close()
 
 
 def _samples(scheme: str, rest: str) -> list[Grey]:

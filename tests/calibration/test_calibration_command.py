@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,9 @@ from perchctl.calibration.lens import parameters_of
 from perchctl.calibration.novelty import Capture, consider
 from perchctl.calibration.types import View
 from perchctl.cli import app
-from perchctl.commands.calibrate_live import coverage_bars
+from perchctl.commands.calibrate_live import captured_views, coverage_bars
+from perchctl.display.page.live import LivePage
+from perchctl.display.page.sketch import Sketch
 from perchctl.errors import TimedOut
 from perchctl.vision.types import CameraModel, Frame
 from tests.helpers.boards import (
@@ -261,6 +264,14 @@ class _Frames:
         pass
 
 
+class _Ended(_Frames):
+    """A stream that is over with its last picture."""
+
+    @property
+    def finished(self) -> bool:  # type: ignore[override]
+        return not self._frames
+
+
 def _clock() -> Callable[[], float]:
     ticks = iter(range(10**9))
     return lambda: float(next(ticks))
@@ -275,15 +286,54 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
         image = renderer.render(pose, rng, noise=1.0)
         images += [image, image, image]  # comes in, is still, stays
     moments: list[Moment] = []
-    views, pictures = capture(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
+    views = capture(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
     assert 5 <= len(views) <= 7
-    assert len(pictures) == len(views)
+    assert sum(m.shot for m in moments) == len(views)
     shots = [m.index for m in moments if m.shot]
     assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
     assert moments[0].advice == "hold still"
     assert 0 < moments[-1].covered["x"] <= 1
     with pytest.raises(TimedOut, match="only 1 views"):
         capture(_Frames(images[:3]), CHESSBOARD, moments.append, _clock(), lambda s: None)
+
+
+def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = draw_camera(np.random.default_rng(3), (320, 240))
+    rng = np.random.default_rng(2)
+    renderer = BoardRenderer(camera, CHESSBOARD)
+    images = []
+    for pose in draw_poses(rng, camera, CHESSBOARD, 2):
+        images += [renderer.render(pose, rng, noise=1.0)] * 2
+    folder = tmp_path / "calib" / "pictures"
+    for names in (["view_001.png", "view_002.png"], ["view_003.png", "view_004.png"]):
+        with pytest.raises(TimedOut, match="only 2 views"):
+            captured_views(_Ended(list(images)), CHESSBOARD, folder, None)
+        assert f"kept 2 pictures: images:{folder} takes them again" in capsys.readouterr().err
+        kept = [cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE) for name in names]
+        assert (kept[0] == images[0]).all()
+        assert (kept[1] == images[2]).all()
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(TimedOut, match="only 2 views"):  # a full disk is no reason to end
+        captured_views(_Ended(list(images)), CHESSBOARD, tmp_path / "file" / "p", None)
+    assert capsys.readouterr().err.count("no longer kept") == 1
+
+
+def test_a_live_camera_is_refused_before_anybody_has_worked_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    output = tmp_path / "calib" / "camera_64x48.yaml"
+    output.parent.mkdir()
+    output.write_text("mine")
+    with contextlib.closing(LivePage(draw_camera(np.random.default_rng(0)), "camera")) as page:
+        page.show(0, Sketch(np.zeros((48, 64), np.uint8)))
+        url = page.url.replace("/?", "/stream?")
+        sentence = refused(calibrate(url), 30)
+        assert "camera_64x48.yaml exists already; add --force" in sentence
+        assert "is a file" in refused(calibrate(url, "--keep-pictures", str(output)), 30)
+    assert output.read_text() == "mine"
 
 
 def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> None:
