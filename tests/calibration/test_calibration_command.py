@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +17,7 @@ from typer.testing import CliRunner, Result
 from perchctl.calibration.files import load_calibration
 from perchctl.calibration.guided import Moment, capture
 from perchctl.calibration.lens import parameters_of
-from perchctl.calibration.novelty import Capture, consider
+from perchctl.calibration.novelty import Capture, Signature, consider, hint, progress, signature
 from perchctl.calibration.types import View
 from perchctl.cli import app
 from perchctl.commands.calibrate_live import captured_views, coverage_bars
@@ -295,6 +296,54 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     assert 0 < moments[-1].covered["x"] <= 1
     with pytest.raises(TimedOut, match="only 1 views"):
         capture(_Frames(images[:3]), CHESSBOARD, moments.append, _clock(), lambda s: None)
+
+
+FOLLOWED = {
+    "move the board to the left rim": {"x": 0.1},
+    "move the board to the right rim": {"x": 0.9},
+    "move the board to the top rim": {"y": 0.1},
+    "move the board to the bottom rim": {"y": 0.9},
+    "come nearer": {"size": 0.95},
+    "go farther away": {"size": 0.1},
+    "tilt the board's right side away": {"tilt_x": 0.3},
+    "tilt the board's left side away": {"tilt_x": -0.3},
+    "tilt the board's lower side away": {"tilt_y": 0.3},
+    "tilt the board's upper side away": {"tilt_y": -0.3},
+}
+"""What is to be done, and how a view shows that it was."""
+
+
+def test_one_advice_at_a_time_leads_to_the_end() -> None:
+    """Whoever does what is said, and nothing else, covers everything in a few views."""
+    rng = np.random.default_rng(1)
+    given: set[str] = set()
+    for _ in range(12):
+        x, y, size, tilt_x, tilt_y = rng.uniform(
+            (0.1, 0.1, 0.2, -0.3, -0.3), (0.9, 0.9, 0.9, 0.3, 0.3)
+        )
+        shown = [Signature(x, y, size, tilt_x, tilt_y)]
+        while (advice := hint(shown)) != "show the board somewhere new":
+            assert advice in FOLLOWED, advice
+            before = min(progress(shown).values())
+            shown.append(dataclasses.replace(shown[-1], **FOLLOWED[advice]))
+            given.add(advice)
+            assert min(progress(shown).values()) >= before
+            assert len(shown) < 12
+    assert given == set(FOLLOWED)
+
+
+def test_a_board_s_farther_side_is_known() -> None:
+    rng = np.random.default_rng(4)
+    camera = draw_camera(rng)
+    for about, name in ((1, "tilt_x"), (0, "tilt_y")):
+        for sign in (-1.0, 1.0):
+            rvec = np.zeros(3)
+            rvec[about] = 0.5 * sign * (-1.0 if about == 1 else 1.0)
+            pose = np.concatenate([rvec, [-0.1, -0.1, 0.5]])
+            corners = CHARUCO.corners_m() @ cv2.Rodrigues(rvec)[0].T
+            assert (corners[:, 2] @ corners[:, 1 - about] > 0) == (sign > 0)
+            view = corner_view(rng, camera, CHARUCO, pose, 0.0, "v")
+            assert sign * getattr(signature(view, CHARUCO), name) > 0.1
 
 
 def test_live_pictures_are_kept_as_they_come_also_of_a_camera_that_goes(
