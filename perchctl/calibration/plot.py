@@ -71,7 +71,7 @@ def _notes(calibration: Calibration) -> list[str]:
         f"{len(calibration.views)} views, RMS {calibration.solution.rms_px:.3f} px",
         f"{len(out)} views rejected" if out else "no view rejected",
     ]
-    return notes + [_shorter(w, 90) for w in calibration.warnings[:2]]
+    return notes + [_shorter(w, 90) for w in map(str, calibration.lacks[:2])]
 
 
 def _coverage(ax: Axes, calibration: Calibration) -> None:

@@ -13,8 +13,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.calibration.bundle import poses_only
+from perchctl.calibration.enough import is_covered
 from perchctl.calibration.lens import (
     parameters_of,
     pixel_derivatives,
@@ -44,26 +46,34 @@ def draws(covariance: Array, seed: int = 0) -> Array:
 
 
 def predict_errors(
-    camera: CameraModel, covariance: Array, ranges_m: Sequence[float] = RANGES_M
+    camera: CameraModel,
+    covariance: Array,
+    ranges_m: Sequence[float] = RANGES_M,
+    covered: NDArray[np.bool_] | None = None,
 ) -> tuple[RangeError, ...]:
-    """95 % lines of the target's position error at each distance."""
+    """95 % lines of the target's position error at each distance, where all of the target
+    lies in `covered` cells of the picture (None: anywhere), and straight ahead."""
     errors = draws(covariance)
     result = []
     for z_m in ranges_m:
-        moved = np.array(
-            [_absorbed(camera, place, z_m) @ errors.T for place in places(camera, z_m)]
-        )
+        there = places(camera, z_m, covered)
+        moved = np.array([_absorbed(camera, place, z_m) @ errors.T for place in there])
         mm = 1e3 * np.linalg.norm(moved, axis=1)  # (places, draws), the axis first
         worst = float(np.quantile(mm.max(axis=0), CONFIDENCE))
         result.append(RangeError(z_m, worst, float(np.quantile(mm[0], CONFIDENCE))))
     return tuple(result)
 
 
-def position_errors_mm(camera: CameraModel, truth: CameraModel, z_m: float) -> Array:
+def position_errors_mm(
+    camera: CameraModel,
+    truth: CameraModel,
+    z_m: float,
+    covered: NDArray[np.bool_] | None = None,
+) -> Array:
     """How far a target seen by `truth` is from where `camera` puts it, at each of the
     places of `truth`; the first is on the axis, (n,) mm."""
     errors = []
-    for place in places(truth, z_m):
+    for place in places(truth, z_m, covered):
         corners_m = target_m(truth, place, z_m)
         seen = project(corners_m, _TURNED, place, truth)
         view = View("", truth.size_px, np.arange(len(corners_m)), corners_m, seen)
@@ -74,9 +84,9 @@ def position_errors_mm(camera: CameraModel, truth: CameraModel, z_m: float) -> A
     return np.array(errors)
 
 
-def places(camera: CameraModel, z_m: float) -> Array:
+def places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None) -> Array:
     """Target centres at that depth, (n, 3): straight ahead, then over the whole picture
-    wherever all corners of a marker are in view."""
+    wherever all corners of a marker are in view; with `covered`, in covered cells."""
     middles = undistort(pixel_grid(camera.size_px, 9, 7), camera)
     found = [np.array([0.0, 0.0, z_m])]
     sizes = (LARGE_M, SMALL_M)
@@ -87,6 +97,8 @@ def places(camera: CameraModel, z_m: float) -> Array:
                 found.append(place)
         if len(found) > 1:  # the large marker decides as long as it fits anywhere
             break
+    if covered is not None:
+        found[1:] = [place for place in found[1:] if _is_covered(camera, place, z_m, covered)]
     return np.array(found)
 
 
@@ -132,6 +144,11 @@ def _in_view(camera: CameraModel, place: Array, side_m: float) -> bool:
     again = undistort(pixels, camera)
     straight = (_SQUARE * side_m)[:, :2] * (1.0, -1.0) + place[:2]
     return bool(np.allclose(again, straight / place[2], atol=1e-3))
+
+
+def _is_covered(camera: CameraModel, place: Array, z_m: float, covered: NDArray[np.bool_]) -> bool:
+    seen = project(target_m(camera, place, z_m), _TURNED, place, camera)
+    return is_covered(covered, seen, camera.size_px)
 
 
 def _absorbed(camera: CameraModel, place: Array, z_m: float) -> Array:
