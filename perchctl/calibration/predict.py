@@ -26,13 +26,14 @@ from perchctl.calibration.lens import (
 )
 from perchctl.calibration.types import RangeError, View
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project, undistort
+from perchctl.vision.camera_model import distort, project, undistort
 from perchctl.vision.types import CameraModel
 
 RANGES_M = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
 LARGE_M, SMALL_M = 0.150, 0.025
 CONFIDENCE = 0.95
 DRAWS = 600
+_CURVE_DEG = np.linspace(0.0, 85.0, 1200)  # from the axis; wider lenses are not drawn further
 _TURNED = np.array([np.pi, 0.0, 0.0])  # the marker's z towards the camera
 _SQUARE: Array = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
@@ -110,9 +111,10 @@ def target_m(camera: CameraModel, place: Array, z_m: float) -> Array:
 
 def ray_errors_px(camera: CameraModel, covariance: Array) -> tuple[float, float, Array]:
     """95 % lines of the RMS and of the largest error of fixed rays over the image, in px,
-    and the 95 % line at each pixel of `pixel_grid` (n,)."""
+    and the 95 % line at each pixel of `pixel_grid` (n,), NaN where the lens images no ray."""
     rays = undistort(pixel_grid(camera.size_px), camera)
-    good = np.isfinite(rays).all(axis=1)
+    # Where the lens model folds back, no ray is imaged.
+    good = np.abs(distort(rays, camera) - pixel_grid(camera.size_px)).max(axis=1) < 0.5
     L = pixel_derivatives(camera, rays_of(rays[good]))
     moved = np.einsum("nkp,dp->dnk", L, draws(covariance))
     distance2 = (moved**2).sum(axis=2)
@@ -120,6 +122,25 @@ def ray_errors_px(camera: CameraModel, covariance: Array) -> tuple[float, float,
     each[good] = np.sqrt(np.quantile(distance2, CONFIDENCE, axis=0))
     rms = float(np.quantile(np.sqrt(distance2.mean(axis=1)), CONFIDENCE))
     return rms, float(np.quantile(np.sqrt(distance2.max(axis=1)), CONFIDENCE)), each
+
+
+def distortion_curve(
+    camera: CameraModel, covariance: Array, far_px: Array
+) -> tuple[Array, Array, Array]:
+    """From the image's centre towards centre + `far_px` (2,), or to where the lens model folds
+    back: pixels from the centre, the lens's shift and its 95 % line in px, (n,) each."""
+    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
+    outward = far_px / np.linalg.norm(far_px)
+    along = outward / focal
+    rays = np.tan(np.radians(_CURVE_DEG))[:, None] * along / np.linalg.norm(along)
+    r_px = (distort(rays, camera) - camera.K[:2, 2]) @ outward
+    ends = ~np.isfinite(r_px) | (np.gradient(r_px) <= 0.0) | (r_px > np.linalg.norm(far_px))
+    count = max(2, int(np.argmax(ends))) if ends.any() else len(r_px)
+    rays, r_px = rays[:count], r_px[:count]
+    L = pixel_derivatives(camera, rays_of(rays)).copy()
+    L[:, :, :4] = 0.0  # the band is of the distortion alone
+    moved = np.einsum("nkp,dp,k->nd", L, draws(covariance), outward)
+    return r_px, r_px - (rays * focal) @ outward, 1.96 * moved.std(axis=1)
 
 
 def ray_difference_px(camera: CameraModel, truth: CameraModel) -> Array:

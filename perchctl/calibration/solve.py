@@ -112,7 +112,9 @@ def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[Lack]:
     lacks = []
     if not usable(fit):
         lacks.append(
-            Lack(f"the lens model {FOLDS_BACK}, where no corners were seen", "add views there")
+            Lack(
+                f"the lens model {FOLDS_BACK}", "no corners were seen there, add views at its rims"
+            )
         )
     if views < GOOD_VIEWS:
         lacks.append(Lack(f"only {views} views", f"add {GOOD_VIEWS - views} or more"))
