@@ -41,7 +41,7 @@ _ARROW_SHARE = 0.06  # of the width: the largest residual's arrow
 _MOST_NAMES = 45
 _MOST_LINES = 24  # of numbers
 LIMIT_LOW = 0.5  # mm: the axis reaches down to it
-_LOOP_SHARE = 0.3  # of the width
+_LOOP_SHARE, _LINE_SHARE = 0.3, 0.04  # of the width
 
 
 def draw_calibration(calibration: Calibration) -> bytes:
@@ -129,9 +129,11 @@ def _coverage(ax: Axes, calibration: Calibration) -> None:
 
 
 def _tells(line: Array, width_px: int) -> bool:
-    """A small closed line (n, 2) is the noise of a level that the error has everywhere."""
+    """A small closed line (n, 2) is the noise of a level that the error has everywhere, and a
+    very short one is hardly seen."""
     closed = bool((line[0] == line[-1]).all())
-    return not closed or float(np.ptp(line, axis=0).max()) > _LOOP_SHARE * width_px
+    least = _LOOP_SHARE if closed else _LINE_SHARE
+    return float(np.ptp(line, axis=0).max()) > least * width_px
 
 
 def _label(ax: Axes, text: str, line: Array, dots: Array, size_px: tuple[int, int]) -> None:

@@ -59,7 +59,7 @@ def captured_views(
             bars(moment.covered, moment.taken, moment.advice)
             if page is not None:
                 page.show(moment.index, _sketch(moment))
-                page.tell(lambda: _page_state(moment))
+                page.tell(lambda: page_state(moment))
 
         views = capture(source, board, show, stopped=stop.requested.is_set)
     if not views:
@@ -119,11 +119,8 @@ def _sketch(moment: Moment) -> Sketch:
     return Sketch(moment.image, outlines, None, (moment.advice,))
 
 
-def _page_state(moment: Moment) -> dict[str, Any]:
-    rows = [
-        [name, "#" * round(20 * share) + "." * (20 - round(20 * share)) + f" {100 * share:.0f} %"]
-        for name, share in moment.covered.items()
-    ]
+def page_state(moment: Moment) -> dict[str, Any]:
+    rows = [[name, f"{100 * share:.0f} %", share] for name, share in moment.covered.items()]
     return {"rows": [*rows, ["views", str(moment.taken)]], "phase": moment.advice}
 
 

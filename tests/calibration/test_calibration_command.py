@@ -20,7 +20,7 @@ from perchctl.calibration.lens import parameters_of
 from perchctl.calibration.novelty import Capture, Signature, consider, hint, progress, signature
 from perchctl.calibration.types import View
 from perchctl.cli import app
-from perchctl.commands.calibrate_live import captured_views, coverage_bars
+from perchctl.commands.calibrate_live import captured_views, coverage_bars, page_state
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import TimedOut
@@ -405,6 +405,17 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
                    views[-1].corners_px, 8.0)  # fmt: skip
     before = consider(Capture(), blurred, CHARUCO)
     assert "blurred" in consider(before, blurred, CHARUCO).advice
+
+
+def test_the_page_s_bars_are_shares_and_no_characters() -> None:
+    image = np.zeros((4, 4), np.uint8)
+    covered = {"x": 0.5, "y": 0.0, "size": 1.0, "tilt": 0.25}
+    state = page_state(Moment(0, image, np.empty((0, 2)), covered, 3, "hold still", False))
+    assert state["phase"] == "hold still"
+    *bars, views = state["rows"]
+    assert [(name, share) for name, _, share in bars] == list(covered.items())
+    assert [text for _, text, _ in bars] == ["50 %", "0 %", "100 %", "25 %"]
+    assert views == ["views", "3"]
 
 
 def test_bars_in_a_pipe_are_one_line_a_view(capsys: pytest.CaptureFixture[str]) -> None:

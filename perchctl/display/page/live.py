@@ -101,7 +101,8 @@ class LivePage:
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> State:
-        """What the page polls: `describe`'s keys (rows, note, phase, battery), and title,
+        """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
+        0..1; note, phase, battery), and title,
         rate_hz, stop (``none``, ``ready``, ``requested``)."""
         try:
             described = self._describe()
