@@ -22,6 +22,7 @@ from perchctl.profile import Profile, TargetConfig, find_calibration, load_profi
 from perchctl.target.blind import blind_lines, mounted
 from perchctl.target.boards import parse_board
 from perchctl.target.checks import check_target
+from perchctl.target.compare import comparison
 from perchctl.target.design import error_curve, make_design
 from perchctl.target.design_text import design_record, design_text
 from perchctl.target.lengths import millimetres
@@ -183,9 +184,18 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
     lines: list[str] = []
     record: dict[str, Any] = {}
     if request.suggest:
-        found, design = suggest(camera, optics, profile, request.magnet_m, request.ceiling_m)
+        found, design = suggest(
+            camera, optics, profile, request.magnet_m, request.ceiling_m, request.page
+        )
+        present = make_design(profile.target, camera, optics, profile, request.ceiling_m)
         lines += [f"note: {note}" for note in found.notes] + [found.command(), ""]
-        record = {"command": found.command(), "notes": list(found.notes)}
+        lines += [f"why: {reason}" for reason in found.reasons]
+        lines += [*comparison(design, present, f"profile {profile.name}"), ""]
+        record = {
+            "command": found.command(),
+            "reasons": list(found.reasons),
+            "notes": list(found.notes),
+        }
     else:
         target = requested_target(request, profile)
         design = make_design(target, camera, optics, profile, request.ceiling_m)
