@@ -207,6 +207,8 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
         sheet = _target(request, profile, design.target)
         lines += sheet.lines
         files |= sheet.files
+    if plot in files:
+        raise UsageError(f"{plot} is the sheet's picture already; name another with --plot")
     files[plot] = draw_design(design, curve)
     lines.append(f"wrote {plot}")
     return TargetOutcome(files, lines, record | {"files": [str(path) for path in files]})

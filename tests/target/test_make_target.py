@@ -81,6 +81,7 @@ REFUSALS = [
     (["-o", "target.txt"], 2, "must end in .pdf"),
     (["-o", "/dev/null/target.pdf"], 30, "/dev/null is a file, not a folder"),
     (["--camera", CAMERA, "--plot", "design.pdf"], 30, "must end in .png"),
+    (["--camera", CAMERA, "-o", "design.pdf", "--png", "60"], 2, "name another with --plot"),
     (["-p", "nothing"], 20, "profile 'nothing' not found"),
     (["--board", "chessboard:9x6"], 30, "COLUMNSxROWS:SQUARE"),
     (["--board", "chessboard:9x6:25mm", "--camera", CAMERA], 2, "different tasks"),
