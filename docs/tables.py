@@ -69,6 +69,7 @@ MEANINGS = {
     "date": "of the measurements in it; printed on the target",
     "camera.source": "`camera:N`, `http://...`, `video:FILE`, `images:DIR`, `sim:`",
     "camera.calibration": "file beside the profile, in `calib/`, or a whole path",
+    "camera.cam": "which camera of a Kalibr file of several: `cam0`, `cam1`, ...",
     "camera.latency_s": "from exposure to arrival",
     "camera.mount.position_m": "the camera in body axes",
     "camera.mount.rpy_deg": "its turn from body axes ([Camera mount](conventions.md#camera-mount))",

@@ -24,7 +24,7 @@ from perchctl.flight.lockstep import fly_lockstep
 from perchctl.log.jsonl import decode
 from perchctl.mission.table import TABLE
 from perchctl.profile import Profile, load_profile
-from tests.helpers.boards import CHARUCO, render_folder
+from tests.helpers.boards import APRILGRID, CHARUCO, render_folder
 from tests.helpers.flights import ROOT, SEED, short_profile
 from tests.helpers.gear import write_turned_about
 from tests.helpers.recording import make_recording
@@ -47,6 +47,7 @@ CAMCHAIN = """cam0:
   intrinsics: [400.5, 401.5, 320.25, 240.75]
   resolution: [640, 480]
 """
+APRIL = "{target_type: aprilgrid, tagCols: 6, tagRows: 6, tagSize: 0.022, tagSpacing: 0.3}\n"
 QUICK = """extends: sim
 planner: {perching_time_s: 0.3}
 """
@@ -105,6 +106,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("place")
     make_recording(folder)
     render_folder(folder / "board", load_calibration(folder / "camera.yaml"), CHARUCO, 8, seed=1)
+    render_folder(folder / "april", load_calibration(folder / "camera.yaml"), APRILGRID, 8, seed=2)
+    (folder / "april_6x6.yaml").write_text(APRIL, encoding="utf-8")
     write_turned_about(folder / "turned")
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")

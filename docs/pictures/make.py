@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from perchctl.calibration.files import load_calibration  # noqa: E402
+from perchctl.calibration.files import camera_of  # noqa: E402
 from perchctl.display.page.live import LivePage  # noqa: E402
 from perchctl.display.page.sketch import Sketch, draw  # noqa: E402
 from perchctl.display.panel import panel  # noqa: E402
@@ -54,7 +54,7 @@ from perchctl.plot import (  # noqa: E402
     new_figure,
     save_png,
 )
-from perchctl.profile import Profile, find_calibration, load_profile  # noqa: E402
+from perchctl.profile import Profile, load_profile  # noqa: E402
 from perchctl.sim.draw import draw_scenario  # noqa: E402
 from perchctl.sim.renderer import Renderer  # noqa: E402
 from perchctl.vision.types import Frame, PipelineState  # noqa: E402
@@ -80,7 +80,7 @@ class Flight:
 
     @cached_property
     def camera(self) -> Any:
-        return load_calibration(find_calibration(self.profile.camera.calibration))
+        return camera_of(self.profile.camera)
 
     @cached_property
     def renderer(self) -> Renderer:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.saddle import fit_saddles
+from perchctl.calibration.saddle import Room, fit_saddles
+from perchctl.calibration.tags import find_tags
 from perchctl.calibration.types import Grey, View
 from perchctl.geometry import Array
-from perchctl.target.boards import Board
+from perchctl.target.board_drawing import TAG_BORDER_CELLS, tag_cells
+from perchctl.target.boards import Board, Kind
 from perchctl.vision.fields import field_picture, is_combed
 
 MIN_CORNERS = 6
@@ -20,6 +23,11 @@ SEARCH_PX = 1600
 """Larger pictures are scaled down to it for the search; corners are fitted at full size."""
 _MOST_MOTION_PX = 12.0
 """Between two fields, for which the mean of both is a picture of the board too."""
+TAG_REACH = 0.6
+"""Of the small squares of an aprilgrid; they are a third as large as a chessboard's."""
+_RIM_PX = 2.0
+"""A tag's corner nearer to the picture's rim is not seen from all sides."""
+_WINDOW_PX = {"chessboard": 11, "aprilgrid": 2}
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
 
@@ -30,7 +38,8 @@ def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -
     Args:
         image: grey, uint8 (h, w).
         refine: fit the corners (`perchctl.calibration.saddle`); otherwise they are
-            OpenCV's, with `cv2.cornerSubPix` and a window of 11x11 for chessboards.
+            OpenCV's, with `cv2.cornerSubPix` in the window of OpenCV's own program for
+            chessboards, and in Kalibr's for aprilgrids.
 
     Of an interlaced picture, whose fields show a moving board in two places, the view is the
     mean of both fields' corners: where the board was half way between them.
@@ -62,25 +71,48 @@ def _whole(image: Grey, board: Board, name: str, refine: bool) -> View | str:
         small = np.asarray(
             cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
         )
-    found = _charuco(small, board) if board.kind == "charuco" else _chessboard(small, board)
+    found = _FINDERS[board.kind](small, board)
     if isinstance(found, str):
         return found
     ids, corners = found
     # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
     corners = (corners + 0.5) / scale - 0.5
-    cells = _cells(board, ids)
     object_m = board.corners_m()[ids]
     if not refine:
-        if board.kind == "chessboard":
-            corners = _fixed_window(image, corners)
+        if board.kind != "charuco":
+            corners = _fixed_window(image, corners, _WINDOW_PX[board.kind])
         return View(name, (w, h), ids, object_m, corners)
-    along, down = _local_axes(cells, corners)
-    margin = 0.5 * (1.0 - board.marker_m / board.square_m) if board.marker_m else 1.0
-    fit = fit_saddles(image, corners, along, down, margin)
+    along, down = _local_axes(_cells(board, ids), corners)
+    fit = fit_saddles(image, corners, along, down, _room(board))
     if fit.ok.sum() < MIN_CORNERS:
         return f"only {int(fit.ok.sum())} corners are sharp enough to be measured"
     good = View(name, (w, h), ids, object_m, fit.corners_px, float(np.median(fit.width_px[fit.ok])))
     return good.keep(fit.ok)
+
+
+def _room(board: Board) -> Room:
+    """How far from a corner nothing but its own four squares is printed."""
+    if board.kind == "aprilgrid" and board.marker_m:
+        # The squares are small; a tag's cells begin behind its border.
+        border = TAG_BORDER_CELLS / len(tag_cells(0)) * board.marker_m / board.square_m
+        return Room(reach=TAG_REACH, black=border)
+    if board.kind == "charuco" and board.marker_m:
+        return Room(white=0.5 * (1.0 - board.marker_m / board.square_m))
+    return Room()
+
+
+def _aprilgrid(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
+    tags = find_tags(image, board)
+    if isinstance(tags, str):
+        return tags
+    ids = np.array([corner for tag in tags for corner in board.tag_corners(tag)], dtype=np.intp)
+    corners = np.concatenate(list(tags.values()))
+    h, w = image.shape
+    inside = ((corners > _RIM_PX) & (corners < (w - 1 - _RIM_PX, h - 1 - _RIM_PX))).all(axis=1)
+    order = np.flatnonzero(inside)[np.argsort(ids[inside])]
+    if len(order) < MIN_CORNERS:
+        return f"only {len(order)} corners of the board found"
+    return ids[order], corners[order]
 
 
 def _charuco(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | str:
@@ -117,16 +149,22 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
     return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
 
 
+_FINDERS: dict[Kind, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
+    "chessboard": _chessboard,
+    "charuco": _charuco,
+    "aprilgrid": _aprilgrid,
+}
+
+
 def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
-    """Column and row of inner corners, (n, 2)."""
-    columns = board.corner_count[0]
-    return np.column_stack([ids % columns, ids // columns]).astype(np.float64)
+    """Places of inner corners in squares, (n, 2)."""
+    return np.asarray(board.corners_m()[ids, :2] / board.square_m)
 
 
-def _fixed_window(image: Grey, corners: Array) -> Array:
+def _fixed_window(image: Grey, corners: Array, half_px: int) -> Array:
     points = np.ascontiguousarray(corners, dtype=np.float32).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
-    moved = cv2.cornerSubPix(image, points, (11, 11), (-1, -1), criteria)
+    moved = cv2.cornerSubPix(image, points, (half_px, half_px), (-1, -1), criteria)
     return np.asarray(moved, dtype=np.float64).reshape(-1, 2)
 
 

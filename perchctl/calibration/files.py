@@ -3,6 +3,7 @@ OpenCV's own FileStorage files (YAML, XML, JSON), and Kalibr's camchain YAML."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import yaml
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.profile import find_calibration
+from perchctl.profile import CameraConfig, find_calibration
 from perchctl.vision.types import CameraModel
 
 KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
@@ -23,10 +24,15 @@ class SizeMissing(InvalidValue):
     """A calibration does not say for pictures of which size it holds."""
 
 
-def load_sized(file: Path | str) -> CameraModel | None:
+def camera_of(config: CameraConfig) -> CameraModel:
+    """The calibrated camera of a profile. Errors: those of `load_calibration`."""
+    return load_calibration(config.calibration, cam=config.cam)
+
+
+def load_sized(file: Path | str, cam: str | None = None) -> CameraModel | None:
     """As `load_calibration`; None where all but the pictures' size is there."""
     try:
-        return load_calibration(file)
+        return load_calibration(file, cam=cam)
     except SizeMissing:
         return None
 
@@ -41,10 +47,13 @@ def assumed_size(file: Path | str, size_px: tuple[int, int]) -> str:
     )
 
 
-def load_calibration(file: Path | str, size_px: tuple[int, int] | None = None) -> CameraModel:
+def load_calibration(
+    file: Path | str, size_px: tuple[int, int] | None = None, cam: str | None = None
+) -> CameraModel:
     """Read a camera model from a file, or by the name of one in `calib/`.
 
-    `size_px` is the pictures' size (width, height) where the file has none.
+    `size_px` is the pictures' size (width, height) where the file has none; `cam` names one
+    of the cameras of a Kalibr file.
     Errors: NotFound (no file), SizeMissing, InvalidValue (wrong content)."""
     path = find_calibration(file) if isinstance(file, str) else file
     try:
@@ -54,11 +63,16 @@ def load_calibration(file: Path | str, size_px: tuple[int, int] | None = None) -
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidValue(f"{path}: cannot be read as a calibration: {error}") from None
     if "opencv-matrix" in text or "<opencv_storage>" in text:
+        _check_no_cam(path, cam)
         return _checked(path, _opencv_values(path), size_px)
     raw = _mapping(path, text)
-    cameras = [key for key in raw if str(key).startswith("cam") and str(key)[3:].isdigit()]
+    cameras = [key for key in raw if re.fullmatch(r"cam\d+", str(key))]
     try:
-        values = _kalibr_values(path, raw, cameras) if cameras else _ros_values(raw)
+        if cameras:
+            values = _kalibr_values(path, raw, _named(path, cameras, cam))
+        else:
+            _check_no_cam(path, cam)
+            values = _ros_values(raw)
     except KeyError as error:
         raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
     except (TypeError, ValueError) as error:
@@ -88,16 +102,32 @@ def _ros_values(raw: dict[Any, Any]) -> dict[str, Any]:
     }
 
 
-def _kalibr_values(path: Path, raw: dict[Any, Any], cameras: list[Any]) -> dict[str, Any]:
-    """The one camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
-    if len(cameras) > 1:
+def _check_no_cam(path: Path, cam: str | None) -> None:
+    if cam is not None:
         raise InvalidValue(
-            f"{path}: holds {len(cameras)} cameras ({', '.join(cameras)}); leave only the "
-            f"upward one"
+            f"{path}: is no Kalibr file and holds one camera only: leave out {cam} "
+            f"(--cam, or camera.cam in the profile)"
         )
-    camera = raw[cameras[0]]
+
+
+def _named(path: Path, cameras: list[str], cam: str | None) -> str:
+    """The camera that is meant."""
+    held = ", ".join(cameras)
+    if cam is None and len(cameras) > 1:
+        raise InvalidValue(
+            f"{path}: holds {len(cameras)} cameras ({held}): name one with --cam {cameras[0]}, or "
+            f"with camera.cam in the profile"
+        )
+    if cam is not None and cam not in cameras:
+        raise InvalidValue(f"{path}: holds no camera {cam!r}; its cameras are {held}")
+    return cam or cameras[0]
+
+
+def _kalibr_values(path: Path, raw: dict[Any, Any], cam: str) -> dict[str, Any]:
+    """One camera of a camchain; pixel (0, 0) is a pixel's centre there too."""
+    camera = raw[cam]
     if not isinstance(camera, dict):
-        raise InvalidValue(f"{path}: {cameras[0]} must hold keys (intrinsics, resolution, ...)")
+        raise InvalidValue(f"{path}: {cam} must hold keys (intrinsics, resolution, ...)")
     projection = camera.get("camera_model", "pinhole")
     if projection != "pinhole":
         raise InvalidValue(f"{path}: camera_model {projection!r} is not supported; use pinhole")

@@ -24,7 +24,8 @@ GONE_AFTER_S = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What to show of a frame: the picture, the corners found, the coverage, the advice."""
+    """What to show of a frame: the picture, the corners found, the coverage, the advice, and
+    the views taken until then."""
 
     index: int
     image: Grey
@@ -33,6 +34,7 @@ class Moment:
     taken: int
     advice: str
     shot: bool
+    views: tuple[View, ...] = ()
 
 
 def capture(
@@ -79,6 +81,7 @@ def capture(
                 len(state.taken),
                 state.advice,
                 state.shot,
+                state.taken,
             )
         )
     return list(state.taken)

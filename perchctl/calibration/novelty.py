@@ -55,7 +55,7 @@ def signature(view: View, board: Board) -> Signature:
         return Signature(float(middle[0]), float(middle[1]), 0.0, 0.0, 0.0)
     H = H / H[2, 2]
     affine = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])
-    columns, rows = board.squares
+    columns, rows = (side / board.square_m for side in board.size_m)
     area = abs(float(np.linalg.det(affine))) * columns * rows
     size = min(1.0, float(np.sqrt(area / (w * h))))
     reach = 0.5 * max(columns, rows)

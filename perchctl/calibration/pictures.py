@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -26,13 +26,13 @@ Progress = Callable[[int, int | None], None]
 
 
 def views_of_images(
-    where: str,
+    where: str | Sequence[Path],
     board: Board,
     refine: bool = True,
     progress: Progress = lambda done, total: None,
     skip_broken: bool = False,
 ) -> tuple[list[View], list[Rejection]]:
-    """Every picture of a folder or glob: the views, and those without a board.
+    """Every picture of a folder or glob (or those given): the views, and those without a board.
 
     Args:
         skip_broken: leave out what is no picture, or only a part of one.
@@ -40,7 +40,7 @@ def views_of_images(
     Raises:
         NotFound: no pictures. InvalidValue: broken ones (all are named), or unequal sizes.
     """
-    paths = image_files(str(Path(where).expanduser()))
+    paths = image_files(where)
     names = _names(paths)
 
     broken: dict[str, str] = {}

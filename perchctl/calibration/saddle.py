@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 
-REACH = 0.42  # of a square: half the window; the next corner's edges begin at 1
 MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
 GRID = 21  # samples across the largest window
 _ITERATIONS = 25
@@ -45,12 +44,27 @@ class Saddles:
     width_px: Array
 
 
+@dataclass(frozen=True)
+class Room:
+    """What is around a corner, in squares.
+
+    Attributes:
+        reach: half of the window; the next corner's edges begin at 1.
+        white, black: how far the white and the black squares are of one grey at their rims (a
+            ChArUco board's markers begin in its white squares, a tag's cells in the black).
+    """
+
+    reach: float = 0.42
+    white: float = 1.0
+    black: float = 1.0
+
+
 def fit_saddles(
     image: NDArray[np.uint8],
     corners_px: Array,
     along_px: Array,
     down_px: Array,
-    white_margin: float = 1.0,
+    room: Room = Room(),
 ) -> Saddles:
     """Refine corners.
 
@@ -59,8 +73,7 @@ def fit_saddles(
         corners_px: first guess, good to a fifth of a square, (n, 2).
         along_px, down_px: the vectors from a corner to its neighbours on the board, as
             the picture shows them, (n, 2) each.
-        white_margin: how far the white squares are empty at their rims, as a part of a
-            square (a ChArUco board's markers begin there).
+        room: how far the picture is of use around a corner.
     """
     n = len(corners_px)
     start = np.asarray(corners_px, dtype=np.float64).reshape(-1, 2)
@@ -69,12 +82,15 @@ def fit_saddles(
     axes = np.stack([along_px, down_px], axis=2)  # (n, 2, 2): board units -> px
     size_px = _thickness_px(axes)
     reach = np.clip(
-        REACH, MIN_REACH_PX / np.maximum(size_px, 1e-6), MAX_REACH_PX / np.maximum(size_px, 1e-6)
+        room.reach,
+        MIN_REACH_PX / np.maximum(size_px, 1e-6),
+        MAX_REACH_PX / np.maximum(size_px, 1e-6),
     )
     uv, offsets = _window(axes, reach)
     grey, inside = _sample(image, start, offsets)
     positive = _white_quadrants(grey, uv)
-    weight = inside * _unprinted(uv, positive, white_margin, size_px)
+    weight = inside * _unprinted(uv, positive, room.white, room.reach, size_px)
+    weight *= _unprinted(uv, ~positive, room.black, room.reach, size_px)
     return _fit(start, axes, offsets, grey, weight, size_px, reach)
 
 
@@ -117,13 +133,16 @@ def _white_quadrants(grey: Array, uv: Array) -> NDArray[np.bool_]:
     return np.asarray((grey * product * near).sum(axis=1) > 0)
 
 
-def _unprinted(uv: Array, positive: NDArray[np.bool_], margin: float, size_px: Array) -> Array:
-    """0 inside of markers in white squares and within their blur, else 1, (n, m)."""
-    if margin >= REACH:
+def _unprinted(
+    uv: Array, positive: NDArray[np.bool_], margin: float, reach: float, size_px: Array
+) -> Array:
+    """0 inside of what is printed in the squares of one colour (those with u v > 0 where
+    `positive`), and within its blur, else 1, (n, m)."""
+    if margin >= reach:
         return np.ones(uv.shape[:2])
-    white = (uv[..., 0] * uv[..., 1] > 0) == positive[:, None]
+    those = (uv[..., 0] * uv[..., 1] > 0) == positive[:, None]
     clear = np.maximum(margin - 1.0 / np.maximum(size_px, 1e-6), 0.5 * margin)
-    return np.asarray(~(white & (np.abs(uv).min(axis=2) > clear[:, None])), dtype=np.float64)
+    return np.asarray(~(those & (np.abs(uv).min(axis=2) > clear[:, None])), dtype=np.float64)
 
 
 def _fit(

@@ -8,33 +8,39 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from perchctl.calibration.tags import detect_tags
 from perchctl.calibration.types import Grey
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.profile.dictionaries import dictionary_names, predefined
-from perchctl.target.boards import Board
+from perchctl.profile.dictionaries import dictionary_names, id_count, predefined
+from perchctl.target.boards import TAG_DICTIONARY, Board
 
 _LARGER = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _MAX_SIDE = 20
 _SEARCH_PX = 1200
 _MAX_MISFIT = 0.2  # of a marker's side
+_TAGS = id_count(TAG_DICTIONARY)
 _LEAST_GRID = 4
 """Smaller grids are seen in many things that are no chessboard."""
 
 
 def seen_instead(images: Sequence[Grey], board: Board) -> str:
     """A half sentence for the error message: what the pictures do show."""
-    if board.kind == "chessboard" and any(_markers(_shrunk(image)) for image in images):
+    small = [_shrunk(image) for image in images]
+    if board.kind != "aprilgrid" and any(len(detect_tags(s, _TAGS)) >= 4 for s in small):
+        return "they show AprilTags with a border of two cells: is it an aprilgrid?"
+    if board.kind != "charuco" and any(_markers(s) for s in small):
         return "they show markers: is it a charuco board?"
-    for image in images:
-        small = _shrunk(image)
-        if board.kind == "charuco":
-            other = _charuco_size(small, board) or _dictionary(small, board)
-        else:
-            other = _chessboard_size(small, board)
-        if other:
-            return other
-    if board.kind == "charuco" and any(_grid(_shrunk(image)) for image in images):
+    looks = {
+        "charuco": (_charuco_size, _dictionary),
+        "chessboard": (_chessboard_size,),
+        "aprilgrid": (_aprilgrid_size,),
+    }
+    for image in small:
+        for look in looks[board.kind]:
+            if other := look(image, board):
+                return other
+    if board.kind != "chessboard" and any(_grid(s) for s in small):
         return "they show a grid without markers: is it a plain chessboard?"
     return ""
 
@@ -42,7 +48,12 @@ def seen_instead(images: Sequence[Grey], board: Board) -> str:
 def larger_than(images: Sequence[Grey], board: Board) -> str:
     """The board's notation when the pictures show a larger one of which the named
     board is a part, else empty. A part calibrates, but is hardly what was meant."""
-    look = _larger_charuco if board.marker_m else _larger_grid
+    looks = {
+        "charuco": _larger_charuco,
+        "chessboard": _larger_grid,
+        "aprilgrid": _larger_aprilgrid,
+    }
+    look = looks[board.kind]
     sizes = [size for size in (look(_shrunk(image), board) for image in images) if size]
     if board.marker_m:
         if not sizes:
@@ -72,6 +83,43 @@ def _larger_charuco(image: Grey, board: Board) -> tuple[int, int] | None:
     if len(numbers) < 4 or (numbers >= board.columns * board.rows // 2).sum() < 2:
         return None
     return board.columns, int(np.ceil(2.0 * (numbers.max() + 1) / board.columns))
+
+
+def _larger_aprilgrid(image: Grey, board: Board) -> tuple[int, int] | None:
+    layout = _aprilgrid_layout(image, board)
+    if layout is None or layout.columns != board.columns or layout.rows <= board.rows:
+        return None
+    return layout.columns, layout.rows
+
+
+def _aprilgrid_size(image: Grey, board: Board) -> str | None:
+    layout = _aprilgrid_layout(image, board)
+    if layout is None or (layout.columns == board.columns and layout.rows <= board.rows):
+        return None
+    return (
+        f"they show an aprilgrid of {layout.columns} columns and {layout.rows} or more rows: use "
+        f"--board {layout.notation()} if so"
+    )
+
+
+def _aprilgrid_layout(image: Grey, board: Board) -> Board | None:
+    """The number of columns with which the tags' numbers lie on a plane; the board's own if
+    that is one."""
+    tags = detect_tags(image, _TAGS)
+    if len(tags) < 4:
+        return None
+    seen = np.concatenate(list(tags.values()))
+    best: tuple[float, Board] | None = None
+    for columns in (board.columns, *range(3, _MAX_SIDE + 1)):
+        rows = max(3, max(tags) // columns + 1)
+        layout = dataclasses.replace(board, columns=columns, rows=rows)
+        numbers = [corner for tag in tags for corner in layout.tag_corners(tag)]
+        misfit = _plane_misfit(layout.corners_m()[numbers, :2], seen)
+        if misfit is not None and misfit <= _MAX_MISFIT and columns == board.columns:
+            return layout
+        if misfit is not None and (best is None or misfit < best[0]):
+            best = (misfit, layout)
+    return best[1] if best is not None and best[0] <= _MAX_MISFIT else None
 
 
 def _chessboard_size(image: Grey, board: Board) -> str | None:
@@ -145,7 +193,12 @@ def _misfit(layout: Board, ids: Array, seen: Array) -> float | None:
         return None
     points = made.getObjPoints()
     flat = np.concatenate([np.asarray(points[numbers[int(i)]])[:, :2] for i in ids])
-    H, _ = cv2.findHomography(flat.astype(np.float64), seen)
+    return _plane_misfit(flat.astype(np.float64), seen)
+
+
+def _plane_misfit(flat: Array, seen: Array) -> float | None:
+    """Of the corners (4n, 2) of markers one after the other, as a part of their side."""
+    H, _ = cv2.findHomography(flat, seen)
     if H is None:
         return None
     mapped = np.column_stack([flat, np.ones(len(flat))]) @ H.T

@@ -52,7 +52,7 @@ def calibrate(
     """
     pictures = len(views) + len(missing)
     check_views(views, pictures)
-    robust = _without_outliers(views, rejecting)
+    robust = robust_fit(views, rejecting)
     check_views(robust.views, pictures)
     # Tilt and coverage first: their messages name best what to add.
     check_variety(robust.views, robust.fit.poses)
@@ -128,9 +128,12 @@ def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[Lack]:
     return lacks
 
 
-def _without_outliers(views: Sequence[View], rejecting: bool) -> Robust:
-    """Outliers are judged by the simplest model that follows the lens: a model that cannot
-    would call the views at the picture's rim outliers."""
+def robust_fit(views: Sequence[View], rejecting: bool = True) -> Robust:
+    """The views without outliers, and the camera that they were judged by: the simplest model
+    that follows the lens. One that cannot would call the views at the picture's rim outliers.
+
+    Raises InvalidValue: the views fit no camera.
+    """
     try:
         if not rejecting:
             return keep_all(views, MODEL_NAMES[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -102,14 +103,19 @@ class VideoSource(Recording):
 
 
 class ImagesSource(Recording):
-    """The pictures of a folder or a glob, in natural order (2 before 10), at `rate_hz`."""
+    """The pictures of a folder or a glob, or those named one by one, in natural order (2
+    before 10), at `rate_hz`."""
 
     def __init__(
-        self, where: str, latency_s: float = 0.0, rate_hz: float = DEFAULT_RATE_HZ
+        self,
+        where: str | Sequence[Path],
+        latency_s: float = 0.0,
+        rate_hz: float = DEFAULT_RATE_HZ,
     ) -> None:
         self._paths = image_files(where)
         self._next = 0
-        super().__init__(f"images:{where}", latency_s, rate_hz, len(self._paths))
+        named = where if isinstance(where, str) else self._paths[0]
+        super().__init__(f"images:{named}", latency_s, rate_hz, len(self._paths))
 
     @property
     def paths(self) -> list[Path]:
@@ -161,8 +167,11 @@ def is_cut_off(data: bytes) -> bool:
     return data.find(b"\xff\xd9", at) < 0
 
 
-def image_files(where: str) -> list[Path]:
-    """Picture files of a folder or glob, naturally sorted; raises NotFound if there are none."""
+def image_files(where: str | Sequence[Path]) -> list[Path]:
+    """Picture files of a folder or glob (or those given, each once), naturally sorted;
+    raises NotFound if there are none."""
+    if not isinstance(where, str):
+        return sorted(set(where), key=_natural)
     folder = Path(where)
     if folder.is_file():
         found = [folder]

@@ -40,6 +40,10 @@ ViewPortOption = Annotated[
     int,
     typer.Option("--view-port", min=0, max=65535, help="Port of the live page; 0: any free one."),
 ]
+CamOption = Annotated[
+    str | None,
+    typer.Option("--cam", help="Which camera of a Kalibr file of several: cam0, cam1, ..."),
+]
 
 
 def main() -> Any:

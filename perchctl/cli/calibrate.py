@@ -7,15 +7,23 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, JsonOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import (
+    CamOption,
+    ForceOption,
+    JsonOption,
+    ViewOption,
+    ViewPortOption,
+    reported,
+)
 
 
 # long: a list of options
 def calibrate(
     source: Annotated[
-        str | None,
+        list[str] | None,
         typer.Argument(
-            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path."
+            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path; or many "
+            "picture files."
         ),
     ] = None,
     board: Annotated[
@@ -23,10 +31,18 @@ def calibrate(
         typer.Option(
             "--board",
             "-b",
-            help="chessboard:9x6:25mm (inner corners) or charuco:10x7:25mm:18mm:DICT_5X5_100 "
-            "(squares; :legacy behind it for OpenCV's old layout).",
+            help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
+            "(squares; :legacy behind it for OpenCV's old layout), aprilgrid:6x6:22mm:0.3 (tags, "
+            "gap as a share of a tag), or Kalibr's .yaml of a board.",
         ),
     ] = "charuco:10x7:25mm:18mm:DICT_5X5_100",
+    measured_width: Annotated[
+        str | None,
+        typer.Option("--measured-width", help="Width of the board's black area as printed, mm."),
+    ] = None,
+    measured_height: Annotated[
+        str | None, typer.Option("--measured-height", help="Its height as printed, mm.")
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -52,6 +68,7 @@ def calibrate(
         Path | None,
         typer.Option("--convert", help="Read an OpenCV, Kalibr or ROS file and write --output."),
     ] = None,
+    cam: CamOption = None,
     mask: Annotated[
         Path | None,
         typer.Option(
@@ -89,14 +106,17 @@ def calibrate(
         from perchctl.commands.calibrate import CalibrateRequest, run
 
         request = CalibrateRequest(
-            source=source,
+            sources=tuple(source or ()),
             board=board,
+            measured_width=measured_width,
+            measured_height=measured_height,
             output=output,
             name=name,
             model=model,
             force=force,
             check=check,
             convert=convert,
+            cam=cam,
             mask=mask,
             reject=reject,
             plain_corners=plain_corners,

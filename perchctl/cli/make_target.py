@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, JsonOption, reported
+from perchctl.cli.app import CamOption, ForceOption, JsonOption, reported
 
 
 # long: a list of options
@@ -51,13 +51,15 @@ def make_target(
         typer.Option(
             "--board",
             help="Print a calibration board instead: charuco:10x7:25mm:18mm:DICT_5X5_100 "
-            "(squares) or chessboard:9x6:25mm (inner corners).",
+            "(squares), chessboard:9x6:25mm (inner corners), aprilgrid:6x6:22mm:0.3 (tags, gap "
+            "as a share of a tag), or Kalibr's .yaml of a board.",
         ),
     ] = None,
     camera: Annotated[
         str | None,
         typer.Option("--camera", help="Design: ranges of the target for this calibration file."),
     ] = None,
+    cam: CamOption = None,
     ceiling: Annotated[
         float | None, typer.Option("--ceiling", help="Height of the ceiling over the floor, m.")
     ] = None,
@@ -106,6 +108,7 @@ def make_target(
             svg=svg,
             board=board,
             camera=camera,
+            cam=cam,
             ceiling_m=ceiling,
             blur_px=blur,
             noise=noise,

@@ -7,7 +7,14 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, ProfileOption, ViewOption, ViewPortOption, reported
+from perchctl.cli.app import (
+    CamOption,
+    ForceOption,
+    ProfileOption,
+    ViewOption,
+    ViewPortOption,
+    reported,
+)
 
 
 def track(
@@ -24,6 +31,7 @@ def track(
             "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
         ),
     ] = None,
+    cam: CamOption = None,
     stills: Annotated[
         bool, typer.Option("--stills", help="Each picture alone: no window, no filter.")
     ] = False,
@@ -55,6 +63,7 @@ def track(
             source=source,
             profile=profile,
             calibration=calibration,
+            cam=cam,
             stills=stills,
             as_json=as_json,
             csv=csv,

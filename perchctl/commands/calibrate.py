@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import itertools
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,39 +19,39 @@ from perchctl.calibration.report import (
 )
 from perchctl.calibration.seen import larger_than, seen_instead
 from perchctl.calibration.solve import AUTO, calibrate
-from perchctl.calibration.types import Grey, Rejection, View
+from perchctl.calibration.types import Rejection, View
 from perchctl.calibration.writing import calibration_text, camera_text
-from perchctl.camera.files import BrokenPicture, VideoSource, image_files, read_grey
-from perchctl.camera.open import open_source, source_spec
 from perchctl.camera.source import check_size
+from perchctl.commands.calibrate_board import board_of
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mask import write_mask
+from perchctl.commands.calibrate_source import Source, source_of
 from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
-from perchctl.target.boards import Board, parse_board
+from perchctl.target.boards import Board
 
 FOLDER = Path("calib")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
-_SAMPLES = 4
-"""Pictures that are searched for another board when none shows the named one."""
-_SAMPLE_EVERY = 30  # frames of a video
 
 
 @dataclass(frozen=True)
 class CalibrateRequest:
     """The command line as it was given; None is not given."""
 
-    source: str | None = None
+    sources: tuple[str, ...] = ()
     board: str = "charuco:10x7:25mm:18mm:DICT_5X5_100"
+    measured_width: str | None = None
+    measured_height: str | None = None
     output: Path | None = None
     name: str = "camera"
     model: str = AUTO
     force: bool = False
     check: Path | None = None
     convert: Path | None = None
+    cam: str | None = None
     mask: Path | None = None
     reject: bool = True
     plain_corners: bool = False
@@ -81,20 +79,28 @@ def run(request: CalibrateRequest) -> int:
 
     Errors: NotFound, InvalidValue, UsageError, TimedOut (a silent camera).
     """
+    measured = request.measured_width is not None or request.measured_height is not None
+    if measured and not (request.convert is request.mask is None):
+        raise UsageError("--measured-* are a board's sides, and --convert and --mask look for none")
     if request.convert is not None:
-        if not (request.source is request.check is request.mask is None):
+        if request.sources or not (request.check is request.mask is None):
             raise UsageError("--convert takes a file and no source, --check or --mask")
         return _convert(request, request.convert)
-    if request.source is None:
+    if request.cam is not None and request.check is None:
+        raise UsageError("--cam names a camera of the file of --check or --convert: give one")
+    if not request.sources:
         raise UsageError(
             "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N or http://..."
         )
+    source = source_of(request.sources)
     if request.mask is not None:
         if request.check is not None or request.output is not None:
             raise UsageError("--mask names its file itself, and takes no --output or --check")
-        return write_mask(source_spec(request.source), request.mask, request.force, request.as_json)
-    source, board = source_spec(request.source), parse_board(request.board)
+        return write_mask(source, request.mask, request.force, request.as_json)
+    board, notes = board_of(request.board, request.measured_width, request.measured_height)
     _check_request(request)
+    for note in notes:
+        say(note)
     if request.check is not None:
         return _check(request, request.check, source, board)
     return _calibrate(request, source, board)
@@ -112,7 +118,7 @@ def _check_request(request: CalibrateRequest) -> None:
         raise UsageError(f"--name {request.name!r} cannot name a file; use a word such as camera")
 
 
-def _calibrate(request: CalibrateRequest, source: str, board: Board) -> int:
+def _calibrate(request: CalibrateRequest, source: Source, board: Board) -> int:
     found = _find_views(request, source, board)
     output = _output(request, found.size_px)
     _check_output(output, request.force)
@@ -134,14 +140,14 @@ def _calibrate(request: CalibrateRequest, source: str, board: Board) -> int:
     return 0
 
 
-def _check(request: CalibrateRequest, file: Path, source: str, board: Board) -> int:
+def _check(request: CalibrateRequest, file: Path, source: Source, board: Board) -> int:
     """Judge an existing calibration by new pictures."""
-    camera = load_sized(file)
+    camera = load_sized(file, request.cam)
     found = _find_views(request, source, board)
     if camera is None:
-        camera = load_calibration(file, found.size_px)
+        camera = load_calibration(file, found.size_px, request.cam)
         say(assumed_size(file, found.size_px))
-    check_size(found.size_px, camera, source)
+    check_size(found.size_px, camera, str(source))
     result = check(camera, found.views)
     for item in found.missing:
         say(f"{item.view}: {item.reason}")
@@ -157,7 +163,7 @@ def _check(request: CalibrateRequest, file: Path, source: str, board: Board) -> 
 
 def _convert(request: CalibrateRequest, file: Path) -> int:
     """Another program's calibration (OpenCV, Kalibr, ROS) as perchctl's file."""
-    camera = load_calibration(file)
+    camera = load_calibration(file, cam=request.cam)
     output = _output(request, camera.size_px)
     if same_file(output, file):
         raise UsageError(f"{output} is the file to convert; name another with --output")
@@ -209,24 +215,24 @@ def _now() -> str:
 # -- views --------------------------------------------------------------------
 
 
-def _find_views(request: CalibrateRequest, source: str, board: Board) -> _Found:
-    scheme, _, rest = source.partition(":")
-    if scheme not in ("images", "video"):
+def _find_views(request: CalibrateRequest, source: Source, board: Board) -> _Found:
+    if source.scheme not in ("images", "video"):
         return _Found(_live_views(request, source, board), [])
     refine = not request.plain_corners
     with search_bar("searching the board") as progress:
-        if scheme == "images":
-            views, missing = views_of_images(rest, board, refine, progress, request.skip_broken)
+        if source.scheme == "images":
+            pictures, skip = source.pictures(), request.skip_broken
+            views, missing = views_of_images(pictures, board, refine, progress, skip)
         else:
-            views, missing = views_of_video(Path(rest).expanduser(), board, refine, progress)
+            views, missing = views_of_video(Path(source.place), board, refine, progress)
     if not views:
-        count = f"{len(missing)} pictures" if scheme == "images" else missing[0].view
-        other = seen_instead(_samples(scheme, rest), board)
+        count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
+        other = seen_instead(source.samples(), board)
         hint = other or "is it wholly in view, sharp, and --board its true layout?"
         raise InvalidValue(
             f"none of {count} of {source} shows the board {board.notation()}; {hint}"
         )
-    whole = larger_than(_samples(scheme, rest), board)
+    whole = larger_than(source.samples(), board)
     if whole:
         raise InvalidValue(
             f"the pictures show a larger board than {board.notation()}: use --board {whole}"
@@ -234,8 +240,8 @@ def _find_views(request: CalibrateRequest, source: str, board: Board) -> _Found:
     return _Found(views, missing)
 
 
-def _live_views(request: CalibrateRequest, source: str, board: Board) -> list[View]:
-    frames = open_source(source, 0.0, None, time.monotonic)
+def _live_views(request: CalibrateRequest, source: Source, board: Board) -> list[View]:
+    frames = source.open()
     try:
         assert frames.size_px is not None  # the first frame is there
         pictures = _pictures_folder(request, frames.size_px)
@@ -243,22 +249,3 @@ def _live_views(request: CalibrateRequest, source: str, board: Board) -> list[Vi
         return captured_views(frames, board, pictures, port)
     finally:
         frames.close()
-
-
-def _samples(scheme: str, rest: str) -> list[Grey]:
-    """A few pictures from over the whole source."""
-    if scheme == "images":
-        paths = image_files(str(Path(rest).expanduser()))
-        step = max(1, len(paths) // _SAMPLES)
-        samples: list[Grey] = []
-        for path in paths[::step][:_SAMPLES]:
-            with contextlib.suppress(BrokenPicture):  # which has been told
-                samples.append(read_grey(path))
-        return samples
-    source = VideoSource(Path(rest).expanduser())
-    frames: list[Grey] = []
-    while (frame := source.poll(0.0)) is not None and len(frames) < _SAMPLES:
-        if frame.index % _SAMPLE_EVERY == 0:
-            frames.append(frame.image)
-    source.close()
-    return frames

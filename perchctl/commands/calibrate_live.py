@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from perchctl.calibration.guided import Moment, capture
+from perchctl.calibration.preview import Flat, LensPreview
 from perchctl.calibration.types import Grey, View
 from perchctl.camera.source import FrameSource
 from perchctl.commands.interrupt import Stopper
@@ -50,6 +51,7 @@ def captured_views(
         stop = stack.enter_context(Stopper().installed())
         camera = _any_camera(source.size_px or _SIZE_UNTIL_KNOWN_PX)
         page = stack.enter_context(live_page(camera, "perchctl calibrate", port))
+        preview = LensPreview()
         bars = stack.enter_context(coverage_bars())
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 
@@ -58,8 +60,10 @@ def captured_views(
                 keeper.keep(moment.image)
             bars(moment.covered, moment.taken, moment.advice)
             if page is not None:
-                page.show(moment.index, _sketch(moment))
-                page.tell(lambda: page_state(moment))
+                preview.offer(moment.views)
+                flat = preview.flat
+                page.show(moment.index, sketch_of(moment, flat))
+                page.tell(lambda: page_state(moment, flat))
 
         views = capture(source, board, show, stopped=stop.requested.is_set)
     if not views:
@@ -111,17 +115,24 @@ def _any_camera(size_px: tuple[int, int]) -> CameraModel:
     return CameraModel(size_px, K, np.zeros(5))
 
 
-def _sketch(moment: Moment) -> Sketch:
+def sketch_of(moment: Moment, flat: Flat | None) -> Sketch:
     outlines: tuple[tuple[str, Any], ...] = ()
     if len(moment.corners_px) >= 3:
         hull = cv2.convexHull(moment.corners_px.astype(np.float32)).reshape(-1, 2)
         outlines = (("small" if moment.shot else "large", hull.astype(np.float64)),)
-    return Sketch(moment.image, outlines, None, (moment.advice,))
+    places_px = None if flat is None else flat.places_px
+    return Sketch(moment.image, outlines, None, (moment.advice,), places_px)
 
 
-def page_state(moment: Moment) -> dict[str, Any]:
-    rows = [[name, f"{100 * share:.0f} %", share] for name, share in moment.covered.items()]
-    return {"rows": [*rows, ["views", str(moment.taken)]], "phase": moment.advice}
+def page_state(moment: Moment, flat: Flat | None) -> dict[str, Any]:
+    rows: list[list[str | float]] = [
+        [name, f"{100 * share:.0f} %", share] for name, share in moment.covered.items()
+    ]
+    rows.append(["views", str(moment.taken)])
+    if flat is not None:
+        by = f"by {flat.views} views"
+        rows.append(["lens", f"{by}: undistorted below, what is straight must look straight"])
+    return {"rows": rows, "phase": moment.advice}
 
 
 class _Keeper:

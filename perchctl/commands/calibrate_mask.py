@@ -9,8 +9,8 @@ from pathlib import Path
 
 from perchctl.calibration.gear import learn_gear, mask_png
 from perchctl.calibration.types import Grey
-from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
+from perchctl.commands.calibrate_source import Source
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_record, say
 from perchctl.errors import TimedOut
@@ -21,14 +21,14 @@ LIVE_S = 20.0
 _PAUSE_S = 0.005
 
 
-def write_mask(source: str, output: Path, force: bool, as_json: bool) -> int:
+def write_mask(source: Source, output: Path, force: bool, as_json: bool) -> int:
     """Learn the mask and write it; returns the exit code.
 
     Errors: NotFound, InvalidValue, TimedOut (a silent camera).
     """
     check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
-        frames = open_source(source, 0.0, None, time.monotonic)
+        frames = source.open()
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().installed())
         if frames.live:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
@@ -49,7 +49,7 @@ def collect(request: CollectRequest, path: Path) -> None:
         if not 0.0 <= getattr(request, name) <= 50.0:
             raise InvalidValue(f"--{name} {getattr(request, name):g} must be between 0 and 50")
     profile = load_profile(request.profile, with_weights=False)
-    camera = load_calibration(profile.camera.calibration)
+    camera = camera_of(profile.camera)
     if request.truth == "sim":
         _collect_simulated(request, path, profile, camera)
     else:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of
 from perchctl.commands.interrupt import signals_to_operator
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port
@@ -139,6 +139,7 @@ def plan_text(options: FlyOptions) -> str:
     lines = [
         f"vehicle      {resolved['uri']}" + (f", seed {options.seed}" if options.simulated else ""),
         f"camera       {resolved['source']}, calibration {resolved['calibration_file']}"
+        + (f" {options.profile.camera.cam}" if options.profile.camera.cam else "")
         + (f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""),
         f"profile      {resolved['profile_file']}: {options.profile.description}".rstrip(": "),
         f"target       {target.large.side_m * 1e3:g} mm {target.large.dictionary}/"
@@ -232,7 +233,7 @@ def live_page(
     if port is None:
         return contextlib.nullcontext()
     return flight_page(
-        load_calibration(options.profile.camera.calibration),
+        camera_of(options.profile.camera),
         f"perchctl fly {options.uri}",
         options.profile.target.large.side_m,
         port,

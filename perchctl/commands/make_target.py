@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of, load_calibration
 from perchctl.commands.make_target_measured import write_measured
 from perchctl.commands.make_target_request import (
     TargetOutcome,
     TargetRequest,
+    check_request,
     check_within,
     requested_target,
 )
@@ -45,7 +46,7 @@ def run(request: TargetRequest) -> int:
 
     Raises NotFound, InvalidValue, UsageError; then nothing has been written.
     """
-    _check_request(request)
+    check_request(request)
     if request.board is not None:
         outcome = _board(request, request.board)
     elif request.measured_large is not None or request.measured_small is not None:
@@ -65,30 +66,6 @@ def run(request: TargetRequest) -> int:
     else:
         print("\n".join(outcome.lines))
     return 0
-
-
-def _check_request(request: TargetRequest) -> None:
-    """Raises UsageError for options that do not go together."""
-    measured = request.measured_large is not None or request.measured_small is not None
-    tasks = [
-        name
-        for name, given in (
-            ("--board", request.board is not None),
-            ("--camera", request.camera is not None),
-            ("--measured-large and --measured-small", measured),
-        )
-        if given
-    ]
-    if len(tasks) > 1:
-        raise UsageError(f"{tasks[0]} and {tasks[1]} are different tasks: give one of them")
-    if request.camera is None:
-        for name, given in (
-            ("--ceiling", request.ceiling_m is not None),
-            ("--suggest", request.suggest),
-            ("--plot", request.plot is not None),
-        ):
-            if given:
-                raise UsageError(f"{name} needs --camera with a calibration file")
 
 
 def _target(request: TargetRequest, profile: Profile, target: TargetConfig) -> TargetOutcome:
@@ -119,17 +96,19 @@ def _target(request: TargetRequest, profile: Profile, target: TargetConfig) -> T
 def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
     """What the profile's camera sees of that target to the end; nothing without a
     calibration, as a sheet needs none."""
-    name = profile.camera.calibration
     try:
-        camera = load_calibration(name)
+        camera = camera_of(profile.camera)
     except PerchError:
         return []
+    name = profile.camera.calibration
     return [f"{name}: {text}" for text in blind_lines(mounted(target, camera, profile))]
 
 
 def _board(request: TargetRequest, notation: str) -> TargetOutcome:
     """The sheet of a calibration board."""
     board = parse_board(notation)
+    if board.scale != (1.0, 1.0):
+        raise UsageError(f"--board {notation}: a board is printed as meant; leave out :measured=")
     page = board_page(board, parse_page(request.page))
     files = _sheet_files(request, "board.pdf", [page], f"perchctl {board.notation()}")
     lines = [
@@ -177,7 +156,7 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
         check_within("--ceiling", request.ceiling_m, 0.3, 50.0, "m")
     profile = load_profile(request.profile or DEFAULT_PROFILE)
     path = find_calibration(camera_name)
-    camera = load_calibration(path)
+    camera = load_calibration(path, cam=request.cam)
     plot = request.plot or (SUGGESTION_PLOT if request.suggest else DESIGN_PLOT)
     check_output(plot, (".png",), request.force)
     optics = Optics(request.blur_px, request.noise)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,30 @@ from perchctl.profile.dictionaries import check_marker_id
 from perchctl.target.lengths import millimetres, parse_length
 
 SIDE_LIMITS_M = (0.004, 2.0)
+
+_PROFILE = {"profile": "-p"}
+_OUTPUT = {"output": "-o"}
+_PAGE = {"page": "--page"}
+_SHEET = _PAGE | {"png_dpi": "--png", "svg": "--svg"}
+_MAGNET = {"magnet": "--magnet"}
+_MARKERS = {
+    "large": "--large",
+    "large_id": "--large-id",
+    "large_dict": "--large-dict",
+    "small": "--small",
+    "small_id": "--small-id",
+    "small_dict": "--small-dict",
+}
+_DESIGN = {
+    "cam": "--cam",
+    "ceiling_m": "--ceiling",
+    "blur_px": "--blur",
+    "noise": "--noise",
+    "plot": "--plot",
+    "suggest": "--suggest",
+}
+_OPTIONS = _PROFILE | _OUTPUT | _SHEET | _MAGNET | _MARKERS | _DESIGN
+"""Options of some tasks only, by their field; --force and --json go with every task."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +57,7 @@ class TargetRequest:
     svg: bool = False
     board: str | None = None
     camera: str | None = None
+    cam: str | None = None
     ceiling_m: float | None = None
     blur_px: float = 1.0
     noise: float = 5.0
@@ -56,6 +81,55 @@ class TargetOutcome:
     files: dict[Path, bytes]
     lines: list[str]
     record: dict[str, Any]
+
+
+def check_request(request: TargetRequest) -> None:
+    """Raises UsageError for tasks that exclude each other, and for an option that would
+    change nothing of what the task writes."""
+    tasks = _tasks(request)
+    if len(tasks) > 1:
+        raise UsageError(f"{tasks[0]} and {tasks[1]} are different tasks: give one of them")
+    task = tasks[0] if tasks else ""
+    allowed = _allowed(request, task)
+    for field in fields(request):
+        name = _OPTIONS.get(field.name)
+        if name is None or name in allowed or getattr(request, field.name) == field.default:
+            continue
+        if not task:
+            raise UsageError(f"{name} needs --camera with a calibration file")
+        if request.suggest and name in _MARKERS.values():
+            raise UsageError(f"{name} does not go with --suggest, which proposes both markers")
+        if task == "--camera" and name not in _DESIGN.values():
+            raise UsageError(f"{name} is for the sheet, which --camera prints with -o only")
+        raise UsageError(
+            f"{name} does not go with {task}, which takes {', '.join(allowed)}: leave it out"
+        )
+
+
+def _tasks(request: TargetRequest) -> list[str]:
+    """What is asked for instead of the target's sheet, as it was named."""
+    measured = request.measured_large is not None or request.measured_small is not None
+    named = {
+        "--board": request.board is not None,
+        "--camera": request.camera is not None,
+        "--measured-large and --measured-small": measured,
+    }
+    return [name for name, given in named.items() if given]
+
+
+def _allowed(request: TargetRequest, task: str) -> tuple[str, ...]:
+    if task == "--board":
+        options = _OUTPUT | _SHEET
+    elif task == "--camera" and request.suggest:
+        options = _PROFILE | _OUTPUT | _PAGE | _MAGNET | _DESIGN
+    elif task == "--camera":
+        printed = _SHEET | _MAGNET if request.output is not None else {}
+        options = _PROFILE | _OUTPUT | _MARKERS | _DESIGN | printed
+    elif task:
+        options = _PROFILE | _OUTPUT | _MARKERS
+    else:
+        options = _PROFILE | _OUTPUT | _SHEET | _MAGNET | _MARKERS
+    return tuple(options.values())
 
 
 def requested_target(request: TargetRequest, profile: Profile) -> TargetConfig:

@@ -53,6 +53,7 @@ class TrackRequest:
     source: str
     profile: str = "sim"
     calibration: Path | None = None
+    cam: str | None = None
     stills: bool = False
     as_json: bool = False
     csv: Path | None = None
@@ -69,6 +70,7 @@ class TrackOptions:
     source: str
     profile: Profile
     calibration: Path
+    cam: str | None
     stills: bool
     outputs: OutputOptions
     page_port: int | None
@@ -93,8 +95,9 @@ def resolve(request: TrackRequest) -> TrackOptions:
             check_output(path, (suffix,), request.force)
     if request.calibration is None:
         calibration = find_calibration(profile.camera.calibration)
+        cam = request.cam or profile.camera.cam
     else:
-        calibration = find_calibration(str(request.calibration))
+        calibration, cam = find_calibration(str(request.calibration)), request.cam
     port = page_port(request.view, request.view_port)
     elsewhere = request.csv or request.overlay or port is not None
     outputs = OutputOptions(
@@ -103,7 +106,7 @@ def resolve(request: TrackRequest) -> TrackOptions:
         csv=request.csv,
         overlay=request.overlay,
     )
-    return TrackOptions(source, profile, calibration, request.stills, outputs, port)
+    return TrackOptions(source, profile, calibration, cam, request.stills, outputs, port)
 
 
 def track(
@@ -203,12 +206,12 @@ class _Run:
         stop: Stopper,
         stack: contextlib.ExitStack,
     ) -> None:
-        camera = load_sized(options.calibration)
+        camera = load_sized(options.calibration, options.cam)
         self.input = _open(options, None if camera is None else camera.size_px, now)
         source = self.input.source
         stack.callback(source.close)
         if camera is None:
-            camera = load_calibration(options.calibration, source.size_px)
+            camera = load_calibration(options.calibration, source.size_px, options.cam)
             say(assumed_size(options.calibration, camera.size_px))
         self.camera = camera
         check_size(source.size_px, camera, self.input.file_name(0))

@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of
 from perchctl.errors import PerchError
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
@@ -59,7 +59,7 @@ class FaultyFlight:
     ) -> None:
         self._profile, self._case, self._log = profile, case, log
         self._scenario = scenario = _scenario_of(case, scenario)
-        camera = load_calibration(profile.camera.calibration)
+        camera = camera_of(profile.camera)
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target)
         radio = FaultyRadio()
         radio.serves(vehicle.firmware)

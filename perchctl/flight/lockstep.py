@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link.mock import MockLink
 from perchctl.log.watch import LogWatcher
@@ -145,7 +145,7 @@ def fly_lockstep(
         flight = fly_lockstep(profile, log=watcher, scenario=scenario, operator_at=operator_at)
         watcher.close(flight.report, flight.perched_miss_m, flight.fell)
         return flight
-    camera = load_calibration(profile.camera.calibration)
+    camera = camera_of(profile.camera)
     vehicle = SimulatedVehicle(scenario, camera, profile.target)
     link = MockLink(vehicle, profile.link.telemetry_period_s)
     assert vehicle.camera is not None

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
 from perchctl.camera.source import FrameSource
@@ -86,7 +86,7 @@ def fly_session(
     """
     check_options(options)
     profile, clock, switch = options.profile, WallClock(), switch or OperatorSwitch()
-    camera = load_calibration(profile.camera.calibration)
+    camera = camera_of(profile.camera)
     pipeline = make_pipeline(profile, camera)
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None

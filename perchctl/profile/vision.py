@@ -33,6 +33,7 @@ class Mounting(Section):
 class CameraConfig(Section):
     source: str = "sim:"
     calibration: str = "example_640x480.yaml"
+    cam: str | None = None
     latency_s: float = Field(0.07, ge=0, le=1)
     mount: Mounting = Mounting()
     start_timeout_s: float = Field(8.0, gt=0, le=60)

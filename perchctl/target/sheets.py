@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.boards import Board, board_rectangles
+from perchctl.target.board_drawing import board_rectangles
+from perchctl.target.boards import Board
 from perchctl.target.drawing import black_rectangles, draw_target, marker_cells
 from perchctl.target.lengths import millimetres
 from perchctl.target.page import (
@@ -95,6 +96,8 @@ def board_page(board: Board, page: tuple[float, float]) -> Page:
     texts = (
         f"perchctl {board.notation()}   print at 100 %, not scaled: both rulers must measure "
         f"100 mm",
+        f"Then measure the black area ({width:g} x {height:g} mm) and give its sides to perchctl "
+        f"calibrate --measured-width and --measured-height.",
     )
     left = max(UNPRINTABLE, cx - width / 2)
     lines = wrapped(texts, _LABEL, w - UNPRINTABLE - left)

@@ -26,12 +26,14 @@ from perchctl.display.page.sketch import Sketch
 from perchctl.errors import TimedOut
 from perchctl.vision.types import CameraModel, Frame
 from tests.helpers.boards import (
+    APRILGRID,
     CHARUCO,
     CHESSBOARD,
     BoardRenderer,
     corner_view,
     draw_camera,
     draw_poses,
+    render_folder,
 )
 
 BOARD = CHARUCO.notation()
@@ -175,6 +177,74 @@ def test_the_wrong_board_says_what_was_seen(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture(scope="module")
+def april_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CameraModel]:
+    camera = draw_camera(np.random.default_rng(8), (480, 360))
+    folder = tmp_path_factory.mktemp("april")
+    render_folder(folder, camera, APRILGRID, 8, seed=8)
+    return folder, camera
+
+
+def test_an_aprilgrid_by_kalibr_s_own_file(april_folder: Rendered, tmp_path: Path) -> None:
+    folder, truth = april_folder
+    board = tmp_path / "april_6x6.yaml"
+    board.write_text(
+        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.022\ntagSpacing: 0.3\n"
+    )
+    output = tmp_path / "camera.yaml"
+    result = calibrate(f"images:{folder}", "-b", str(board), "-o", str(output), "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    error = np.abs(parameters_of(load_calibration(output)) - parameters_of(truth))
+    assert (error < 3.5 * np.array(list(told["std"].values()))).all()
+    assert error[:2].max() < 0.7
+    assert told["views_used"] == 8
+    assert told["rms_px"] < 0.12
+    assert yaml.safe_load(output.read_text())["board"] == APRILGRID.notation()
+
+
+@pytest.mark.parametrize(
+    ("board", "hint"),
+    [
+        ("aprilgrid:5x6:22mm:0.3", "an aprilgrid of 6 columns and 6 or more rows"),
+        ("aprilgrid:7x6:22mm:0.3", "an aprilgrid of 6 columns and 6 or more rows"),
+        ("aprilgrid:6x4:22mm:0.3", "larger board than aprilgrid:6x4:22mm:0.3: use --board "
+         "aprilgrid:6x6:22mm:0.3"),
+        (BOARD, "they show AprilTags"),
+        ("chessboard:9x6:25mm", "they show AprilTags"),
+    ],
+)  # fmt: skip
+def test_the_wrong_board_for_an_aprilgrid_says_what_was_seen(
+    april_folder: Rendered, tmp_path: Path, board: str, hint: str
+) -> None:
+    pictures = f"{april_folder[0]}/board_0[0123].png"
+    assert hint in refused(calibrate(pictures, "-b", board, "-o", f"{tmp_path}/o.yaml"), 30)
+
+
+def test_an_aprilgrid_named_for_another_board_says_what_was_seen(
+    rendered: Rendered, tmp_path: Path
+) -> None:
+    pictures = f"{rendered[0]}/board_0[0123].png"
+    said = refused(calibrate(pictures, "-b", "aprilgrid", "-o", f"{tmp_path}/o.yaml"), 30)
+    assert "is it a charuco board?" in said
+
+
+def test_a_print_is_measured_along_both_sides(rendered: Rendered, tmp_path: Path) -> None:
+    output = tmp_path / "o.yaml"
+    words = (f"images:{rendered[0]}", "-b", BOARD, "-o", str(output))
+    said = refused(calibrate(*words, "--measured-width", "249.5"), 2)
+    assert "--measured-width and --measured-height go together" in said
+    said = refused(calibrate(*words, "--measured-width", "24.9", "--measured-height", "17.4"), 30)
+    assert "measure its black area, in mm" in said
+    result = calibrate(*words, "--measured-width", "245.8", "--measured-height", "17.41cm")
+    assert result.exit_code == 0, result.output
+    assert "width: 245.8 mm, -1.68 % against 250 mm" in result.stderr
+    assert "was the page scaled" in result.stderr
+    assert "height: 174.1 mm, -0.51 % against 175 mm" in result.stderr
+    board = yaml.safe_load(output.read_text())["board"]
+    assert board == f"{BOARD}:measured=245.8x174.1mm"
+
+
 @pytest.mark.parametrize("named", ["chessboard:8x6:25mm", "chessboard:11x8:25mm"])
 def test_the_wrong_chessboard_says_what_was_seen(
     chessboard_folder: Path, tmp_path: Path, named: str
@@ -198,10 +268,38 @@ def test_two_views_only(rendered: Rendered, tmp_path: Path) -> None:
     assert "add 3" in sentence
 
 
+def test_pictures_named_one_by_one_are_the_folder_s(
+    calibrated: Result, rendered: Rendered, tmp_path: Path
+) -> None:
+    """As a shell hands over board*.png; one of them named twice is one picture."""
+    words = [str(p) for p in sorted(rendered[0].iterdir())]
+    result = calibrate(*words, words[3], "-b", BOARD, "-o", f"{tmp_path}/o.yaml", "--json")
+    assert result.exit_code == 0, result.output
+    told, folder = json.loads(result.stdout), json.loads(calibrated.stdout)
+    assert {k: told[k] for k in ("fx", "views_used", "rms_px")} == {
+        k: folder[k] for k in ("fx", "views_used", "rms_px")
+    }
+
+
+def test_many_sources_must_all_be_pictures(rendered: Rendered, tmp_path: Path) -> None:
+    one, two = (f"{rendered[0]}/board_0{k}.png" for k in (0, 1))
+    output = ("-o", f"{tmp_path}/o.yaml")
+    assert "does not exist" in refused(calibrate(one, f"{tmp_path}/no.png", *output), 20)
+    for other in (str(rendered[0]), "camera:0"):
+        said = refused(calibrate(one, two, other, *output), 20 if ":" in other else 2)
+        assert other in said
+    said = refused(calibrate(one, two, "-b", "chessboard:9x6:25mm", *output), 30)
+    assert "none of 2 pictures of" in said
+    assert "and 1 more shows" in said
+
+
 def test_usage() -> None:
     refused(calibrate(), 2)
     refused(calibrate("camera:0", "--convert", "x.yaml"), 2)
     refused(calibrate("images:/nowhere"), 20)
+    sides = ("--measured-width", "249", "--measured-height", "174")
+    assert "look for none" in refused(calibrate("--convert", "x.yaml", *sides), 2)
+    assert "look for none" in refused(calibrate("images:.", "--mask", "x.png", *sides), 2)
     refused(calibrate("images:.", "-b", "chess:9x6"), 30)
     refused(calibrate("images:.", "--model", "cubic"), 30)
 
@@ -290,6 +388,7 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     views = capture(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
     assert 5 <= len(views) <= 7
     assert sum(m.shot for m in moments) == len(views)
+    assert [len(m.views) for m in moments] == [m.taken for m in moments]
     shots = [m.index for m in moments if m.shot]
     assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
     assert moments[0].advice == "hold still"
@@ -410,7 +509,7 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
 def test_the_page_s_bars_are_shares_and_no_characters() -> None:
     image = np.zeros((4, 4), np.uint8)
     covered = {"x": 0.5, "y": 0.0, "size": 1.0, "tilt": 0.25}
-    state = page_state(Moment(0, image, np.empty((0, 2)), covered, 3, "hold still", False))
+    state = page_state(Moment(0, image, np.empty((0, 2)), covered, 3, "hold still", False), None)
     assert state["phase"] == "hold still"
     *bars, views = state["rows"]
     assert [(name, share) for name, _, share in bars] == list(covered.items())

@@ -10,11 +10,15 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration.files import camera_of, load_calibration
 from perchctl.calibration.lens import COEFFICIENTS, MODEL_NAMES, parameters_of
 from perchctl.calibration.solve import calibrate
 from perchctl.calibration.writing import calibration_text, camera_text
+from perchctl.cli import app
+from perchctl.errors import InvalidValue
+from perchctl.profile import CameraConfig
 from perchctl.vision.types import CameraModel
 from tests.helpers.boards import corner_views, draw_camera
 
@@ -107,3 +111,71 @@ def test_kalibr_s_file_is_read(tmp_path: Path) -> None:
     assert parameters_of(written).tolist() == [
         400.5, 401.5, 320.25, 240.75, -0.2, 0.05, 0.001, -0.002, 0.0,
     ]  # fmt: skip
+
+
+def _camchain(path: Path) -> Path:
+    """Kalibr's file of two cameras, cam0 with a focal length of 300 px, cam1 with 400 px."""
+    path.write_text(
+        "\n".join(
+            f"cam{k}:\n  camera_model: pinhole\n  distortion_model: radtan\n"
+            f"  distortion_coeffs: [-0.2, 0.05, 0.001, -0.002]\n"
+            f"  intrinsics: [{300 + 100 * k}.0, {300 + 100 * k}.0, 320.0, 240.0]\n"
+            f"  resolution: [640, 480]\n  T_cn_cnm1: []"
+            for k in (0, 1)
+        )
+    )
+    return path
+
+
+def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
+    chain = _camchain(tmp_path / "camchain.yaml")
+    assert load_calibration(chain, cam="cam0").K[0, 0] == 300.0
+    assert load_calibration(chain, cam="cam1").K[0, 0] == 400.0
+    assert camera_of(CameraConfig(calibration=str(chain), cam="cam1")).K[0, 0] == 400.0
+    with pytest.raises(InvalidValue, match=r"2 cameras \(cam0, cam1\): name one with --cam cam0"):
+        load_calibration(chain)
+    with pytest.raises(InvalidValue, match=r"no camera 'cam2'; its cameras are cam0, cam1"):
+        load_calibration(chain, cam="cam2")
+    with pytest.raises(InvalidValue, match="is no Kalibr file"):
+        load_calibration("example_640x480.yaml", cam="cam0")
+
+
+@pytest.mark.parametrize("words", [
+    ("calibrate", "--convert", "{chain}", "-o", "{out}.yaml"),
+    ("calibrate", "{pictures}", "--check", "{chain}"),
+    ("make-target", "--camera", "{chain}", "--plot", "{out}.png"),
+    ("track", "{pictures}", "--stills", "--json", "--calibration", "{chain}"),
+    ("track", "{pictures}", "--stills", "--json", "-p", "{profile}"),
+])  # fmt: skip
+def test_every_command_that_reads_kalibr_s_file_takes_the_camera(
+    tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    """And says which there are where none is named."""
+    (tmp_path / "pictures").mkdir()
+    cv2.imwrite(str(tmp_path / "pictures" / "grey.png"), np.full((480, 640), 90, np.uint8))
+    profile = tmp_path / "mine.yaml"
+    profile.write_text("extends: sim\ncamera: {calibration: camchain.yaml}\n")
+    places = {
+        "chain": str(_camchain(tmp_path / "camchain.yaml")),
+        "pictures": f"images:{tmp_path / 'pictures'}",
+        "profile": str(profile),
+        "out": str(tmp_path / "out"),
+    }
+    command = [word.format(**places) for word in words]
+    without = CliRunner().invoke(app, command)
+    named = CliRunner().invoke(app, [*command, "--cam", "cam1"])
+    assert without.exit_code == 30
+    assert "holds 2 cameras (cam0, cam1)" in without.stderr
+    assert "cameras" not in named.stderr
+    if "--check" not in words:  # which goes on to find no board
+        assert named.exit_code == 0, named.output
+    wrong = CliRunner().invoke(app, [*command, "--cam", "cam7"])
+    assert wrong.exit_code == 30
+    assert "its cameras are cam0, cam1" in wrong.stderr
+
+
+@pytest.mark.parametrize("words", [("calibrate", "images:."), ("make-target",)])
+def test_a_camera_of_no_file_is_refused(words: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(app, [*words, "--cam", "cam0"])
+    assert result.exit_code == 2
+    assert "--cam" in result.stderr

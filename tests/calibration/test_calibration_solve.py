@@ -295,3 +295,22 @@ def test_a_check_by_frontal_views_says_that_it_cannot_tell() -> None:
         check(camera, views)
     with pytest.raises(InvalidValue, match="at least 3"):
         check(camera, views[:2])
+
+
+def test_a_print_stretched_along_one_side_is_mended_by_its_measured_sides() -> None:
+    """A printer's feed is off by 0.5 %, and the board is held upright: as it was meant it
+    bends the lens; one that is larger as a whole changes nothing."""
+    rng = np.random.default_rng(3)
+    camera = draw_camera(rng)
+    printed = CHARUCO.measured(0.250, 0.175 * 1.005)
+    views = corner_views(rng, camera, printed, noise_px=0.03)
+    meant = [dataclasses.replace(v, object_m=CHARUCO.corners_m()[v.ids]) for v in views]
+    larger = [dataclasses.replace(v, object_m=1.004 * v.object_m) for v in views]
+    known, wrong, scaled = (calibrate(v, "", "plumb_bob", False) for v in (views, meant, larger))
+    assert known.solution.rms_px < 0.06
+    assert wrong.solution.rms_px > 2 * known.solution.rms_px
+    truth = parameters_of(camera)
+    off, mended = (np.abs(parameters_of(c.camera) - truth)[:2].max() for c in (wrong, known))
+    assert mended < 0.3
+    assert off > 3 * mended
+    assert parameters_of(scaled.camera) == pytest.approx(parameters_of(known.camera), rel=1e-4)

@@ -68,6 +68,9 @@ def test_the_command_writes_a_mask(tmp_path: Path) -> None:
     again = calibrate(f"images:{tmp_path / 'turned'}", "--mask", str(file))
     assert again.exit_code == InvalidValue.exit_code
     assert "--force" in again.stderr
+    files = [str(path) for path in (tmp_path / "turned").iterdir()]
+    assert calibrate(*files, "--mask", str(file), "--force").exit_code == 0
+    assert (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == image).all()
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 
 from perchctl.display.page.server import PageServer
-from perchctl.display.page.sketch import Sketch, draw
+from perchctl.display.page.sketch import Sketch, draw, draw_flat
 from perchctl.errors import InvalidValue
 from perchctl.vision.types import CameraModel
 
@@ -64,7 +64,7 @@ class LivePage:
         self._number = 0
         self._frame: int | None = None
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
-        self._jpeg: tuple[int, bytes] = (0, b"")
+        self._jpegs: dict[bool, tuple[int, bytes]] = {}
         self._describe: Callable[[], State] = dict
         try:
             self._server = PageServer(self, port)
@@ -111,6 +111,7 @@ class LivePage:
             described = {}
         stop = "none" if self._on_stop is None else "requested" if self._stop_requested else "ready"
         fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
+        fixed["flat"] = self._is_there(-1, flat=True)  # there is a picture without distortion
         return described | fixed | {"page_problem": self.problem}
 
     def rate_hz(self) -> float:
@@ -121,21 +122,33 @@ class LivePage:
             return 0.0
         return (len(times) - 1) / (times[-1] - times[0])
 
-    def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
-        """The newest picture if newer than `number`, drawn; None when none came for a while."""
+    def jpeg_after(self, number: int, flat: bool = False) -> tuple[int, bytes] | None:
+        """The newest picture if newer than `number`, drawn; or the same `flat`, without the
+        lens's distortion. None when none came for a while."""
         with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._number > number, WAIT_S)
+            self._changed.wait_for(lambda: self.closed or self._is_there(number, flat), WAIT_S)
             newest, sketch = self._number, self._sketch
-        if sketch is None or newest <= number:
-            return None
+            if sketch is None or not self._is_there(number, flat):
+                return None
         with self._drawing:  # once, for all readers
-            if self._jpeg[0] < newest:
+            known = self._jpegs.get(flat)
+            if known is None or known[0] < newest:
+                picture = draw_flat(sketch) if flat else draw(sketch, self.camera)
+                if picture is None:
+                    return None
                 quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-                ok, jpeg = cv2.imencode(".jpg", draw(sketch, self.camera), quality)
+                ok, jpeg = cv2.imencode(".jpg", picture, quality)
                 if not ok:
                     return None
-                self._jpeg = (newest, jpeg.tobytes())
-            return self._jpeg
+                known = self._jpegs[flat] = (newest, jpeg.tobytes())
+            return known
+
+    def _is_there(self, number: int, flat: bool) -> bool:
+        """Whether a picture newer than `number` has come, and can be drawn `flat`."""
+        sketch = self._sketch
+        if sketch is None or self._number <= number:
+            return False
+        return not flat or sketch.flat_places_px is not None
 
     def pause(self, seconds: float) -> bool:
         """Wait, less when the page closes; True when it has."""

@@ -44,7 +44,7 @@ class Content(Protocol):
 
     def state(self) -> dict[str, Any]: ...
 
-    def jpeg_after(self, number: int) -> tuple[int, bytes] | None: ...
+    def jpeg_after(self, number: int, flat: bool = False) -> tuple[int, bytes] | None: ...
 
     def pause(self, seconds: float) -> bool: ...
 
@@ -82,16 +82,17 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if not self._from_here():
             return
-        match urlsplit(self.path).path:
+        wanted = urlsplit(self.path).path
+        match wanted:
             case "/":
                 self._send_page()
             case "/state":
                 state = json.dumps(self.server.page.state())
                 self._send(200, "application/json", state.encode())
-            case "/stream":
-                self._send_stream()
+            case "/stream" | "/flat":
+                self._send_stream(flat=wanted == "/flat")
             case _:
-                self._refuse(404, "there is /, /state and /stream")
+                self._refuse(404, "there is /, /state, /stream and /flat")
 
     def do_POST(self) -> None:
         if not self._from_here():
@@ -127,22 +128,22 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.page.opened.set()
         self._send(200, "text/html; charset=utf-8", html.encode(), policy)
 
-    def _send_stream(self) -> None:
+    def _send_stream(self, flat: bool) -> None:
         if not self.server.streams.acquire(blocking=False):
             self._refuse(503, f"{MAX_STREAMS} others are looking already")
             return
         try:
-            self._stream()
+            self._stream(flat)
         finally:
             self.server.streams.release()
 
-    def _stream(self) -> None:
+    def _stream(self, flat: bool) -> None:
         self._head(200, f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
         self.end_headers()
         self.wfile.write(f"--{_BOUNDARY}\r\n".encode())
         page, number = self.server.page, 0
         while not page.closed:
-            newest = page.jpeg_after(number)
+            newest = page.jpeg_after(number, flat)
             if newest is None:
                 continue
             number, jpeg = newest

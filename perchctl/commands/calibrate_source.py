@@ -1,0 +1,95 @@
+"""What `perchctl calibrate` takes its views from: one source, or many picture files."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from perchctl.calibration.types import Grey
+from perchctl.camera.files import (
+    IMAGE_SUFFIXES,
+    BrokenPicture,
+    ImagesSource,
+    VideoSource,
+    image_files,
+    read_grey,
+)
+from perchctl.camera.open import open_source, source_spec
+from perchctl.camera.source import FrameSource
+from perchctl.errors import NotFound, UsageError
+
+_SAMPLES = 4
+_SAMPLE_EVERY = 30  # frames of a video
+
+
+@dataclass(frozen=True)
+class Source:
+    """A source as `open_source` takes it, or the picture files that were named one by one."""
+
+    spec: str
+    files: tuple[Path, ...] = ()
+
+    def __str__(self) -> str:
+        """How messages name it."""
+        return f"{self.files[0]} and {len(self.files) - 1} more" if self.files else self.spec
+
+    @property
+    def scheme(self) -> str:
+        """``images``, ``video``, or a live source's."""
+        return self.spec.partition(":")[0]
+
+    @property
+    def place(self) -> str:
+        """What stands behind the scheme: a path, for ``images`` and ``video``."""
+        return str(Path(self.spec.partition(":")[2]).expanduser())
+
+    def pictures(self) -> list[Path]:
+        """The picture files of a source of ``images``. Raises NotFound: there are none."""
+        return image_files(self.files or self.place)
+
+    def open(self) -> FrameSource:
+        """Its frames, of a live source too. Errors: those of `open_source`."""
+        if self.files:
+            return ImagesSource(self.files)
+        return open_source(self.spec, 0.0, None, time.monotonic)
+
+    def samples(self) -> list[Grey]:
+        """A few pictures from over the whole recording."""
+        if self.scheme == "images":
+            paths = self.pictures()
+            step = max(1, len(paths) // _SAMPLES)
+            samples: list[Grey] = []
+            for path in paths[::step][:_SAMPLES]:
+                with contextlib.suppress(BrokenPicture):  # which has been told
+                    samples.append(read_grey(path))
+            return samples
+        source = VideoSource(Path(self.place))
+        frames: list[Grey] = []
+        while (frame := source.poll(0.0)) is not None and len(frames) < _SAMPLES:
+            if frame.index % _SAMPLE_EVERY == 0:
+                frames.append(frame.image)
+        source.close()
+        return frames
+
+
+def source_of(words: Sequence[str]) -> Source:
+    """The source that the command line names; several words are picture files, which is what
+    a shell makes of ``left*.jpg``.
+
+    Raises NotFound, UsageError.
+    """
+    if len(words) == 1:
+        return Source(source_spec(words[0]))
+    files = tuple(Path(word) for word in words)
+    for file in files:
+        if not file.exists():
+            raise NotFound(f"{file} does not exist; several sources are picture files, one by one")
+        if not file.is_file() or file.suffix.lower() not in IMAGE_SUFFIXES:
+            raise UsageError(
+                f"{file} is no picture file: several sources must all be pictures, as in "
+                f"left*.jpg; a folder, a video or a camera stands alone"
+            )
+    return Source("images:", files)
