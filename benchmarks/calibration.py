@@ -74,9 +74,9 @@ def main() -> None:
         for e in result.errors:
             if e.z_m not in RANGES_M:
                 continue
-            true_mm = position_errors_mm(result.camera, truth, e.z_m)
+            true_mm = position_errors_mm(result.camera, truth, e.z_m, result.covered)
             for what, true, line95 in (
-                ("anywhere", true_mm.max(), e.mm95),
+                ("where boards were seen", true_mm.max(), e.mm95),
                 ("straight ahead", true_mm[0], e.axis_mm95),
             ):
                 key = f"{what} at {100 * e.z_m:g} cm"

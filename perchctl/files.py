@@ -3,39 +3,52 @@
 A file is written under a temporary name beside its place, brought to the disk, and renamed:
 a reader finds the old file or the new one, never a part of one. Logs and sessions, which grow
 line by line, are not written this way.
+
+One rule for what a command writes: an existing file is replaced with ``--force`` only, which is
+asked before any long work; folders that are missing are made.
 """
 
 from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from itertools import count
 from pathlib import Path
 
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue
+
+FORMAT = "the format that is written"
 
 
-def check_place(path: Path, *, replace: bool = True, make_folders: bool = False) -> None:
+def check_output(path: Path, suffixes: Sequence[str], force: bool, content: str = FORMAT) -> None:
+    """As `check_place`, and the name must end in one of `suffixes` (the case does not matter),
+    which the message says is `content`. Raises InvalidValue."""
+    if path.suffix.lower() not in suffixes:
+        raise InvalidValue(f"{path} must end in {' or '.join(suffixes)}, which is {content}")
+    check_place(path, force)
+
+
+def check_place(path: Path, force: bool) -> None:
     """Whether a file can be put there; to be called before any long work.
 
     Args:
-        replace: an existing file may be replaced.
-        make_folders: folders that are missing will be made.
+        force: an existing file may be replaced.
 
     Raises:
-        NotFound: the folder is missing. InvalidValue: the path is a folder, or a file that
-        must not be replaced.
+        InvalidValue: the path is a folder, a file that must not be replaced, or where no file
+        and no folder can be made.
     """
-    if path.is_dir():
+    # Of os.path, which takes a folder without rights for one that holds nothing.
+    if os.path.isdir(path):
         raise InvalidValue(f"{path} is a folder: name a file in it")
-    if path.exists() and not replace:
+    if os.path.exists(path) and not force:
         raise InvalidValue(f"{path} exists already; add --force to replace it, or name another")
-    if not (make_folders or path.parent.is_dir()):
-        raise NotFound(
-            f"folder {path.parent} for {path.name} does not exist: make it, or name another"
-        )
+    folder = next(folder for folder in path.absolute().parents if os.path.exists(folder))
+    if not os.path.isdir(folder):
+        raise InvalidValue(f"{path} cannot be written: {folder} is a file, not a folder")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InvalidValue(f"{path} cannot be written: no right to write in {folder}")
 
 
 def same_file(one: Path, other: Path) -> bool:
@@ -49,7 +62,7 @@ def cannot_be_written(path: Path, error: OSError, more: str = "") -> InvalidValu
 
 
 class PartFile:
-    """A file under a temporary name, until it is whole.
+    """A file under a temporary name, until it is whole; its folder is made.
 
     `part` is the path to write to. It has the suffix of `path`, by which some libraries
     choose the format. All methods raise OSError.
@@ -58,6 +71,8 @@ class PartFile:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+        self._made = [folder for folder in path.parents if not folder.exists()]
+        path.parent.mkdir(parents=True, exist_ok=True)
 
     def write(self, data: bytes) -> None:
         """The whole content at once."""
@@ -73,44 +88,32 @@ class PartFile:
     def keep(self) -> None:
         """Put the file in its place."""
         os.replace(self.part, self.path)
+        self._made.clear()
 
     def drop(self) -> None:
-        """Remove the temporary file, if there is one."""
+        """Remove the temporary file, if there is one, and the folders that were made for it."""
         self.part.unlink(missing_ok=True)
+        with suppress(OSError):  # something else was put into one
+            for folder in self._made:
+                folder.rmdir()
 
 
-def write_files(
-    files: Mapping[Path, bytes], *, make_folders: bool = False, keep_old: bool = False
-) -> dict[Path, Path]:
+def write_files(files: Mapping[Path, bytes]) -> None:
     """Write all files, or none: the first is renamed when the last is on the disk.
 
-    Args:
-        make_folders: make folders that are missing; those of a failure are removed again.
-        keep_old: copy each existing file to a new name, as in ``weights.yaml.bak1``.
-
-    Returns:
-        The copies, by the path of the file that they were made of.
-
     Raises:
-        NotFound, InvalidValue: as `check_place`; or a full disk, or missing rights.
+        InvalidValue: a path is a folder; or a full disk, or missing rights.
     """
     for path in files:
-        check_place(path, make_folders=make_folders)
-    copies: dict[Path, Path] = {}
+        check_place(path, force=True)
     parts: list[PartFile] = []
     path = Path()
     try:
         with ExitStack() as undo:
             for path, data in files.items():
-                if make_folders:
-                    _make_folder(path.parent, undo)
                 parts.append(PartFile(path))
                 undo.callback(parts[-1].drop)
                 parts[-1].write(data)
-            for path in files:
-                if keep_old and path.exists():
-                    copies[path] = _copy(path)
-                    undo.callback(copies[path].unlink)
             for part in parts:
                 path = part.path
                 part.keep()
@@ -118,26 +121,3 @@ def write_files(
     except OSError as error:
         more = "; nothing was changed: free some space, or choose another place"
         raise cannot_be_written(path, error, more) from None
-    return copies
-
-
-def _make_folder(folder: Path, undo: ExitStack) -> None:
-    if not folder.exists():
-        _make_folder(folder.parent, undo)
-        folder.mkdir()
-        undo.callback(_remove_folder, folder)
-
-
-def _remove_folder(folder: Path) -> None:
-    with suppress(OSError):  # something else was put into it
-        folder.rmdir()
-
-
-def _copy(path: Path) -> Path:
-    """A copy under the next name that is free."""
-    for number in count(1):
-        copy = path.with_name(f"{path.name}.bak{number}")
-        with suppress(FileExistsError), copy.open("xb") as stream:
-            stream.write(path.read_bytes())
-            return copy
-    raise AssertionError("unreachable")

@@ -29,7 +29,7 @@ def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
 
 
 def save_png(figure: Figure, file: Path | BinaryIO) -> None:
-    """Write the figure; a file is there whole or not at all. Raises InvalidValue, NotFound."""
+    """Write the figure; a file is there whole or not at all. Raises InvalidValue."""
     content = BytesIO()
     figure.savefig(content, format="png", metadata={"Software": None})
     if isinstance(file, Path):

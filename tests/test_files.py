@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.errors import InvalidValue, NotFound
-from perchctl.files import PartFile, check_place, same_file, write_files
+from perchctl.errors import InvalidValue
+from perchctl.files import PartFile, check_output, check_place, same_file, write_files
 from tests.helpers.disk import full_disk
 
 
@@ -19,21 +19,32 @@ def test_an_existing_file_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text("mine")
     with pytest.raises(InvalidValue, match="exists already; add --force"):
-        check_place(path, replace=False)
-    check_place(path)
+        check_place(path, force=False)
+    check_place(path, force=True)
     with pytest.raises(InvalidValue, match="is a folder"):
-        check_place(tmp_path)
+        check_place(tmp_path, force=True)
 
 
-def test_a_missing_folder_is_named_or_made(tmp_path: Path) -> None:
+def test_a_missing_folder_is_made(tmp_path: Path) -> None:
     path = tmp_path / "made" / "new" / "a.txt"
-    with pytest.raises(NotFound, match=r"new for a\.txt does not exist"):
-        write_files({path: b"a"})
+    check_place(path, force=False)
     assert names(tmp_path) == []
-    check_place(path, make_folders=True)
-    assert names(tmp_path) == []
-    assert write_files({path: b"a"}, make_folders=True) == {}
+    write_files({path: b"a"})
     assert path.read_bytes() == b"a"
+    with pytest.raises(InvalidValue, match=r"a\.txt is a file, not a folder"):
+        check_place(path / "new" / "b.txt", force=True)
+
+
+def test_a_folder_without_rights_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.access", lambda place, mode: Path(place) != tmp_path)
+    with pytest.raises(InvalidValue, match=rf"no right to write in {tmp_path}$"):
+        check_place(tmp_path / "new" / "a.txt", force=True)
+
+
+def test_a_name_says_the_format(tmp_path: Path) -> None:
+    check_output(tmp_path / "a.YML", (".yaml", ".yml"), force=False)
+    with pytest.raises(InvalidValue, match=r"a\.png must end in \.yaml or \.yml, which is text"):
+        check_output(tmp_path / "a.png", (".yaml", ".yml"), force=True, content="text")
 
 
 def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
@@ -42,10 +53,10 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     files = {old: b"new", large: bytes(400_000)}
     sentence = r"report\.png cannot be written: .*nothing was changed"
     with full_disk(room=200_000), pytest.raises(InvalidValue, match=sentence):
-        write_files(files, make_folders=True, keep_old=True)
+        write_files(files)
     assert old.read_text() == "old"
     assert names(tmp_path) == ["camera.yaml"]
-    write_files(files, make_folders=True)
+    write_files(files)
     assert old.read_bytes() == b"new"
     assert large.stat().st_size == 400_000
     assert names(tmp_path) == ["camera.yaml", "made"]
@@ -55,17 +66,8 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
 def test_a_folder_in_a_file_s_place_leaves_the_others_alone(tmp_path: Path) -> None:
     (tmp_path / "b").mkdir()
     with pytest.raises(InvalidValue, match="b is a folder"):
-        write_files({tmp_path / "a": b"a", tmp_path / "b": b"b"}, keep_old=True)
+        write_files({tmp_path / "a": b"a", tmp_path / "b": b"b"})
     assert names(tmp_path) == ["b"]
-
-
-def test_the_old_file_is_kept_aside(tmp_path: Path) -> None:
-    path = tmp_path / "w.yaml"
-    assert write_files({path: b"1"}, keep_old=True) == {}
-    assert write_files({path: b"2"}, keep_old=True) == {path: tmp_path / "w.yaml.bak1"}
-    assert write_files({path: b"3"}, keep_old=True) == {path: tmp_path / "w.yaml.bak2"}
-    read = {name: (tmp_path / name).read_bytes() for name in names(tmp_path)}
-    assert read == {"w.yaml": b"3", "w.yaml.bak1": b"1", "w.yaml.bak2": b"2"}
 
 
 def test_a_part_is_hidden_beside_its_place_until_it_is_kept(tmp_path: Path) -> None:
@@ -82,6 +84,8 @@ def test_a_part_is_hidden_beside_its_place_until_it_is_kept(tmp_path: Path) -> N
     dropped.write(b"other")
     dropped.drop()
     assert file.path.read_bytes() == b"film"
+    assert names(tmp_path) == ["film.mp4"]
+    PartFile(tmp_path / "made" / "new" / "film.mp4").drop()
     assert names(tmp_path) == ["film.mp4"]
 
 

@@ -87,6 +87,14 @@ def coverage(views: Sequence[View]) -> NDArray[np.bool_]:
     return map_.astype(np.bool_)
 
 
+def is_covered(map_: NDArray[np.bool_], points_px: Array, size_px: tuple[int, int]) -> bool:
+    """Whether all of the points (n, 2) lie in covered cells."""
+    rows, columns = map_.shape
+    cells = np.floor((points_px + 0.5) / size_px * (columns, rows)).astype(np.intp)
+    x, y = np.clip(cells, 0, (columns - 1, rows - 1)).T
+    return bool(map_[y, x].all())
+
+
 def uncovered_text(map_: NDArray[np.bool_]) -> str:
     """The emptier ninths of the picture, the emptiest first: 'at the top left and right'."""
     thirds = [

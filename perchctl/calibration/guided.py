@@ -44,15 +44,15 @@ def capture(
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
-) -> tuple[list[View], list[Grey]]:
-    """Views taken, and their pictures, until all is covered or `stopped`.
+) -> list[View]:
+    """Views taken, until all is covered or `stopped`; `show` gets each frame, those that are
+    taken with `Moment.shot`.
 
     A source that is gone ends the capture with what there is, if that may be enough.
 
     Raises TimedOut: the camera is gone before that.
     """
     state = Capture()
-    pictures: list[Grey] = []
     last_s = clock()
     while not (state.finished or stopped()):
         frame = source.poll(clock())
@@ -71,8 +71,6 @@ def capture(
         name = f"view {len(state.taken) + 1}"
         seen = find_board(frame.image, board, name)
         state = consider(state, seen, board)
-        if state.shot:
-            pictures.append(frame.image)
         corners = seen.corners_px if isinstance(seen, View) else np.empty((0, 2))
         show(
             Moment(
@@ -86,4 +84,4 @@ def capture(
                 state.taken,
             )
         )
-    return list(state.taken), pictures
+    return list(state.taken)

@@ -27,7 +27,8 @@ _BLUR_SHARE = 2.5 / 640.0
 @dataclass(frozen=True)
 class Signature:
     """Where and how a view shows the board: middle of its corners as a part of the width
-    and the height, size as a part of the picture, tilt about the picture's two axes."""
+    and the height, size as a part of the picture, and by how much its right and its lower side
+    are farther away than the others."""
 
     x: float
     y: float
@@ -145,7 +146,7 @@ def consider(capture: Capture, seen: View | str, board: Board) -> Capture:
     if seen.blur_px > max(_BLUR_SHARE * width, 1.0) or seen.blur_px > 2.5 * sharpest:
         return Capture(taken, signatures, seen, "too blurred: more light, or hold still")
     if not is_new(here, signatures):
-        return Capture(taken, signatures, seen, _hint(signatures))
+        return Capture(taken, signatures, seen, hint(signatures))
     grown = (*signatures, here)
     return Capture((*taken, seen), grown, seen, f"taken, {len(grown)} views", True)
 
@@ -159,13 +160,24 @@ def _moved_px(before: View | None, now: View) -> float:
     return float(np.median(np.linalg.norm(before.corners_px[a] - now.corners_px[b], axis=1)))
 
 
-def _hint(signatures: Sequence[Signature]) -> str:
+def hint(signatures: Sequence[Signature]) -> str:
+    """One thing to do, in the picture's directions: towards where the least was shown so far
+    of what is covered least."""
     done = progress(signatures)
     least = min(AXES, key=lambda axis: done[axis])
-    hints = {
-        "x": "move the board to the left and right rims",
-        "y": "move the board to the top and bottom rims",
-        "size": "come nearer, and go farther away",
-        "tilt": "tilt the board, about both axes",
-    }
-    return hints[least] if done[least] < 1.0 else "show the board somewhere new"
+    if done[least] >= 1.0:
+        return "show the board somewhere new"
+    if least != "tilt":
+        shown = [getattr(s, least) for s in signatures]
+        more = min(shown) + max(shown) < 1.0
+        return {
+            "x": f"move the board to the {'right' if more else 'left'} rim",
+            "y": f"move the board to the {'bottom' if more else 'top'} rim",
+            "size": "come nearer" if more else "go farther away",
+        }[least]
+    across, down = [s.tilt_x for s in signatures], [s.tilt_y for s in signatures]
+    if np.ptp(across) <= np.ptp(down):
+        side = "right" if min(across) + max(across) < 0.0 else "left"
+    else:
+        side = "lower" if min(down) + max(down) < 0.0 else "upper"
+    return f"tilt the board's {side} side away"

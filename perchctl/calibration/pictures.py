@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 from perchctl.calibration.detect import find_board
 from perchctl.calibration.novelty import pick
 from perchctl.calibration.types import Grey, Rejection, View
-from perchctl.camera.files import VideoSource, image_files, read_grey
+from perchctl.camera.files import BrokenPicture, VideoSource, image_files, read_grey
 from perchctl.errors import InvalidValue
 from perchctl.target.boards import Board
 from perchctl.vision.fields import field_picture, is_combed
@@ -30,18 +30,30 @@ def views_of_images(
     board: Board,
     refine: bool = True,
     progress: Progress = lambda done, total: None,
+    skip_broken: bool = False,
 ) -> tuple[list[View], list[Rejection]]:
     """Every picture of a folder or glob (or those given): the views, and those without a board.
 
+    Args:
+        skip_broken: leave out what is no picture, or only a part of one.
+
     Raises:
-        NotFound: no pictures. InvalidValue: an unreadable one, or unequal sizes.
+        NotFound: no pictures. InvalidValue: broken ones (all are named), or unequal sizes.
     """
     paths = image_files(where)
     names = _names(paths)
 
-    def look(job: tuple[str, Path]) -> tuple[str, tuple[int, int], View | str]:
+    broken: dict[str, str] = {}
+
+    def look(job: tuple[str, Path]) -> tuple[str, tuple[int, int] | None, View | str]:
         name, path = job
-        image = read_grey(path)
+        try:
+            image = read_grey(path)
+        except BrokenPicture as error:
+            broken[name] = error.reason
+            return name, None, error.reason
+        if broken and not skip_broken:
+            return name, None, ""  # only the broken ones are still asked for
         size_px = (image.shape[1], image.shape[0])
         return name, size_px, find_board(image, board, name, refine)
 
@@ -52,8 +64,9 @@ def views_of_images(
         for done, (name, size_px, seen) in enumerate(
             pool.map(look, zip(names, paths, strict=True)), start=1
         ):
-            first = first or (name, size_px)
-            if size_px != first[1]:
+            if size_px is not None:
+                first = first or (name, size_px)
+            if size_px is not None and first is not None and size_px != first[1]:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise InvalidValue(
                     f"{name} is {size_px[0]}x{size_px[1]} px but {first[0]} is "
@@ -62,7 +75,20 @@ def views_of_images(
                 )
             _sort(seen, name, views, missing)
             progress(done, len(paths))
+    if broken and not (skip_broken and first):
+        raise InvalidValue(_broken_text(broken, len(paths)))
     return views, missing
+
+
+def _broken_text(broken: Mapping[str, str], count: int) -> str:
+    """All of them by name, and what to do."""
+    named = ", ".join(f"{name} {reason}" for name, reason in broken.items())
+    if len(broken) == count:
+        return f"none of the {count} pictures can be used: {named}"
+    return (
+        f"{len(broken)} of {count} pictures cannot be used: {named}; replace or remove them, or "
+        f"leave them out with --skip-broken"
+    )
 
 
 def views_of_video(

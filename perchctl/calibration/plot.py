@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import io
-from typing import Any
+from collections.abc import Sequence
+from textwrap import wrap
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Rectangle
+from matplotlib.figure import Figure, SubFigure
 
-from perchctl.calibration.lens import PARAMETERS, pixel_derivatives, rays_of
-from perchctl.calibration.predict import draws, ray_errors_px
+from perchctl.calibration.lens import PARAMETERS
+from perchctl.calibration.predict import distortion_curve, ray_errors_px
 from perchctl.calibration.types import Calibration
 from perchctl.calibration.verdict import Level, level, limit_mm, sentence
 from perchctl.geometry import Array
@@ -26,52 +28,71 @@ from perchctl.plot import (
     new_figure,
     save_png,
 )
-from perchctl.vision.camera_model import distort, undistort
 
 BANNER: dict[Level, str] = {"fly": GREEN, "care": "#B36B00", "stop": "#B00020"}
-SIZE_IN = (13.0, 11.5)
+WIDTH_IN, PANELS_IN = 13.0, 10.8
 DPI = 100
+_HEADLINE_PT, _NOTES_PT = 13.5, 9.5
+_HEADLINE_CHARS, _NOTES_CHARS = 104, 150
+"""As many fit into the banner's width."""
+_LINE_IN = 1.45 / 72.0  # height of a line of one point
+_MARGIN_IN = 0.11
 _ARROW_SHARE = 0.06  # of the width: the largest residual's arrow
 _MOST_NAMES = 45
+_MOST_LINES = 24  # of numbers
 LIMIT_LOW = 0.5  # mm: the axis reaches down to it
+_LOOP_SHARE, _LINE_SHARE = 0.3, 0.04  # of the width
 
 
 def draw_calibration(calibration: Calibration) -> bytes:
     """The report as a PNG."""
-    figure = new_figure(*SIZE_IN, dpi=DPI)
-    grid = figure.add_gridspec(4, 2, height_ratios=(0.22, 1.25, 1.0, 1.0))
-    _banner(figure.add_subplot(grid[0, :]), calibration)
-    _coverage(figure.add_subplot(grid[1, 0]), calibration)
-    _residuals(figure.add_subplot(grid[1, 1]), calibration)
-    _views(figure.add_subplot(grid[2, 0]), calibration)
-    _target(figure.add_subplot(grid[2, 1]), calibration)
-    _distortion(figure.add_subplot(grid[3, 0]), calibration)
-    _numbers(figure.add_subplot(grid[3, 1]), calibration)
     content = io.BytesIO()
-    save_png(figure, content)
+    save_png(report_figure(calibration), content)
     return content.getvalue()
 
 
-def _banner(ax: Axes, calibration: Calibration) -> None:
-    ax.set_axis_off()
-    colour = BANNER[level(calibration)]
-    ax.add_patch(Rectangle((0, 0), 1, 1, transform=ax.transAxes, color=colour))
-    # Outside of the layout: a long sentence must not squeeze the panels.
-    style: dict[str, Any] = {"transform": ax.transAxes, "color": "white", "in_layout": False}
-    verdict = sentence(calibration)
-    size = 15 if len(verdict) < 100 else 11.5
-    ax.text(0.012, 0.64, verdict, fontsize=size, weight="bold", va="center", **style)
-    lines = _notes(calibration)
-    ax.text(0.012, 0.22, _plain("   |   ".join(lines)), fontsize=9.5, va="center", **style)
+def report_figure(calibration: Calibration) -> Figure:
+    """The verdict in a banner, and six panels."""
+    headline = wrap(sentence(calibration), _HEADLINE_CHARS)
+    notes = [line for note in _notes(calibration) for line in wrap(note, _NOTES_CHARS)]
+    banner_in = 2 * _MARGIN_IN + _LINE_IN * (_HEADLINE_PT * len(headline) + _NOTES_PT * len(notes))
+    figure = new_figure(WIDTH_IN, banner_in + PANELS_IN, dpi=DPI)
+    halves = figure.add_gridspec(2, 1, height_ratios=(banner_in, PANELS_IN))
+    banner, panels = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
+    banner.set_facecolor(BANNER[level(calibration)])
+    _write(banner, banner_in, headline, notes)
+    grid = panels.add_gridspec(3, 2, height_ratios=(1.25, 1.0, 1.0))
+    _coverage(panels.add_subplot(grid[0, 0]), calibration)
+    _residuals(panels.add_subplot(grid[0, 1]), calibration)
+    _views(panels.add_subplot(grid[1, 0]), calibration)
+    _target(panels.add_subplot(grid[1, 1]), calibration)
+    _distortion(panels.add_subplot(grid[2, 0]), calibration)
+    _numbers(panels.add_subplot(grid[2, 1]), calibration)
+    return figure
+
+
+def _write(
+    banner: SubFigure, height_in: float, headline: Sequence[str], notes: Sequence[str]
+) -> None:
+    """Line by line from the top."""
+    top_in = _MARGIN_IN
+    for lines, size_pt, weight in ((headline, _HEADLINE_PT, "bold"), (notes, _NOTES_PT, "normal")):
+        for line in lines:
+            top_in += _LINE_IN * size_pt
+            banner.text(
+                0.012, 1.0 - (top_in - 0.3 * _LINE_IN * size_pt) / height_in, _plain(line),
+                fontsize=size_pt, weight=weight, color="white", va="baseline",
+            )  # fmt: skip
 
 
 def _notes(calibration: Calibration) -> list[str]:
+    """What it rests on, and whole sentences on what would mend it."""
     out = [r for r in calibration.rejections if not r.corners]
-    notes = [
-        f"{len(calibration.views)} views, RMS {calibration.solution.rms_px:.3f} px",
-        f"{len(out)} views rejected" if out else "no view rejected",
-    ]
-    return notes + [_shorter(w, 90) for w in calibration.warnings[:2]]
+    found = (
+        f"{len(calibration.views)} views, RMS {calibration.solution.rms_px:.3f} px, "
+        f"{f'{len(out)} views rejected' if out else 'no view rejected'}"
+    )
+    return [found, *map(str, calibration.lacks)]
 
 
 def _coverage(ax: Axes, calibration: Calibration) -> None:
@@ -87,18 +108,44 @@ def _coverage(ax: Axes, calibration: Calibration) -> None:
         if view.name not in used:
             ax.plot(*view.corners_px.T, "x", markersize=4, color=VERMILLION)
     *_, each = ray_errors_px(calibration.camera, calibration.solution.covariance)
-    error = each.reshape(13, 17)
-    if np.isfinite(error).all():
-        x, y = np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 13)
-        lines = ax.contour(
-            x, y, error, levels=(0.1, 0.3, 1, 3, 10), colors=BLACK, linewidths=0.8, alpha=0.7
-        )
-        ax.clabel(lines, fmt="%g px", fontsize=8)
+    error = np.ma.masked_invalid(each.reshape(13, 17))
+    x, y = np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 13)
+    dots = np.concatenate([view.corners_px for view in calibration.seen])
+    with catch_warnings():
+        simplefilter("ignore", UserWarning)  # there may be no line at all
+        contours = ax.contour(x, y, error, levels=(0.1, 0.3, 1, 3, 10))
+    contours.remove()  # drawn by hand, without those that tell nothing
+    for value, found in zip(contours.levels, contours.allsegs, strict=True):
+        lines = [line for line in found if len(line) and _tells(line, w)]
+        for line in lines:
+            ax.plot(*line.T, color=BLACK, linewidth=0.8, alpha=0.7)
+        if lines:
+            _label(ax, f"{value:g} px", max(lines, key=len), dots, (w, h))
     covered = 100 * calibration.covered.mean()
     ax.set_title(
         f"Coverage {covered:.0f} %: orange is uncovered; lines: 95 % error of a ray", fontsize=10
     )
     _frame(ax, w, h)
+
+
+def _tells(line: Array, width_px: int) -> bool:
+    """A small closed line (n, 2) is the noise of a level that the error has everywhere, and a
+    very short one is hardly seen."""
+    closed = bool((line[0] == line[-1]).all())
+    least = _LOOP_SHARE if closed else _LINE_SHARE
+    return float(np.ptp(line, axis=0).max()) > least * width_px
+
+
+def _label(ax: Axes, text: str, line: Array, dots: Array, size_px: tuple[int, int]) -> None:
+    """On the line (n, 2), where the fewest dots are, within the frame."""
+    margin = 0.06 * size_px[0]
+    inside = np.clip(line, margin, np.array(size_px) - margin)
+    if (inside == line).all(axis=1).any():
+        inside = line[(inside == line).all(axis=1)]
+    apart = np.linalg.norm(inside[:, None] - dots[None], axis=2).min(axis=1)
+    x, y = inside[int(np.argmax(apart))]
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.9, "pad": 1.0}
+    ax.text(x, y, text, fontsize=8, ha="center", va="center", bbox=box, zorder=5, clip_on=True)
 
 
 def _residuals(ax: Axes, calibration: Calibration) -> None:
@@ -162,7 +209,15 @@ def _target(ax: Axes, calibration: Calibration) -> None:
     limit = np.array([limit_mm(z / 100) for z in fine])
     ax.fill_between(fine, limit, 1e4, color=VERMILLION, alpha=0.13, linewidth=0)
     ax.plot(fine, limit, color=VERMILLION, linewidth=1.2, label="limit for perching")
-    ax.plot(z_cm, worst, "o--", color=GREY, markersize=3, linewidth=1, label="worst in the picture")
+    ax.plot(
+        z_cm,
+        worst,
+        "o--",
+        color=GREY,
+        markersize=3,
+        linewidth=1,
+        label="worst where boards were seen",
+    )
     ax.plot(z_cm, axis, "o-", color=BLUE, markersize=4, linewidth=2, label="straight ahead")
     ax.set_xscale("log")
     ax.set_yscale("log")
@@ -188,40 +243,30 @@ def _distortion(ax: Axes, calibration: Calibration) -> None:
     corners = np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]], dtype=np.float64)
     away = corners - centre
     far = away[np.argmax(np.linalg.norm(away, axis=1))]
-    r_px, shift, spread = _radial(calibration, far)
-    ax.fill_between(r_px, shift - spread, shift + spread, color=SKY, alpha=0.4, linewidth=0)
-    ax.plot(r_px, shift, color=BLUE, linewidth=1.8)
-    ax.axhline(0, color=GREY, linewidth=0.8)
-    used = np.concatenate(
-        [np.linalg.norm(v.corners_px - centre, axis=1) for v in calibration.views]
+    far_px = float(np.linalg.norm(far))
+    r_px, shift, spread = distortion_curve(camera, calibration.solution.covariance, far)
+    ax.fill_between(
+        r_px, shift - spread, shift + spread, color=SKY, alpha=0.4, linewidth=0, label="95 % band"
     )
-    ax.axvline(float(used.max()), color=VERMILLION, linewidth=1.2, linestyle=":")
-    ax.text(float(used.max()), 0.96, " outermost corner seen", fontsize=8, va="top", ha="right",
-            rotation=90, transform=ax.get_xaxis_transform())  # fmt: skip
+    ax.plot(r_px, shift, color=BLUE, linewidth=1.8, label="moved by the lens")
+    ax.axhline(0, color=GREY, linewidth=0.8)
+    used = max(
+        float(np.linalg.norm(v.corners_px - centre, axis=1).max()) for v in calibration.views
+    )
+    ax.axvline(used, color=VERMILLION, linewidth=1.2, linestyle=":", label="outermost corner seen")
+    if r_px[-1] < 0.99 * far_px:
+        folds = f"the model folds back at {r_px[-1]:.0f} px"
+        ax.axvline(r_px[-1], color=BLACK, linewidth=1.2, linestyle="--", label=folds)
     low, high = float(shift.min()), float(shift.max())
     margin = 0.25 * (high - low) + 0.5
     ax.set_ylim(low - margin, high + margin)
-    ax.set_xlim(0, float(r_px.max()))
+    ax.set_xlim(0, far_px)
     ax.set_xlabel("distance from the image centre [px]")
     ax.set_ylabel("moved by the lens [px]")
     ax.set_title(f"Distortion ({camera.model}) with its 95 % band", fontsize=10)
     ax.grid(True, color=GRID, linewidth=0.6)
-
-
-def _radial(calibration: Calibration, far_px: Array) -> tuple[Array, Array, Array]:
-    """Along a half diagonal: pixels from the centre, the lens's shift and its 95 % line."""
-    camera = calibration.camera
-    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
-    centre = camera.K[:2, 2]
-    edge = undistort((centre + far_px)[None], camera)[0]
-    rays = np.linspace(0, 1, 60)[:, None] * edge
-    seen = distort(rays, camera) - centre
-    outward = far_px / np.linalg.norm(far_px)
-    shift = (seen - rays * focal) @ outward
-    L = pixel_derivatives(camera, rays_of(rays)).copy()
-    L[:, :, :4] = 0.0  # the band is of the distortion alone
-    moved = np.einsum("nkp,dp,k->nd", L, draws(calibration.solution.covariance), outward)
-    return seen @ outward, shift, 1.96 * moved.std(axis=1)
+    # The curve begins at 0 on the left and ends on the right, far below or above.
+    ax.legend(fontsize=8, loc="lower left" if shift[-1] < 0 else "upper left")
 
 
 def _numbers(ax: Axes, calibration: Calibration) -> None:
@@ -233,22 +278,26 @@ def _numbers(ax: Axes, calibration: Calibration) -> None:
         digits = 2 if name[0] in "fc" else 5
         lines.append(f"{name:4}{value:12.{digits}f}{std:12.{digits}f}")
     lines += ["", f"{'lens model':22}{'RMS':>8}{'held out':>10}"]
+    notes = list(dict.fromkeys(s.note for s in calibration.scores if s.note))
     for s in calibration.scores:
         mark = ">" if s.model == calibration.camera.model else " "
         rms = "-" if s.rms_px is None else f"{s.rms_px:.4f}"
         held = "-" if s.held_out_px is None else f"{s.held_out_px:.4f}"
         best = " recommended" if s.model == calibration.recommended else ""
-        note = f" ({s.note})" if s.note else ""
-        lines.append(f"{mark} {s.model:20}{rms:>8}{held:>10}{best}{_shorter(note, 40)}")
+        note = f" ({notes.index(s.note) + 1})" if s.note else ""
+        lines.append(f"{mark} {s.model:20}{rms:>8}{held:>10}{best}{note}")
+    lines += [f"({i}) {_shorter(note, 74)}" for i, note in enumerate(notes, start=1)]
     out = [f"{r.view}: {r.reason}" for r in calibration.rejections]
     out += [f"{r.view}: {r.reason}" for r in calibration.missing]
     if out:
-        lines += ["", "left out:"] + [f"  {_shorter(text, 74)}" for text in out[:4]]
-        if len(out) > 4:
-            lines.append(f"  and {len(out) - 4} more (--json names them)")
+        room = _MOST_LINES - len(lines) - 3
+        named = out if len(out) <= room + 1 else out[:room]
+        lines += ["", "left out:"] + [f"  {_shorter(text, 74)}" for text in named]
+        if len(out) > len(named):
+            lines.append(f"  and {len(out) - len(named)} more (--json names them)")
     ax.text(
-        0.0, 1.0, _plain("\n".join(lines)), family="monospace", fontsize=8.2, va="top", ha="left",
-        transform=ax.transAxes, in_layout=False,
+        0.0, 1.0, _plain("\n".join(lines)), family="monospace", fontsize=7.8, linespacing=1.15,
+        va="top", ha="left", transform=ax.transAxes, in_layout=False,
     )  # fmt: skip
 
 

@@ -13,8 +13,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.calibration.bundle import poses_only
+from perchctl.calibration.enough import is_covered
 from perchctl.calibration.lens import (
     parameters_of,
     pixel_derivatives,
@@ -24,13 +26,14 @@ from perchctl.calibration.lens import (
 )
 from perchctl.calibration.types import RangeError, View
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project, undistort
+from perchctl.vision.camera_model import distort, project, undistort
 from perchctl.vision.types import CameraModel
 
 RANGES_M = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
 LARGE_M, SMALL_M = 0.150, 0.025
 CONFIDENCE = 0.95
 DRAWS = 600
+_CURVE_DEG = np.linspace(0.0, 85.0, 1200)  # from the axis; wider lenses are not drawn further
 _TURNED = np.array([np.pi, 0.0, 0.0])  # the marker's z towards the camera
 _SQUARE: Array = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
 
@@ -44,26 +47,34 @@ def draws(covariance: Array, seed: int = 0) -> Array:
 
 
 def predict_errors(
-    camera: CameraModel, covariance: Array, ranges_m: Sequence[float] = RANGES_M
+    camera: CameraModel,
+    covariance: Array,
+    ranges_m: Sequence[float] = RANGES_M,
+    covered: NDArray[np.bool_] | None = None,
 ) -> tuple[RangeError, ...]:
-    """95 % lines of the target's position error at each distance."""
+    """95 % lines of the target's position error at each distance, where all of the target
+    lies in `covered` cells of the picture (None: anywhere), and straight ahead."""
     errors = draws(covariance)
     result = []
     for z_m in ranges_m:
-        moved = np.array(
-            [_absorbed(camera, place, z_m) @ errors.T for place in places(camera, z_m)]
-        )
+        there = places(camera, z_m, covered)
+        moved = np.array([_absorbed(camera, place, z_m) @ errors.T for place in there])
         mm = 1e3 * np.linalg.norm(moved, axis=1)  # (places, draws), the axis first
         worst = float(np.quantile(mm.max(axis=0), CONFIDENCE))
         result.append(RangeError(z_m, worst, float(np.quantile(mm[0], CONFIDENCE))))
     return tuple(result)
 
 
-def position_errors_mm(camera: CameraModel, truth: CameraModel, z_m: float) -> Array:
+def position_errors_mm(
+    camera: CameraModel,
+    truth: CameraModel,
+    z_m: float,
+    covered: NDArray[np.bool_] | None = None,
+) -> Array:
     """How far a target seen by `truth` is from where `camera` puts it, at each of the
     places of `truth`; the first is on the axis, (n,) mm."""
     errors = []
-    for place in places(truth, z_m):
+    for place in places(truth, z_m, covered):
         corners_m = target_m(truth, place, z_m)
         seen = project(corners_m, _TURNED, place, truth)
         view = View("", truth.size_px, np.arange(len(corners_m)), corners_m, seen)
@@ -74,9 +85,9 @@ def position_errors_mm(camera: CameraModel, truth: CameraModel, z_m: float) -> A
     return np.array(errors)
 
 
-def places(camera: CameraModel, z_m: float) -> Array:
+def places(camera: CameraModel, z_m: float, covered: NDArray[np.bool_] | None = None) -> Array:
     """Target centres at that depth, (n, 3): straight ahead, then over the whole picture
-    wherever all corners of a marker are in view."""
+    wherever all corners of a marker are in view; with `covered`, in covered cells."""
     middles = undistort(pixel_grid(camera.size_px, 9, 7), camera)
     found = [np.array([0.0, 0.0, z_m])]
     sizes = (LARGE_M, SMALL_M)
@@ -87,6 +98,8 @@ def places(camera: CameraModel, z_m: float) -> Array:
                 found.append(place)
         if len(found) > 1:  # the large marker decides as long as it fits anywhere
             break
+    if covered is not None:
+        found[1:] = [place for place in found[1:] if _is_covered(camera, place, z_m, covered)]
     return np.array(found)
 
 
@@ -98,9 +111,10 @@ def target_m(camera: CameraModel, place: Array, z_m: float) -> Array:
 
 def ray_errors_px(camera: CameraModel, covariance: Array) -> tuple[float, float, Array]:
     """95 % lines of the RMS and of the largest error of fixed rays over the image, in px,
-    and the 95 % line at each pixel of `pixel_grid` (n,)."""
+    and the 95 % line at each pixel of `pixel_grid` (n,), NaN where the lens images no ray."""
     rays = undistort(pixel_grid(camera.size_px), camera)
-    good = np.isfinite(rays).all(axis=1)
+    # Where the lens model folds back, no ray is imaged.
+    good = np.abs(distort(rays, camera) - pixel_grid(camera.size_px)).max(axis=1) < 0.5
     L = pixel_derivatives(camera, rays_of(rays[good]))
     moved = np.einsum("nkp,dp->dnk", L, draws(covariance))
     distance2 = (moved**2).sum(axis=2)
@@ -108,6 +122,25 @@ def ray_errors_px(camera: CameraModel, covariance: Array) -> tuple[float, float,
     each[good] = np.sqrt(np.quantile(distance2, CONFIDENCE, axis=0))
     rms = float(np.quantile(np.sqrt(distance2.mean(axis=1)), CONFIDENCE))
     return rms, float(np.quantile(np.sqrt(distance2.max(axis=1)), CONFIDENCE)), each
+
+
+def distortion_curve(
+    camera: CameraModel, covariance: Array, far_px: Array
+) -> tuple[Array, Array, Array]:
+    """From the image's centre towards centre + `far_px` (2,), or to where the lens model folds
+    back: pixels from the centre, the lens's shift and its 95 % line in px, (n,) each."""
+    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
+    outward = far_px / np.linalg.norm(far_px)
+    along = outward / focal
+    rays = np.tan(np.radians(_CURVE_DEG))[:, None] * along / np.linalg.norm(along)
+    r_px = (distort(rays, camera) - camera.K[:2, 2]) @ outward
+    ends = ~np.isfinite(r_px) | (np.gradient(r_px) <= 0.0) | (r_px > np.linalg.norm(far_px))
+    count = max(2, int(np.argmax(ends))) if ends.any() else len(r_px)
+    rays, r_px = rays[:count], r_px[:count]
+    L = pixel_derivatives(camera, rays_of(rays)).copy()
+    L[:, :, :4] = 0.0  # the band is of the distortion alone
+    moved = np.einsum("nkp,dp,k->nd", L, draws(covariance), outward)
+    return r_px, r_px - (rays * focal) @ outward, 1.96 * moved.std(axis=1)
 
 
 def ray_difference_px(camera: CameraModel, truth: CameraModel) -> Array:
@@ -132,6 +165,11 @@ def _in_view(camera: CameraModel, place: Array, side_m: float) -> bool:
     again = undistort(pixels, camera)
     straight = (_SQUARE * side_m)[:, :2] * (1.0, -1.0) + place[:2]
     return bool(np.allclose(again, straight / place[2], atol=1e-3))
+
+
+def _is_covered(camera: CameraModel, place: Array, z_m: float, covered: NDArray[np.bool_]) -> bool:
+    seen = project(target_m(camera, place, z_m), _TURNED, place, camera)
+    return is_covered(covered, seen, camera.size_px)
 
 
 def _absorbed(camera: CameraModel, place: Array, z_m: float) -> Array:

@@ -55,7 +55,7 @@ def calibration_record(result: Calibration, file: Path, picture: Path | None) ->
         ],
         "recommended": result.recommended,
         "coverage": float(result.covered.mean()),
-        "warnings": list(result.warnings),
+        "warnings": [str(lack) for lack in result.lacks],
         "verdict": level(result),
         "file": str(file),
         "report": None if picture is None else str(picture),
@@ -95,7 +95,7 @@ def check_record(result: CheckResult, file: Path) -> dict[str, Any]:
 
 
 def calibration_lines(result: Calibration) -> list[str]:
-    """What was left out, the lens, the models, warnings, and the verdict at the end."""
+    """What was left out, the lens, the models, what it lacks, and the verdict at the end."""
     solution = result.solution
     lines = [f"left out {r.view}: {r.reason}" for r in result.missing[:_MOST_MISSING]]
     if len(result.missing) > _MOST_MISSING:
@@ -118,7 +118,7 @@ def calibration_lines(result: Calibration) -> list[str]:
     lines.append(f"on views held out: {', '.join(tried)}; {result.recommended} is recommended")
     if result.camera.model != result.recommended:
         lines.append(f"--model {result.camera.model} was used as asked")
-    return [*lines, *result.warnings, sentence(result)]
+    return [*lines, *map(str, result.lacks), sentence(result)]
 
 
 def _whole_views(rejections: Iterable[Rejection]) -> list[dict[str, str]]:

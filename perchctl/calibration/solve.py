@@ -23,7 +23,7 @@ from perchctl.calibration.enough import (
 from perchctl.calibration.lens import MODEL_NAMES, pixel_grid
 from perchctl.calibration.predict import predict_errors, ray_errors_px
 from perchctl.calibration.robust import Robust, keep_all, reject, weighted_fit
-from perchctl.calibration.types import Calibration, ModelScore, Rejection, View
+from perchctl.calibration.types import Calibration, Lack, ModelScore, Rejection, View
 from perchctl.errors import InvalidValue
 from perchctl.vision.camera_model import distort, undistort
 
@@ -73,11 +73,11 @@ def calibrate(
         missing=tuple(missing),
         scores=tuple(scores),
         recommended=recommended,
-        errors=predict_errors(solution.camera, covariance),
+        errors=predict_errors(solution.camera, covariance, covered=covered),
         ray_rms_px95=rms95,
         ray_max_px95=max95,
         covered=covered,
-        warnings=tuple(_warnings(fit, len(robust.views), covered)),
+        lacks=tuple(_lacks(fit, len(robust.views), covered)),
     )
 
 
@@ -106,21 +106,26 @@ def _chosen(fits: Mapping[str, Fit], scores: Sequence[ModelScore], model: str) -
     return fits[model]
 
 
-def _warnings(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[str]:
-    """What would make the calibration better."""
-    warnings = []
+def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[Lack]:
+    """What keeps it from being a good calibration, whatever its error, and goes
+    with more pictures."""
+    lacks = []
     if not usable(fit):
-        warnings.append(
-            f"the lens model {FOLDS_BACK}, where no corners were seen: add views at its rims"
+        lacks.append(
+            Lack(
+                f"the lens model {FOLDS_BACK}", "no corners were seen there, add views at its rims"
+            )
         )
     if views < GOOD_VIEWS:
-        warnings.append(f"only {views} views: {GOOD_VIEWS} or more are better")
+        lacks.append(Lack(f"only {views} views", f"add {GOOD_VIEWS - views} or more"))
     if covered.mean() < GOOD_COVERED:
-        warnings.append(
-            f"{100 * (1 - covered.mean()):.0f} % of the picture is uncovered: add views with the "
-            f"board {uncovered_text(covered)}"
+        lacks.append(
+            Lack(
+                f"{100 * (1 - covered.mean()):.0f} % of the picture is uncovered",
+                f"add views with the board {uncovered_text(covered)}",
+            )
         )
-    return warnings
+    return lacks
 
 
 def robust_fit(views: Sequence[View], rejecting: bool = True) -> Robust:

@@ -89,6 +89,17 @@ class Rejection:
 
 
 @dataclass(frozen=True)
+class Lack:
+    """What a calibration lacks, and what would mend it."""
+
+    what: str
+    advice: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.advice}"
+
+
+@dataclass(frozen=True)
 class ModelScore:
     """How a lens model predicts views it was not fitted to."""
 
@@ -103,7 +114,8 @@ class ModelScore:
 class RangeError:
     """95 % line of the target's position error at one distance.
 
-    mm95: anywhere in the picture where the target is seen whole (the worst place);
+    mm95: the worst place of those where the target is seen whole and the boards were seen,
+    so that it rests on corners and not on what the lens model says beyond them;
     axis_mm95: straight ahead of the camera.
     """
 
@@ -120,7 +132,8 @@ class Calibration:
         views: those used, without rejected corners; `solution` belongs to them.
         seen: all views in which the board was found, as found.
         missing: pictures without a board, and why.
-        covered: share of the picture's cells with a corner, and the cells (rows, columns).
+        covered: the picture's cells (rows, columns) that boards were seen in.
+        lacks: what keeps it from being a good one, whatever its error.
         ray_rms_px95, ray_max_px95: 95 % lines of the ray error over the image, RMS and
             worst place, in px.
     """
@@ -137,7 +150,7 @@ class Calibration:
     ray_rms_px95: float
     ray_max_px95: float
     covered: NDArray[np.bool_]
-    warnings: tuple[str, ...] = ()
+    lacks: tuple[Lack, ...] = ()
 
     @property
     def camera(self) -> CameraModel:

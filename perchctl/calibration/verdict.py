@@ -25,11 +25,12 @@ def limit_mm(z_m: float) -> float:
 
 
 def level(calibration: Calibration) -> Level:
-    """By the predicted error straight ahead of the camera, where perching happens; at the
-    picture's rims, where the search may see the target first, twice the limit will do."""
+    """By the predicted error straight ahead of the camera, where perching happens; aside,
+    where the search may see the target first, twice the limit will do. Of what the boards did
+    not cover nothing is known, so that a calibration that lacks coverage is no good one."""
     ahead = max(e.axis_mm95 / limit_mm(e.z_m) for e in calibration.errors)
     aside = max(e.mm95 / limit_mm(e.z_m) for e in calibration.errors)
-    if ahead <= 1.0 and aside <= ASIDE_FACTOR:
+    if ahead <= 1.0 and aside <= ASIDE_FACTOR and not calibration.lacks:
         return "fly"
     return "care" if ahead <= CARE_FACTOR else "stop"
 
@@ -44,5 +45,7 @@ def sentence(calibration: Calibration) -> str:
     )
     aside = max(calibration.errors, key=lambda e: e.mm95 / limit_mm(e.z_m))
     if aside.mm95 > ASIDE_FACTOR * limit_mm(aside.z_m):
-        text += f", at the rims {aside.mm95:.2g} mm at {aside.z_m * 100:.0f} cm"
+        text += f", aside {aside.mm95:.2g} mm at {aside.z_m * 100:.0f} cm"
+    if calibration.lacks:
+        text += ", but " + " and ".join(lack.what for lack in calibration.lacks)
     return text

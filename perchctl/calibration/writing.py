@@ -58,7 +58,7 @@ def calibration_text(calibration: Calibration, name: str, date: str) -> str:
     more = [
         *_matrix("parameter_std", solution.std[None]),
         *_matrix("parameter_covariance", solution.covariance),
-        "# columns: distance in m; 95 % lines in mm anywhere in the picture, and straight ahead",
+        "# columns: distance in m; 95 % lines in mm wherever boards were seen, and straight ahead",
         *_matrix("target_error", errors),
     ]
     return text + "\n".join(more) + "\n"

@@ -130,12 +130,41 @@ class ImagesSource(Recording):
         return read_grey(path), t_s
 
 
+class BrokenPicture(InvalidValue):
+    """A file that is no picture, or a part of one; `reason` goes behind its name."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"{path} {reason}; remove or replace it")
+        self.reason = reason
+
+
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """A picture file as grey; raises InvalidValue if it is none."""
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    """A picture file as grey; raises BrokenPicture if it is none, or is cut off."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise BrokenPicture(path, f"cannot be read: {error.strerror or error}") from None
+    if is_cut_off(data):
+        raise BrokenPicture(path, "is cut off")
+    # An empty array is an error of OpenCV's.
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     if image is None:
-        raise InvalidValue(f"{path} cannot be read as a picture; remove or replace it")
+        raise BrokenPicture(path, "cannot be read as a picture")
     return to_grey(image)
+
+
+def is_cut_off(data: bytes) -> bool:
+    """Whether a JPEG or PNG has no end. Decoders fill the rest with grey and tell it on
+    stderr, without the file's name."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data
+    if not data.startswith(b"\xff\xd8"):
+        return False
+    # Segments before the picture's data: one of them may hold a whole small JPEG.
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        at += 2 + int.from_bytes(data[at + 2 : at + 4])
+    return data.find(b"\xff\xd9", at) < 0
 
 
 def image_files(where: str | Sequence[Path]) -> list[Path]:

@@ -65,6 +65,7 @@ ProfileOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 ViewOption = Annotated[
     bool, typer.Option("--view", help="Serve a live page on 127.0.0.1 and print its address.")
 ]

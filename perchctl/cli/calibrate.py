@@ -9,6 +9,7 @@ import typer
 
 from perchctl.cli.app import (
     CamOption,
+    ForceOption,
     JsonOption,
     ViewOption,
     ViewPortOption,
@@ -61,7 +62,7 @@ def calibrate(
             "--model", help="auto (the recommended), plumb_bob, rational_polynomial or fisheye."
         ),
     ] = "auto",
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    force: ForceOption = False,
     check: Annotated[
         Path | None,
         typer.Option("--check", help="Judge this calibration by the source's pictures instead."),
@@ -85,9 +86,15 @@ def calibrate(
     plain_corners: Annotated[
         bool, typer.Option("--plain-corners", help="OpenCV's corners, not the fitted ones.")
     ] = False,
+    skip_broken: Annotated[
+        bool, typer.Option("--skip-broken", help="Leave out pictures that cannot be read.")
+    ] = False,
     keep_pictures: Annotated[
         Path | None,
-        typer.Option("--keep-pictures", help="Folder for the pictures taken of a live camera."),
+        typer.Option(
+            "--keep-pictures",
+            help="Folder for a live camera's pictures. Default: beside the output.",
+        ),
     ] = None,
     as_json: JsonOption = False,
     view: ViewOption = False,
@@ -116,6 +123,7 @@ def calibrate(
             mask=mask,
             reject=reject,
             plain_corners=plain_corners,
+            skip_broken=skip_broken,
             keep_pictures=keep_pictures,
             as_json=as_json,
             view=view,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ProfileOption, perform, reported
+from perchctl.cli.app import ForceOption, JsonOption, ProfileOption, perform, reported
 from perchctl.cli.complete import complete_source
 
 
@@ -74,6 +74,7 @@ def fit_weights(
     anyway: Annotated[
         bool, typer.Option("--anyway", help="Write weights that are not recommended, too.")
     ] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fit the merge weights to poses whose truth is known, and verify that they help.
@@ -114,6 +115,7 @@ def fit_weights(
             output=output,
             plot=plot,
             anyway=anyway,
+            force=force,
             as_json=as_json,
         )
         perform(run, request)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import CamOption, JsonOption, perform, reported
+from perchctl.cli.app import CamOption, ForceOption, JsonOption, perform, reported
 from perchctl.cli.complete import complete_profile
 
 
@@ -74,7 +74,8 @@ def make_target(
         float, typer.Option("--noise", help="Sigma of the picture's noise, grey levels of 255.")
     ] = 5.0,
     plot: Annotated[
-        Path | None, typer.Option("--plot", help="The design's picture (design.png).")
+        Path | None,
+        typer.Option("--plot", help="The design's picture (design.png or suggestion.png)."),
     ] = None,
     suggest: Annotated[
         bool, typer.Option("--suggest", help="Propose sizes and ids for --camera.")
@@ -87,9 +88,7 @@ def make_target(
         str | None,
         typer.Option("--measured-small", help="Side of the small black square as printed, mm."),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Let --measured-* change an existing profile.")
-    ] = False,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print the target (or a board), true to size; design it; write measured sizes.

@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import CamOption, ProfileOption, ViewOption, ViewPortOption, perform, reported
+from perchctl.cli.app import (
+    CamOption,
+    ForceOption,
+    ProfileOption,
+    ViewOption,
+    ViewPortOption,
+    perform,
+    reported,
+)
 from perchctl.cli.complete import complete_source
 
 
@@ -43,6 +51,7 @@ def track(
     overlay: Annotated[
         Path | None, typer.Option("--overlay", help="Write the pictures with results as .mp4.")
     ] = None,
+    force: ForceOption = False,
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
 ) -> None:
@@ -69,6 +78,7 @@ def track(
             as_json=as_json,
             csv=csv,
             overlay=overlay,
+            force=force,
             view=view,
             view_port=view_port,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,10 +31,11 @@ from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
 from perchctl.errors import InvalidValue, PerchError, UsageError
-from perchctl.files import check_place, same_file, write_files
+from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target.boards import Board
 
 FOLDER = Path("calib")
+SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class CalibrateRequest:
     mask: Path | None = None
     reject: bool = True
     plain_corners: bool = False
+    skip_broken: bool = False
     keep_pictures: Path | None = None
     as_json: bool = False
     view: bool = False
@@ -110,6 +113,8 @@ def _check_request(request: CalibrateRequest) -> None:
         raise InvalidValue(f"lens model {request.model!r} is unknown; allowed are {allowed}")
     if request.output is not None:
         _check_output(request.output, request.force)
+    if request.keep_pictures is not None:
+        check_place(request.keep_pictures / "view_001.png", force=True)
     if not request.name.strip() or "/" in request.name:
         raise UsageError(f"--name {request.name!r} cannot name a file; use a word such as camera")
 
@@ -122,7 +127,7 @@ def _calibrate(request: CalibrateRequest, source: Source, board: Board) -> int:
     say(f"{len(found.views)} views of the board{missing}")
     result = calibrate(found.views, board.notation(), request.model, request.reject, found.missing)
     text = calibration_text(result, request.name, _now())
-    write_files({output: text.encode()}, make_folders=True)
+    write_files({output: text.encode()})
     for line in calibration_lines(result):
         say(line)
     picture = drawn(lambda: _draw(result, _picture_of(output)))
@@ -166,12 +171,12 @@ def _convert(request: CalibrateRequest, file: Path) -> int:
     """Another program's calibration (OpenCV, Kalibr, ROS) as perchctl's file."""
     camera = load_calibration(file, cam=request.cam)
     output = _output(request, camera.size_px)
-    check_place(output, replace=request.force, make_folders=True)
     if same_file(output, file):
         raise UsageError(f"{output} is the file to convert; name another with --output")
+    check_output(output, SUFFIXES, request.force, CONTENT)
     notes = {"date": _now(), "converted_from": file.name}
     text = camera_text(camera, request.name, notes)
-    write_files({output: text.encode()}, make_folders=True)
+    write_files({output: text.encode()})
     say(f"wrote {output} ({camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px)")
     if request.as_json:
         print_record(camera_record(camera) | {"file": str(output)})
@@ -191,9 +196,22 @@ def _picture_of(output: Path) -> Path:
     return output.with_suffix(".png")
 
 
+def _pictures_folder(request: CalibrateRequest, size_px: tuple[int, int]) -> Path | None:
+    """Where a live camera's pictures go; raises what `_check_output` does, before a person
+    has worked for them."""
+    if request.check is not None:
+        return request.keep_pictures
+    output = _output(request, size_px)
+    _check_output(output, request.force)
+    if request.keep_pictures is not None:
+        return request.keep_pictures
+    names = (f"{output.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
+    return next(folder for name in names if not (folder := output.with_name(name)).exists())
+
+
 def _check_output(output: Path, force: bool) -> None:
-    for path in (output, _picture_of(output)):
-        check_place(path, replace=force, make_folders=True)
+    check_output(output, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
+    check_place(_picture_of(output), force)
 
 
 def _now() -> str:
@@ -205,12 +223,12 @@ def _now() -> str:
 
 def _find_views(request: CalibrateRequest, source: Source, board: Board) -> _Found:
     if source.scheme not in ("images", "video"):
-        port = page_port(request.view, request.view_port)
-        return _Found(captured_views(source.spec, board, request.keep_pictures, port), [])
+        return _Found(_live_views(request, source, board), [])
     refine = not request.plain_corners
     with search_bar("searching the board") as progress:
         if source.scheme == "images":
-            views, missing = views_of_images(source.pictures(), board, refine, progress)
+            pictures, skip = source.pictures(), request.skip_broken
+            views, missing = views_of_images(pictures, board, refine, progress, skip)
         else:
             views, missing = views_of_video(Path(source.place), board, refine, progress)
     if not views:
@@ -226,3 +244,14 @@ def _find_views(request: CalibrateRequest, source: Source, board: Board) -> _Fou
             f"the pictures show a larger board than {board.notation()}: use --board {whole}"
         )
     return _Found(views, missing)
+
+
+def _live_views(request: CalibrateRequest, source: Source, board: Board) -> list[View]:
+    frames = source.open()
+    try:
+        assert frames.size_px is not None  # the first frame is there
+        pictures = _pictures_folder(request, frames.size_px)
+        port = page_port(request.view, request.view_port)
+        return captured_views(frames, board, pictures, port)
+    finally:
+        frames.close()

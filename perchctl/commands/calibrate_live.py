@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -19,7 +18,7 @@ from rich.text import Text
 from perchctl.calibration.guided import Moment, capture
 from perchctl.calibration.preview import Flat, LensPreview
 from perchctl.calibration.types import Grey, View
-from perchctl.camera.open import open_source
+from perchctl.camera.source import FrameSource
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page
@@ -35,20 +34,20 @@ _SIZE_UNTIL_KNOWN_PX = (640, 480)
 
 
 def captured_views(
-    spec: str, board: Board, pictures_folder: Path | None, port: int | None
+    source: FrameSource, board: Board, pictures: Path | None, port: int | None
 ) -> list[View]:
     """Views of a live camera, taken until all is covered or Ctrl-C ends it.
 
     Args:
-        pictures_folder: where to keep their pictures; None: nowhere.
+        pictures: the folder that gets their pictures, each as it is taken; None: none does.
         port: of the live page; None: no page.
 
     Raises:
-        InvalidValue: no view was taken. Those of `open_source`, `capture` and `write_files`.
+        InvalidValue: no view was taken. Those of `capture`.
     """
+    keeper = _Keeper(pictures)
     with contextlib.ExitStack() as stack:
-        source = open_source(spec, 0.0, None, time.monotonic)
-        stack.callback(source.close)
+        stack.callback(keeper.tell)
         stop = stack.enter_context(Stopper().installed())
         camera = _any_camera(source.size_px or _SIZE_UNTIL_KNOWN_PX)
         page = stack.enter_context(live_page(camera, "perchctl calibrate", port))
@@ -57,6 +56,8 @@ def captured_views(
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 
         def show(moment: Moment) -> None:
+            if moment.shot:
+                keeper.keep(moment.image)
             bars(moment.covered, moment.taken, moment.advice)
             if page is not None:
                 preview.offer(moment.views)
@@ -64,11 +65,11 @@ def captured_views(
                 page.show(moment.index, sketch_of(moment, flat))
                 page.tell(lambda: page_state(moment, flat))
 
-        views, pictures = capture(source, board, show, stopped=stop.requested.is_set)
-    if pictures_folder is not None and pictures:
-        _keep(pictures, pictures_folder)
+        views = capture(source, board, show, stopped=stop.requested.is_set)
     if not views:
-        raise InvalidValue(f"no view of the board {board.notation()} was taken from {spec}")
+        raise InvalidValue(
+            f"no view of the board {board.notation()} was taken from {source.describe()}"
+        )
     return views
 
 
@@ -124,9 +125,8 @@ def sketch_of(moment: Moment, flat: Flat | None) -> Sketch:
 
 
 def page_state(moment: Moment, flat: Flat | None) -> dict[str, Any]:
-    rows = [
-        [name, "#" * round(20 * share) + "." * (20 - round(20 * share)) + f" {100 * share:.0f} %"]
-        for name, share in moment.covered.items()
+    rows: list[list[str | float]] = [
+        [name, f"{100 * share:.0f} %", share] for name, share in moment.covered.items()
     ]
     rows.append(["views", str(moment.taken)])
     if flat is not None:
@@ -135,8 +135,28 @@ def page_state(moment: Moment, flat: Flat | None) -> dict[str, Any]:
     return {"rows": rows, "phase": moment.advice}
 
 
-def _keep(pictures: list[Grey], folder: Path) -> None:
-    encoded = [cv2.imencode(".png", picture)[1].tobytes() for picture in pictures]
-    files = {folder / f"view_{i:03d}.png": png for i, png in enumerate(encoded, start=1)}
-    write_files(files, make_folders=True)
-    say(f"kept {len(pictures)} pictures in {folder}")
+class _Keeper:
+    """Writes each picture as it is taken, behind those that the folder has already."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._kept = 0
+        self._failed = False
+
+    def keep(self, picture: Grey) -> None:
+        """Never raises: pictures that cannot be kept are still calibrated from."""
+        if self._folder is None or self._failed:
+            return
+        numbers = (path.stem.removeprefix("view_") for path in self._folder.glob("view_*.png"))
+        newest = max((int(number) for number in numbers if number.isdecimal()), default=0)
+        png = cv2.imencode(".png", picture)[1].tobytes()
+        try:
+            write_files({self._folder / f"view_{newest + 1:03d}.png": png})
+            self._kept += 1
+        except InvalidValue as error:
+            self._failed = True
+            say(f"pictures are no longer kept: {error}")
+
+    def tell(self) -> None:
+        if self._kept:
+            say(f"kept {self._kept} pictures: images:{self._folder} takes them again")

@@ -13,8 +13,8 @@ from perchctl.camera.source import FrameSource
 from perchctl.commands.calibrate_source import Source
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_record, say
-from perchctl.errors import InvalidValue, TimedOut
-from perchctl.files import check_place, write_files
+from perchctl.errors import TimedOut
+from perchctl.files import check_output, write_files
 
 LIVE_S = 20.0
 """For which a live camera is looked at."""
@@ -26,9 +26,7 @@ def write_mask(source: Source, output: Path, force: bool, as_json: bool) -> int:
 
     Errors: NotFound, InvalidValue, TimedOut (a silent camera).
     """
-    if output.suffix.lower() != ".png":
-        raise InvalidValue(f"--mask {output}: a mask is a PNG file, as in gear.png")
-    check_place(output, replace=force, make_folders=True)
+    check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
         frames = source.open()
         stack.callback(frames.close)
@@ -36,7 +34,7 @@ def write_mask(source: Source, output: Path, force: bool, as_json: bool) -> int:
         if frames.live:
             say(f"turn the vehicle about for {LIVE_S:g} s (Ctrl-C ends and writes the mask)")
         gear = learn_gear(_pictures(frames, stop.requested.is_set))
-    write_files({output: mask_png(gear)}, make_folders=True)
+    write_files({output: mask_png(gear)})
     say(
         f"wrote {output}: the vehicle covers {100 * gear.share:.1f} % of the picture, by "
         f"{gear.pictures} pictures; set camera.mask to it"

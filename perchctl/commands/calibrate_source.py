@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 from perchctl.calibration.types import Grey
 from perchctl.camera.files import (
     IMAGE_SUFFIXES,
+    BrokenPicture,
     ImagesSource,
     VideoSource,
     image_files,
@@ -59,7 +61,11 @@ class Source:
         if self.scheme == "images":
             paths = self.pictures()
             step = max(1, len(paths) // _SAMPLES)
-            return [read_grey(p) for p in paths[::step][:_SAMPLES]]
+            samples: list[Grey] = []
+            for path in paths[::step][:_SAMPLES]:
+                with contextlib.suppress(BrokenPicture):  # which has been told
+                    samples.append(read_grey(path))
+            return samples
         source = VideoSource(Path(self.place))
         frames: list[Grey] = []
         while (frame := source.poll(0.0)) is not None and len(frames) < _SAMPLES:

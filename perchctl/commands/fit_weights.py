@@ -14,7 +14,7 @@ from perchctl.commands.fit_weights_request import CollectRequest, FitRequest
 from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, UsageError
-from perchctl.files import check_place, same_file, write_files
+from perchctl.files import check_output, same_file, write_files
 from perchctl.profile import Profile, find_weights, load_profile
 from perchctl.profile.places import data_folder, user_config_folder
 from perchctl.weights.check import check
@@ -52,6 +52,7 @@ class FitOptions:
     plot: Path | None = None
     as_json: bool = False
     anyway: bool = False
+    force: bool = False
 
 
 def run(request: FitRequest) -> int:
@@ -95,18 +96,17 @@ def resolve(request: FitRequest) -> FitOptions:
         raise InvalidValue(
             f"--order {request.order!r} is unknown; allowed are shuffled and recorded"
         )
-    if request.plot is not None:
-        if request.plot.suffix.lower() != ".png":
-            raise InvalidValue(f"--plot {request.plot} must end in .png")
-        check_place(request.plot)
     twice = [path for k, path in enumerate(data) if any(same_file(path, o) for o in data[:k])]
     if twice:
         raise InvalidValue(
             f"{twice[0]} is named twice: the same rows twice are no more evidence; name it once"
         )
-    for target in (request.output, request.plot):
-        if target is not None and any(same_file(target, source) for source in data):
+    for target, suffixes in ((request.output, (".yaml", ".yml")), (request.plot, (".png",))):
+        if target is None:
+            continue
+        if any(same_file(target, source) for source in data):
             raise UsageError(f"{target} is the data itself; write the result to another file")
+        check_output(target, suffixes, request.force)
     return FitOptions(
         # The weights file may not be there yet: this command makes it.
         profile=load_profile(request.profile, with_weights=False),
@@ -123,6 +123,7 @@ def resolve(request: FitRequest) -> FitOptions:
         plot=request.plot,
         as_json=request.as_json,
         anyway=request.anyway,
+        force=request.force,
     )
 
 
@@ -214,6 +215,9 @@ def _write(options: FitOptions, result: Result) -> Path | None:
             else "no file written: the weights are not recommended"
         )
         return None
+    if target.exists() and not options.force:
+        say(f"{target} exists already and stays as it is; add --force to replace it")
+        return None
     if not recommended and not options.anyway:
         sentence = (
             f"{target} not written: on no axis do the weights beat the better single marker beyond "
@@ -228,9 +232,8 @@ def _write(options: FitOptions, result: Result) -> Path | None:
     if options.anyway:
         content["weights"] = dict(content["fitted"])
         content["axes"] = dict.fromkeys(AXES, "merged")
-    aside = write_weights(target, content)
-    kept = "" if aside is None else f" (the old one is kept as {aside.name})"
-    say(f"weights: {target}{kept}")
+    write_weights(target, content)
+    say(f"weights: {target}")
     if options.profile.merge.method != "weights":
         say(
             f"profile {options.profile.name} merges by {options.profile.merge.method}: these "

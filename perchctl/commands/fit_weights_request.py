@@ -41,4 +41,5 @@ class FitRequest:
     output: Path | None = None
     plot: Path | None = None
     anyway: bool = False
+    force: bool = False
     as_json: bool = False

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import camera_of
+from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port

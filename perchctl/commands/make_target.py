@@ -18,11 +18,12 @@ from perchctl.commands.make_target_request import (
 )
 from perchctl.commands.output import print_record
 from perchctl.errors import PerchError, UsageError
-from perchctl.files import check_place, write_files
+from perchctl.files import check_output, check_place, write_files
 from perchctl.profile import Profile, TargetConfig, find_calibration, load_profile
 from perchctl.target.blind import blind_lines, mounted
 from perchctl.target.boards import parse_board
 from perchctl.target.checks import check_target
+from perchctl.target.compare import comparison
 from perchctl.target.design import error_curve, make_design
 from perchctl.target.design_text import design_record, design_text
 from perchctl.target.lengths import millimetres
@@ -35,7 +36,7 @@ from perchctl.target.svg import svg_bytes
 
 __all__ = ["TargetRequest", "run"]
 
-DEFAULT_PLOT = "design.png"
+DESIGN_PLOT, SUGGESTION_PLOT = Path("design.png"), Path("suggestion.png")
 DEFAULT_PROFILE = "sim"
 BLUR_LIMIT_PX, NOISE_LIMIT = 20.0, 60.0
 
@@ -57,6 +58,8 @@ def run(request: TargetRequest) -> int:
         target = requested_target(request, profile)
         outcome = _target(request, profile, target)
         outcome.lines.extend(_mounting(profile, target))
+    for path in outcome.files:
+        check_place(path, request.force)
     write_files(outcome.files)
     if request.as_json:
         print_record(outcome.record)
@@ -154,15 +157,24 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
     profile = load_profile(request.profile or DEFAULT_PROFILE)
     path = find_calibration(camera_name)
     camera = load_calibration(path, cam=request.cam)
-    plot = request.plot or Path(DEFAULT_PLOT)
-    check_place(plot)
+    plot = request.plot or (SUGGESTION_PLOT if request.suggest else DESIGN_PLOT)
+    check_output(plot, (".png",), request.force)
     optics = Optics(request.blur_px, request.noise)
     lines: list[str] = []
     record: dict[str, Any] = {}
     if request.suggest:
-        found, design = suggest(camera, optics, profile, request.magnet_m, request.ceiling_m)
+        found, design = suggest(
+            camera, optics, profile, request.magnet_m, request.ceiling_m, request.page
+        )
+        present = make_design(profile.target, camera, optics, profile, request.ceiling_m)
         lines += [f"note: {note}" for note in found.notes] + [found.command(), ""]
-        record = {"command": found.command(), "notes": list(found.notes)}
+        lines += [f"why: {reason}" for reason in found.reasons]
+        lines += [*comparison(design, present, f"profile {profile.name}"), ""]
+        record = {
+            "command": found.command(),
+            "reasons": list(found.reasons),
+            "notes": list(found.notes),
+        }
     else:
         target = requested_target(request, profile)
         design = make_design(target, camera, optics, profile, request.ceiling_m)
@@ -174,6 +186,8 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
         sheet = _target(request, profile, design.target)
         lines += sheet.lines
         files |= sheet.files
+    if plot in files:
+        raise UsageError(f"{plot} is the sheet's picture already; name another with --plot")
     files[plot] = draw_design(design, curve)
     lines.append(f"wrote {plot}")
     return TargetOutcome(files, lines, record | {"files": [str(path) for path in files]})

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from perchctl.commands.make_target_request import TargetOutcome, TargetRequest, requested_target
-from perchctl.errors import UsageError
+from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_place
 from perchctl.profile import load_profile
 from perchctl.target.lengths import parse_length
@@ -26,13 +26,13 @@ def write_measured(request: TargetRequest) -> TargetOutcome:
     Raises NotFound, InvalidValue, UsageError; then nothing has been written.
     """
     base, path = _profile_to_write(request)
-    check_place(path)
     changed = path.exists() and request.output is None
-    if path.exists() and not request.force:
-        raise UsageError(
-            f"{path} exists: --force writes the sizes into it, "
-            f"or -o NEW.yaml makes a small profile that extends it"
+    if changed and not request.force:
+        raise InvalidValue(
+            f"{path} exists already; add --force to write the sizes into it, "
+            f"or -o NEW.yaml for a small profile that extends it"
         )
+    check_place(path, request.force)
     profile = load_profile(base)
     found = measured_target(
         requested_target(request, profile),

@@ -16,7 +16,8 @@ SIDE_LIMITS_M = (0.004, 2.0)
 
 _PROFILE = {"profile": "-p"}
 _OUTPUT = {"output": "-o"}
-_SHEET = {"page": "--page", "png_dpi": "--png", "svg": "--svg"}
+_PAGE = {"page": "--page"}
+_SHEET = _PAGE | {"png_dpi": "--png", "svg": "--svg"}
 _MAGNET = {"magnet": "--magnet"}
 _MARKERS = {
     "large": "--large",
@@ -120,7 +121,7 @@ def _allowed(request: TargetRequest, task: str) -> tuple[str, ...]:
     if task == "--board":
         options = _OUTPUT | _SHEET
     elif task == "--camera" and request.suggest:
-        options = _PROFILE | _OUTPUT | _MAGNET | _DESIGN
+        options = _PROFILE | _OUTPUT | _PAGE | _MAGNET | _DESIGN
     elif task == "--camera":
         printed = _SHEET | _MAGNET if request.output is not None else {}
         options = _PROFILE | _OUTPUT | _MARKERS | _DESIGN | printed

@@ -26,9 +26,8 @@ from perchctl.display.page.flight import AXES_OF_SIDE
 from perchctl.display.page.live import LivePage
 from perchctl.display.page.sketch import Sketch
 from perchctl.errors import Interrupted, NotFound, UsageError
-from perchctl.files import same_file
+from perchctl.files import check_output, same_file
 from perchctl.profile import Profile, find_calibration, load_profile
-from perchctl.track.files import check_output
 from perchctl.track.outputs import OutputOptions, Outputs
 from perchctl.track.result import Tracked
 from perchctl.track.tracker import (
@@ -62,6 +61,7 @@ class TrackRequest:
     as_json: bool = False
     csv: Path | None = None
     overlay: Path | None = None
+    force: bool = False
     view: bool = False
     view_port: int = 0
 
@@ -94,10 +94,10 @@ def resolve(request: TrackRequest) -> TrackOptions:
     stills = _are_stills(request, source)
     for path, suffix in ((request.csv, ".csv"), (request.overlay, ".mp4")):
         if path is not None:
-            check_output(path, suffix)
             place = source.partition(":")[2]
             if place and same_file(path, Path(place).expanduser()):
                 raise UsageError(f"{path} is the source itself; write the result to another file")
+            check_output(path, (suffix,), request.force)
     if request.calibration is None:
         calibration = find_calibration(profile.camera.calibration)
         cam = request.cam or profile.camera.cam

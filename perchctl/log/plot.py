@@ -47,8 +47,7 @@ def plot_flight(log: FlightLog, png_path: Path | str) -> None:
     the paper's figure 6), where frames were lost, height, thrust and battery, over the
     named phases; and the last seconds with the target in millimetres.
 
-    Raises InvalidValue for a log without ticks or a file that cannot be written, NotFound
-    for a missing folder.
+    Raises InvalidValue for a log without ticks or a file that cannot be written.
     """
     if not log.records:
         raise InvalidValue(f"{log.path}: the log holds no ticks, there is nothing to plot")

@@ -39,6 +39,7 @@ class Optics:
     noise: float = 5.0
 
 
+@cache
 def smallest_side_px(
     target: TargetConfig, marker: MarkerName, optics: Optics, picture_px: int
 ) -> float | None:

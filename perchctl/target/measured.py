@@ -98,18 +98,19 @@ def write_profile(path: Path, text: str, expected: Profile) -> None:
 
     Raises InvalidValue: the text is another profile, or cannot be written.
     """
-    file = PartFile(path)
     try:
-        file.write(text.encode("utf-8"))
-        if not _reads_as(file.part, expected):
-            raise InvalidValue(
-                f"{path}: the sizes could not be put into this file: edit target by hand"
-            )
-        file.keep()
+        file = PartFile(path)
+        try:
+            file.write(text.encode("utf-8"))
+            if not _reads_as(file.part, expected):
+                raise InvalidValue(
+                    f"{path}: the sizes could not be put into this file: edit target by hand"
+                )
+            file.keep()
+        finally:
+            file.drop()
     except OSError as error:
         raise cannot_be_written(path, error) from None
-    finally:
-        file.drop()
 
 
 def _reads_as(path: Path, expected: Profile) -> bool:

@@ -119,6 +119,11 @@ def _place(target: TargetConfig, page: tuple[float, float], texts: tuple[str, ..
     return place
 
 
+def fits(target: TargetConfig, page: tuple[float, float]) -> bool:
+    """Whether the page, in mm, holds the target with its white and its rulers."""
+    return _fitted(target, page, _caption(target, "sizes from the command line", None)) is not None
+
+
 def fitting_page(target: TargetConfig) -> str:
     """The page, for --page, that holds the target: a named one, or a size."""
     return _fitting_page(target, _caption(target, "sizes from the command line", None))

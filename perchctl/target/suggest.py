@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -12,17 +14,19 @@ from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, Profile, TargetConfig
 from perchctl.target.checks import check_target
 from perchctl.target.design import Design, focal_px, make_design
+from perchctl.target.lengths import millimetres
 from perchctl.target.limits import Optics, smallest_side_px
-from perchctl.target.sheets import fitting_page
+from perchctl.target.page import parse_page
+from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.visible import FieldOfView, turned_outline
 from perchctl.vision.types import CameraModel
 
 DEFAULT_SEARCH_M = 1.15
 """Range to cover where no ceiling is named: the paper's z1."""
 FAR_MARGIN, OVERLAP_MARGIN, NEAR_MARGIN = 1.10, 1.20, 0.95
-SMALL_RANGE = (0.08, 0.21)
-"""Side of the small marker per side of the large one: up to 0.21 both are read with a
-white centre of two cells (32 of 150 mm, by trial)."""
+SMALL_RANGE = (0.08, 0.19)
+"""Side of the small marker per side of the large one: up to 0.19 the large one is read as far
+as around a smaller one, by trial (from 13 px on at a blur of 0.6 px; at 0.21 from 36 px on)."""
 _LARGE = ("DICT_4X4_1000", 997)
 _SMALL = ("DICT_ARUCO_ORIGINAL", 5)
 _LARGE_STEP_M, _SMALL_STEP_M = 0.005, 0.0005
@@ -31,10 +35,12 @@ _LARGE_LIMITS_M = (0.03, 1.0)
 
 @dataclass(frozen=True)
 class Suggestion:
-    """`page` holds the target; `notes` name what could not be met."""
+    """`page` holds the target; `reasons` say what its sizes follow from, `notes` name what
+    could not be met."""
 
     target: TargetConfig
     page: str
+    reasons: tuple[str, ...]
     notes: tuple[str, ...]
 
     def command(self) -> str:
@@ -46,18 +52,30 @@ class Suggestion:
         )
 
 
+@dataclass(frozen=True)
+class _Smalls:
+    """The small marker's side beside a large one: at least so much that it is seen before the
+    large one leaves the picture, at most what `why` says."""
+
+    least_m: float
+    most_m: float
+    why: str
+
+
 def suggest(
     camera: CameraModel,
     optics: Optics,
     profile: Profile,
     magnet_m: float,
     ceiling_m: float | None = None,
+    page: str = "a4",
 ) -> tuple[Suggestion, Design]:
-    """The smallest large marker that is seen from the highest search position, and a small
-    one that is whole at the stand-off and seen before the large one leaves the picture.
+    """The largest markers that the page holds and that are seen all the way, as every error
+    falls with the size; a larger page only where the search needs it.
 
-    Raises InvalidValue where the blur leaves nothing to read.
+    Raises InvalidValue where the blur leaves nothing to read, or for a ceiling too low.
     """
+    search_m = _search_range_m(profile, ceiling_m)
     base = _target(0.150, 0.025)
     picture_px = max(camera.size_px)
     large_px = smallest_side_px(base, "large", optics, picture_px)
@@ -67,39 +85,81 @@ def suggest(
             f"no marker is read through a blur of {optics.blur_px:g} px and noise "
             f"{optics.noise:g}: a sharper picture is needed"
         )
-    f, view, notes = focal_px(camera), FieldOfView(camera), []
-    search_m = DEFAULT_SEARCH_M
-    if ceiling_m is not None:
-        search_m = ceiling_m - profile.planner.search.max_height_m
-        if search_m <= 0.0:
-            raise InvalidValue(
-                f"--ceiling {ceiling_m:g} is below the highest search position "
-                f"({profile.planner.search.max_height_m:g} m): lower planner.search.max_height_m"
-            )
-    large_m = math.ceil(FAR_MARGIN * search_m * large_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
-    if not _LARGE_LIMITS_M[0] <= large_m <= _LARGE_LIMITS_M[1]:
-        notes.append(f"a large marker of {1e3 * large_m:.0f} mm would be needed")
-        large_m = min(max(large_m, _LARGE_LIMITS_M[0]), _LARGE_LIMITS_M[1])
-    large_near_m = view.nearest_m(turned_outline(large_m), np.eye(3), np.zeros(3))
-    least_m = 0.0 if large_near_m is None else OVERLAP_MARGIN * large_near_m * small_px / f
-    most_m = min(
-        SMALL_RANGE[1] * large_m,
-        magnet_m / math.sqrt(2.0),
-        NEAR_MARGIN * _largest_at_standoff_m(view, profile),
-    )
-    if least_m > most_m:
+    f, notes = focal_px(camera), []
+    bridging = partial(_smalls, FieldOfView(camera), profile, magnet_m, small_px / f)
+    needed_m = math.ceil(FAR_MARGIN * search_m * large_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
+    if not _LARGE_LIMITS_M[0] <= needed_m <= _LARGE_LIMITS_M[1]:
+        notes.append(f"a large marker of {1e3 * needed_m:.0f} mm would be needed")
+    needed_m = min(max(needed_m, _LARGE_LIMITS_M[0]), _LARGE_LIMITS_M[1])
+    large_m = _largest_m(needed_m, parse_page(page), bridging)
+    smalls = bridging(large_m)
+    if smalls.least_m > smalls.most_m:
         notes.append(
-            f"the small marker would have to be {1e3 * least_m:.1f} mm to be seen before the large "
-            f"one leaves the picture, and can be {1e3 * most_m:.1f} mm at most"
+            f"the small marker would have to be {1e3 * smalls.least_m:.1f} mm to be seen before "
+            f"the large one leaves the picture, and can be {1e3 * smalls.most_m:.1f} mm at most"
         )
-    wish_m = most_m if least_m > most_m else math.sqrt(least_m * most_m) if least_m else most_m
-    small_m = max(wish_m, SMALL_RANGE[0] * large_m, 0.005)
+    small_m = max(smalls.most_m, SMALL_RANGE[0] * large_m, 0.005)
     small_m = math.floor(small_m / _SMALL_STEP_M + 1e-6) * _SMALL_STEP_M
     target = _target(round(large_m, 4), round(small_m, 4))
     check_target(target, max(magnet_m, math.sqrt(2.0) * target.small.side_m))
-    page = fitting_page(target)
+    held = page if fits(target, parse_page(page)) else fitting_page(target)
+    read = f"read from {100 * search_m:.0f} cm away with {millimetres(needed_m)} mm"
+    wider = fits(_target(large_m + _LARGE_STEP_M, small_m), parse_page(page))
+    bound = "beside a larger one no small one takes over" if wider else f"{held} holds no larger"
+    reasons = (
+        f"large {millimetres(large_m)} mm: {read} and more; the larger, the more exact, and {bound}"
+        if large_m > needed_m
+        else f"large {millimetres(large_m)} mm: {read} and no less",
+        f"small {millimetres(small_m)} mm: takes over from the large one with "
+        f"{1e3 * smalls.least_m:.1f} mm and more; the larger, the more exact, and beyond that "
+        f"{smalls.why}",
+    )
     design = make_design(target, camera, optics, profile, ceiling_m)
-    return Suggestion(target, page, tuple(notes)), design
+    return Suggestion(target, held, reasons, tuple(notes)), design
+
+
+def _search_range_m(profile: Profile, ceiling_m: float | None) -> float:
+    """Camera to target at the highest search position."""
+    if ceiling_m is None:
+        return DEFAULT_SEARCH_M
+    range_m = ceiling_m - profile.planner.search.max_height_m
+    if range_m <= 0.0:
+        raise InvalidValue(
+            f"--ceiling {ceiling_m:g} is below the highest search position "
+            f"({profile.planner.search.max_height_m:g} m): lower planner.search.max_height_m"
+        )
+    return range_m
+
+
+def _smalls(
+    view: FieldOfView, profile: Profile, magnet_m: float, angle: float, large_m: float
+) -> _Smalls:
+    """`angle`: the smallest side that is read, per range."""
+    near_m = view.nearest_m(turned_outline(large_m), np.eye(3), np.zeros(3))
+    least_m = 0.0 if near_m is None else OVERLAP_MARGIN * near_m * angle
+    most_m, why = min(
+        (SMALL_RANGE[1] * large_m, "the large one is not read as far around it"),
+        (magnet_m / math.sqrt(2.0), "it is not inside of the magnet"),
+        (
+            NEAR_MARGIN * _largest_at_standoff_m(view, profile),
+            "it is not whole in the picture at the stand-off",
+        ),
+    )
+    return _Smalls(least_m, most_m, why)
+
+
+def _largest_m(
+    needed_m: float, page: tuple[float, float], bridging: Callable[[float], _Smalls]
+) -> float:
+    """The largest side, from the needed one on, that the page holds and that a small marker
+    takes over from; else the needed one."""
+    count = int((_LARGE_LIMITS_M[1] - needed_m) / _LARGE_STEP_M)
+    for side_m in (needed_m + k * _LARGE_STEP_M for k in range(count, 0, -1)):
+        if fits(_target(side_m, SMALL_RANGE[0] * side_m), page):
+            smalls = bridging(side_m)
+            if smalls.least_m <= smalls.most_m:
+                return side_m
+    return needed_m
 
 
 def _target(large_m: float, small_m: float) -> TargetConfig:

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.display.page.sketch import Sketch, draw
-from perchctl.errors import InvalidValue
-from perchctl.files import PartFile, cannot_be_written, check_place
+from perchctl.files import PartFile, cannot_be_written
 from perchctl.track.result import CSV_COLUMNS, Tracked, csv_row
 from perchctl.vision.types import CameraModel
 
@@ -20,20 +19,15 @@ _TICKS_HZ = 90_000  # of the video's times
 _H264 = {"preset": "veryfast", "crf": "20", "bf": "0"}  # no frames out of order: times begin at 0
 
 
-def check_output(path: Path, suffix: str) -> None:
-    """Whether a file can be made there. Errors: InvalidValue (name), NotFound (folder)."""
-    if path.suffix.lower() != suffix:
-        raise InvalidValue(f"{path} must end in {suffix}, which is the format that is written")
-    check_place(path)
-
-
 class _ResultFile:
     """A file that grows under a temporary name; `close` puts it in its place or removes it."""
 
-    def __init__(self, path: Path, suffix: str) -> None:
-        check_output(path, suffix)
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._file = PartFile(path)
+        try:
+            self._file = PartFile(path)
+        except OSError as error:
+            raise cannot_be_written(path, error) from None
 
     def close(self, keep: bool) -> None:
         """Errors: InvalidValue for a file that cannot be completed; it is then removed."""
@@ -57,10 +51,11 @@ class CsvFile(_ResultFile):
     """One row a frame, `t_s` first. Errors: InvalidValue where it cannot be written."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, ".csv")
+        super().__init__(path)
         try:
             self._stream = self._file.part.open("w", encoding="utf-8", newline="")
         except OSError as error:
+            self._file.drop()
             raise cannot_be_written(path, error) from None
         self._writer = csv.writer(self._stream, lineterminator="\n")
         self._writer.writerow(CSV_COLUMNS)
@@ -89,7 +84,7 @@ class OverlayFile(_ResultFile):
     def __init__(self, path: Path, camera: CameraModel, rate_hz: float) -> None:
         import av  # late: most runs write no video
 
-        super().__init__(path, ".mp4")
+        super().__init__(path)
         self._camera, self._start_s, self._last = camera, 0.0, -1
         try:
             with _as_os_error():

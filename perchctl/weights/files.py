@@ -16,10 +16,7 @@ _HEAD = """\
 """
 
 
-def write_weights(path: Path, content: dict[str, Any]) -> Path | None:
-    """Write the file; an existing one is kept aside. Returns where, or None.
-
-    Errors: InvalidValue when it cannot be written; the old file then stays in place.
-    """
+def write_weights(path: Path, content: dict[str, Any]) -> None:
+    """Write the file. Errors: InvalidValue when it cannot be; the old one then stays."""
     text = _HEAD + yaml.safe_dump({"format": FORMAT, **content}, sort_keys=False)
-    return write_files({path: text.encode("utf-8")}, make_folders=True, keep_old=True).get(path)
+    write_files({path: text.encode("utf-8")})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from perchctl.calibration.pictures import views_of_images
 from perchctl.calibration.predict import position_errors_mm, predict_errors, ray_difference_px
 from perchctl.calibration.solve import calibrate
 from perchctl.calibration.types import View
-from perchctl.calibration.verdict import limit_mm
+from perchctl.calibration.verdict import level, limit_mm, sentence
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
@@ -89,9 +90,47 @@ def test_rendered_boards_and_their_truth(scenes_folder: Path) -> None:
     assert np.sqrt((rays**2).mean()) < result.ray_rms_px95
     assert rays.max() < result.ray_max_px95
     for e in result.errors:
-        true_mm = position_errors_mm(result.camera, truth, e.z_m)
+        true_mm = position_errors_mm(result.camera, truth, e.z_m, result.covered)
         assert true_mm.max() < e.mm95
         assert true_mm[0] < e.axis_mm95
+
+
+RANK = {"stop": 0, "care": 1, "fly": 2}
+
+
+def rank_and_aside(views: Sequence[View]) -> tuple[int, float]:
+    """How good the verdict is (a refusal is the worst), and the error aside, in limits."""
+    try:
+        result = calibrate(views, "")
+    except InvalidValue:
+        return -1, np.inf
+    return RANK[level(result)], max(e.mm95 / limit_mm(e.z_m) for e in result.errors)
+
+
+def test_more_photographs_do_not_look_worse(chessboard_folder: Path) -> None:
+    """Beyond the corners the polynomial of all of them is wilder than that of six."""
+    views, _ = views_of_images(str(chessboard_folder), CHESSBOARD)
+    few, many = rank_and_aside(views[:6]), rank_and_aside(views)
+    assert few[0] <= many[0] == RANK["care"]
+    assert few[1] > many[1]
+
+
+def test_more_views_do_not_look_worse() -> None:
+    views, _ = drawn(5, views=14, noise_px=0.2)
+    ranks = [rank_and_aside(views[:n])[0] for n in (4, 6, 9, 14)]
+    assert ranks == sorted(ranks)
+    assert (ranks[0], ranks[-1]) == (-1, RANK["fly"])
+
+
+def test_what_boards_did_not_cover_is_not_good_to_fly_with() -> None:
+    views, camera = drawn(5, views=20, noise_px=0.05)
+    right = 0.62 * camera.size_px[0]
+    cut = [v.keep(v.corners_px[:, 0] < right) for v in views]
+    result = calibrate([v for v in cut if len(v) >= 8], "")
+    assert max(e.axis_mm95 / limit_mm(e.z_m) for e in result.errors) < 1.0
+    assert level(result) == "care"
+    assert "% of the picture is uncovered" in sentence(result)
+    assert "right" in str(result.lacks[-1])
 
 
 def test_the_minimum_is_opencv_s() -> None:

@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera.files import ImagesSource, Recording, VideoSource
+from perchctl.camera.files import (
+    BrokenPicture,
+    ImagesSource,
+    Recording,
+    VideoSource,
+    read_grey,
+)
 from perchctl.camera.mjpeg import without_password
 from perchctl.camera.open import is_live, open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size, to_grey
@@ -162,3 +168,30 @@ def test_grey_from_every_kind_of_array() -> None:
         assert out.dtype == np.uint8
         assert out.flags.c_contiguous
         assert np.array_equal(out, grey)
+
+
+def test_a_picture_that_is_cut_off_is_named_before_a_decoder_speaks_of_it(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (90, 120), np.uint8)
+    jpeg, png = (cv2.imencode(suffix, image)[1].tobytes() for suffix in (".jpg", ".png"))
+    small = cv2.imencode(".jpg", image[:9, :9])[1].tobytes()
+    inside = b"\xff\xe1" + (len(small) + 2).to_bytes(2) + small  # as cameras have previews
+    for name, data in {"a.jpg": jpeg, "b.png": png, "c.jpg": jpeg[:2] + inside + jpeg[2:]}.items():
+        path = tmp_path / name
+        path.write_bytes(data + b"more behind it")
+        assert read_grey(path).shape == (90, 120)
+        for kept in (len(data) // 2, len(data) - 6 if name == "b.png" else len(data) - 1, 300):
+            path.write_bytes(data[:kept])
+            with pytest.raises(BrokenPicture, match=rf"{name} is cut off.*remove or replace it"):
+                read_grey(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("data", [b"", b"no picture", b"\xff\xd8", None])
+def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None:
+    path = tmp_path / "a.jpg"
+    if data is not None:
+        path.write_bytes(data)
+    with pytest.raises(BrokenPicture, match=r"a\.jpg (cannot be read|is cut off)"):
+        read_grey(path)

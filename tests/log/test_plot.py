@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.log.plot import plot_flight, title_of
 from perchctl.log.read import FlightLog, read_log
@@ -125,7 +125,8 @@ def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:
     empty = FlightLog(log.path, log.header, [], [], None, True)
     with pytest.raises(InvalidValue, match="no ticks"):
         plot_flight(empty, tmp_path / "f.png")
-    with pytest.raises(NotFound, match=r"for folder\.png does not exist"):
+    (tmp_path / "no").write_text("in the way")
+    with pytest.raises(InvalidValue, match=r"no is a file, not a folder"):
         plot_flight(log, tmp_path / "no" / "folder.png")
 
 

@@ -17,6 +17,7 @@ import pytest
 from perchctl.profile import Profile, TargetConfig, load_profile
 from perchctl.target.bound import pose_bound
 from perchctl.target.checks import check_target
+from perchctl.target.compare import comparison
 from perchctl.target.design import Design, Ranges, error_curve, make_design
 from perchctl.target.design_text import design_record, design_text
 from perchctl.target.drawing import marker_corners_m
@@ -174,7 +175,28 @@ def test_what_is_suggested_covers_the_way(
     assert design.ranges.z1_m is not None
     assert design.ranges.z1_m >= (1.15 if ceiling_m is None else ceiling_m - 1.3)
     check_target(found.target, 0.05)
+    assert found.page == "a4"
     assert f"--large {found.target.large.side_m * 1e3:g}mm" in found.command()
+
+
+def test_what_is_suggested_is_more_exact_than_the_target_there_is(profile: Profile) -> None:
+    """At every range at which both are seen; and it says what its sizes follow from."""
+    camera, optics = camera_of(380.0), Optics(2.0)
+    found, design = suggest(camera, optics, profile, 0.05, 2.4)
+    present = make_design(profile.target, camera, optics, profile, 2.4)
+    assert found.target.large.side_m > profile.target.large.side_m
+    rows = {row[:30].strip(): row[30:].split()[-2:] for row in comparison(design, present, "sim")}
+    assert rows[""] == ["proposed", "sim"]
+    errors = [values for what, values in rows.items() if what.startswith("least error")]
+    assert len(errors) == 4
+    assert all(float(new) < float(old) for new, old in errors)
+    large, small = found.reasons
+    assert "a4 holds no larger" in large
+    assert "the larger, the more exact" in small
+    larger, _ = suggest(camera, optics, profile, 0.05, 2.4, "a3")
+    assert larger.page == "a3"
+    assert larger.target.large.side_m > found.target.large.side_m
+    assert "not inside of the magnet" in larger.reasons[1]
 
 
 def test_what_no_target_can_cover_is_said(profile: Profile) -> None:

@@ -35,7 +35,7 @@ def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
     out, _ = call()
     assert "wrote target.pdf" in out
     first = Path("target.pdf").read_bytes()
-    call("-o", "target.pdf")
+    call("-o", "target.pdf", "--force")
     assert files() == {"target.pdf"}
     assert Path("target.pdf").read_bytes() == first
 
@@ -54,7 +54,7 @@ def test_the_profile_s_own_date_is_on_the_sheet() -> None:
     Path("mine.yaml").write_text("extends: sim\ndate: 2026-03-01\n")
     call("-p", "mine.yaml", "--svg")
     assert "(profile mine, 2026-03-01)" in Path("target.svg").read_text()
-    call("-p", "mine.yaml", "--svg", "--large", "140mm")
+    call("-p", "mine.yaml", "--svg", "--large", "140mm", "--force")
     assert "2026" not in Path("target.svg").read_text()
 
 
@@ -79,7 +79,9 @@ REFUSALS = [
     (["--page", "a9"], 30, "allowed are a4, letter, a3"),
     (["--png", "9"], 30, "50 to 1200 dpi"),
     (["-o", "target.txt"], 2, "must end in .pdf"),
-    (["-o", "nowhere/target.pdf"], 20, "does not exist"),
+    (["-o", "/dev/null/target.pdf"], 30, "/dev/null is a file, not a folder"),
+    (["--camera", CAMERA, "--plot", "design.pdf"], 30, "must end in .png"),
+    (["--camera", CAMERA, "-o", "design.pdf", "--png", "60"], 2, "name another with --plot"),
     (["-p", "nothing"], 20, "profile 'nothing' not found"),
     (["--board", "chessboard:9x6"], 30, "COLUMNSxROWS:SQUARE"),
     (["--board", "chessboard:9x6:25mm", "--camera", CAMERA], 2, "different tasks"),
@@ -173,7 +175,7 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     path.write_text(PROFILES[name])
     before = load_profile("./mine.yaml")
     words = ("-p", "mine.yaml", "--measured-large", "149.6", "--measured-small", "24.9mm")
-    _, err = call(*words, code=2)
+    _, err = call(*words, code=30)
     assert "--force" in err
     assert path.read_text() == PROFILES[name]
     call(*words, "--force")
@@ -191,7 +193,7 @@ def test_a_small_profile_of_a_file_in_another_folder_finds_it() -> None:
     Path("base/mine.yaml").write_text("extends: crazyflie\nlog: {plot: false}\n")
     call("-p", "base/mine.yaml", "--measured-large", "149.6", "-o", "measured.yaml")
     assert load_profile("./measured.yaml").log.plot is False
-    _, err = call("-p", "base/mine.yaml", "--measured-large", "150", "-o", "measured.yaml", code=2)
+    _, err = call("-p", "base/mine.yaml", "--measured-large", "150", "-o", "measured.yaml", code=30)
     assert "measured.yaml exists" in err
 
 
@@ -217,7 +219,7 @@ def test_both_ways_say_from_where_on_the_mounting_is_blind() -> None:
     assert "example_640x480.yaml: never blind (by whole markers alone: blind from 20 mm" in out
     out, _ = call("--camera", CAMERA)
     assert "mounting  never blind" in out
-    out, _ = call("--camera", CAMERA, "--json")
+    out, _ = call("--camera", CAMERA, "--json", "--force")
     assert json.loads(out)["blind"]["left_m"] == 0.0
 
 

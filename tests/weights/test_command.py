@@ -69,8 +69,12 @@ def test_weights_go_to_a_file_and_from_there_into_a_flight(session: Path, tmp_pa
     assert cv2.imread(str(plot)).shape[0] > 500
     written = yaml.safe_load(out.read_text())
     assert len(written["data"]["sha256"]) == 64
-    assert run(session, "-o", out, "--method", "lms").exit_code == 0
-    assert yaml.safe_load((tmp_path / "w.yaml.bak1").read_text()) == written
+    refused = run(session, "-o", out, "--method", "lms")
+    assert refused.exit_code == 30
+    assert refused.stdout == ""
+    assert "w.yaml exists already; add --force" in refused.stderr
+    assert run(session, "-o", out, "--method", "lms", "--force").exit_code == 0
+    assert yaml.safe_load(out.read_text()) != written
     (tmp_path / "mine.yaml").write_text(
         "extends: paper\nmerge: {method: weights, weights_file: w.yaml}\n", encoding="utf-8"
     )
@@ -88,6 +92,12 @@ def test_the_profile_s_own_file_is_where_they_go(session: Path, tmp_path: Path) 
     with pytest.raises(Exception, match=r"weights_file: /.*/fitted\.yaml does not exist"):
         load_profile(str(profile))
     assert run(session, "-p", profile).exit_code == 0
+    written = (tmp_path / "fitted.yaml").read_text()
+    again = run(session, "-p", profile, "--method", "lms")
+    assert again.exit_code == 0
+    assert "TABLE I" in again.stdout
+    assert "fitted.yaml exists already and stays as it is; add --force" in again.stderr
+    assert (tmp_path / "fitted.yaml").read_text() == written
     (tmp_path / "heir.yaml").write_text(f"extends: {profile}\n", encoding="utf-8")
     for name in ("mine.yaml", "heir.yaml"):
         assert load_profile(str(tmp_path / name)).merge.weights.x == pytest.approx(0.8, abs=0.05)

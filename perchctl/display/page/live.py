@@ -101,8 +101,9 @@ class LivePage:
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> State:
-        """What the page polls: `describe`'s keys (rows, note, phase, battery, over), and title,
-        rate_hz, stop (``none``, ``ready``, ``requested``, ``over``)."""
+        """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
+        0..1; note, phase, battery, over), and title, rate_hz, stop (``none``, ``ready``,
+        ``requested``, ``over``)."""
         try:
             described = self._describe()
         except Exception as error:
