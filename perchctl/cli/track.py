@@ -19,6 +19,7 @@ from perchctl.cli.app import (
 from perchctl.cli.complete import complete_source
 
 
+# long: a list of options
 def track(
     source: Annotated[
         str,

@@ -72,6 +72,6 @@ def test_a_good_mounting_needs_no_advice(gear_m: tuple[float, float, float]) -> 
 
 
 def test_a_gear_far_aside_is_never_seen() -> None:
-    mount = of((0.4, 0.0, 0.0))
+    mount = of((0.28, 0.0, 0.0))
     assert mount.blind.whole_m is None
     assert "blind in all of the last 10 cm" in blind_lines(mount)[0]

@@ -252,7 +252,7 @@ def test_kalibr_s_own_file_of_a_board_is_read(tmp_path: Path) -> None:
         ("tagCols: 6", "tagCols: 6.5", "not whole"),
         ("tagCols: 6", "tagCols: .inf", "not whole"),
         ("0.088", ".nan", "not a length"),
-        ("0.088", "[", "ParserError"),
+        ("0.088", "[", "not YAML"),
         ("tagCols: 6", "tagCols: 1", "3 to 100"),
         ("tagSpacing: 0.3", "tagSpacing: 3", "share of the tag"),
     ],
