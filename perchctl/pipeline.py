@@ -28,7 +28,7 @@ from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners
 from perchctl.vision.solve import Candidate
 from perchctl.vision.strategies import Merged, MergeStrategy, Prior, make_strategy
-from perchctl.vision.tracks import TrackSetup, followed_on, make_track_setup
+from perchctl.vision.tracks import TrackSetup, followed_on, make_track_setup, surest_of
 from perchctl.vision.types import (
     Attitude,
     CameraModel,
@@ -174,7 +174,7 @@ def _followed(
     disagreeing = state.disagreeing_frames
     if both and taken:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
-    surest = next(iter(measured.poses.values()), None)
+    surest = surest_of(measured)
     sees = surest is not None and taken
     if surest is not None and sees:
         sighting = Sighting(surest, attitude)

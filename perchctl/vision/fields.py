@@ -62,11 +62,13 @@ _TURNED_EVIDENCE = 1.0  # against an order that was taken for known
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
-    """What is known of a stream. `kind`: of the last frame that was looked at. `votes`: for the
+    """What is known of a stream. `kind`: of the last frame that was looked at, `skipped` frames
+    ago. `votes`: for the
     top field being the earlier one. `top_first`: None until it is known. `previous`: the last
     picture, where it was combed."""
 
     kind: PictureKind | None = None
+    skipped: int = 0
     votes: float = 0.0
     top_first: bool | None = None
     periods_s: tuple[float, ...] = ()
@@ -90,7 +92,7 @@ def combing(image: Grey) -> float:
     groups, width = len(image) // _GROUP, image.shape[1]
     if groups == 0:
         return 0.0
-    # Groups of rows side by side, so that the next row is `width` further along; every second
+    # Groups of rows side by side, so that the next row is `width` further along; every third
     # group is enough.
     flat = np.ascontiguousarray(image[: groups * _GROUP]).reshape(groups, _GROUP * width)[::3]
     above2, above, row, below, below2 = (
@@ -163,8 +165,12 @@ def separated(
     ``progressive`` that none is. In a stream in which none was seen yet, every third frame
     is looked at.
     """
-    if frame.fields is None and mode == "auto" and state.kind == "whole" and frame.index % _EVERY:
+    skip = frame.fields is None and mode == "auto" and state.kind == "whole"
+    if skip and state.skipped + 1 < _EVERY:
         frame = replace(frame, fields="whole")
+        state = replace(state, skipped=state.skipped + 1)
+    else:
+        state = replace(state, skipped=0)
     frame = looked_at(frame, mode)
     if state.kind != "woven":  # a stream of fields stays one
         state = replace(state, kind=frame.fields)

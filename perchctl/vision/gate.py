@@ -7,12 +7,13 @@ stranger's and feeds no filter; the planner then sees a target that is not measu
 is watched: as long as it goes on it stays one, however vague the lock becomes meanwhile.
 
 The lock goes over to a stranger explicitly: to one that rests on both markers, at once if the
-lock never did or was hardly begun, or, if it is as far away as the target was, after
-`REACQUIRE_S` in which the target was not seen. A lock that nothing has confirmed for `FORGET_S`
-is forgotten.
+lock never did, or, if it is as far away as the target was, after `REACQUIRE_S` in which the
+target was not seen; and to any that was seen more often than a lock that is hardly begun. A
+lock that nothing has confirmed for `FORGET_S` is forgotten.
 
 Where the state estimate jumps, the target seems to jump in the world, but not in the picture:
-a pose that goes on from the last one relative to the vehicle is the target's, too.
+a pose that goes on from the last one relative to the vehicle, though not in the world, is the
+target's, too.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ _SIDEWAYS, _ALONG = 0.015, 0.02
 _PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
 _TURNED_RAD = math.radians(15.0)  # worth a word
 # How a hovering vehicle moves relative to the target while its estimate jumps.
-_CALM_S, _CALM_MPS, _CALM_RADPS = 0.1, 0.3, 0.5
+_CALM_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
+_EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfits
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +67,12 @@ class Sight:
 @dataclass(frozen=True, eq=False)
 class Verdict:
     """Whether the pose is the target's; if so, whether the tracks have to begin anew there,
-    else whose it is; and a sentence for people where that is not as ever."""
+    else whose it is; and a sentence for people where that is not as ever. `same`: though the
+    tracks begin anew, it is the target that was locked on."""
 
     taken: bool
     afresh: bool = False
+    same: bool = False
     stranger: Stranger | None = None
     text: str = ""
 
@@ -80,8 +84,10 @@ def judged(
     lock, stranger = remembered(lock, stranger, sight.t_s)
     if stranger is not None and stranger.in_world != sight.in_world:
         stranger = None
-    if lock is None or lock.in_world != sight.in_world or sight.t_s <= lock.track.t_s:
+    if lock is None or lock.in_world != sight.in_world:
         return Verdict(taken=True)
+    if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
+        return Verdict(taken=False, stranger=stranger)
     if stranger is None and _clearly(lock.track, sight, constants):
         return Verdict(taken=True)
     wanted = _expected(lock.track, sight.t_s, constants)
@@ -92,8 +98,8 @@ def judged(
     theirs = other is not None and other.squared <= _GATE
     if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
         return Verdict(taken=True, stranger=stranger)
-    if not theirs and _goes_on(lock, sight):
-        return Verdict(taken=True, afresh=True, text=_JUMPED)
+    if not theirs and _goes_on(lock, sight, fit):
+        return Verdict(taken=True, afresh=True, same=True, text=_JUMPED)
     seen = _watched(stranger if theirs else None, sight, fit, constants)
     if _believed(lock, seen, sight):
         text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
@@ -112,14 +118,16 @@ def remembered(
     age_s = t_s - lock.track.t_s
     # A place in the level frame means nothing for long, but a stranger stays a stranger.
     lasting = lock.in_world or stranger is not None
-    if abs(age_s) > (FORGET_S if lasting else MAX_GAP_S):
+    # A clock that was set back: nothing that is older than it will be confirmed.
+    if age_s < -MAX_GAP_S or age_s > (FORGET_S if lasting else MAX_GAP_S):
         return None, None
     return lock, stranger
 
 
-def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, afresh: bool) -> Lock:
+def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict) -> Lock:
     """The lock after a pose that was taken; `track` is what it fed."""
-    before = None if afresh else lock
+    anew = verdict.afresh and not verdict.same
+    before = None if lock is None or anew or lock.in_world != sight.in_world else lock
     return Lock(
         track=track,
         pose=sight.pose,
@@ -134,9 +142,11 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, afresh: bool) ->
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Squared distance in units of its spread S (4, 4); how far away (m), how far turned, and
+    """By how much it is off (4,); its square in units of its spread S (4, 4); how far away (m),
+    how far turned, and
     how much farther up (m), and whether that alone is too much."""
 
+    off: Array
     squared: float
     S: Array
     away_m: float
@@ -171,6 +181,7 @@ def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
     R = constants.R if measured.R is None else measured.R
     S = wanted.R + R + bias @ bias.T + np.diag(_unclaimed(_range_m(sight)) ** 2)
     return _Fit(
+        off=off,
         squared=float(off @ np.linalg.solve(S, off)),
         S=S,
         away_m=float(np.linalg.norm(off[1:])),
@@ -199,8 +210,9 @@ def _unclaimed(range_m: float) -> Array:
     return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
 
 
-def _goes_on(lock: Lock, sight: Sight) -> bool:
-    """Whether the pose goes on from the last one as seen from the vehicle."""
+def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
+    """Whether the pose goes on from the last one as seen from the vehicle, much better than
+    in the world (`fit`): what is off in both did not come about by the estimate."""
     dt_s = sight.t_s - lock.track.t_s
     if not sight.in_world or dt_s > _CALM_S:
         return False
@@ -209,7 +221,10 @@ def _goes_on(lock: Lock, sight: Sight) -> bool:
     off[1:] = sight.pose.e_m - lock.pose.e_m
     moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
     moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
-    return float((off * off / (_unclaimed(range_m) ** 2 + moved * moved)).sum()) <= _GATE
+    unclaimed = _unclaimed(range_m)
+    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, fit.off))
+    calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE
+    return calm and seen < _EXPLAINED * jumped
 
 
 # --- strangers ---------------------------------------------------------------------

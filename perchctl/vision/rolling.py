@@ -47,9 +47,17 @@ def seen_at_once(
         if readout_s is None:
             out.append(replace(d, common_px=moved_px))
         else:
-            sigma_px = float(np.hypot(d.sigma_px, TURN_SIGMA * np.abs(moved_px).max()))
-            back_px, along_px = d.corners_px - moved_px, FLOW_SIGMA * moved_px
-            out.append(replace(d, corners_px=back_px, sigma_px=sigma_px, common_px=along_px))
+            turned_px = TURN_SIGMA * float(np.abs(moved_px).max())
+            cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
+            out.append(
+                replace(
+                    d,
+                    corners_px=d.corners_px - moved_px,
+                    sigma_px=float(np.hypot(d.sigma_px, turned_px)),
+                    cov_px2=cov_px2,
+                    common_px=FLOW_SIGMA * moved_px,
+                )
+            )
     return out
 
 

@@ -15,6 +15,7 @@ from perchctl.vision.pose import PoseSetup
 from perchctl.vision.types import (
     Attitude,
     Lock,
+    MarkerPose,
     MarkerTrack,
     Measured,
     PipelineState,
@@ -89,17 +90,23 @@ def followed_on(
         surest = next(iter(tracks.values()))
         if len(tracks) > 1:
             surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
-        lock = locked(lock, surest, sight, verdict.afresh)
+        lock = locked(lock, surest, sight, verdict)
     return Followed(measured, tracks, lock, stranger, verdict.taken, verdict.text)
 
 
 def _sight(measured: Measured, fed: Mapping[str, Measurement], t_s: float, in_world: bool) -> Sight:
     """What the gate has to judge: the surest pose of those that would be fed."""
-    name, pose = min(
-        measured.fed.items(), key=lambda each: float(each[1].sigma_m @ each[1].sigma_m)
-    )
+    pose = surest_of(measured)
+    assert pose is not None
+    name = next(n for n, each in measured.fed.items() if each is pose)
     whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
     return Sight(t_s, pose, fed[name], in_world, whole)
+
+
+def surest_of(measured: Measured) -> MarkerPose | None:
+    """Of the poses that are fed, or else of all."""
+    poses = measured.fed or measured.poses
+    return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)
 
 
 def _stepped(

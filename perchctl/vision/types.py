@@ -104,6 +104,7 @@ class Detections:
     flow_px_s: dict[MarkerName, Array] = field(default_factory=dict)  # of each corner, (4, 2)
     edge_shift: EdgeShift | None = None
     ghost_px: float = 0.0  # between the double edges of two blended fields; 0: single edges
+    ghost_age: int = 0  # pictures since these were looked for
 
     def get(self, marker: MarkerName) -> Detection | None:
         return self.large if marker == "large" else self.small
@@ -266,7 +267,7 @@ class Measured:
     """What one frame's corners gave.
 
     Attributes:
-        poses: by ``joint``, ``large``, ``small``; the surest first.
+        poses: by ``joint``, ``large``, ``small``, in this order.
         fed: the track that each pose of this frame goes into.
         contradicting: the two markers exclude each other.
     """

@@ -195,6 +195,52 @@ def test_an_estimate_that_jumps_loses_no_target(
         assert np.abs(output.target.world_m - TARGET_M - jump_m).max() < 0.015
 
 
+@pytest.mark.parametrize("missed", [0, 1, 2, 4, 8])
+@pytest.mark.parametrize("jump_m", [(0.0, 0.0, 0.08), (0.12, 0.0, 0.0)])
+def test_an_estimate_that_jumps_while_frames_are_missed_loses_no_target(
+    build: Build, missed: int, jump_m: tuple[float, float, float]
+) -> None:
+    watch = Watch(build(), in_world=True)
+    watch.show(LOCKED)
+    watch.show(missed, markers=())
+    watch.jumped_m = jump_m
+    assert all(measured(watch.show(10)))
+
+
+def test_what_is_off_in_the_picture_too_is_no_jump_of_the_estimate(build: Build) -> None:
+    """One pose that is 10 cm off does not move the tracks, and the next are taken as ever."""
+    watch = Watch(build(), in_world=True)
+    watch.show(LOCKED)
+    assert measured(watch.show(1, away_m=(0.15, 0.0, 0.0))) == [False]
+    assert all(measured(watch.show(5)))
+
+
+def test_a_lock_keeps_its_standing_when_the_estimate_jumps(build: Build) -> None:
+    watch = Watch(build(), in_world=True)
+    watch.show(60)
+    watch.jumped_m = (0.0, 0.0, 0.4)
+    assert all(measured(watch.show(3)))
+    assert not any(measured(watch.show(12, markers=("large",), scale=0.5)))
+    assert not any(measured(watch.show(12, away_m=(0.24, 0.0, 0.0))))
+
+
+def test_a_frame_out_of_order_captures_no_lock(watch: Watch) -> None:
+    """Two frames of a burst whose fields overlap: the later one's are judged, the other's are
+    not measured."""
+    watch.show(LOCKED)
+    watch.k -= 2
+    assert not any(measured(watch.show(1, **HALF)))
+    watch.k += 1
+    assert not any(measured(watch.show(12, **HALF)))
+    assert measured(watch.show(1)) == [True]
+
+
+def test_a_clock_that_was_set_back_begins_anew(watch: Watch) -> None:
+    watch.show(LOCKED)
+    watch.k -= int(5.0 * HZ)
+    assert any(measured(watch.show(3)))
+
+
 def test_both_markers_overrule_a_lock_on_one(watch: Watch) -> None:
     """What was locked on was perhaps never the target."""
     watch.show(20, markers=("large",), scale=0.5)

@@ -288,10 +288,8 @@ def _alignment(
     grid, light, error = scene.grid, equations.light, equations.error
     corners_px = through_lens(projected(fit.H, *UNIT.T), scene.camera)
     pattern = pattern_seen(drawing, grid, fit.blur_px / scene.node_px, light, error)
-    covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE] * repeated(
-        error.reshape(grid.n, grid.n)
-    )
     many = repeated(error.reshape(grid.n, grid.n))
+    covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE] * many
     soft = soft_cells(drawing, grid.axis, drawing.reach / grid.n, fit.blur_px / scene.node_px)
     cells = cells_seen(
         drawing.cells,

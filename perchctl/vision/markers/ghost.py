@@ -42,9 +42,10 @@ def with_ghosts(
     velocity = now.velocity_px_s
     if velocity is not None and float(np.hypot(*velocity)) < SLOW_PX_S:
         return now
-    single = velocity is not None and previous is not None and previous.ghost_px == 0.0
-    if single and now.frame_index % _EVERY:
-        return now
+    if velocity is not None and previous is not None and previous.ghost_px == 0.0:
+        age = previous.ghost_age + 1
+        if age < _EVERY:
+            return replace(now, ghost_age=age)
     seen = [d for name in MARKERS if (d := now.get(name)) is not None]
     shows = _shows_best(seen)
     ghost_px = 0.0 if shows is None else double_edge_px(image, shows)
