@@ -143,8 +143,7 @@ def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """By how much it is off (4,); its square in units of its spread S (4, 4); how far away (m),
-    how far turned, and
-    how much farther up (m), and whether that alone is too much."""
+    how far turned, how much farther up (m), and whether that alone is too much."""
 
     off: Array
     squared: float
