@@ -56,7 +56,9 @@ def same_file(one: Path, other: Path) -> bool:
     return one.exists() and other.exists() and one.samefile(other)
 
 
-def cannot_be_written(path: Path, error: OSError, more: str = "") -> InvalidValue:
+def cannot_be_written(
+    path: Path, error: OSError, more: str = ": free some space, or choose another place"
+) -> InvalidValue:
     """The operating system's refusal as one sentence."""
     return InvalidValue(f"{path} cannot be written: {error.strerror or error}{more}")
 

@@ -10,7 +10,8 @@ from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
 from perchctl.errors import InvalidValue, NotFound, TimedOut
 
-ALLOWED = "camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, sim:"
+REAL = "camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH"
+ALLOWED = f"{REAL}, sim:"
 
 FIRST_FRAME_WITHIN_S = 8.0
 SCHEMES = ("camera", "video", "images", "http", "https", "sim")
@@ -29,12 +30,12 @@ def source_spec(source: str) -> str:
         return f"images:{source}"
     if path.is_file():
         return f"{'images' if path.suffix.lower() in IMAGE_SUFFIXES else 'video'}:{source}"
-    if path.suffix or "/" in source:
-        raise NotFound(
-            f"{source} does not exist; a source is a video, picture or folder of pictures, or "
-            f"one of camera:N, video:FILE, images:DIR, http://HOST:PORT/PATH"
-        )
-    return source  # `open_source` names what is allowed
+    if scheme_of(source) and not path.suffix and "/" not in source:
+        return source  # `open_source` names what is allowed
+    raise NotFound(
+        f"{source} does not exist; a source is a video, picture or folder of pictures, or "
+        f"one of camera:N, video:FILE, images:DIR, http://HOST:PORT/PATH"
+    )
 
 
 def scheme_of(spec: str) -> str:
@@ -96,7 +97,7 @@ def open_source(
     if spec == "sim:":
         raise InvalidValue(
             "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "
-            f"other sources are {ALLOWED}"
+            f"other sources are {REAL}"
         )
     raise InvalidValue(f"camera source {spec!r} is unknown; allowed are {ALLOWED}")
 

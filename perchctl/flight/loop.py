@@ -255,7 +255,8 @@ def _report(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) ->
         reason=_reason(state, obs, passed),
         attempts=_attempts(state),
         duration_s=obs.t_s - state.started_s,
-        locked=obs.telemetry.has(LOCKED),
+        # The telemetry at hand is older than an emergency stop, which always locks.
+        locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
         history=passed,
     )
 

@@ -188,7 +188,9 @@ def _one_sentence(path: Path, error: ValidationError) -> str:
     first = faults[0]
     key = clipped(".".join(str(part) for part in first["loc"]) or "profile")
     if first["type"] == "extra_forbidden":
-        text = f"this key is unknown; allowed here are {', '.join(_keys_at(first['loc'][:-1]))}"
+        above = first["loc"][:-1]
+        keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
+        text = f"this key is unknown; allowed here are {', '.join(keys)}"
     elif first["type"] == "value_error":
         text = clipped(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
     elif first["type"] == "model_type":

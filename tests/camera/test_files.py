@@ -110,10 +110,11 @@ def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
     assert source_spec(f"{tmp_path}/*.png") == f"images:{tmp_path}/*.png"
     assert source_spec(str(picture)) == f"images:{picture}"
     assert source_spec(str(video)) == f"video:{video}"
-    for spec in ("camera:0", "http://host/stream", "webcam"):
+    for spec in ("camera:0", "http://host/stream", "webcam:0"):
         assert source_spec(spec) == spec
-    with pytest.raises(NotFound, match=r"none\.mp4 does not exist"):
-        source_spec("none.mp4")
+    for path in ("none.mp4", "none"):
+        with pytest.raises(NotFound, match=f"^{path} does not exist"):
+            source_spec(path)
 
 
 def test_a_password_is_not_shown() -> None:

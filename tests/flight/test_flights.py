@@ -281,3 +281,4 @@ def test_ctrl_c_twice_cuts_the_motors(phase: Phase) -> None:
     assert report.outcome is Outcome.EMERGENCY
     assert EXIT_CODE_OF[report.outcome] == 53
     assert flown.flight.locked  # docs/firmware.md, "Emergency stop"
+    assert report.locked  # which is said, though no telemetry has told it yet

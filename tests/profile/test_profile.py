@@ -55,7 +55,7 @@ def _refusal(tmp_path: Path, text: str) -> str:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("planer: {}", ["planer", "unknown", "planner"]),
+        ("planer: {}", ["planer", "unknown", "extends", "planner"]),
         ("kalman: {alfa: 0.85}", ["kalman.alfa", "unknown", "alpha"]),
         ("target: {large: {dictionary: DICT_4X4_100, id: 997, side_m: 0.15}}",
          ["target.large", "997", "0..99", "DICT_4X4_1000"]),

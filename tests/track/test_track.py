@@ -557,7 +557,8 @@ def test_ctrl_c_leaves_whole_files(video: Path, tmp_path: Path) -> None:
 def test_a_full_disk_is_one_sentence_and_leaves_no_file(video: Path, tmp_path: Path) -> None:
     old = tmp_path / "x.csv"
     old.write_text("old")
-    with full_disk(room=4_000), pytest.raises(InvalidValue, match=r"x\.csv cannot be written"):
+    sentence = r"x\.csv cannot be written: .*: free some space"
+    with full_disk(room=4_000), pytest.raises(InvalidValue, match=sentence):
         track(video, csv=old, overlay=tmp_path / "x.mp4", force=True)
     assert old.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["x.csv"]
@@ -584,8 +585,9 @@ def command(*words: str) -> tuple[int, str, str]:
         (["nowhere.mp4"], 20, "nowhere.mp4 does not exist"),
         (["video:nowhere.mp4"], 20, "nowhere.mp4 was not found"),
         (["images:*.nothing"], 20, "names pictures"),
-        (["nonsense"], 30, "allowed are camera:N"),
-        (["sim:"], 30, "needs a link of sim://"),
+        (["nonsense"], 20, "nonsense does not exist; a source is a video, picture or folder"),
+        (["nonsense:1"], 30, "allowed are camera:N"),
+        (["sim:"], 30, "needs a link of sim://; other sources are camera:N"),
         (["PICTURES", "--calibration", "no.yaml"], 20, "no.yaml not found"),
         (["PICTURES", "-p", "nobody"], 20, "profile 'nobody' not found"),
         (["PICTURES", "--csv", "x.txt"], 30, "must end in .csv"),
