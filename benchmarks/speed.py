@@ -1,12 +1,12 @@
 """Time a frame on a moving sequence, against two full-frame detectors: same frames, same
-process, one thread, CPU time. Of several passes each frame's least counts: what else a
-machine does makes small steps dearer than large ones."""
+process, one thread, CPU time. All take turns, and of several passes each frame's least counts:
+what else a machine does makes small steps dearer than large ones."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from common import (
@@ -27,7 +27,9 @@ from perchctl.pipeline import FieldState, pictures, step
 from perchctl.vision.markers.detect import detect
 from perchctl.vision.types import Attitude, Detections, Frame, PipelineOutput, PipelineState
 
-RATE_HZ, PASSES = 30.0, 5
+RATE_HZ, PASSES = 30.0, 15
+BASE, WHOLE = "two full-frame detectors", "frame to target pose"
+Found = dict[str, object]
 
 
 def path(t: float) -> tuple[Array, Attitude]:
@@ -50,19 +52,22 @@ def sequence(count: int) -> Iterator[tuple[Frame, Attitude, Array]]:
 
 
 def timed(
-    count: int, work: Callable[[int], dict[str, object]], afresh: Callable[[], None]
-) -> tuple[Array, list[dict[str, object]]]:
-    """CPU ms of each frame, and what was found in it; each pass begins `afresh`."""
-    least = np.full(count, math.inf)
-    found: list[dict[str, object]] = []
+    count: int, works: Mapping[str, Callable[[int], Found]], afresh: Callable[[], None]
+) -> dict[str, tuple[Array, list[Found]]]:
+    """Of each work the CPU ms of each frame, and what was found in it; all take turns, and
+    each pass begins `afresh`."""
+    least = {label: np.full(count, math.inf) for label in works}
+    found: dict[str, list[Found]] = {}
     for _ in range(PASSES):
-        afresh()
-        found = []
-        for k in range(count):
-            start = time.thread_time()
-            found.append(work(k))
-            least[k] = min(least[k], (time.thread_time() - start) * 1e3)
-    return least, found
+        for label, work in works.items():
+            afresh()
+            found[label] = []
+            for k in range(count):
+                start = time.thread_time()
+                found[label].append(work(k))
+                took_ms = (time.thread_time() - start) * 1e3
+                least[label][k] = min(least[label][k], took_ms)
+    return {label: (least[label], found[label]) for label in works}
 
 
 def main() -> None:
@@ -74,16 +79,16 @@ def main() -> None:
     setup = setup_with()
     errors = []
 
-    def plain(k: int) -> dict[str, object]:
+    def plain(k: int) -> Found:
         return dict(plain_detect(frames[k][0].image))
 
-    def detection(k: int) -> dict[str, object]:
+    def detection(k: int) -> Found:
         nonlocal last
         seen = detect(frames[k][0], last, setup.detector, CAMERA)
         last = seen if seen.large or seen.small else last
         return {"large": seen.large, "small": seen.small}
 
-    def whole(k: int, attitude: Attitude | None) -> dict[str, object]:
+    def whole(k: int, attitude: Attitude | None) -> Found:
         nonlocal state, stream
         stream, (frame,) = pictures(stream, frames[k][0], setup)
         state, output = step(state, frame, attitude, setup)
@@ -94,24 +99,23 @@ def main() -> None:
         last, state, stream = None, PipelineState(), FieldState()
 
     rows = []
-    base = np.ones(2)
     total = {name: sum(seen) for name, seen in visible.items()}
-    for label, work in (
-        ("two full-frame detectors", plain),
-        ("detection, corners refined", detection),
-        ("frame to target pose", lambda k: whole(k, frames[k][1])),
-        ("the same without attitude", lambda k: whole(k, None)),
-    ):
-        times, found = timed(len(frames), work, afresh)
-        if work is plain:
-            base = np.percentile(times, [50, 99])
+    works: dict[str, Callable[[int], Found]] = {
+        BASE: plain,
+        "detection, corners refined": detection,
+        WHOLE: lambda k: whole(k, frames[k][1]),
+        "the same without attitude": lambda k: whole(k, None),
+    }
+    results = timed(len(frames), works, afresh)
+    base = np.percentile(results[BASE][0], [50, 99])
+    for label, (times, found) in results.items():
         median, p99 = (float(v) for v in np.percentile(times, [50, 99]))
         hits = [
             sum(visible[name][k] and f.get(name) is not None for k, f in enumerate(found))
             for name in total
         ]
         rows.append((label, median, p99, float(base[0]) / median, float(base[1]) / p99, *hits))
-        if label == "frame to target pose":
+        if label == WHOLE:
             for (_, _, T), f in zip(frames, found, strict=True):
                 output = f["all"]
                 assert isinstance(output, PipelineOutput)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.geometry import Array, rot_z
+from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile
 from perchctl.profile.mask import read_mask
 from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
@@ -28,7 +28,13 @@ from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners
 from perchctl.vision.solve import Candidate
 from perchctl.vision.strategies import Merged, MergeStrategy, Prior, make_strategy
-from perchctl.vision.tracks import TrackSetup, followed_on, make_track_setup, surest_of
+from perchctl.vision.tracks import (
+    Followed,
+    TrackSetup,
+    followed_on,
+    make_track_setup,
+    surest_of,
+)
 from perchctl.vision.types import (
     Attitude,
     CameraModel,
@@ -178,12 +184,13 @@ def _followed(
     sees = surest is not None and taken
     if surest is not None and sees:
         sighting = Sighting(surest, attitude)
+    target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     new = PipelineState(
         tracks=followed.tracks,
         in_world=in_world,
         measured=measured,
         attitude=attitude,
-        target=state.target,
+        target=target or state.target,
         last=detections if anything and taken else _still_useful(state.last, t_s),
         sighting=sighting if sees or followed.tracks else None,
         disagreeing_frames=disagreeing,
@@ -191,7 +198,6 @@ def _followed(
         lock=followed.lock,
         stranger=followed.stranger,
     )
-    target = _at_frame(new, t_s, pipeline)
     output = PipelineOutput(
         detections=detections,
         poses=measured.poses,
@@ -201,7 +207,7 @@ def _followed(
         lock_note=followed.note or (SEVERAL if detections.targets > 1 else ""),
         fields=fields,
     )
-    return replace(new, target=target or state.target), output
+    return new, output
 
 
 def estimate(
@@ -240,16 +246,23 @@ def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
 # --- from the tracks to the target -------------------------------------------------
 
 
-def _at_frame(state: PipelineState, t_s: float, pipeline: Pipeline) -> TargetEstimate | None:
-    """The target at the newest frame's time; None without a track."""
-    fed, attitude, before = state.measured.fed, state.attitude, state.target
-    merged = pipeline.strategy.merge(state.tracks, fed)
+def _at_frame(
+    followed: Followed,
+    before: TargetEstimate | None,
+    t_s: float,
+    attitude: Attitude | None,
+    in_world: bool,
+    pipeline: Pipeline,
+) -> TargetEstimate | None:
+    """The target at the newest frame's time; None without a track. `before`: the last one."""
+    fed, tracks = followed.measured.fed, followed.tracks
+    merged = pipeline.strategy.merge(tracks, fed)
     if merged is None:
         return None
-    measured = any(n in state.tracks and state.tracks[n].t_s == t_s for n in fed)
+    measured = any(n in tracks and tracks[n].t_s == t_s for n in fed)
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
-    if attitude is not None and state.in_world:
+    if attitude is not None and in_world:
         place = _in_world(merged, attitude, pipeline)
     else:
         place = _level(merged, attitude, pipeline)
@@ -284,7 +297,7 @@ def _level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dic
 
 def _in_world(merged: Merged, attitude: Attitude, pipeline: Pipeline) -> dict[str, Any]:
     """The same of tracks in the world, as seen from the vehicle at `attitude`."""
-    turn = rot_z(-attitude.yaw_rad)
+    turn = attitude.R_world_level.T
     bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
     world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
     e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)

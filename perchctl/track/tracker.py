@@ -19,15 +19,7 @@ from perchctl.pipeline import (
     pictures,
     step,
 )
-from perchctl.profile import Profile, TargetConfig
-from perchctl.target.print_check import (
-    MIN_FRAMES,
-    PrintVerdict,
-    SizeRatio,
-    combined,
-    size_ratio,
-    verdict,
-)
+from perchctl.profile import Profile
 from perchctl.track.jumps import JUMPS, jumped, pose_in
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
 from perchctl.vision.fields import BLENDED, INTERLACED
@@ -41,7 +33,6 @@ from perchctl.vision.types import (
 )
 
 MOST_NOTES = 20
-FOLD_RATIOS = 500  # frames whose size ratios are kept one by one
 # A live picture that stands still or is noise is no measurement; the others are searched.
 _NO_PICTURE = ("frozen", "snow")
 _DISAGREE = "the two markers contradict: check the print's sizes and the calibration"
@@ -156,42 +147,6 @@ class Tally:
             f"{self.frames} {plural} in {took_s:.1f} s ({self.frames / took_s:.0f} a second): "
             f"large {share * self.large:.0f} %, small {share * self.small:.0f} %{counted}"
         )
-
-
-@dataclass(eq=False)
-class PrintCheck:
-    """The ratio of the two markers' apparent sizes over the frames that show both."""
-
-    camera: CameraModel
-    target: TargetConfig
-    _ratios: list[SizeRatio] = field(default_factory=list)
-
-    def add(self, output: PipelineOutput | None) -> None:
-        if output is None:
-            return
-        large, small = output.detections.large, output.detections.small
-        if large is None or small is None or not (large.refined and small.refined):
-            return
-        ratio = size_ratio(
-            large.corners_px,
-            small.corners_px,
-            (large.sigma_px, small.sigma_px),
-            self.camera,
-            self.target,
-        )
-        if ratio is not None:
-            self._ratios.append(ratio)
-        if len(self._ratios) >= FOLD_RATIOS:
-            mean = combined(self._ratios)
-            self._ratios = [] if mean is None else [mean]
-
-    @property
-    def judged(self) -> bool:
-        """Whether enough frames showed both markers."""
-        return sum(ratio.frames for ratio in self._ratios) >= MIN_FRAMES
-
-    def verdict(self) -> PrintVerdict:
-        return verdict(combined(self._ratios), self.target)
 
 
 class Notes:

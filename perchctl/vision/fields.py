@@ -166,16 +166,16 @@ def separated(
     is looked at.
     """
     skip = frame.fields is None and mode == "auto" and state.kind == "whole"
-    if skip and state.skipped + 1 < _EVERY:
-        frame = replace(frame, fields="whole")
-        state = replace(state, skipped=state.skipped + 1)
-    else:
-        state = replace(state, skipped=0)
-    frame = looked_at(frame, mode)
-    if state.kind != "woven":  # a stream of fields stays one
-        state = replace(state, kind=frame.fields)
+    skip = skip and state.skipped + 1 < _EVERY
+    frame = replace(frame, fields="whole") if skip else looked_at(frame, mode)
+    skipped = state.skipped + 1 if skip else 0
+    # A stream of fields stays one.
+    kind = state.kind if state.kind == "woven" else frame.fields
+    periods_s = _periods_s(state, frame)
     if frame.fields == "whole":
-        return _timed(replace(state, previous=None), frame), (frame,)
+        new = FieldState(kind, skipped, state.votes, state.top_first, periods_s, frame.t_s)
+        return new, (frame,)
+    state = replace(state, kind=kind, skipped=skipped)
     if mode in ("top", "bottom"):
         state = replace(_timed(state, frame), top_first=mode == "top")
     else:
@@ -191,14 +191,17 @@ def separated(
     )
 
 
-def _timed(state: FieldState, frame: Frame) -> FieldState:
+def _periods_s(state: FieldState, frame: Frame) -> tuple[float, ...]:
     """With the time since the last frame."""
-    periods_s = state.periods_s
     if state.last_s is not None:
         gap_s = frame.t_s - state.last_s
         if _ANY_PERIOD_S[0] < gap_s < _ANY_PERIOD_S[1]:
-            periods_s = (*periods_s[1 - _KEPT_PERIODS :], gap_s)
-    return replace(state, periods_s=periods_s, last_s=frame.t_s)
+            return (*state.periods_s[1 - _KEPT_PERIODS :], gap_s)
+    return state.periods_s
+
+
+def _timed(state: FieldState, frame: Frame) -> FieldState:
+    return replace(state, periods_s=_periods_s(state, frame), last_s=frame.t_s)
 
 
 def _voted(state: FieldState, frame: Frame) -> FieldState:

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
 import numpy as np
-from filterpy.kalman import predict, update
+from filterpy.kalman import predict
 
 from perchctl.geometry import Array, finite, wrap_rad
 from perchctl.profile import KalmanConfig
@@ -33,7 +35,6 @@ MAX_GAP_S = 1.0
 MAX_PREDICTION_S = 1.0
 """Beyond it the target is taken to stay where it was predicted."""
 
-H: Array = np.eye(8)[MEASURED]  # equation 2
 _AXES: Array = np.eye(3)
 _STILL: Array = np.eye(8)
 _MOVES: Array = np.eye(8, k=1)
@@ -62,6 +63,12 @@ class ProcessNoise:
     heading_radps2: float
     turn_radps2: float = 0.0
     wanders: bool = False
+
+    @cached_property
+    def unturned(self) -> Array:
+        """What a second adds to the rates of yaw, x, y and z, but for the turning, (4, 4)."""
+        push = np.array([self.heading_radps2, *3 * [self.acceleration_mps2]])
+        return np.diag(push * push) * _PUSH_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +152,9 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
     if noise is None:
         return setup.Q
     pushed = _pushed(noise, position_m) * dt_s
-    Q = np.empty((8, 8))
-    Q[MEASURED, MEASURED] = pushed * (dt_s * dt_s / 3.0)
-    Q[MEASURED, RATES] = Q[RATES, MEASURED] = pushed * (dt_s / 2.0)
-    Q[RATES, RATES] = pushed
+    # Of a value and its rate, which follow each other in the state.
+    pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
+    Q = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.wanders:
         Q[MEASURED, MEASURED] += _WANDER * dt_s
     return Q
@@ -156,12 +162,15 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
 
 def _pushed(noise: ProcessNoise, position_m: Array) -> Array:
     """What a second adds to the rates of yaw, x, y and z, (4, 4)."""
-    turned2 = noise.turn_radps2**2
-    every_way = noise.acceleration_mps2**2 + turned2 * float(position_m @ position_m)
-    density = np.zeros((4, 4))
-    density[0, 0] = noise.heading_radps2**2
-    density[1:, 1:] = every_way * _AXES - turned2 * (position_m[:, None] * position_m)
-    return density * _PUSH_S
+    if noise.turn_radps2 == 0.0:
+        return noise.unturned
+    turned2 = noise.turn_radps2**2 * _PUSH_S
+    x, y, z = position_m.tolist()
+    density = noise.unturned.copy()
+    density[1:, 1:] += turned2 * (
+        (x * x + y * y + z * z) * _AXES - np.outer(position_m, position_m)
+    )
+    return density
 
 
 def start_track(measured: Measurement, t_s: float, setup: FilterSetup) -> MarkerTrack:
@@ -211,16 +220,29 @@ def step_track(
         return _coast(track, dt_s, t_s, setup)
     F, Q = transition(dt_s), process_noise(dt_s, track.x[POSITION], setup)
     x, P = predict(track.x, track.P, F=F, Q=Q)
-    on_branch = np.array(measured.z, dtype=np.float64)  # the yaw nearest to the prediction
-    on_branch[0] = x[YAW] + wrap_rad(float(on_branch[0]) - float(x[YAW]))
-    R = setup.R if measured.R is None else measured.R
-    x, P = update(x, P, on_branch, R, H)
-    x[YAW] = wrap_rad(float(x[YAW]))
+    x, P, gain = _updated(x, P, measured.z, setup.R if measured.R is None else measured.R)
     bias = F @ track.bias
     if measured.bias is not None:
-        gain = np.linalg.solve(R, P[MEASURED]).T  # P H^T R^-1, with the P after the update
-        bias = bias + gain @ (measured.bias - bias[MEASURED])
+        bias += gain @ (measured.bias - bias[MEASURED])
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
+
+
+def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Array]:
+    """State and covariance after a measurement, in Joseph's form, and the gain (8, 4).
+
+    filterpy's `update` does the same and takes four times as long: equation 2's H only picks rows.
+    """
+    off = z - x[MEASURED]
+    off[0] = wrap_rad(float(off[0]))  # the yaw nearest to the prediction
+    regular, solved = cv2.solve(P[MEASURED, MEASURED] + R, P[MEASURED], flags=cv2.DECOMP_CHOLESKY)
+    if not regular:  # no covariance: it tells nothing
+        return x, P, np.zeros((8, 4))
+    gain = np.asarray(solved.T, dtype=np.float64)
+    x = x + gain @ off
+    x[YAW] = wrap_rad(float(x[YAW]))
+    left = _STILL.copy()
+    left[:, MEASURED] -= gain
+    return x, left @ P @ left.T + gain @ R @ gain.T, gain
 
 
 def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:

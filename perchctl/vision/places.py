@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from perchctl.geometry import Array, rot_z, wrap_rad
+from perchctl.geometry import Array, wrap_rad
 from perchctl.vision.filter import PRINT, TILTS, FilterSetup, Measurement, pose_noise, tilted
 from perchctl.vision.pose import PoseSetup, level_rotation
 from perchctl.vision.types import Attitude, MarkerPose
+
+_STILL = np.eye(4)
 
 
 def to_world(
@@ -17,7 +19,7 @@ def to_world(
     """Place (3,) and heading in the world of the state estimate, from those relative to the
     gear in the level frame."""
     way_m = e_m + level_rotation(attitude) @ setup.gear_body_m
-    position_m = np.asarray(attitude.position_m) + rot_z(attitude.yaw_rad) @ way_m
+    position_m = np.asarray(attitude.position_m) + attitude.R_world_level @ way_m
     return position_m, wrap_rad(e_yaw_rad + attitude.yaw_rad)
 
 
@@ -26,7 +28,7 @@ def to_level(
 ) -> tuple[Array, float]:
     """Inverse of `to_world`."""
     gear_level = level_rotation(attitude) @ setup.gear_body_m
-    way = rot_z(-attitude.yaw_rad) @ (position_m - np.asarray(attitude.position_m))
+    way = (position_m - np.asarray(attitude.position_m)) @ attitude.R_world_level
     return way - gear_level, wrap_rad(yaw_rad - attitude.yaw_rad)
 
 
@@ -38,15 +40,13 @@ def measurement(
     setup: PoseSetup,
 ) -> Measurement:
     """What a pose tells a track in the world (with an attitude), or in the level frame."""
-    z, turn = np.empty(4), None
-    z[0], z[1:], way_m = pose.e_yaw_rad, pose.e_m, pose.e_m
+    z, way_m = np.empty(4), pose.e_m
+    z[0], z[1:] = pose.e_yaw_rad, pose.e_m
     if in_world:
         assert attitude is not None
-        turn = np.eye(4)
-        turn[:3, :3] = rot_z(attitude.yaw_rad)
-        way_m = pose.e_m + level_rotation(attitude) @ setup.gear_body_m
+        way_m = pose.e_m + attitude.R_level_body @ setup.gear_body_m
         z[0] = wrap_rad(pose.e_yaw_rad + attitude.yaw_rad)
-        z[1:] = turn[:3, :3] @ way_m + attitude.position_m
+        z[1:] = attitude.R_world_level @ way_m + attitude.position_m
     if constants.process is None or pose.cov is None:
         return Measurement(z)
     noise = pose.cov.copy()
@@ -55,9 +55,11 @@ def measurement(
     bias[1:, PRINT] = pose.print_m
     if attitude is not None:
         bias[1:, TILTS] = tilted(way_m) * constants.tilt_sigma_rad
-    if turn is not None:
+    if in_world and attitude is not None:
+        turn = _STILL.copy()
+        turn[:3, :3] = attitude.R_world_level
         noise = turn @ noise @ turn.T
-        bias[1:] = turn[:3, :3] @ bias[1:]
+        bias[1:] = attitude.R_world_level @ bias[1:]
     return Measurement(z, pose_noise(noise), bias)
 
 
@@ -66,6 +68,6 @@ def seen_from(bias_m: Array, attitude: Attitude, constants: FilterSetup, setup: 
     (3, 4): of `bias_m` (3, 4), by which they have moved the target, less what roll and pitch
     make of the gear's place."""
     gear_level = level_rotation(attitude) @ setup.gear_body_m
-    moved = rot_z(-attitude.yaw_rad) @ bias_m
+    moved = attitude.R_world_level.T @ bias_m
     moved[:, TILTS] -= tilted(gear_level) * constants.tilt_sigma_rad
     return np.asarray(moved)

@@ -12,25 +12,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import cv2
 import numpy as np
 
-from perchctl.geometry import R_MARKER_TARGET, Array, finite, rotation_from_rpy, yaw_of
+from perchctl.geometry import R_MARKER_TARGET, Array, finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.vision.camera_model import undistort_px
+from perchctl.vision.curl import lift_of
+from perchctl.vision.points import Points, make_points
 from perchctl.vision.solve import (
     Candidate,
-    Points,
     Scored,
     TiltPrior,
     covariance,
     flat,
     gauss_newton,
-    make_points,
     mirror_solution,
     solve,
 )
@@ -38,6 +38,8 @@ from perchctl.vision.types import MARKERS, Attitude, CameraModel, Detection, Mar
 
 _ATTITUDE_TILT_RAD = math.radians(6.0)  # mounting, estimate and ceiling together
 _PREVIOUS_TILT_RAD = math.radians(10.0)  # between two frames
+_CURLED_CHI2 = 3.0  # of both markers' corners on a flat sheet, a degree of freedom
+_EXPLAINED = 0.5  # of that is left where the sheet's curl is what it comes from
 _Source = Literal["large", "small", "joint"]
 
 __all__ = [
@@ -71,6 +73,16 @@ class PoseSetup:
         """Of both markers, the large one's first, (8, 3)."""
         return np.concatenate([self.object_points[name] for name in MARKERS])
 
+    @cached_property
+    def lift(self) -> dict[MarkerName, Array]:
+        """Of each marker's corners, on a sheet that curls."""
+        return {n: lift_of(points, self.curl_per_m) for n, points in self.object_points.items()}
+
+    @cached_property
+    def all_lift(self) -> Array:
+        """Of both."""
+        return lift_of(self.all_points, self.curl_per_m)
+
 
 def make_pose_setup(
     config: PoseConfig,
@@ -103,9 +115,7 @@ def square(side_m: float) -> Array:
 
 def level_rotation(attitude: Attitude | None) -> Array:
     """``R_level_body`` (3, 3); without an attitude the vehicle counts as level."""
-    if attitude is None:
-        return np.eye(3)
-    return rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, 0.0)
+    return np.eye(3) if attitude is None else attitude.R_level_body
 
 
 def estimate_pose(
@@ -138,20 +148,32 @@ def estimate_pose(
     if solution is None:
         return None
     source = "joint" if len(detections) > 1 else detections[0].marker
-    return _level_pose(source, t_s, solution, points, R_level_body, setup)
+    pose = _level_pose(source, t_s, solution, points, R_level_body, setup)
+    if source != "joint" or pose.chi2 < _CURLED_CHI2 or setup.curl_per_m == 0.0:
+        return pose
+    if any(d.lying_sigma_px > 0.0 for d in detections):
+        return pose  # sides between interpolated rows look curled
+    # No flat sheet has both markers where they are. One that curls may, or the corners err.
+    points = replace(points, curled=True)
+    settled = _continued(points, solution, prior, setup.config)
+    if settled is None:
+        return pose
+    bent = _level_pose(source, t_s, settled, points, R_level_body, setup)
+    return replace(bent, chi2=pose.chi2) if bent.chi2 < _EXPLAINED * pose.chi2 else pose
 
 
 def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
     """The corners through a pinhole, None where the lens cannot have imaged them."""
     if len(detections) > 1:
-        object_m = setup.all_points
+        object_m, lift = setup.all_points, setup.all_lift
         raw_px = np.concatenate([d.corners_px for d in detections])
     else:
-        object_m, raw_px = setup.object_points[detections[0].marker], detections[0].corners_px
+        marker, raw_px = detections[0].marker, detections[0].corners_px
+        object_m, lift = setup.object_points[marker], setup.lift[marker]
     image_px = undistort_px(raw_px, setup.camera)
     if not finite(image_px):
         return None
-    return make_points(detections, object_m, image_px, setup.camera.K)
+    return make_points(detections, object_m, image_px, setup.camera.K, lift)
 
 
 def _continued(
@@ -191,7 +213,7 @@ def _level_pose(
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
     R_level_cam = R_level_body @ R_body_cam
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
-    cov, chi2, curl = covariance(points, solution, R[:, 2])
+    cov, chi2, curl = covariance(points, solution)
     e_m = R_level_body @ (R_body_cam @ solution.tvec + t_body_cam_m - setup.gear_body_m)
     heading = R_level_cam @ R @ R_MARKER_TARGET
     G = np.zeros((4, 6))  # change of (e, e_yaw) with (rvec, tvec)
@@ -201,7 +223,7 @@ def _level_pose(
     # A target that is larger by a share is farther away by that share of the way to it.
     print_m = np.empty((3, 2))
     print_m[:, 0] = setup.size_sigma * (R_level_cam @ solution.tvec)
-    print_m[:, 1] = setup.curl_per_m * (R_level_cam @ curl[3:])
+    print_m[:, 1] = R_level_cam @ curl[3:]
     cov_e[:3, :3] += print_m @ print_m.T
     variance = np.maximum(np.diagonal(cov_e), 0.0)
     return MarkerPose(
@@ -217,6 +239,7 @@ def _level_pose(
         chi2=chi2,
         cov=cov_e,
         print_m=print_m,
+        camera_cov=cov,
     )
 
 

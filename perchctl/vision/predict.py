@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from perchctl.geometry import Array, finite, rotation_from_rpy
+from perchctl.geometry import Array, finite
 from perchctl.vision.camera_model import project
 from perchctl.vision.filter import MAX_GAP_S
 from perchctl.vision.pose import PoseSetup, rotation_matrix, rotation_vector
@@ -40,6 +40,5 @@ def expected_corners(
 
 def _world_cam(attitude: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
     """Rotation (3, 3) and place (3,) of the camera in the world."""
-    R_world_body = rotation_from_rpy(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
-    T_body_cam = setup.T_body_cam
+    R_world_body, T_body_cam = attitude.R_world_body, setup.T_body_cam
     return R_world_body @ T_body_cam[:3, :3], R_world_body @ T_body_cam[:3, 3] + attitude.position_m

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array
+from perchctl.geometry import Array, rot_z, rotation_from_rpy
 
 MarkerName = Literal["large", "small"]
 PictureKind = Literal["whole", "woven", "top", "bottom"]
@@ -123,6 +124,20 @@ class Attitude:
     yaw_rad: float
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    @cached_property
+    def R_level_body(self) -> Array:
+        """Roll and pitch, (3, 3)."""
+        return rotation_from_rpy(self.roll_rad, self.pitch_rad, 0.0)
+
+    @cached_property
+    def R_world_level(self) -> Array:
+        """The heading, (3, 3)."""
+        return rot_z(self.yaw_rad)
+
+    @cached_property
+    def R_world_body(self) -> Array:
+        return self.R_world_level @ self.R_level_body
+
 
 @dataclass(frozen=True, eq=False)
 class MarkerPose:
@@ -139,6 +154,7 @@ class MarkerPose:
         print_m: by how much one standard deviation of the print's errors moves `e_m`, (3, 2):
             its size's, and of the sheet's curl. Included in `sigma_m` and `cov`, but the same
             in every frame.
+        camera_cov: covariance (6, 6) of (rvec_rad, tvec_m), without the print's.
     """
 
     source: Literal["large", "small", "joint"]
@@ -153,6 +169,7 @@ class MarkerPose:
     chi2: float = 0.0
     cov: Array | None = None
     print_m: Array = field(default_factory=lambda: np.zeros((3, 2)))
+    camera_cov: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from perchctl.geometry import wrap_rad
 from perchctl.profile import KalmanConfig
 from perchctl.vision.filter import (
     MAX_PREDICTION_S,
+    MEASURED,
     POSITION,
     RATES,
     VELOCITY,
@@ -19,7 +20,6 @@ from perchctl.vision.filter import (
     VZ,
     YAW,
     YAW_RATE,
-    H,
     Measurement,
     X,
     Y,
@@ -35,6 +35,7 @@ from perchctl.vision.types import MarkerTrack
 
 CONFIG = KalmanConfig(noise="fixed")
 SETUP = make_filter(CONFIG)
+H = np.eye(8)[MEASURED]
 
 
 def test_state_order_is_the_papers() -> None:

@@ -7,14 +7,13 @@ import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project, undistort_px
+from perchctl.vision.points import Points, make_points
 from perchctl.vision.pose import rotation_matrix, square
 from perchctl.vision.solve import (
     Candidate,
-    Points,
     Scored,
     TiltPrior,
     gauss_newton,
-    make_points,
     mirror_solution,
 )
 from perchctl.vision.types import Detection

@@ -17,6 +17,8 @@ from perchctl.sim.analogue import spoil
 from perchctl.vision.types import Frame, MarkerPose, PipelineState
 from tests.helpers.target_picture import pose_of, render
 
+pytestmark = pytest.mark.long
+
 Build = Callable[..., Pipeline]
 Picture = Callable[[Array, Array, int], NDArray[np.uint8]]
 TRUE_PRINT = TargetConfig(size_sigma=0.0, curl_per_m=0.0)

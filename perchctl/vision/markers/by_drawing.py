@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.markers.align import Alignment, align
 from perchctl.vision.markers.corners import RefinedCorners
+from perchctl.vision.markers.lines import CLIPPED_GREY, CLIPPED_SHARE, CLIPPED_SIGMA_PX
 from perchctl.vision.markers.pattern import LEAST_SIDE_PX, Pattern
 from perchctl.vision.markers.square import doubled_area, mean_side_px, side_lengths_px
 from perchctl.vision.types import CameraModel
@@ -55,7 +56,16 @@ def aligned(
     ):
         return None
     sigma_px = math.hypot(max(found.sigma_px, _MIN_SIGMA_PX), _BLUR_SIGMA * found.blur_px)
+    if _is_clipped(image, found.corners_px):
+        sigma_px = math.hypot(sigma_px, CLIPPED_SIGMA_PX)
     return RefinedCorners(found.corners_px, sigma_px, True)
+
+
+def _is_clipped(image: NDArray[np.uint8], corners_px: Array) -> bool:
+    """Whether the marker's white is: no light makes its drawing then."""
+    (left, top), (right, bottom) = corners_px.min(axis=0), corners_px.max(axis=0)
+    part = image[max(int(top), 0) : int(bottom) + 1, max(int(left), 0) : int(right) + 1]
+    return int(np.count_nonzero(part > CLIPPED_GREY)) > CLIPPED_SHARE * part.size
 
 
 def verified(found: Alignment, max_sigma: float = _MAX_SIGMA) -> bool:

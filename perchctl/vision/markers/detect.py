@@ -74,7 +74,9 @@ def detect(
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     look = _look(empty_frames, bool(expected), setup)
-    turn = empty_frames // 2 if empty_frames is not None and look == "near" else None
+    turn = (
+        (empty_frames + 2) // 4 if empty_frames is not None and look in ("near", "fits") else None
+    )
     lately = measured_lately(previous, frame.t_s)
     shift = known_from(None if previous is None else previous.edge_shift)
 
@@ -91,13 +93,19 @@ def detect(
 
 
 def _look(empty_frames: int | None, expected: bool, setup: DetectorSetup) -> Look:
-    """After a loss the place where the target should be and the whole picture take turns, then
-    a sharp target and, in every Nth frame, a blurred one."""
+    """After a loss the place where the target should be and the whole picture take turns, and
+    there the search and the fits of a blurred target do; later a sharp target and, in every Nth
+    frame, a blurred one. The first frame without it may only be blurred: that has both."""
     if empty_frames is None:
         return "all"
+    fits = setup.blurred and setup.by_lines
     if expected and setup.window:
-        return "sharp" if empty_frames % 2 else "near"
-    if not (setup.blurred and setup.by_lines):
+        if empty_frames % 2:
+            return "sharp"
+        if empty_frames == 0 or not fits:
+            return "near"
+        return "fits" if empty_frames % 4 else "window"
+    if not fits:
         return "sharp"
     if setup.blurred_every == 1:
         return "all"
@@ -120,16 +128,18 @@ def _looked(
     whether the target was measured a moment ago, `turn` of the fits to a blurred one."""
     image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
-    seen = _followed(image, hidden, expected, setup, camera, shift)
+    seen = {} if look == "fits" else _followed(image, hidden, expected, setup, camera, shift)
     if not seen and lately and setup.cut:
         both = completed(expected, setup.ratio, camera)
         if is_cut(both, image.shape, hidden):
             seen = cut_markers(image, expected, setup.patterns, camera, hidden)
-    if look != "blurred" and (not seen or _missing(seen, expected, image.shape, hidden)):
+    if look not in ("blurred", "fits") and (
+        not seen or _missing(seen, expected, image.shape, hidden)
+    ):
         found = search(image, expected, setup, look)
         if len(found.corners_px) >= len(seen):
             seen = _refined(image, hidden, found, setup, camera)
-    if not seen and look != "sharp" and setup.blurred and setup.by_lines:
+    if not seen and look not in ("sharp", "window") and setup.blurred and setup.by_lines:
         seen = _in_blur(image, expected, setup, camera, turn)
     return Detections(
         frame_index=frame.index,

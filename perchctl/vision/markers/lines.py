@@ -16,6 +16,7 @@ candidates), each corner is refined on its own (`perchctl.vision.markers.corners
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,7 +27,7 @@ from perchctl.geometry import Array, finite
 from perchctl.vision.camera_model import distort
 from perchctl.vision.markers.corners import RAW_SIGMA_PX, RefinedCorners, refine_each
 from perchctl.vision.markers.pattern import Rim
-from perchctl.vision.markers.profiles import PROFILES, Floats
+from perchctl.vision.markers.profiles import ALONG, PROFILES, Floats
 from perchctl.vision.markers.shift import Border, edge_shift
 from perchctl.vision.markers.sides import Markers, Measured, Samples, markers_of, measure
 from perchctl.vision.markers.square import BEFORE
@@ -40,18 +41,20 @@ _MIN_INLIERS = 0.5
 _TAILS = 1.7  # what robust weights take away from a residual's square, and from the samples
 _BEND, _BEND_BLURS = 0.6, 2.0  # what the next edge, a cell away, does to one; in units of blur
 _REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide edges
-_CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
-_CLIPPED_SHARE = 0.05  # of the profiles
+CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
+CLIPPED_SHARE = 0.05  # of the profiles
 _WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off an edge that is wide and not central
 _LEAST_ROWS = 2.0  # times the other sides' variance shows that rows shake
 _LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apart
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
 _SHIFT_PRIOR_PX = 0.15  # what glare and gamma do to edges
 _CLIPPED_PRIOR_PX = 0.4  # what clipping does
-_CLIPPED_GREY = 248.0
+CLIPPED_GREY = 248.0
 _ONES: Array = np.ones(PROFILES)
 _ONES32: Floats = np.ones(PROFILES, dtype=np.float32)
 _QUARTERS: Array = np.full(4, 0.25)
+_PARABOLA: Array = ALONG**2 - (ALONG**2).mean()
+_BOWED = 3.0  # standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,7 @@ def _refined_once(
         return nothing
     measured = measure(image, markers, camera, with_inner=known is None)
     sides = measured.sides
-    clipped = _clipped(sides) > _CLIPPED_SHARE
+    clipped = _clipped(sides) > CLIPPED_SHARE
     if known is not None and clipped.any():
         # How far clipping moves edges changes with the light.
         return _refined_once(image, raw_px, rims, camera, None)
@@ -137,7 +140,7 @@ def _refined_once(
         corners = _intersect(fit.lines)
         if not finite(corners):
             return nothing
-        shift = _measured_shift(markers, measured, corners)
+        shift = _measured_shift(markers, measured, fit, corners)
     applied = shift if shift is not None else EdgeShift(0.0, _shift_prior_px(sides))
     corners = _intersect(_moved_outwards(markers, fit, applied.shift_px))
     if not finite(corners):
@@ -197,11 +200,13 @@ def _intersect(lines: Array) -> Array:
 def _shift_prior_px(sides: Samples) -> float:
     """How far edges are shifted before that is measured: by white as the camera sees it
     beyond the sides."""
-    clipped = float(sides.grey[:, :, -1].mean()) > _CLIPPED_GREY
+    clipped = float(sides.grey[:, :, -1].mean()) > CLIPPED_GREY
     return _CLIPPED_PRIOR_PX if clipped else _SHIFT_PRIOR_PX
 
 
-def _measured_shift(markers: Markers, measured: Measured, corners: Array) -> EdgeShift | None:
+def _measured_shift(
+    markers: Markers, measured: Measured, fit: _Lines, corners: Array
+) -> EdgeShift | None:
     """None where no inner edge was sampled."""
     inner, k = measured.inner, measured.inner_of
     if inner is None:
@@ -215,20 +220,40 @@ def _measured_shift(markers: Markers, measured: Measured, corners: Array) -> Edg
         cells=markers.rims[k].cells,
         cell_px=float(markers.cell_px[k]),
         tolerance=markers.rims[k].tolerance,
+        bow_px=_bow_px(markers, measured.sides, fit, k),
     )
     return edge_shift(border, _shift_prior_px(measured.sides))
+
+
+def _bow_px(markers: Markers, sides: Samples, fit: _Lines, k: int) -> float:
+    """How far the ends of marker k's sides lie further out than their middles, the mean of
+    its sides, as far as noise does not explain it."""
+    of_k = slice(4 * k, 4 * k + 4)
+    lines, points = fit.lines[of_k], sides.points[of_k]
+    away = np.matmul(points, lines[:, :2, None])[..., 0] - lines[:, 2:]
+    scale = _outwards(markers, fit)[of_k] * markers.px_per_unit[of_k]
+    mass = np.maximum(sides.weight[of_k] @ (_PARABOLA * _PARABOLA), 1e-9)
+    bow_px = scale * ((sides.weight[of_k] * away) @ _PARABOLA) / mass
+    mean_px = float(bow_px @ _QUARTERS)
+    noise_px = 0.25 * math.sqrt(float((fit.residual_px[of_k] ** 2 / mass).sum()))
+    return mean_px if abs(mean_px) > _BOWED * noise_px else 0.0
 
 
 def _moved_outwards(markers: Markers, fit: _Lines, shift_px: float) -> Array:
     """The lines (4m, 3) moved out of their markers."""
     if shift_px == 0.0:
         return fit.lines
-    out = (markers.corners - markers.corners.mean(axis=1)[:, None]).reshape(-1, 2)
     lines = fit.lines.copy()
-    # The line's normal may point either way.
-    outwards = np.sign(lines[:, 0] * out[:, 0] + lines[:, 1] * out[:, 1])
-    lines[:, 2] += outwards * (shift_px / markers.px_per_unit)
+    lines[:, 2] += _outwards(markers, fit) * (shift_px / markers.px_per_unit)
     return lines
+
+
+def _outwards(markers: Markers, fit: _Lines) -> Array:
+    """+1 where a line's normal, which may point either way, points out of its marker, else
+    -1, (4m,)."""
+    corners = markers.corners
+    out = (corners - (_QUARTERS @ corners)[:, None]).reshape(-1, 2)
+    return np.asarray(np.sign(fit.lines[:, 0] * out[:, 0] + fit.lines[:, 1] * out[:, 1]))
 
 
 def _accepted(
@@ -256,9 +281,9 @@ def _accepted(
 def _clipped(sides: Samples) -> Array:
     """Share of the profiles of the m markers that end in clipped white, (m,)."""
     ends = sides.grey[:, :, -1]
-    if ends.max() <= _CLIPPED_GREY:
+    if ends.max() <= CLIPPED_GREY:
         return np.zeros(len(ends) // 4)
-    glaring = np.count_nonzero(ends > _CLIPPED_GREY, axis=1) / PROFILES
+    glaring = np.count_nonzero(ends > CLIPPED_GREY, axis=1) / PROFILES
     return np.asarray(glaring.reshape(-1, 4) @ _QUARTERS)
 
 
@@ -279,7 +304,7 @@ def _sigma_px(
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
     bend_px = _BEND * blur_px * np.exp(-cell_px / (_BEND_BLURS * blur_px))
     reach_px = _REACH * blur_px**3
-    clipped_px = np.where(clipped, _CLIPPED_SIGMA_PX, 0.0)
+    clipped_px = np.where(clipped, CLIPPED_SIGMA_PX, 0.0)
     # Edges are not where they were meant to be printed.
     print_px = np.array([rim.tolerance for rim in markers.rims]) * cell_px
     return np.asarray(np.sqrt(noise2 + bend_px**2 + reach_px**2 + clipped_px**2 + print_px**2))

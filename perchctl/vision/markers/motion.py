@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from perchctl.geometry import Array
 from perchctl.vision.types import MARKERS, Detections, MarkerName
 
+_QUARTERS: Array = np.full(4, 0.25)
 _MAX_GAP_S = 0.25  # older motion is no evidence of where to look
 
 
@@ -41,4 +44,4 @@ def with_motion(now: Detections, previous: Detections | None) -> Detections:
     if not flow:
         return now
     first = next(iter(flow.values()))
-    return replace(now, velocity_px_s=first.mean(axis=0), flow_px_s=flow)
+    return replace(now, velocity_px_s=_QUARTERS @ first, flow_px_s=flow)

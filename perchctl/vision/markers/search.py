@@ -23,9 +23,10 @@ from perchctl.vision.markers.detector import (
 from perchctl.vision.markers.square import mean_side_px, nested
 from perchctl.vision.types import MARKERS, MarkerName
 
-Look = Literal["near", "sharp", "blurred", "all"]
+Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
 """How a picture is searched for a target that is not simply where it is expected: near to
-that place, in blur too; all over for a sharp one, or for one that blur hides; or all that."""
+that place, by a search (window), by fits to a blurred one, or both (near); all over for a sharp
+one, or for one that blur hides; or all that."""
 _WINDOW_MARGIN = 0.25  # of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
@@ -70,7 +71,7 @@ def search(
     look: Look = "all",
 ) -> Found:
     """By the window, if there is one, and by the whole picture where that gave too little; only
-    one of them with a `look` that is "near" or "sharp"."""
+    one of them with a `look` that is "near", "window" or "sharp"."""
     whole = Box(0, 0, image.shape[1], image.shape[0])
     if setup.window and expected and look != "sharp":
         box = search_window(expected, setup.ratio, image.shape) or whole
@@ -79,7 +80,9 @@ def search(
             found = _pass(image, box, expected, setup, QUICK_THRESHOLDS)
         if len(found.corners_px) < 2 and box != whole:
             found = _pass(image, box, expected, setup, OPENCV_THRESHOLDS)
-        if len(found.corners_px) >= (2 if box == whole else 1) or (look == "near" and box != whole):
+        if len(found.corners_px) >= (2 if box == whole else 1) or (
+            look in ("near", "window") and box != whole
+        ):
             return found
     return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS)
 

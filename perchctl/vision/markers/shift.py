@@ -27,7 +27,7 @@ class Border:
     corners (4, 2): of its outer edge as fitted, normalised. points (4, n, 2) and weight
     (4, n): of its inner edge. blur_px, depth_px (4,): of the inner edge, and the border's
     width. cells: along a side; cell_px: their mean width. tolerance: of a printed edge's
-    place, in cells.
+    place, in cells. bow_px: how far the outer edge's ends lie further out than its middle.
     """
 
     corners: Array
@@ -38,6 +38,7 @@ class Border:
     cells: int
     cell_px: float
     tolerance: float
+    bow_px: float = 0.0
 
 
 def edge_shift(border: Border, prior_px: float) -> EdgeShift:
@@ -57,7 +58,10 @@ def edge_shift(border: Border, prior_px: float) -> EdgeShift:
     some = mass > _MIN_PROFILES
     if not some.any():
         return EdgeShift(0.0, prior_px)
-    shift, variance = _mean_of_sides(far_px, w, mass, some)
+    # A sheet that curls, or a lens that is known badly, moves places by the square of their way
+    # from the centre: outer edges farther than inner ones, and their ends farther than middles.
+    bent_px = 8.0 * r / (3.0 * border.cells) * border.bow_px
+    shift, variance = _mean_of_sides(far_px + bent_px, w, mass, some, bent_px)
     # What no averaging takes away: the neighbours' blur and the print.
     variance += (2.0 * math.exp(-border.cell_px / 2.2)) ** 2 + (
         border.tolerance * border.cell_px
@@ -78,13 +82,15 @@ def known_from(earlier: EdgeShift | None) -> EdgeShift | None:
 
 
 def _mean_of_sides(
-    far_px: Array, w: Array, mass: Array, some: NDArray[np.bool_]
+    far_px: Array, w: Array, mass: Array, some: NDArray[np.bool_], each_px: float
 ) -> tuple[float, float]:
-    """Mean over the sides that count and its variance, px and px^2."""
+    """Mean over the sides that count and its variance, px and px^2; `each_px` is by how much
+    one may be off beside its noise."""
     share = w / np.maximum(mass, 1e-9)[:, None]
     mean = (share * far_px).sum(axis=1)
     scatter = (share * (far_px - mean[:, None]) ** 2).sum(axis=1)
-    information = some / (2.0 * scatter / np.maximum(mass, 1.0) + _SHIFT_FLOOR_PX**2)
+    least = _SHIFT_FLOOR_PX**2 + each_px**2
+    information = some / (2.0 * scatter / np.maximum(mass, 1.0) + least)
     total = float(information.sum())
     shift = float(information @ mean) / total
     # Sides that disagree are worth less.

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -71,6 +72,25 @@ def test_lines_beat_subpix_tenfold_in_bias() -> None:
     line = abs(errors(0.0, 0.7, "line", 6, 0.150)[:, 0].mean())
     assert subpix > 0.05
     assert line < subpix / 10.0
+
+
+@pytest.mark.parametrize("curl", [-0.02, 0.02])
+def test_a_sheet_that_curls_shifts_no_edges(curl: float) -> None:
+    """It narrows or widens the large marker's border as glare would. The small marker is hardly
+    moved, and not by what that border shows."""
+    rvec, tvec = pose_of(0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
+    image = render(rvec, tvec, blur_px=0.8)
+    large, small = (true_corners(rvec, tvec, side_m) for side_m in (0.150, 0.025))
+    centre = small.mean(axis=0)
+    reach_px = float(np.linalg.norm(large - centre, axis=1).mean())
+    way = np.stack(np.meshgrid(*(np.arange(n) for n in image.shape[::-1])), axis=2) - centre
+    squared = (way**2).sum(axis=2, keepdims=True) / reach_px**2
+    at = (centre + way * (1.0 - curl * squared)).astype(np.float32)
+    curled = np.asarray(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_CUBIC), np.uint8)
+    found = refine(curled, np.stack([large, small]), [RIMS[6], RIMS[7]], CAMERA, "line")[1]
+    out = (small - centre) / np.linalg.norm(small - centre, axis=1, keepdims=True)
+    assert found.refined
+    assert abs(float(((found.corners_px - small) * out).sum(axis=1).mean())) < 0.08
 
 
 def test_sigma_follows_the_noise() -> None:

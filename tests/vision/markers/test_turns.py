@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.pipeline import step
+from perchctl.profile import DetectorConfig
 from perchctl.vision.markers import detect as detect_room
 from perchctl.vision.markers import search as search_room
 from perchctl.vision.types import Frame, PipelineState
@@ -108,6 +109,16 @@ def test_what_comes_back_is_found_by_the_second_frame(
         assert not stream.see(EMPTY)
     back = render(*place)
     assert any(stream.see(back) for _ in range(2))
+
+
+@pytest.mark.parametrize("lost", [2, 6])
+def test_without_fits_to_blurred_targets_no_frame_is_left_unsearched(
+    build: object, lost: int
+) -> None:
+    stream = Stream(build(detector=DetectorConfig(blurred=False)))  # type: ignore[operator]
+    for k in range(3 + lost):
+        assert stream.see(render(*NEAR) if k < 3 else EMPTY) == (k < 3)
+    assert stream.see(render(*NEAR))
 
 
 def test_blur_after_a_loss_is_seen_through_near_the_old_place(stream: Stream) -> None:

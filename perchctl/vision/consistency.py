@@ -1,0 +1,221 @@
+"""What a flight tells about the camera's latency and mounting, while it flies.
+
+The target stands still in the world. Where the pictures are later than the profile says by d,
+it is placed as the vehicle was d earlier: beside its place by d times the speed at which the
+vehicle's motion and turning sweep the line of sight. Where the camera is turned from what the
+profile says, it is placed beside by the turn times the way to it. So the place of the target in
+the estimate's world, frame by frame, is linear in the delay and the turn, with what the vehicle
+did as known factors, and one least squares over a flight gives both.
+
+The rest of the place's wandering is no white noise: the vehicle's estimate walks and drifts. So
+each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors
+through the same one as the target's place, and what is summed are the innovations: that is
+the generalized least squares of the whole flight with a few numbers of memory (de Jong 1991, "The
+diffuse Kalman filter"). Nothing is solved until somebody asks (`solved`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from perchctl.geometry import Array, wrap_rad
+from perchctl.vision.pose import PoseSetup, rotation_matrix
+from perchctl.vision.types import Attitude, MarkerPose
+
+X, Y, HEADING = range(3)
+PLACE, DELAY, TILT_X, TILT_Y, TURN, SCALE, DRIFT_X, DRIFT_Y = range(8)
+"""Columns: the target's place (rad for its heading), and what may explain how it moves."""
+_PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
+"""What is thought possible before anything is seen, standard deviations: 100 ms, 6 deg of the
+mounting's roll and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of
+drift."""
+
+STEP_S = 0.02
+"""Of the difference that stands for a speed: a shake of 5 Hz keeps 0.94 of its."""
+NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
+"""Of the vehicle's speed and rates of turn, as its estimate has them. It looks like motion, and
+like motion that is seen at once: what is not well above it is taken for rest."""
+JITTER_S = 0.008
+"""By which single pictures are early or late."""
+LEAST_SIGMA_M, LEAST_SIGMA_RAD = 5e-4, 1e-3
+WALK_M, WALK_RAD = 5e-3, math.radians(0.1)
+"""Of the estimate's place, and of its heading, roll and pitch, in a second's random walk."""
+MOST_GAP_S = 0.5
+GATE_SIGMAS = 5.0
+_POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
+"""What the gate takes for possible beyond the noise: 200 ms, and 0.4 rad about each axis."""
+LEAST_RANGE_M = 0.15
+"""Nearer, nothing is swept: it is pressed soon, and its estimate may run away."""
+STAMPS_S = 0.003
+"""What an average does not take away: of the stamps of telemetry and exposure, and of the
+vehicle's own answer to the noise of its estimate."""
+LARGE_TURN = 0.03
+"""The speeds are those of the profile's mounting: a large turn is known to this part of it."""
+LEAST_FRAMES = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """A flight's memory: `level` (3, 8) and its `variance` (3,) as the newest frame left them,
+    None before the first; `information` (8, 8) of the innovations; `rows` that they are of."""
+
+    t_s: float = -math.inf
+    began_s: float = 0.0
+    level: Array | None = None
+    variance: Array = field(default_factory=lambda: np.zeros(3))
+    information: Array = field(default_factory=lambda: np.zeros((8, 8)))
+    rows: int = 0
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What the flight shows beyond the profile, each with one standard deviation.
+
+    `delay_s`: by how much the pictures are later. `turn_rad`: the camera's turn about body x, y
+    and z. The attitude's constant error, which moves the target just as a mounting's roll and
+    pitch do, is in their `turn_sigma_rad`.
+    """
+
+    delay_s: float
+    delay_sigma_s: float
+    turn_rad: tuple[float, float, float]
+    turn_sigma_rad: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One frame's target. `rows` (3, 8) as the columns have them, `variance` (3,) of the place,
+    and `range_m` along the upward axis."""
+
+    t_s: float
+    rows: Array
+    variance: Array
+    range_m: float
+
+
+def moment_of(
+    t_s: float,
+    pose: MarkerPose,
+    before: Attitude,
+    after: Attitude,
+    velocity_mps: tuple[float, float, float],
+    delay_s: float,
+    setup: PoseSetup,
+) -> Moment:
+    """The frame's target for the vehicle's attitude `STEP_S` before and after the frame's time
+    less `delay_s`, and its velocity then. `delay_s` is the delay that is thought likely: about
+    it, the factors are those of small changes."""
+    assert pose.cov is not None
+    T_body_cam = setup.T_body_cam
+    R_body_cam = T_body_cam[:3, :3]
+    x, y, z = (R_body_cam @ pose.tvec_m).tolist()  # from the camera, body axes
+    place = (R_body_cam @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
+    axis = (R_body_cam @ rotation_matrix(pose.rvec_rad)[:, 0]).tolist()
+    R0, R1 = _upper_rows(before), _upper_rows(after)
+    heading0, heading1 = (math.atan2(_dot(R[1], axis), _dot(R[0], axis)) for R in (R0, R1))
+    turned = wrap_rad(heading1 - heading0)
+    rows, noise = [], []
+    speeds = [
+        (_dot(q, place) - _dot(p, place)) / (2.0 * STEP_S) + v
+        for p, q, v in zip(R0, R1, velocity_mps, strict=False)
+    ]
+    moves = _above(math.hypot(*speeds), math.hypot(NOISE_MPS, NOISE_RADPS * z))
+    aside_m2 = 0.5 * float(pose.cov[0, 0] + pose.cov[1, 1])
+    for i in (X, Y):
+        at = before.position_m[i] + after.position_m[i] + _dot(R0[i], place) + _dot(R1[i], place)
+        speed = moves * speeds[i]
+        u, v, w = (0.5 * (p + q) for p, q in zip(R0[i], R1[i], strict=True))
+        # Minus the cross products of the body's axes with the way, and the way itself.
+        factors = [speed, v * z - w * y, w * x - u * z, u * y - v * x, u * x + v * y]
+        rows.append([0.5 * at + delay_s * speed, *factors, 0.0, 0.0])
+        noise.append(aside_m2 + LEAST_SIGMA_M**2 + (JITTER_S * speed) ** 2)
+    rate = turned / (2.0 * STEP_S)
+    rate *= _above(abs(rate), NOISE_RADPS)
+    rows.append([heading0 + 0.5 * turned + delay_s * rate, rate] + 6 * [0.0])
+    noise.append(float(pose.cov[3, 3]) + LEAST_SIGMA_RAD**2 + (JITTER_S * rate) ** 2)
+    return Moment(t_s, np.array(rows), np.array(noise), z)
+
+
+def _above(size: float, noise: float) -> float:
+    """The part of a motion that counts: none of what noise can be, all of what is far above."""
+    return max(0.0, 1.0 - (2.0 * noise / max(size, 1e-9)) ** 2)
+
+
+def _upper_rows(attitude: Attitude) -> tuple[tuple[float, float, float], ...]:
+    """The first two of ``R_world_body``: without arrays, as this is done for every picture."""
+    cr, sr = math.cos(attitude.roll_rad), math.sin(attitude.roll_rad)
+    cp, sp = math.cos(attitude.pitch_rad), math.sin(attitude.pitch_rad)
+    cy, sy = math.cos(attitude.yaw_rad), math.sin(attitude.yaw_rad)
+    return (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+    )
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def added(old: Sums, new: Moment) -> Sums:
+    """The sums with one more frame. After a gap, or where the target or the estimate's world has
+    jumped, the level begins anew, and what was learned is kept."""
+    if old.level is None:
+        first = new.rows, new.variance
+        return replace(old, t_s=new.t_s, began_s=new.t_s, level=first[0], variance=first[1])
+    gap_s = new.t_s - old.t_s
+    if gap_s <= 0.0:
+        return old
+    rows = new.rows.copy()
+    rows[X, DRIFT_X] = rows[Y, DRIFT_Y] = new.t_s - old.began_s
+    change = rows - old.level
+    change[HEADING, PLACE] = wrap_rad(float(change[HEADING, PLACE]))
+    walk_m2 = WALK_M**2 + (WALK_RAD * new.range_m) ** 2
+    predicted = old.variance + np.array([walk_m2, walk_m2, WALK_RAD**2]) * gap_s
+    spread = predicted + new.variance
+    size = np.abs(change)
+    beyond = size[:, PLACE] - GATE_SIGMAS * np.sqrt(spread) > size @ _POSSIBLE
+    if gap_s > MOST_GAP_S or beyond.any():
+        return replace(old, t_s=new.t_s, level=rows, variance=new.variance)
+    gain = predicted / spread
+    return Sums(
+        new.t_s,
+        old.began_s,
+        old.level + gain[:, None] * change,
+        (1.0 - gain) * predicted,
+        old.information + change.T @ (change / spread[:, None]),
+        old.rows + 3,
+    )
+
+
+def solved(sums: Sums, attitude_sigma_rad: float) -> Consistency | None:
+    """What the flight shows so far; None after less than a second of frames.
+
+    `attitude_sigma_rad`: constant error of the estimate's roll and pitch.
+    """
+    if sums.rows < 3 * LEAST_FRAMES:
+        return None
+    information = sums.information[1:, 1:] + np.diag(1.0 / _PRIOR**2)
+    moved = sums.information[1:, PLACE]
+    covariance = np.linalg.inv(information)
+    found = covariance @ moved
+    left = float(sums.information[PLACE, PLACE] - found @ moved)
+    # More scatter than claimed widens what is claimed, less of it narrows nothing.
+    covariance *= max(1.0, left / sums.rows)
+    sigma = np.sqrt(np.diagonal(covariance))
+    by = {column: column - 1 for column in (DELAY, TILT_X, TILT_Y, TURN, SCALE)}
+    tilts = [math.hypot(float(sigma[by[c]]), attitude_sigma_rad) for c in (TILT_X, TILT_Y)]
+    turn = math.atan2(float(found[by[TURN]]), 1.0 - float(found[by[SCALE]]))
+    return Consistency(
+        delay_s=float(found[by[DELAY]]),
+        delay_sigma_s=math.hypot(float(sigma[by[DELAY]]), STAMPS_S),
+        turn_rad=(float(found[by[TILT_X]]), float(found[by[TILT_Y]]), turn),
+        turn_sigma_rad=(
+            tilts[0],
+            tilts[1],
+            math.hypot(float(sigma[by[TURN]]), LARGE_TURN * turn),
+        ),
+    )
