@@ -7,6 +7,8 @@ allowed and what to do, in one sentence.
 
 from __future__ import annotations
 
+import sys
+
 
 class PerchError(Exception):
     """Base of all reported failures; `exit_code` becomes the process's."""
@@ -18,6 +20,14 @@ class PerchError(Exception):
 class UsageError(PerchError):
     exit_code = 2
     meaning = "wrong usage of the command line"
+
+
+def no_simulator(missing: str | None = "mujoco") -> UsageError:
+    """Where the extra ``sim`` is not installed, of which `missing` is a part."""
+    return UsageError(
+        f"the simulator is not installed ({missing} is missing); install it with: "
+        f"{sys.executable} -m pip install 'perchctl[sim]'"
+    )
 
 
 class ConnectionFailed(PerchError):

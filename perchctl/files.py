@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import stat
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -67,18 +68,22 @@ class PartFile:
     """A file under a temporary name, until it is whole; its folder is made.
 
     `part` is the path to write to. It has the suffix of `path`, by which some libraries
-    choose the format. All methods raise OSError.
+    choose the format. A file that is replaced keeps its permissions; a new one gets `mode`,
+    by default the system's. All methods raise OSError.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, mode: int | None = None) -> None:
         self.path = path
+        self._mode = mode_of(path) if path.exists() else mode
         self.part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
         self._made = [folder for folder in path.parents if not folder.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
 
     def write(self, data: bytes) -> None:
         """The whole content at once."""
-        with self.part.open("xb") as stream:
+        # Until it is whole nobody else reads what may not be for them.
+        mode = 0o666 if self._mode is None else 0o600
+        with open(self.part, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as stream:
             stream.write(data)
         self.sync()
 
@@ -89,6 +94,9 @@ class PartFile:
 
     def keep(self) -> None:
         """Put the file in its place."""
+        if self._mode is not None:
+            with suppress(OSError):  # some file systems have none to set
+                self.part.chmod(self._mode)
         os.replace(self.part, self.path)
         self._made.clear()
 
@@ -100,8 +108,17 @@ class PartFile:
                 folder.rmdir()
 
 
-def write_files(files: Mapping[Path, bytes]) -> None:
+def mode_of(path: Path) -> int:
+    """A file's permissions. Raises OSError."""
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def write_files(files: Mapping[Path, bytes], mode: int | None = None) -> None:
     """Write all files, or none: the first is renamed when the last is on the disk.
+
+    Args:
+        mode: permissions of those that are new, by default the system's; one that is replaced
+            keeps its own.
 
     Raises:
         InvalidValue: a path is a folder; or a full disk, or missing rights.
@@ -113,7 +130,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
     try:
         with ExitStack() as undo:
             for path, data in files.items():
-                parts.append(PartFile(path))
+                parts.append(PartFile(path, mode))
                 undo.callback(parts[-1].drop)
                 parts[-1].write(data)
             for part in parts:
@@ -121,5 +138,5 @@ def write_files(files: Mapping[Path, bytes]) -> None:
                 part.keep()
             undo.pop_all()
     except OSError as error:
-        more = "; nothing was changed: free some space, or choose another place"
+        more = "; nothing was written: free some space, or choose another place"
         raise cannot_be_written(path, error, more) from None

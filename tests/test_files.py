@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.files import PartFile, check_output, check_place, same_file, write_files
+from perchctl.files import PartFile, check_output, check_place, mode_of, same_file, write_files
 from tests.helpers.disk import full_disk
 
 
@@ -51,7 +51,7 @@ def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     old, large = tmp_path / "camera.yaml", tmp_path / "made" / "deep" / "report.png"
     old.write_text("old")
     files = {old: b"new", large: bytes(400_000)}
-    sentence = r"report\.png cannot be written: .*nothing was changed"
+    sentence = r"report\.png cannot be written: .*nothing was written"
     with full_disk(room=200_000), pytest.raises(InvalidValue, match=sentence):
         write_files(files)
     assert old.read_text() == "old"
@@ -87,6 +87,31 @@ def test_a_part_is_hidden_beside_its_place_until_it_is_kept(tmp_path: Path) -> N
     assert names(tmp_path) == ["film.mp4"]
     PartFile(tmp_path / "made" / "new" / "film.mp4").drop()
     assert names(tmp_path) == ["film.mp4"]
+
+
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path: Path) -> None:
+    """And those of a new one may be asked for."""
+    old, new, plain = tmp_path / "old", tmp_path / "new", tmp_path / "plain"
+    for mode in (0o600, 0o440, 0o664):
+        old.write_bytes(b"old")
+        old.chmod(mode)
+        new.unlink(missing_ok=True)
+        write_files({old: b"mine", new: b"copy"}, mode=0o640)
+        assert (mode_of(old), mode_of(new)) == (mode, 0o640)
+        assert old.read_bytes() == b"mine"
+        old.chmod(0o600)
+    write_files({plain: b"new"})
+    (tmp_path / "by_system").touch()
+    assert mode_of(plain) == mode_of(tmp_path / "by_system")
+
+
+def test_what_is_not_for_all_is_for_nobody_else_before_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "mine"
+    path.touch(mode=0o664)
+    file = PartFile(path)
+    file.write(b"mine")
+    assert mode_of(file.part) == 0o600
+    file.drop()
 
 
 def test_one_file_by_two_names(tmp_path: Path) -> None:

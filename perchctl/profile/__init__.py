@@ -3,6 +3,8 @@
 schema: the models, each key with its bounds (vision and mission hold the larger sections).
 load: reading, `extends`, the files a profile names. plain_yaml: what of YAML is read.
 old_keys: what earlier versions called them. places: where shipped and the user's files are.
+limits: keys that must fit each other. keys: each with its unit, bounds and meaning.
+written: as a commented file, and as a schema for editors.
 dictionaries: ArUco's ids.
 """
 

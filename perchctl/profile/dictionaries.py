@@ -30,6 +30,17 @@ def id_count(name: str) -> int:
     return int(predefined(name).bytesList.shape[0])
 
 
+def is_one_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
+    """Whether both are the same black and white cells, at any turn: ``DICT_4X4_50`` holds the
+    first ids of ``DICT_4X4_1000``."""
+    one, two = predefined(name), predefined(other)
+    if one.markerSize != two.markerSize:
+        return False
+    turns = two.bytesList[other_id].reshape(4, -1)  # a row for each quarter turn
+    cells = one.bytesList[marker_id].reshape(4, -1)[0]
+    return any(bool((cells == turn).all()) for turn in turns)
+
+
 def check_marker_id(name: str, marker_id: int) -> None:
     """Raises ValueError when the id is outside its dictionary, with what would hold it."""
     count = id_count(name)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote
 from perchctl.profile.old_keys import with_present_keys
@@ -51,17 +51,30 @@ def load_profile(name: str, *, with_weights: bool = True) -> Profile:
     take the place of `merge.weights` unless told otherwise. Old keys are read, with a
     `ProfileNote` as warning. Errors: NotFound, InvalidValue."""
     path = find_profile(name)
-    values = _resolved(path, seen=())
-    values.setdefault("name", path.stem)
-    try:
-        profile = Profile.model_validate(values)
-    except ValidationError as error:
-        raise InvalidValue(_one_sentence(path, error)) from None
+    profile = _checked(path, _read_yaml(path))
     if profile.merge.weights_file is None or not with_weights:
         return profile
     fitted = read_weights(find_weights(profile.merge.weights_file))
     merge = profile.merge.model_copy(update={"weights": fitted.weights})
     return profile.model_copy(update={"merge": merge})
+
+
+def check_profile(path: Path, text: str) -> None:
+    """Whether the profile at `path` would load with another text. Errors: NotFound,
+    InvalidValue."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ProfileNote)  # said when it was loaded
+        _checked(path, _values_of(text, path))
+
+
+def _checked(path: Path, own: dict[str, Any]) -> Profile:
+    """A profile by what its own file holds."""
+    values = _resolved(path, own, seen=())
+    values.setdefault("name", path.stem)
+    try:
+        return Profile.model_validate(values)
+    except ValidationError as error:
+        raise InvalidValue(_one_sentence(path, error)) from None
 
 
 def find_weights(name: str) -> Path:
@@ -83,7 +96,7 @@ def read_weights(path: Path) -> FittedWeights:
     try:
         return FittedWeights.model_validate(values)
     except ValidationError as error:
-        raise InvalidValue(_one_sentence(path, error)) from None
+        raise InvalidValue(_one_sentence(path, error, FittedWeights)) from None
 
 
 def find_calibration(name: str) -> Path:
@@ -105,10 +118,11 @@ def _choices() -> str:
     return ", ".join(listing("profiles"))
 
 
-def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
+def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
+    """What the file at `path` holds itself, on top of what it extends."""
     if path in seen:
         raise InvalidValue(f"{path}: extends: the chain of profiles comes back to itself")
-    values = _with_present_keys(_read_yaml(path), path)
+    values = _with_present_keys(own, path)
     if not values:
         raise InvalidValue(
             f"{path}: the profile is empty, and would fly what nobody chose: begin with a line "
@@ -127,7 +141,7 @@ def _resolved(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         base = find_profile(str(beside.absolute()) if by_path else base_name)
     except NotFound as error:
         raise NotFound(f"{path}: extends: {error}") from None
-    return _merged(_resolved(base, (*seen, path)), values)
+    return _merged(_resolved(base, _read_yaml(base), (*seen, path)), values)
 
 
 def _with_present_keys(values: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -156,11 +170,17 @@ def _place_beside(
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        values = parse_yaml(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise InvalidValue(f"{path}: not a text file in UTF-8") from None
     except OSError as error:
         raise NotFound(f"{path}: cannot be read: {error.strerror}") from None
+    return _values_of(text, path)
+
+
+def _values_of(text: str, path: Path) -> dict[str, Any]:
+    try:
+        values = parse_yaml(text)
     except ValueError as error:
         raise InvalidValue(f"{path}: {error}") from None
     if values is None:
@@ -183,10 +203,21 @@ _MOST_OF_A_FAULT = 1000
 _BOUNDS = ("less_than_equal", "greater_than_equal")
 
 
-def _one_sentence(path: Path, error: ValidationError) -> str:
-    faults = error.errors(include_url=False)
-    first = faults[0]
-    key = clipped(".".join(str(part) for part in first["loc"]) or "profile")
+_COUNTS = ("tuple_type", "too_long", "missing")
+
+
+def _one_sentence(path: Path, error: ValidationError, model: type[BaseModel] = Profile) -> str:
+    key, text = first_fault(error, model)
+    more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+    return f"{path}: {key or 'profile'}: {text}{more}"
+
+
+def first_fault(error: ValidationError, model: type[BaseModel] = Profile) -> tuple[str, str]:
+    """The key of the first fault that was found in values of `model`, empty where it is of no
+    single one, and what is wrong."""
+    first = error.errors(include_url=False)[0]
+    key = clipped(".".join(str(part) for part in first["loc"]))
+    count = _numbers_at(model, first["loc"]) if first["type"] in _COUNTS else 0
     if first["type"] == "extra_forbidden":
         above = first["loc"][:-1]
         keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
@@ -196,14 +227,27 @@ def _one_sentence(path: Path, error: ValidationError) -> str:
     elif first["type"] == "model_type":
         found = clipped(repr(first["input"]))
         text = f"must hold keys and values, found {found}; give some, or remove it"
+    elif count:
+        key = clipped(".".join(part for part in first["loc"] if isinstance(part, str)))
+        text = f"needed are {count} numbers, found {clipped(repr(first['input']))}"
     else:
         found = clipped(repr(first["input"]))
         text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
         names = [part for part in first["loc"] if isinstance(part, str)]
         if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:
             text += " (metres: were millimetres or centimetres meant?)"
-    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
-    return f"{path}: {key}: {text}{more}"
+    return key, text
+
+
+def _numbers_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> int:
+    """How many the key there takes in a row; 0 of any other key."""
+    kind: Any = model
+    for part in loc:
+        if isinstance(part, str):
+            field = getattr(kind, "model_fields", {}).get(part)
+            kind = field.annotation if field else None
+    rows = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
+    return len(get_args(rows[0])) if rows else 0
 
 
 def _keys_at(loc: tuple[int | str, ...]) -> list[str]:

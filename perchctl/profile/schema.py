@@ -12,6 +12,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from perchctl.profile.base import Range, Section
+from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.old_keys import with_present_keys
 from perchctl.profile.vision import (
@@ -26,57 +27,85 @@ from perchctl.profile.vision import (
 
 
 class LinkConfig(Section):
-    uri: str = "sim://"
-    connect_timeout_s: float = Field(15.0, gt=0, le=120)
-    parameters: dict[str, int | float] = Field(default_factory=dict)
-    telemetry_period_s: float = Field(0.01, ge=0.01, le=0.1)
-    loop_hz: float = Field(50.0, ge=5, le=200)
+    uri: str = Field("sim://", description="`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
+    connect_timeout_s: float = Field(15.0, gt=0, le=120, description="for both tries together")
+    parameters: dict[str, int | float] = Field(
+        default_factory=dict, description="firmware parameters, set and read back before the flight"
+    )
+    telemetry_period_s: float = Field(0.01, ge=0.01, le=0.1, description="of position and attitude")
+    loop_hz: float = Field(50.0, ge=5, le=200, description="turns of the flight loop")
 
 
 class SimulationConfig(Section):
     """Ranges from which a seed draws one flight's conditions (`perchctl.sim.draw`)."""
 
-    start_offset_m: float = Field(0.5, ge=0, le=5)
-    target_yaw_deg: Range = (-180.0, 180.0)
-    ceiling_z_m: Range = (1.8, 2.6)
-    mass_kg: Range = (0.038, 0.042)
-    battery_rest_v: Range = (3.85, 4.2)
-    camera_latency_s: Range = (0.03, 0.12)
-    camera_jitter_s: float = Field(0.008, ge=0, le=0.2)
-    camera_rate_hz: float = Field(30.0, gt=0, le=200)
-    camera_drop_rate: float = Field(0.1, ge=0, lt=1)
-    camera_burst_frames: tuple[int, int] | None = (8, 20)
-    camera_noise_sigma: Range = (4.0, 8.0)
-    camera_exposure_s: float = Field(0.008, ge=0, le=0.05)
-    camera_defocus_px: float = Field(0.6, ge=0, le=10)
-    camera_fields: Literal["progressive", "top", "bottom"] = "progressive"
-    camera_blended: bool = False
-    camera_readout_s: float = Field(0.0, ge=0, le=0.05)
-    camera_flicker: float = Field(0.0, ge=0, le=1)
-    camera_pumping: float = Field(0.0, ge=0, le=0.9)
-    camera_analogue: float = Field(0.0, ge=0, le=1)
-    mount_error_deg: float = Field(1.0, ge=0, le=20)
-    mount_error_m: float = Field(0.001, ge=0, le=0.05)
-    estimate_noise_m: float = Field(0.002, ge=0, le=0.2)
-    estimate_tilt_bias_deg: float = Field(0.3, ge=0, le=10)
-    drift_mps: float = Field(0.01, ge=0, le=0.2)
-    draught_mps: Range = (0.0, 0.3)
-    magnet_force_n: float = Field(1.2, ge=0, le=20)
-    first_contact_fails: float = Field(0.1, ge=0, le=1)
-    no_target: bool = False
+    start_offset_m: float = Field(
+        0.5, ge=0, le=5, description="start under the target, at most so far aside in x and in y"
+    )
+    target_yaw_deg: Range = Field((-180.0, 180.0), description="the target's heading")
+    ceiling_z_m: Range = Field((1.8, 2.6), description="over the floor")
+    mass_kg: Range = Field((0.038, 0.042), description="all-up")
+    battery_rest_v: Range = Field((3.85, 4.2), description="at the start")
+    camera_latency_s: Range = Field((0.03, 0.12), description="the true one")
+    camera_jitter_s: float = Field(0.008, ge=0, le=0.2, description="of the latency, one sigma")
+    camera_rate_hz: float = Field(30.0, gt=0, le=200, description="frames")
+    camera_drop_rate: float = Field(0.1, ge=0, lt=1, description="share of frames lost")
+    camera_burst_frames: tuple[int, int] | None = Field(
+        (8, 20), description="frames lost in one go, once a flight"
+    )
+    camera_noise_sigma: Range = Field((4.0, 8.0), description="of 255")
+    camera_exposure_s: float = Field(0.008, ge=0, le=0.05, description="motion blur")
+    camera_defocus_px: float = Field(0.6, ge=0, le=10, description="sigma of the lens's blur")
+    camera_fields: Literal["progressive", "top", "bottom"] = Field(
+        "progressive", description="interlaced: which row's field comes first"
+    )
+    camera_blended: bool = Field(
+        False, description="the two fields averaged, as some converters do"
+    )
+    camera_readout_s: float = Field(
+        0.0, ge=0, le=0.05, description="rolling shutter: from the first row to the last"
+    )
+    camera_flicker: float = Field(
+        0.0, ge=0, le=1, description="share of the light that comes and goes 100 times a second"
+    )
+    camera_pumping: float = Field(
+        0.0, ge=0, le=0.9, description="share by which an exposure control that hunts is off"
+    )
+    camera_analogue: float = Field(
+        0.0, ge=0, le=1, description="trembling, torn and lost lines; 1 is about to be lost"
+    )
+    mount_error_deg: float = Field(
+        1.0, ge=0, le=20, description="what the profile's mount is wrong by, at most"
+    )
+    mount_error_m: float = Field(
+        0.001, ge=0, le=0.05, description="what the profile's mount is wrong by, at most"
+    )
+    estimate_noise_m: float = Field(0.002, ge=0, le=0.2, description="of the state estimate")
+    estimate_tilt_bias_deg: float = Field(
+        0.3, ge=0, le=10, description="of the state estimate, at most"
+    )
+    drift_mps: float = Field(0.01, ge=0, le=0.2, description="of the state estimate")
+    draught_mps: Range = Field((0.0, 0.3), description="wind, with gusts")
+    magnet_force_n: float = Field(1.2, ge=0, le=20, description="that the magnet holds")
+    first_contact_fails: float = Field(
+        0.1, ge=0, le=1, description="share of flights in which the first contact does not hold"
+    )
+    no_target: bool = Field(False, description="a bare ceiling")
 
 
 class LogConfig(Section):
-    directory: str = "perchctl-logs"
-    plot: bool = True
+    directory: str = Field("perchctl-logs", description="for the log and its plot")
+    plot: bool = Field(True, description="draw the flight after it")
 
 
 class Profile(Section):
     """One flight's resolved configuration."""
 
-    name: str = "unnamed"
-    description: str = ""
-    date: datetime.date | None = None  # of the measurements in it; printed on the target
+    name: str = Field("unnamed", description="of the profile; else its file's")
+    description: str = Field("", description="one sentence for people")
+    date: datetime.date | None = Field(
+        None, description="of the measurements in it; printed on the target"
+    )
     camera: CameraConfig = CameraConfig()
     vehicle: VehicleConfig = VehicleConfig()
     target: TargetConfig = TargetConfig()
@@ -97,15 +126,8 @@ class Profile(Section):
         return with_present_keys(values)[0] if isinstance(values, dict) else values
 
     @model_validator(mode="after")
-    def _heights_fit(self) -> Profile:
-        if self.planner.search.max_height_m > self.safety.max_height_m:
-            raise ValueError(
-                f"planner.search.max_height_m ({self.planner.search.max_height_m}) must not "
-                f"exceed safety.max_height_m ({self.safety.max_height_m})"
-            )
-        if self.planner.takeoff_height_m > self.planner.search.max_height_m:
-            raise ValueError(
-                f"planner.takeoff_height_m ({self.planner.takeoff_height_m}) must not exceed "
-                f"planner.search.max_height_m ({self.planner.search.max_height_m})"
-            )
+    def _limits_fit(self) -> Profile:
+        for limit in IMPOSSIBLE:
+            if not limit.holds(self):
+                raise ValueError(limit.sentence(self))
         return self

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile.base import BodyVector3, Section, Vector3
-from perchctl.profile.dictionaries import check_marker_id
+from perchctl.profile.dictionaries import check_marker_id, is_one_pattern
 
 
 class Mounting(Section):
@@ -22,8 +22,13 @@ class Mounting(Section):
     image's right to the vehicle's left.
     """
 
-    position_m: BodyVector3 = (0.0, 0.0, 0.01)
-    rpy_deg: Vector3 = (0.0, 0.0, 0.0)
+    position_m: BodyVector3 = Field(
+        (0.0, 0.0, 0.01), description="the camera in body axes: forward, left, up"
+    )
+    rpy_deg: Vector3 = Field(
+        (0.0, 0.0, 0.0),
+        description="its turn; at 0 0 0 the picture's right is forward, its bottom left",
+    )
 
     @field_validator("rpy_deg")
     @classmethod
@@ -52,27 +57,74 @@ def _eighths(angle: float) -> int:
     )
 
 
+MOST_LATENCY_S = 1.0
+START_LATENCY_S = 0.07
+"""Where a flight begins that measures it: most cameras are 60 to 100 ms late."""
+USED_LATENCY_S = (0.02, 0.2)
+"""What such a flight uses: no camera's exposure and transfer take less; and past the second a
+picture is so late that the target is not to be steered by."""
+
+
 class CameraConfig(Section):
-    source: str = "sim:"
-    calibration: str = "example_640x480.yaml"
-    cam: str | None = None
-    latency_s: float = Field(0.07, ge=0, le=1)
+    source: str = Field(
+        "sim:", description="`camera:N`, `http://...`, `video:FILE`, `images:DIR`, `sim:`"
+    )
+    calibration: str = Field(
+        "example_640x480.yaml", description="file beside the profile, in `calib/`, or a whole path"
+    )
+    cam: str | None = Field(
+        None, description="which camera of a Kalibr file of several: `cam0`, `cam1`, ..."
+    )
+    latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] | Literal["measured"] = Field(
+        START_LATENCY_S, description="from exposure to arrival; `measured`: by each flight"
+    )
     mount: Mounting = Mounting()
-    start_timeout_s: float = Field(8.0, gt=0, le=60)
-    mirrored: bool = False  # flip the picture before use
-    mask: str | None = None  # picture of what the vehicle's own gear covers
-    fields: Literal["auto", "top", "bottom", "progressive"] = "auto"  # of interlaced pictures
-    readout_s: float | None = Field(0.0, ge=0, le=0.05)  # of a rolling shutter; none: unknown
+    start_timeout_s: float = Field(8.0, gt=0, le=60, description="wait for the first good picture")
+    mirrored: bool = Field(False, description="flip each picture before use")
+    mask: str | None = Field(None, description="picture of what the vehicle itself covers, white")
+    fields: Literal["auto", "top", "bottom", "progressive"] = Field(
+        "auto",
+        description="interlaced pictures: found by measure, or which field is earlier, or never",
+    )
+    readout_s: float | None = Field(
+        0.0,
+        ge=0,
+        le=0.05,
+        description="rolling shutter: from the first row to the last; none: not known",
+    )
+
+    @field_validator("latency_s", mode="before")
+    @classmethod
+    def _a_time_or_measured(cls, latency_s: Any) -> Any:
+        """One sentence for both kinds of value."""
+        number = isinstance(latency_s, (int, float)) and not isinstance(latency_s, bool)
+        if latency_s == "measured" or (number and 0.0 <= latency_s <= MOST_LATENCY_S):
+            return latency_s
+        raise ValueError(
+            f"found {latency_s!r}; allowed are 0 to {MOST_LATENCY_S:g} (seconds), or the word "
+            f"measured, to have each flight measure it"
+        )
+
+    @property
+    def start_latency_s(self) -> float:
+        """What is taken off a picture's time of arrival until a flight has measured it."""
+        return START_LATENCY_S if isinstance(self.latency_s, str) else self.latency_s
 
 
 class VehicleConfig(Section):
-    gear_body_m: BodyVector3 = (0.0, 0.0, 0.03)
+    gear_body_m: BodyVector3 = Field(
+        (0.0, 0.0, 0.03), description="tip of the magnet gear in body axes: forward, left, up"
+    )
 
 
 class MarkerConfig(Section):
-    dictionary: str
-    id: int = Field(ge=0)
-    side_m: float = Field(ge=0.004, le=2.0)
+    dictionary: str = Field(description="an OpenCV dictionary")
+    id: int = Field(ge=0, description="within the dictionary")
+    side_m: float = Field(
+        ge=0.004,
+        le=2.0,
+        description="of the black square, as printed; small: less than half of large",
+    )
 
     @model_validator(mode="after")
     def _id_in_dictionary(self) -> MarkerConfig:
@@ -90,15 +142,27 @@ class TargetConfig(Section):
 
     large: MarkerConfig = MarkerConfig(dictionary="DICT_4X4_1000", id=997, side_m=0.150)
     small: MarkerConfig = MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=5, side_m=0.025)
-    size_sigma: float = Field(0.005, ge=0, le=0.1)
-    curl_per_m: float = Field(0.03, ge=0, le=10)
+    size_sigma: float = Field(
+        0.005,
+        ge=0,
+        le=0.1,
+        description="share by which all printed sizes may be off; less once measured",
+    )
+    curl_per_m: float = Field(
+        0.03,
+        ge=0,
+        le=10,
+        description="so much times r^2 a place r from the sheet's centre may be off its plane",
+    )
 
     @model_validator(mode="after")
     def _markers_differ(self) -> TargetConfig:
-        if (self.large.dictionary, self.large.id) == (self.small.dictionary, self.small.id):
+        large, small = self.large, self.small
+        if is_one_pattern(large.dictionary, large.id, small.dictionary, small.id):
+            both = dict.fromkeys(f"{m.dictionary}/{m.id}" for m in (large, small))
             raise ValueError(
-                f"large and small are the same marker, {self.large.dictionary}/{self.large.id}, "
-                f"which cannot be told apart: give one of them another id"
+                f"large and small are the same marker, {' and '.join(both)}, which cannot be told "
+                f"apart: give one of them another id"
             )
         return self
 
@@ -113,20 +177,34 @@ class TargetConfig(Section):
 
 
 class DetectorConfig(Section):
-    refinement: Literal["none", "subpix", "line"] = "line"
-    window: bool = True  # search around the last pose first
-    blurred: bool = True  # look once more where blur may hide the target
-    blurred_every: int = Field(4, ge=1, le=100)  # ... then every Nth of a stream without it
-    cut: bool = True  # where the picture cuts both markers: by what is left of them
-    correction_bits_large: int = Field(0, ge=0, le=3)
-    correction_bits_small: int = Field(1, ge=0, le=3)
+    refinement: Literal["none", "subpix", "line"] = Field(
+        "line", description="of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
+    )
+    window: bool = Field(True, description="look around the last pose first")
+    blurred: bool = Field(True, description="look once more where blur may hide the target")
+    blurred_every: int = Field(
+        4,
+        ge=1,
+        le=100,
+        description="... so in every Nth picture of a stream without it, not for a sharp one",
+    )
+    cut: bool = Field(
+        True,
+        description="measure by what is left of the drawing where the picture cuts both markers",
+    )
+    correction_bits_large: int = Field(0, ge=0, le=3, description="wrong cells that are corrected")
+    correction_bits_small: int = Field(1, ge=0, le=3, description="wrong cells that are corrected")
 
 
 class PoseConfig(Section):
-    solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = "sqpnp"
-    refine: bool = True
-    max_reprojection_px: float = Field(3.0, gt=0)
-    each_marker: bool = False  # beside the joint pose also each marker's own, for the log
+    solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = Field(
+        "sqpnp", description="OpenCV's solver for the first guess"
+    )
+    refine: bool = Field(True, description="least squares on the corners after it")
+    max_reprojection_px: float = Field(3.0, gt=0, description="no pose above this RMS")
+    each_marker: bool = Field(
+        False, description="beside the joint pose also each marker's own, for the log"
+    )
 
 
 class KalmanConfig(Section):
@@ -143,36 +221,78 @@ class KalmanConfig(Section):
     of the state estimate by that estimate's drift only, at most so fast.
     """
 
-    k1: float = Field(0.04, gt=0)
-    k2: float = Field(0.004, gt=0)
-    alpha: float = Field(0.85, gt=0, le=1)
-    n_max: int = Field(8, ge=0, le=100)
-    frame: Literal["level", "world"] = "world"
-    noise: Literal["fixed", "measured"] = "measured"
-    acceleration_mps2: float = Field(3.0, gt=0, le=100)
-    turn_radps2: float = Field(3.0, gt=0, le=1000)
-    drift_mps2: float = Field(0.1, gt=0, le=100)
-    attitude_sigma_deg: float = Field(0.3, ge=0, le=10)
-    drift_mps: float = Field(0.05, ge=0, le=1)
-    gate: bool = True  # a pose that contradicts the target's track is not taken
+    k1: float = Field(
+        0.04, gt=0, description="measurement noise, the paper's R = k1 I, with `noise: fixed`"
+    )
+    k2: float = Field(
+        0.004,
+        gt=0,
+        description="process noise of a frame, the paper's Q = k2 I, with `noise: fixed`",
+    )
+    alpha: float = Field(
+        0.85, gt=0, le=1, description="a coasting track's speeds are multiplied by it each frame"
+    )
+    n_max: int = Field(8, ge=0, le=100, description="frames for which a track coasts")
+    frame: Literal["level", "world"] = Field(
+        "world", description="where tracks live: `level` as the paper, or `world`"
+    )
+    noise: Literal["fixed", "measured"] = Field(
+        "measured",
+        description="k1 and k2 for every frame, or each pose's own covariance and accelerations",
+    )
+    acceleration_mps2: float = Field(
+        3.0,
+        gt=0,
+        le=100,
+        description="of camera or target in the level frame, with `noise: measured`",
+    )
+    turn_radps2: float = Field(
+        3.0, gt=0, le=1000, description="of the camera's attitude and heading, likewise"
+    )
+    drift_mps2: float = Field(
+        0.1,
+        gt=0,
+        le=100,
+        description="of the state estimate's drift, for tracks in the world, likewise",
+    )
+    attitude_sigma_deg: float = Field(
+        0.3, ge=0, le=10, description="constant error of roll and pitch, likewise"
+    )
+    drift_mps: float = Field(
+        0.05,
+        ge=0,
+        le=1,
+        description="an unmeasured target moves in the estimate's world at most so fast",
+    )
+    gate: bool = Field(True, description="a pose that contradicts the target's track is not taken")
 
 
 class WeightsConfig(Section):
-    x: float = Field(0.275, ge=0, le=1)
-    y: float = Field(0.306, ge=0, le=1)
-    z: float = Field(0.728, ge=0, le=1)
-    yaw: float = Field(0.469, ge=0, le=1)
+    x: float = Field(
+        0.275, ge=0, le=1, description="the large marker's share; the small one has the rest"
+    )
+    y: float = Field(0.306, ge=0, le=1, description="as x")
+    z: float = Field(0.728, ge=0, le=1, description="as x")
+    yaw: float = Field(0.469, ge=0, le=1, description="as x")
 
 
 class MergeConfig(Section):
-    method: Literal["weights", "joint"] = "joint"
+    method: Literal["weights", "joint"] = Field(
+        "joint", description="the paper's weights, or both markers solved as one"
+    )
     weights: WeightsConfig = WeightsConfig()
-    weights_file: str | None = None  # of `perchctl fit-weights`; replaces `weights`
-    stages: Literal["seen", "range"] = "seen"  # range: by z2 and z3, equations 4, 6, 11
-    z2_m: float = Field(0.25, gt=0)
-    z3_m: float = Field(0.12, gt=0)
-    disagreement_m: float = Field(0.03, gt=0)
-    disagreement_frames: int = Field(15, ge=1)
+    weights_file: str | None = Field(
+        None, description="of `perchctl fit-weights`; replaces `weights`"
+    )
+    stages: Literal["seen", "range"] = Field(
+        "seen", description="merge what is seen, or by distance as equations 4, 6, 11"
+    )
+    z2_m: float = Field(0.25, gt=0, description="farthest range of the small marker")
+    z3_m: float = Field(0.12, gt=0, description="nearest range of the whole large marker")
+    disagreement_m: float = Field(
+        0.03, gt=0, description="farther apart than this the markers contradict"
+    )
+    disagreement_frames: int = Field(15, ge=1, description="so many in a row, and it lands")
 
     @model_validator(mode="after")
     def _ranges_in_order(self) -> MergeConfig:

@@ -62,6 +62,15 @@ def mounted(target: TargetConfig, camera: CameraModel, profile: Profile) -> Moun
     return Mounted(here, turned, (roll, pitch, yaw))
 
 
+def sees_small(camera: CameraModel, profile: Profile, range_m: float) -> bool:
+    """Whether the whole small marker is in the picture with the gear's tip so far under it."""
+    T_body_cam = profile.camera.mount.T_body_cam
+    R = T_body_cam[:3, :3].T
+    target_m = np.add(profile.vehicle.gear_body_m, (0.0, 0.0, range_m))
+    outline = square_outline(profile.target.small.side_m)
+    return _holds(FieldOfView(camera), outline, R, R @ (target_m - T_body_cam[:3, 3]))
+
+
 def blind_lines(mount: Mounted) -> list[str]:
     """For people, a line or two."""
     lines = [f"{_both(mount.blind)}, the gear under the target's centre"]
@@ -96,16 +105,18 @@ def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m:
         return R @ np.array([0.0, 0.0, range_m]) + offset
 
     def whole(range_m: float) -> bool:
-        return any(
-            view.holds(np.column_stack([o, np.zeros(len(o))]) @ R.T + centre(range_m))
-            for o in outlines
-        )
+        return any(_holds(view, outline, R, centre(range_m)) for outline in outlines)
 
     def left(range_m: float) -> bool:
         pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre(range_m) / half_m)
         return whole(range_m) or shows_enough(pose, patterns, camera)
 
     return Blind(*(_nearest_m(seen) for seen in (whole, left)))
+
+
+def _holds(view: FieldOfView, outline_m: Array, R: Array, centre: Array) -> bool:
+    """Whether an outline (n, 2) about that centre, in the camera's axes, is in the picture."""
+    return view.holds(np.column_stack([outline_m, np.zeros(len(outline_m))]) @ R.T + centre)
 
 
 def _nearest_m(seen: Callable[[float], bool]) -> float | None:

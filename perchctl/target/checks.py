@@ -51,8 +51,11 @@ class TargetCheck:
         return f"{white}; both markers are read from the drawing"
 
 
-def check_target(target: TargetConfig, magnet_m: float) -> TargetCheck:
-    """Raises InvalidValue, in one sentence, for the first thing that is wrong."""
+def check_target(target: TargetConfig, magnet_m: float, *, search: bool = True) -> TargetCheck:
+    """Raises InvalidValue, in one sentence, for the first thing that is wrong.
+
+    `search` for sizes and ids that would do, to name them: takes seconds.
+    """
     _check_magnet(target, magnet_m)
     large, small = target.large, target.small
     for name, marker in (("large", large), ("small", small)):
@@ -69,9 +72,9 @@ def check_target(target: TargetConfig, magnet_m: float) -> TargetCheck:
             raise InvalidValue(
                 f"the white ring around the small marker would be {check.ring_m * 1e3:.1f} mm, "
                 f"and {low * 1e3:.1f} to {high * 1e3:.1f} mm are needed: "
-                f"{_white_hint(target, white_ids)}"
+                f"{_white_hint(target, white_ids, search)}"
             )
-    _check_reading(target, white_ids)
+    _check_reading(target, white_ids, search)
     return check
 
 
@@ -122,7 +125,7 @@ def _turns_onto_itself(marker: MarkerConfig) -> bool:
     return any(np.array_equal(cells, np.rot90(cells, turn)) for turn in (1, 2, 3))
 
 
-def _check_reading(target: TargetConfig, white_ids: tuple[int, ...]) -> None:
+def _check_reading(target: TargetConfig, white_ids: tuple[int, ...], search: bool) -> None:
     """Reads the drawing: both markers must be found, and each whole dictionary must find
     nothing else in it."""
     large, small = target.large, target.small
@@ -138,7 +141,7 @@ def _check_reading(target: TargetConfig, white_ids: tuple[int, ...]) -> None:
         if name not in seen:
             raise InvalidValue(
                 f"the {name} marker cannot be read from this drawing: "
-                f"{_white_hint(target, white_ids)}"
+                f"{_white_hint(target, white_ids, search)}"
             )
     same_size = predefined(large.dictionary).markerSize == predefined(small.dictionary).markerSize
     for marker, other in ((large, small), (small, large)):
@@ -182,7 +185,9 @@ def _distance(a: MarkerConfig, b: MarkerConfig) -> int:
     return min(int((np.rot90(first, turn) != second).sum()) for turn in range(4))
 
 
-def _white_hint(target: TargetConfig, white_ids: tuple[int, ...]) -> str:
+def _white_hint(target: TargetConfig, white_ids: tuple[int, ...], search: bool) -> str:
+    if not search:
+        return "take a smaller small marker, or another id"
     fits = largest_small_m(target)
     small = "take a smaller --small" + ("" if fits is None else f" (up to {millimetres(fits)}mm)")
     if target.large.id in white_ids:

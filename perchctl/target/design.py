@@ -17,7 +17,7 @@ from perchctl.geometry import Array
 from perchctl.profile import Profile, TargetConfig
 from perchctl.target.blind import Mounted, mounted
 from perchctl.target.bound import PoseBound, pose_bound
-from perchctl.target.limits import Optics, smallest_side_px
+from perchctl.target.limits import TRIALS, Optics, smallest_side_px
 from perchctl.target.visible import FieldOfView, square_outline, turned_outline
 from perchctl.vision.types import CameraModel
 
@@ -87,12 +87,14 @@ def focal_px(camera: CameraModel) -> float:
     return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
 
 
-def design_ranges(target: TargetConfig, camera: CameraModel, optics: Optics) -> Ranges:
+def design_ranges(
+    target: TargetConfig, camera: CameraModel, optics: Optics, trials: int = TRIALS
+) -> Ranges:
     """By trial through the detector (far) and by geometry (near)."""
     f = focal_px(camera)
     picture_px = max(camera.size_px)
-    large_px = smallest_side_px(target, "large", optics, picture_px)
-    small_px = smallest_side_px(target, "small", optics, picture_px)
+    large_px = smallest_side_px(target, "large", optics, picture_px, trials)
+    small_px = smallest_side_px(target, "small", optics, picture_px, trials)
     return _ranges(target, FieldOfView(camera), f, large_px, small_px)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from perchctl.geometry import Array
 from perchctl.profile import TargetConfig
 from perchctl.target.drawing import marker_corners_m
 from perchctl.vision.camera_model import undistort_px
-from perchctl.vision.types import CameraModel
+from perchctl.vision.types import CameraModel, PipelineOutput
 
 CORNER_BIAS_PX = 0.02
 """What a refined corner errs inwards or outwards in all frames alike; no number of frames
@@ -27,6 +27,7 @@ MIN_ERROR = 0.003
 a printer's dot."""
 SIGMAS = 3.0
 MIN_FRAMES = 5
+_FOLD = 500  # frames whose size ratios are kept one by one
 _STEPS = 12
 _SETTLED = 1e-10
 
@@ -142,6 +143,42 @@ def verdict(ratio: SizeRatio | None, target: TargetConfig) -> PrintVerdict:
         f"print error: {ratio_text}; measure both black squares and give them to "
         f"perchctl make-target --measured-large MM --measured-small MM",
     )
+
+
+@dataclass(eq=False)
+class PrintCheck:
+    """The ratio of the two markers' apparent sizes over the frames that show both."""
+
+    camera: CameraModel
+    target: TargetConfig
+    _ratios: list[SizeRatio] = field(default_factory=list)
+
+    def add(self, output: PipelineOutput | None) -> None:
+        if output is None:
+            return
+        large, small = output.detections.large, output.detections.small
+        if large is None or small is None or not (large.refined and small.refined):
+            return
+        ratio = size_ratio(
+            large.corners_px,
+            small.corners_px,
+            (large.sigma_px, small.sigma_px),
+            self.camera,
+            self.target,
+        )
+        if ratio is not None:
+            self._ratios.append(ratio)
+        if len(self._ratios) >= _FOLD:
+            mean = combined(self._ratios)
+            self._ratios = [] if mean is None else [mean]
+
+    @property
+    def judged(self) -> bool:
+        """Whether enough frames showed both markers."""
+        return sum(ratio.frames for ratio in self._ratios) >= MIN_FRAMES
+
+    def verdict(self) -> PrintVerdict:
+        return verdict(combined(self._ratios), self.target)
 
 
 def _linearised(

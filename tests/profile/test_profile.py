@@ -70,12 +70,24 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("simulation: {ceiling_z_m: [2.6, 1.8]}", ["simulation.ceiling_z_m", "2.6", "1.8"]),
         ("planner: {search: {max_height_m: 9}}", ["planner.search.max_height_m"]),
         ("vehicle: {gear_body_m: [0, 0, 3]}", ["vehicle.gear_body_m.2", "0.3, found 3 (metres"]),
+        ("vehicle: {gear_body_m: 0.03}", ["gear_body_m: needed are 3 numbers, found 0.03"]),
+        ("vehicle: {gear_body_m: [0, 0.1]}", ["gear_body_m: needed are 3 numbers, found [0, 0.1]"]),
+        ("planner: {approach_xy_m: [1, 2, 3]}", ["approach_xy_m: needed are 2 numbers, found"]),
+        ("simulation: {mass_kg: 0.04}", ["mass_kg: needed are 2 numbers, found 0.04"]),
         ("camera: {mount: {position_m: [-30, 0, 0]}}", ["camera.mount.position_m.0", "-30"]),
         ("camera: {mount: {rpy_deg: [0, 0, 1.5708]}}",
          ["camera.mount.rpy_deg", "found 1.5708", "90 degrees in radians", "write 90"]),
         ("camera: {mount: {rpy_deg: [3.14, 0, -0.785]}}", ["found 3.14", "write 180"]),
+        *((f"camera: {{latency_s: {value}}}",
+           ["camera.latency_s", f"found {found};", "0 to 1 (seconds)", "the word measured"])
+          for value, found in [("80", "80"), ("-0.1", "-0.1"), ("auto", "'auto'"),
+                               ("null", "None"), (".nan", "nan")]),
+        ("camera: {latency_s: yes}", ["camera.latency_s"]),
         ("target: {small: {dictionary: DICT_4X4_1000, id: 997, side_m: 0.025}}",
          ["target", "the same marker", "DICT_4X4_1000/997", "another id"]),
+        ("target: {large: {dictionary: DICT_4X4_50, id: 5, side_m: 0.15}, "
+         "small: {dictionary: DICT_4X4_250, id: 5, side_m: 0.025}}",
+         ["target", "the same marker", "DICT_4X4_50/5 and DICT_4X4_250/5", "another id"]),
         ("kalman: {k1: 1}\nmerge: {}\nkalman: {k2: 1}", ["line 3", "kalman", "line 1", "keep one"]),
         ("kalman: {k1: 1,\n  k1: 2}", ["line 2", "k1 is there twice"]),
         ("planner: {takeoff_height_m: yes}", ["planner.takeoff_height_m", "yes", "a number"]),
@@ -95,6 +107,16 @@ def test_faults_are_one_sentence(tmp_path: Path, text: str, expected: list[str])
     message = _refusal(tmp_path, text)
     for word in expected:
         assert word in message
+
+
+def test_a_latency_is_a_time_or_measured(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("camera: {latency_s: measured}")
+    camera = load_profile(str(path)).camera
+    assert (camera.latency_s, camera.start_latency_s) == ("measured", 0.07)
+    assert camera.model_validate(camera.model_dump(mode="json")) == camera
+    path.write_text("camera: {latency_s: 0.05}")
+    assert load_profile(str(path)).camera.start_latency_s == 0.05
 
 
 @pytest.mark.parametrize("angles", ["[0.3, -1.57, 90.2]", "[0, 0, 1.56]", "[0, 180, -45]"])

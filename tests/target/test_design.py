@@ -62,6 +62,7 @@ def paper_design(profile: Profile) -> Design:
     return make_design(TARGET, PAPER_CAMERA, Optics(2.5), profile, 2.4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("focal_px", "blur_px"), [(250.0, 2.5), (380.0, 1.5)])
 def test_ranges_agree_with_the_renderer(bench: ModuleType, focal_px: float, blur_px: float) -> None:
     """The other cameras and blurs: benchmarks/ranges_by_design.py."""
@@ -163,6 +164,7 @@ def test_gaps_are_named(profile: Profile, paper_design: Design) -> None:
     assert "gap before contact" in warnings_of(aside, ranges)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("focal_px", "blur_px", "ceiling_m"), [(380.0, 2.0, 2.4), (250.0, 0.6, None)]
 )
@@ -179,6 +181,7 @@ def test_what_is_suggested_covers_the_way(
     assert f"--large {found.target.large.side_m * 1e3:g}mm" in found.command()
 
 
+@pytest.mark.long
 def test_what_is_suggested_is_more_exact_than_the_target_there_is(profile: Profile) -> None:
     """At every range at which both are seen; and it says what its sizes follow from."""
     camera, optics = camera_of(380.0), Optics(2.0)
@@ -199,6 +202,7 @@ def test_what_is_suggested_is_more_exact_than_the_target_there_is(profile: Profi
     assert "not inside of the magnet" in larger.reasons[1]
 
 
+@pytest.mark.long
 def test_what_no_target_can_cover_is_said(profile: Profile) -> None:
     found, _ = suggest(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
     assert any("small marker would have to be" in note for note in found.notes)

@@ -58,6 +58,7 @@ def test_the_profile_s_own_date_is_on_the_sheet() -> None:
     assert "2026" not in Path("target.svg").read_text()
 
 
+@pytest.mark.long
 def test_the_design_and_its_plot() -> None:
     out, _ = call("--camera", CAMERA, "--ceiling", "2.4", "--blur", "2.0", "-o", "t.pdf")
     assert "z1" in out
@@ -214,6 +215,7 @@ def test_a_scaled_page_is_noticed() -> None:
     assert "was the page scaled" in out
 
 
+@pytest.mark.long
 def test_both_ways_say_from_where_on_the_mounting_is_blind() -> None:
     out, _ = call("-p", "sim")
     assert "example_640x480.yaml: never blind (by whole markers alone: blind from 20 mm" in out

@@ -1,0 +1,97 @@
+"""Keys that must fit each other: each pair that dooms every flight is refused, and says why."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from perchctl.check.limits import DOUBTFUL
+from perchctl.profile import Profile
+from perchctl.profile.limits import IMPOSSIBLE, Limit
+from tests.helpers.flights import short_profile
+
+BROKEN: tuple[Mapping[str, Any], ...] = (
+    {"planner.search.max_height_m": 3.1},
+    {"planner.takeoff_height_m": 1.4},
+    {"planner.takeoff_speed_mps": 0.02},
+    {"camera.latency_s": 0.4},
+    {"link.telemetry_period_s": 0.1},
+    {"link.telemetry_period_s": 0.1, "safety.proof_age_s": 0.2, "safety.telemetry_hold_s": 0.1},
+    {"link.telemetry_period_s": 0.1, "safety.proof_age_s": 0.2, "safety.telemetry_land_s": 0.1},
+    {"planner.estimate.dwell_s": 4.0},
+    {"planner.align.dwell_s": 10.0, "planner.align.timeout_s": 10.0},
+    {"planner.ascend.settle_dwell_s": 10.0},
+    {"planner.ascend.settle_dwell_s": 9.0, "planner.ascend.timeout_s": 9.0},
+    {"planner.perch.contact_dwell_s": 3.0},
+    {"planner.complete.release_timeout_s": 1.8},
+    {"planner.recover.dwell_s": 6.0},
+)
+"""In the order of `IMPOSSIBLE`, each breaks one."""
+
+
+@pytest.mark.parametrize("number", range(len(IMPOSSIBLE)))
+def test_each_impossible_pair_is_refused_with_its_keys(number: int) -> None:
+    limit = IMPOSSIBLE[number]
+    with pytest.raises(ValidationError) as caught:
+        short_profile(BROKEN[number], base="sim")
+    said = str(caught.value.errors()[0]["ctx"]["error"])
+    assert limit.because in said
+    for key in limit.keys:
+        assert key in said
+    assert "\n" not in said
+
+
+def test_each_pair_is_broken_once() -> None:
+    assert len(BROKEN) == len(IMPOSSIBLE)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"planner.search.max_height_m": 3.0},
+        {"planner.takeoff_height_m": 1.3},
+        {"camera.latency_s": 0.39},
+        {"planner.perch.contact_dwell_s": 2.9},
+        {"planner.complete.release_timeout_s": 1.9},
+    ],
+    ids=str,
+)
+def test_what_just_fits_is_taken(changes: Mapping[str, Any]) -> None:
+    assert isinstance(short_profile(changes, base="sim"), Profile)
+
+
+def test_a_measured_latency_counts_as_where_the_flight_begins() -> None:
+    measured = {"camera.latency_s": "measured", "safety.max_frame_age_s": 0.08}
+    assert isinstance(short_profile(measured, base="sim"), Profile)
+    with pytest.raises(ValidationError, match=r"camera.latency_s \(0.07\) must be less than"):
+        short_profile(measured | {"safety.max_frame_age_s": 0.06}, base="sim")
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [limit for limits in (IMPOSSIBLE, *DOUBTFUL.values()) for limit in limits if limit.left[1:]],
+    ids=lambda limit: limit.because,
+)
+def test_only_a_sum_is_told_as_one(limit: Limit) -> None:
+    """Where parts are said to come to something together, they do."""
+    profile = short_profile({}, base="sim")
+    left = limit.sentence(profile).partition(" must ")[0]
+    parts, plus, value = left.partition(", together ")
+    assert bool(plus) == (" + " in left)
+    numbers = [float(re.sub(r".*\(|\).*", "", part)) for part in parts.split(" + ") if plus]
+    if plus:
+        assert float(value.rstrip(",")) == pytest.approx(sum(numbers))
+
+
+def test_a_landing_that_takes_too_long_is_told_as_one() -> None:
+    high = short_profile({"safety.max_height_m": 9.4}, base="sim")
+    (limit,) = (limit for limit in DOUBTFUL["time limits"] if not limit.holds(high))
+    assert limit.sentence(high).startswith(
+        "twice the time that landing from safety.max_height_m (9.4 m) takes at "
+        "planner.landing.speed_mps (0.3 m/s) is 62.7 s, and must be less than "
+        "planner.landing.timeout_s (30 s)"
+    )

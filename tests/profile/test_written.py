@@ -1,0 +1,90 @@
+"""A profile written as a file with comments, the schema for editors, and the picture in words."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from perchctl.profile import Mounting, Profile, load_profile
+from perchctl.profile.keys import keys
+from perchctl.profile.picture import EDGES, edges_beside, edges_of, mount_from_edges
+from perchctl.profile.written import editor_schema, profile_text
+from tests.helpers.flights import short_profile
+
+HOSTILE = "a: b # c, 'd' \"e\" [f] {g} \\ \N{GREEK SMALL LETTER MU}\nnext: line"
+
+
+def uncommented(text: str) -> list[str]:
+    """Keys with a value of their own and no comment on the line above."""
+    lines = text.splitlines()
+    return [
+        line
+        for above, line in itertools.pairwise(["", *lines])
+        if line.strip() and not line.lstrip().startswith("#")
+        and not line.endswith(":") and not above.lstrip().startswith("#")
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv"])
+def test_a_written_profile_is_read_as_it_was(name: str, tmp_path: Path) -> None:
+    profile = load_profile(name)
+    text = profile_text(profile)
+    (tmp_path / "again.yaml").write_text(text, encoding="utf-8")
+    assert load_profile(str(tmp_path / "again.yaml")) == profile
+    assert uncommented(text) == []
+    assert max(len(line) for line in text.splitlines() if line.lstrip().startswith("#")) <= 80
+
+
+def test_a_hostile_text_stays_a_text(tmp_path: Path) -> None:
+    profile = short_profile({"description": HOSTILE, "link.parameters": {"a.b": 1e-7}}, base="sim")
+    (tmp_path / "again.yaml").write_text(profile_text(profile), encoding="utf-8")
+    assert load_profile(str(tmp_path / "again.yaml")) == profile
+
+
+def test_only_the_named_keys_are_written() -> None:
+    values = yaml.safe_load(profile_text(Profile(), {"target.small.id", "link.uri"}))
+    assert values == {"target": {"small": {"id": 5}}, "link": {"uri": "sim://"}}
+
+
+def test_the_schema_holds_each_key_with_meaning_and_unit() -> None:
+    schema = editor_schema()
+    assert "extends" in schema["properties"]
+    for key in keys(Profile()):
+        section = schema
+        *names, last = key.path.split(".")
+        for name in names:
+            reference = section["properties"][name]["$ref"]
+            section = schema["$defs"][reference.removeprefix("#/$defs/")]
+        said = section["properties"][last]["description"]
+        assert said == key.meaning + (f" ({key.unit})" if key.unit else "")
+        assert section["additionalProperties"] is False
+        assert "required" not in section
+
+
+PLACES = {"front": (1.0, 0.0, 0.0), "left": (0.0, 1.0, 0.0)}
+
+
+@pytest.mark.parametrize("front", EDGES)
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_hand_over_the_vehicle_comes_in_where_it_was_said(front: str, mirrored: bool) -> None:
+    """A point above the vehicle's front, or its left side, is seen at that edge."""
+    left = edges_beside(front)[int(mirrored)]
+    turn_deg, found_mirrored = mount_from_edges(front, left)
+    assert found_mirrored is mirrored
+    mount = Mounting(position_m=(0, 0, 0), rpy_deg=(0, 0, turn_deg))
+    for side, edge in (("front", front), ("left", left)):
+        above = np.add(PLACES[side], (0, 0, 1))
+        x, y, z = mount.T_body_cam[:3, :3].T @ above
+        seen = (-x if mirrored else x, y)  # in the picture as the camera gives it
+        assert z > 0
+        np.testing.assert_allclose(seen, EDGES[edge], atol=1e-12)
+    assert edges_of(mount, mirrored) == (front, left)
+
+
+@pytest.mark.parametrize("rpy_deg", [(180, 0, 0), (0, 0, 45), (0, 90, 0)])
+def test_a_camera_that_fits_no_edges_has_none(rpy_deg: tuple[float, float, float]) -> None:
+    assert edges_of(Mounting(rpy_deg=rpy_deg), False) is None
