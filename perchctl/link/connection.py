@@ -115,11 +115,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
     `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
     connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`.
     """
-    import cflib.crtp
-
-    _hush_cflib()
-    if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
-        cflib.crtp.init_drivers()
+    ready_cflib()
     _keep_radio_patient()
     share_s = timeout_s / CONNECT_TRIES
     for _ in range(CONNECT_TRIES):
@@ -138,6 +134,15 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
         f"no Crazyflie at {uri}: no answer within {share_s:.0f} s "
         f"(is it switched on, is the address right?)"
     )
+
+
+def ready_cflib() -> None:
+    """Its drivers known, and silent."""
+    import cflib.crtp
+
+    _hush_cflib()
+    if not cflib.crtp.CLASSES:  # init_drivers() extends this list at each call
+        cflib.crtp.init_drivers()
 
 
 def send_packets(cf: Any, packets: Iterable[Packet]) -> None:

@@ -40,16 +40,15 @@ class LogBlocks:
     def start(self, log: Any, uri: str, period_s: float) -> None:
         """Start the blocks in cflib's `log` and wait for the first sample.
 
-        `period_s` is rounded to 10 ms. Raises NotFound for a refused block, TimedOut.
+        Raises NotFound for a refused block, TimedOut.
         """
         self._started_s = self._clock()
-        fast_ms = max(10, 10 * round(period_s * 100))
         for name, variables in BLOCKS.items():
             if name in FAST_BLOCKS:
-                _start_block(log, uri, name, variables, fast_ms, self._on_data)
+                start_block(log, uri, name, variables, period_s, self._on_data)
             elif all(log.toc.get_element_by_complete_name(n) is not None for n in variables):
                 self._awaited.add(name)
-                _start_block(log, uri, name, variables, int(1e3 * SLOW_PERIOD_S), self._on_data)
+                start_block(log, uri, name, variables, SLOW_PERIOD_S, self._on_data)
         if not self._first_sample.wait(FIRST_SAMPLE_TIMEOUT_S):
             missing = self._assembler.missing()
             raise TimedOut(
@@ -77,16 +76,19 @@ class LogBlocks:
         self._first_sample.set()
 
 
-def _start_block(
+def start_block(
     log: Any,
     uri: str,
     name: str,
     variables: dict[str, str],
-    period_ms: int,
+    period_s: float,
     on_data: Callable[[int, dict[str, float], Any], None],
 ) -> None:
+    """Start a block in cflib's `log`. `period_s` is rounded to 10 ms; `on_data` gets the stamp
+    in ms, the values by name and the block. Raises NotFound for a refused one."""
     from cflib.crazyflie.log import LogConfig
 
+    period_ms = max(10, 10 * round(period_s * 100))
     block = LogConfig(name=_PREFIX + name, period_in_ms=period_ms)
     for variable, ctype in variables.items():
         block.add_variable(variable, ctype)

@@ -23,12 +23,17 @@ def check_firmware(cf: Any, uri: str) -> None:
             f"the firmware at {uri} has protocol {version}, perchctl needs "
             f"{NEEDED_PROTOCOL} or later (release 2026.08): update the firmware"
         )
-    for name in NEEDED:
-        if cf.log.toc.get_element_by_complete_name(name) is None:
-            raise NotFound(
-                f"the firmware at {uri} has no log variable {name}, which perchctl "
-                f"needs: update the firmware to release 2026.08 or later"
-            )
+    for name in missing_variables(cf):
+        raise NotFound(
+            f"the firmware at {uri} has no log variable {name}, which perchctl "
+            f"needs: update the firmware to release 2026.08 or later"
+        )
+
+
+def missing_variables(cf: Any) -> list[str]:
+    """Those of the needed ones that the firmware does not log."""
+    toc = cf.log.toc
+    return [name for name in NEEDED if toc.get_element_by_complete_name(name) is None]
 
 
 def set_parameters(cf: Any, uri: str, parameters: Mapping[str, float]) -> None:

@@ -8,12 +8,14 @@ from perchctl.errors import InvalidValue
 
 FORMS = {
     "sim": r"sim://",
-    "radio": r"radio://(\d+|[0-9A-Fa-f]{10})(/\d{1,3}(/(250K|1M|2M)(/[0-9A-Fa-f]{1,10})?)?)?(\?.+)?",
+    "radio": r"radio://([0-9]+|[0-9A-Fa-f]{10})((?:/[^/?\s]*){0,3})(\?.+)?",
     "usb": r"usb://\d+",
     "udp": r"udp://[^/:\s]+:\d{1,5}",
     "tcp": r"tcp://[^/:\s]+:\d{1,5}",
     "serial": r"serial://.+",
 }
+MOST_CHANNEL, RATES = 125, ("250K", "1M", "2M")
+ADDRESS_DIGITS = 10
 EXAMPLES = "sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://127.0.0.1:19850"
 
 UDEV_HELP = """\
@@ -34,9 +36,37 @@ log in again, and plug the radio or the vehicle in again."""
 def check_uri(uri: str) -> str:
     """The URI's scheme. Raises InvalidValue, which names what is allowed."""
     scheme = uri.split("://", 1)[0]
-    if scheme in FORMS and re.fullmatch(FORMS[scheme], uri):
-        port = uri.rpartition(":")[2] if scheme in ("udp", "tcp") else "1"
-        if 0 < int(port) <= 65535:
-            return scheme
-        raise InvalidValue(f"URI {uri!r} has no port of 1 to 65535; examples: {EXAMPLES}")
-    raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
+    form = re.fullmatch(FORMS[scheme], uri) if scheme in FORMS else None
+    if form is None:
+        raise InvalidValue(f"URI {uri!r} is not one of a vehicle; examples: {EXAMPLES}")
+    wrong = _wrong_with_radio(form[2].split("/")[1:]) if scheme == "radio" else ""
+    if scheme in ("udp", "tcp") and not 0 < int(uri.rpartition(":")[2]) <= 65535:
+        wrong = "has no port of 1 to 65535"
+    if wrong:
+        raise InvalidValue(f"URI {uri!r} {wrong}; examples: {EXAMPLES}")
+    return scheme
+
+
+def _wrong_with_radio(parts: list[str]) -> str:
+    """Of channel, rate and address, as far as they are given; empty where all are right."""
+    channel, rate, address, *_ = [*parts, None, None, None]
+    if channel is not None and not _is_channel(channel):
+        return f"has channel {channel!r}; allowed are 0 to {MOST_CHANNEL}"
+    if rate is not None and rate not in RATES:
+        return f"has data rate {rate!r}; allowed are {', '.join(RATES)}"
+    if address is not None and not re.fullmatch(f"[0-9A-Fa-f]{{{ADDRESS_DIGITS}}}", address):
+        return f"has address {address!r}; needed are ten hex digits"
+    return ""
+
+
+def _is_channel(text: str) -> bool:
+    return re.fullmatch("[0-9]{1,3}", text) is not None and int(text) <= MOST_CHANNEL
+
+
+def with_whole_address(uri: str) -> str:
+    """A radio's URI as cflib finds it, which leaves an address's zeros in front away."""
+    return re.sub(
+        r"^(radio://[^/]+/[^/]+/[^/]+/)([0-9A-Fa-f]+)",
+        lambda found: found[1] + found[2].zfill(ADDRESS_DIGITS),
+        uri,
+    )

@@ -44,7 +44,8 @@ Forces = tuple[float, float, float, float]
 class Powertrain:
     """`forces_n` M1..M4; `rest_v` the cell's resting voltage, `battery_v` under load."""
 
-    def __init__(self, rest_v: float) -> None:
+    def __init__(self, rest_v: float, resistance_ohm: float | None = None) -> None:
+        self._resistance_ohm = CELL_RESISTANCE_OHM if resistance_ohm is None else resistance_ohm
         self.rest_v = rest_v
         self.battery_v = rest_v
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
@@ -77,7 +78,7 @@ class Powertrain:
         self.forces_n = forces = (f1, f2, f3, f4)
         current_a = _AMPERES_PER_N * (f1 + f2 + f3 + f4)
         self.rest_v -= current_a * CONTROL_PERIOD_S / CELL_CHARGE_C * CELL_SLOPE_V
-        self.battery_v = self.rest_v - CELL_RESISTANCE_OHM * current_a
+        self.battery_v = self.rest_v - self._resistance_ohm * current_a
         return forces
 
 

@@ -36,6 +36,11 @@ class Scenario:
         first_contact_force_n: pull at the first contact; None means the same.
         no_target: the ceiling is bare.
         camera_freeze_at_s, camera_gone_at_s: faults; None means never.
+        motor_strength: what is left of each motor's thrust, M1..M4.
+        propeller_shake_g: what each propeller at full shakes the accelerometer by, rms.
+        cell_resistance_ohm: of the battery; None means a good one.
+        rssi_dbm: of the radio, at the vehicle.
+        parameters: the firmware's, where they differ from its release at boot.
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         second_target_m: where a second sheet like the first hangs, in the target's axes.
     """
@@ -74,6 +79,11 @@ class Scenario:
     draught_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     magnet_force_n: float = 1.2
     first_contact_force_n: float | None = None
+    motor_strength: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
+    propeller_shake_g: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05)
+    cell_resistance_ohm: float | None = None
+    rssi_dbm: float = -40.0
+    parameters: dict[str, float] = field(default_factory=dict)
     no_target: bool = False
     camera_freeze_at_s: float | None = None
     camera_gone_at_s: float | None = None

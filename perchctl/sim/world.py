@@ -79,7 +79,9 @@ class World:
         # Farther than this below the ceiling the gear cannot touch it.
         self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._steps = 0
-        self.powertrain = Powertrain(scenario.battery_rest_v)
+        self.powertrain = Powertrain(scenario.battery_rest_v, scenario.cell_resistance_ohm)
+        if min(scenario.motor_strength) < 1.0:
+            self.powertrain.strength = scenario.motor_strength
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
         self._held = False

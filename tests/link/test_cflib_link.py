@@ -191,6 +191,7 @@ def test_telemetry_comes_in_order_and_in_the_loops_time(sim: SimProcess) -> None
         assert link.telemetry() == [] or link.telemetry()[0].t_s > times[-1]
 
 
+@pytest.mark.long
 def test_a_silent_link_is_reported(sim: SimProcess) -> None:
     with linked(sim) as link:
         assert link.problem(time.monotonic()) is None
@@ -213,6 +214,7 @@ def test_idle_sends_nothing(sim: SimProcess) -> None:
 # --- In the air -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_raw_thrust_works_and_a_perched_vehicle_is_left_unlocked(sim: SimProcess) -> None:
     """Firmware facts: raw thrust is forced to 0 until unlocked, and a first raw packet in the
     air would cut the motors; stop + notify + a close after the flying bit clears do not lock."""
@@ -247,6 +249,7 @@ def test_raw_thrust_works_and_a_perched_vehicle_is_left_unlocked(sim: SimProcess
         assert sim.truth()["magnet_engaged"]
 
 
+@pytest.mark.long
 def test_closing_waits_for_the_landing(sim: SimProcess) -> None:
     with linked(sim) as link:
         take_off(link, sim)
@@ -261,6 +264,7 @@ def test_closing_waits_for_the_landing(sim: SimProcess) -> None:
         assert not info(sim) & LOCKED
 
 
+@pytest.mark.long
 def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> None:
     """Firmware facts: high-level hover never times out; the zero setpoint of close_link would
     end it at once, and so neither a close that gives up waiting nor a refused connection
@@ -285,6 +289,7 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
         assert not info(sim) & LOCKED
 
 
+@pytest.mark.long
 def test_the_emergency_stop_cuts_and_locks(sim: SimProcess) -> None:
     with linked(sim) as link:
         take_off(link, sim)

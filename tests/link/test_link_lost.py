@@ -67,6 +67,7 @@ def test_motors_off_for_less_than_two_seconds_is_no_flight_but_no_farewell_eithe
 # --- leaving ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_closing_sends_no_zero_setpoint_when_nothing_is_known_any_more(sim: SimProcess) -> None:
     """The last sample shows a vehicle on the ground; what it does since then is unknown."""
     with linked(sim, landing_wait_s=0.5) as link:
@@ -110,6 +111,7 @@ def lose(link: CflibLink) -> None:
     assert link.problem(time.monotonic()) == "Too many packets lost"
 
 
+@pytest.mark.long
 def test_a_lost_link_is_opened_again_for_the_landing(sim: SimProcess) -> None:
     with linked(sim) as link:
         take_off(link, sim)

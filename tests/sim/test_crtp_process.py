@@ -268,6 +268,7 @@ sys.stdin.readline()
 """
 
 
+@pytest.mark.long
 def test_flies_on_when_the_parent_is_killed(tmp_path: Path, toc_cache: str) -> None:
     """The vehicle outlives a kill -9 of its parent, answers meanwhile, and then ends."""
     code = _PARENT.format(root=ROOT, folder=str(tmp_path))

@@ -12,7 +12,7 @@ from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.commands import HlGoTo, PositionCommand
 from perchctl.sim.firmware.controller import Pid
 from perchctl.sim.firmware.planner import AxisState, Polynomial
-from tests.helpers.firmware_rig import PERFECT, make_rig
+from tests.helpers.firmware_rig import PERFECT, Rig, make_rig
 
 HERE = PositionCommand(0.0, 0.0, 0.8, 0.0)
 CTYPES = {"uint8_t", "uint16_t", "uint32_t", "int8_t", "int16_t", "int32_t", "float"}
@@ -271,3 +271,61 @@ def test_polynomial_derivatives_are_its_own() -> None:
 
 def test_a_plan_of_no_duration_is_its_goal() -> None:
     assert Polynomial(AxisState(0.0), 1.0, 0.0).at(0.0) == AxisState(1.0)
+
+
+# --- Health tests ------------------------------------------------------------------------
+
+
+def health(rig: Rig, test: str) -> None:
+    rig.run(0.5)
+    rig.firmware.set_parameter(f"health.{test}", 1)
+    rig.run(4.5)
+
+
+def variances(rig: Rig) -> list[float]:
+    log = rig.firmware.log_value
+    return [log(f"health.motorVarXM{m}") + log(f"health.motorVarYM{m}") for m in (1, 2, 3, 4)]
+
+
+def test_the_propeller_test_tells_good_dead_and_unbalanced_apart() -> None:
+    """docs/firmware.md, "Propeller test"."""
+    rig = make_rig(motor_strength=(1, 0, 1, 1), propeller_shake_g=(0.05, 0.05, 0.3, 0.05))
+    health(rig, "startPropTest")
+    first, dead, unbalanced, fourth = variances(rig)
+    assert dead < 0.01 < min(first, fourth)
+    assert unbalanced > 10 * max(first, fourth)
+    assert rig.firmware.log_value("health.motorPass") == 0x80
+    assert rig.firmware.log_value("health.motorTestCount") == 1
+    assert rig.firmware.get_parameter("health.startPropTest") == 0
+    assert rig.info == 0x020E
+    assert rig.world.z_m == pytest.approx(0.012, abs=0.002)
+
+
+def test_a_threshold_sets_the_bits_of_the_motors_within() -> None:
+    rig = make_rig(propeller_shake_g=(0.05, 0.05, 0.3, 0.05))
+    rig.firmware.set_parameter("health.propTestThreshold", 1.0)
+    health(rig, "startPropTest")
+    assert rig.firmware.log_value("health.motorPass") == 0x80 | 0b1011
+
+
+@pytest.mark.parametrize(("ohm", "good"), [(None, True), (2.5, False)])
+def test_the_battery_test_sees_a_weak_cell(ohm: float | None, good: bool) -> None:
+    """docs/firmware.md, "Battery test"."""
+    rig = make_rig(cell_resistance_ohm=ohm)
+    health(rig, "startBatTest")
+    assert rig.firmware.log_value("health.batteryPass") == good
+    assert (rig.firmware.log_value("health.batterySag") < 0.7) is good
+
+
+def test_a_health_test_in_the_air_is_a_motor_cut() -> None:
+    rig = make_rig()
+    rig.take_off()
+    rig.firmware.set_parameter("health.startPropTest", 1)
+    rig.run(0.3)
+    assert rig.world.vz_mps < -1.0
+
+
+def test_parameters_and_radio_are_the_scenario_s() -> None:
+    rig = make_rig(parameters={"deck.bcFlow2": 0, "system.selftestPassed": 0}, rssi_dbm=-88.0)
+    assert rig.firmware.get_parameter("deck.bcFlow2") == 0
+    assert rig.firmware.log_value("radio.rssi") == 88.0

@@ -58,6 +58,7 @@ def test_a_target_that_is_not_there_is_told() -> None:
     assert Teller(Scenario())(phase("searched-out"), 9.0) == ""
 
 
+@pytest.mark.long
 def test_a_flight_says_it_in_its_events_and_in_its_log(tmp_path: Path) -> None:
     """The ascent lasts from 4.4 to 10 s."""
     profile = short_profile({"planner.attempts": 1})

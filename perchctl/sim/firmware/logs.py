@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Protocol
 
 from perchctl.sim.firmware.controller import Controller
 from perchctl.sim.firmware.estimator import Estimator
+from perchctl.sim.firmware.health import Health
 from perchctl.sim.firmware.motors import MotorDriver
 from perchctl.sim.firmware.power import PowerMonitor
 from perchctl.sim.firmware.setpoint import Setpoint
 from perchctl.sim.firmware.supervisor import Supervisor
+from perchctl.sim.scenario import Scenario
 
 if TYPE_CHECKING:
     from perchctl.sim.world import World
@@ -29,6 +31,8 @@ class Logged(Protocol):
     controller: Controller
     supervisor: Supervisor
     power: PowerMonitor
+    health: Health
+    scenario: Scenario
     driver: MotorDriver
     flown_setpoint: Setpoint
 
@@ -49,6 +53,7 @@ def log_getters(firmware: Logged) -> dict[str, Getter]:
         **_translation(firmware),
         **_rotation(firmware),
         **_motors(firmware),
+        **_health(firmware.health),
     }
 
 
@@ -74,7 +79,7 @@ def _system(firmware: Logged) -> dict[str, Getter]:
         "controller.actuatorThrust": _field(controller, "thrust"),
         **{f"controller.{a}": _field(controller, f"desired_{a}_deg") for a in ANGLES},
         "controller.accelz": lambda: estimator.acc_g[2],
-        "radio.rssi": lambda: 40.0,
+        "radio.rssi": lambda: -firmware.scenario.rssi_dbm,
         "radio.isConnected": lambda: 1.0,
         "kalman.inFlight": _field(supervisor, "is_flying"),
         "range.zrange": lambda: 1000.0 * max(0.0, firmware.world.z_m),
@@ -156,3 +161,22 @@ def _motors(firmware: Logged) -> dict[str, Getter]:
 
     getters = {f"motor.m{i + 1}": motor(i) for i in range(4)}
     return getters | {f"motor.m{i + 1}req": request(i) for i in range(4)}
+
+
+def _health(health: Health) -> dict[str, Getter]:
+    """The results of the firmware's own tests."""
+
+    def variance(motor: int, axis: int) -> Getter:
+        return lambda: health.variance[motor][axis]
+
+    getters = {
+        f"health.motorVar{'XY'[axis]}M{motor + 1}": variance(motor, axis)
+        for motor in range(4)
+        for axis in range(2)
+    }
+    return getters | {
+        "health.motorPass": _field(health, "motor_pass"),
+        "health.motorTestCount": _field(health, "motor_tests"),
+        "health.batteryPass": _field(health, "battery_pass"),
+        "health.batterySag": _field(health, "sag_v"),
+    }

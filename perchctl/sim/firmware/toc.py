@@ -116,8 +116,8 @@ _PARAMETER_GROUPS: dict[str, str] = {
     " bcDWM1000=0! bcLighthouse4=0! bcUSD=0! bcAI=0! bcActiveMarker=0! bcLoco=0! bcFlow=0!"
     " bcZRanger=0! bcGTGPS=0! bcBigQuad=0! bcOA=0! bcServo=0! bcColorLedTop=0!"
     " bcColorLedBot=0! bcCPPM=0!",
-    "health": "uint8_t: startPropTest=0 startBatTest=0; uint16_t: propTestPWMRatio=0*"
-    " batTestPWMRatio=0*",
+    "health": "uint8_t: startPropTest=0 startBatTest=0; float: propTestThreshold=0*;"
+    " uint16_t: propTestPWMRatio=0* batTestPWMRatio=0*",
     "locSrv": "uint8_t: enRangeStreamFP32=0 enLhAngleStream=0; float: extPosStdDev=0.01"
     " extQuatStdDev=0.0045",
     "loco": "uint8_t: mode=0",

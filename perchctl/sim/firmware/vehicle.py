@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from perchctl.sim.firmware.commands import HighLevelCommand, LowLevelCommand
 from perchctl.sim.firmware.controller import Controller
 from perchctl.sim.firmware.estimator import Estimator
+from perchctl.sim.firmware.health import BATTERY, PROPELLERS, Health
 from perchctl.sim.firmware.logs import log_getters
 from perchctl.sim.firmware.motors import MOTORS_OFF, MotorDriver
 from perchctl.sim.firmware.parameters import apply_parameter
@@ -64,10 +65,12 @@ class Firmware:
         self.controller = Controller()
         self.driver = MotorDriver()
         self.power = PowerMonitor(self.world.battery_v)
+        self.health = Health(self.scenario)
         self._getters: dict[str, Callable[[], float]] = log_getters(self)
         self._external_positions = True
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
+        self._parameters |= self.scenario.parameters
         for name in PARAMETERS:
             self._apply(name)
 
@@ -81,6 +84,9 @@ class Firmware:
         step = self._steps
         t_s = step * CONTROL_PERIOD_S
         supervisor = self.supervisor
+        if self.health.testing:
+            self._test(t_s)
+            return
         self.estimator.update(
             self.world,
             t_s,
@@ -122,6 +128,18 @@ class Firmware:
         self.flown_setpoint = setpoint
         self._steps = step + 1
         self.world.step(motors)
+
+    def _test(self, t_s: float) -> None:
+        """A control period of a health test, in which nothing else is heard (source)."""
+        for name in (PROPELLERS, BATTERY):
+            self._parameters[f"health.{name}"] = 0.0
+        self.motors = self.health.pwm(
+            self.world.powertrain.forces_n, self.world.battery_v, self._parameters
+        )
+        if self._steps % SUPERVISOR_EVERY == 0:
+            self.power.update(t_s, self.world.battery_v, self._parameters)
+        self._steps += 1
+        self.world.step(self.motors)
 
     # Commands -----------------------------------------------------------------------
 
@@ -223,6 +241,9 @@ class Firmware:
                 self.estimator.reset(self.t_s)
         elif name == "stabilizer.estimator":
             self._external_positions = value == ESTIMATOR_KALMAN
+        elif name in (f"health.{PROPELLERS}", f"health.{BATTERY}"):
+            if value:
+                self.health.start(name.removeprefix("health."))
         elif name == "stabilizer.stop":
             self.supervisor.emergency = self.supervisor.emergency or value != 0.0
         else:

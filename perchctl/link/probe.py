@@ -1,0 +1,208 @@
+"""A vehicle's link, looked at: what it answers, what it holds, how good the radio is.
+
+Nothing that is sent here flies, arms or turns a motor, but `start_health_test`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from perchctl.errors import NotFound, TimedOut
+from perchctl.link.connection import Connection, send_packets
+from perchctl.link.estimate import EstimateLink
+from perchctl.link.prepare import missing_variables
+from perchctl.profile import LinkConfig
+from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.vehicle import Telemetry
+
+ANSWER_S = 0.5
+ASKED_TIMES = 3
+ECHO_PERIOD_S = 0.02
+_ECHO_MARK = 1  # cflib's own pings begin with 0
+_BLOCK_BYTES = 26
+_VERSION_CHANNEL, _GET_FIRMWARE = 1, 1
+HealthTest = Literal["startPropTest", "startBatTest"]
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """Packets that were sent to come back, and after how long those that did came."""
+
+    sent: int = 0
+    round_trip_s: tuple[float, ...] = ()
+
+    @property
+    def lost(self) -> float:
+        """Share, 0 to 1; 1 of none sent."""
+        return 1.0 - len(self.round_trip_s) / self.sent if self.sent else 1.0
+
+    @property
+    def p95_s(self) -> float | None:
+        """95 of 100 came sooner; None of none."""
+        ordered = sorted(self.round_trip_s)
+        return ordered[int(0.95 * (len(ordered) - 1))] if ordered else None
+
+
+class ProbeLink(EstimateLink):
+    """An `EstimateLink` that refuses no firmware: what is wrong with it is what is asked for.
+
+    `quality` is the radio's, %: how few of its packets had to be sent again; None without one.
+    """
+
+    def __init__(self, uri: str, config: LinkConfig, clock: Callable[[], float]) -> None:
+        super().__init__(uri, config, clock)
+        self.quality: float | None = None
+        self.missing: tuple[str, ...] = ()
+
+    def _prepare(self, connection: Connection) -> None:
+        self.missing = tuple(missing_variables(connection.cf))
+        connection.cf.link_statistics.link_quality_updated.add_callback(self._on_quality)
+        if not self.missing:
+            try:
+                self._start_logging(connection)
+            except (NotFound, TimedOut):
+                return  # `telemetry` stays empty
+
+    @property
+    def cf(self) -> Any:
+        """cflib's object."""
+        assert self.connection is not None
+        return self.connection.cf
+
+    def protocol(self) -> int:
+        """-1 where the vehicle is too old to have one."""
+        return int(self.cf.platform.get_protocol_version())
+
+    def firmware(self) -> str | None:
+        """The firmware's version, None where it does not tell."""
+        question = Packet(Port.PLATFORM, _VERSION_CHANNEL, bytes((_GET_FIRMWARE,)))
+        answer = self._ask(question)
+        return None if answer is None else answer[1:].rstrip(b"\0").decode(errors="replace")
+
+    def parameters(self) -> dict[str, float]:
+        """All, as they were read when the link was opened."""
+        return {
+            f"{group}.{name}": float(value)
+            for group, values in self.cf.param.values.items()
+            for name, value in values.items()
+        }
+
+    def age_s(self) -> float:
+        """Of the newest sample, in the older of its parts; infinite without one."""
+        newest = self._blocks.newest
+        return math.inf if newest is None else self._clock() - newest.t_s + newest.behind_s
+
+    def lost(self) -> str | None:
+        """Why the link is gone, None while it is there."""
+        return "it was closed" if self.connection is None else self.connection.lost
+
+    def newest(self) -> Telemetry | None:
+        return self._blocks.newest
+
+    def has_variable(self, name: str) -> bool:
+        return self.cf.log.toc.get_element_by_complete_name(name) is not None
+
+    def variables(self, names: Iterable[str]) -> dict[str, float]:
+        """The newest values of log variables; without those that are missing or do not come."""
+        known = [name for name in names if self.has_variable(name)]
+        values: dict[str, float] = {}
+        for block in _blocks(known):
+            values |= self._read(block)
+        return values
+
+    def echoes(self, duration_s: float, period_s: float = ECHO_PERIOD_S) -> Echoes:
+        """Send packets to come back for so long, and wait `ANSWER_S` for the last."""
+        sent_s: list[float] = []
+        back_s: dict[int, float] = {}
+        all_back = threading.Event()
+
+        def on_packet(packet: Any) -> None:
+            data = bytes(packet.data)
+            if len(data) == _ECHO.size and data[0] == _ECHO_MARK:
+                back_s.setdefault(_ECHO.unpack(data)[1], time.monotonic())
+                if len(back_s) == count:
+                    all_back.set()
+
+        count = max(1, round(duration_s / period_s))
+        self.cf.add_header_callback(on_packet, Port.LINK, 0)
+        try:
+            start_s = time.monotonic()
+            for number in range(count):
+                sent_s.append(time.monotonic())
+                send_packets(self.cf, [Packet(Port.LINK, 0, _ECHO.pack(_ECHO_MARK, number))])
+                time.sleep(max(0.0, start_s + (number + 1) * period_s - time.monotonic()))
+            all_back.wait(ANSWER_S)
+        finally:
+            self.cf.remove_header_callback(on_packet, Port.LINK, 0)
+        trips = tuple(t_s - sent_s[n] for n, t_s in list(back_s.items()) if n < len(sent_s))
+        return Echoes(count, trips)
+
+    def start_health_test(self, test: HealthTest) -> None:
+        """Turns motors: to be asked for first. In the air it cuts them
+        (docs/firmware.md, "Propeller test")."""
+        with contextlib.suppress(KeyError, AttributeError):  # the link is gone: no result comes
+            self.cf.param.set_value(f"health.{test}", "1")
+
+    def _on_quality(self, percent: float) -> None:
+        self.quality = float(percent)
+
+    def _ask(self, question: Packet) -> bytes | None:
+        """The answer that begins as the question does; None where none comes."""
+        arrived = threading.Event()
+        answers: list[bytes] = []
+
+        def on_packet(packet: Any) -> None:
+            data = bytes(packet.data)
+            if data.startswith(question.data):
+                answers.append(data)
+                arrived.set()
+
+        self.cf.add_header_callback(on_packet, question.port, question.channel)
+        try:
+            for _ in range(ASKED_TIMES):
+                send_packets(self.cf, [question])
+                if arrived.wait(ANSWER_S):
+                    return answers[0]
+        finally:
+            self.cf.remove_header_callback(on_packet, question.port, question.channel)
+        return None
+
+    def _read(self, names: list[str]) -> dict[str, float]:
+        from cflib.crazyflie.log import LogConfig
+
+        arrived = threading.Event()
+        values: dict[str, float] = {}
+
+        def on_data(_stamp: int, data: dict[str, float], _block: Any) -> None:
+            values.update(data)
+            arrived.set()
+
+        block = LogConfig(name="perch_probe", period_in_ms=50)
+        for name in names:
+            block.add_variable(name)
+        block.data_received_cb.add_callback(on_data)
+        try:
+            self.cf.log.add_config(block)
+            block.start()
+        except (KeyError, AttributeError):  # cflib's ways to say that the link is gone
+            return {}
+        arrived.wait(ASKED_TIMES * ANSWER_S)
+        block.stop()
+        block.delete()
+        return values
+
+
+_ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
+
+
+def _blocks(names: list[str]) -> list[list[str]]:
+    """So many as fit into a log block each, whatever their types."""
+    each = _BLOCK_BYTES // 4
+    return [names[at : at + each] for at in range(0, len(names), each)]

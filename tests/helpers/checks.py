@@ -1,0 +1,59 @@
+"""What the tests of `perchctl check` share: quick ones, rows, options, a vehicle."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+from perchctl.check import health, lift, link
+from perchctl.flight.session import FlyOptions
+from perchctl.link.scan import Answering
+from perchctl.profile import Profile, find_profile, load_profile
+from perchctl.sim.process.handle import SimProcess
+from perchctl.vehicle import Telemetry
+from tests.helpers.mission import READY, telemetry
+
+PROFILE = load_profile("sim")
+NOWHERE = "udp://127.0.0.1:9"
+NO_CAMERA = "camera:97"
+QUICK: dict[str, Any] = {
+    "listen_s": 0.1, "rehearse_s": 0.2, "lift_s": 0.2, "health_s": 0.2,
+    "other_vehicles": lambda uri: Answering((), "no Crazyradio is plugged in"),
+}  # fmt: skip
+VEHICLE = ["address", *link.NAMES, lift.NAME, *health.NAMES]
+AT_REST = telemetry(
+    1.0, 0.0, thrust=0.0, supervisor=READY, battery_v=4.1, position_variance_m2=1e-4
+)
+
+
+def said(**changes: Any) -> Telemetry:
+    """At rest, but for this."""
+    return replace(AT_REST, **changes)
+
+
+def options(uri: str, source: str = NO_CAMERA, profile: Profile = PROFILE) -> FlyOptions:
+    return FlyOptions(profile, find_profile("sim"), uri, source)
+
+
+def wait_for(sim: SimProcess, seconds: float) -> None:
+    """Of simulated time from now. A vehicle that was just replaced has its estimator to settle,
+    however long the process has run."""
+    end_s = time.monotonic() + 20.0 + seconds
+    until_s = sim.truth()["t_s"] + seconds
+    while sim.truth()["t_s"] < until_s:
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+class Borrowed:
+    """A simulated vehicle that goes on when it is left."""
+
+    def __init__(self, sim: SimProcess) -> None:
+        self.sim = sim
+
+    def __enter__(self) -> SimProcess:
+        return self.sim
+
+    def __exit__(self, *_: object) -> None:
+        return None

@@ -1,0 +1,64 @@
+"""The command line as tests run it: in this process, or in one of its own on pipes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from perchctl.cli import app
+from tests.helpers.flights import ROOT
+
+ON_THE_WAY = ("perchctl: connecting", "perchctl: check: ")
+
+
+@dataclass(frozen=True)
+class Said:
+    code: int
+    stdout: str
+    stderr: str
+
+    @property
+    def complaint(self) -> str:
+        """The one sentence on stderr, beside what is said on the way."""
+        lines = [s for s in self.stderr.splitlines() if not s.startswith(ON_THE_WAY)]
+        assert len(lines) == 1, self.stderr
+        assert lines[0].startswith("perchctl: ")
+        return lines[0].removeprefix("perchctl: ")
+
+
+def run(*arguments: str) -> Said:
+    """The application in this process."""
+    result = CliRunner().invoke(app, arguments)
+    assert "Traceback" not in result.output
+    return Said(result.exit_code, result.stdout, result.stderr)
+
+
+def run_apart(*arguments: str, **environment: str) -> Said:
+    """The application in a process of its own, on pipes, without a terminal."""
+    clean = {k: v for k, v in os.environ.items() if k not in ("CFLIB_URI", "NO_COLOR")}
+    done = subprocess.run(
+        [sys.executable, "-m", "perchctl", *arguments],
+        env=clean | {"PYTHONPATH": str(ROOT)} | environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert "Traceback" not in done.stderr
+    return Said(done.returncode, done.stdout, done.stderr)
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Logs and the table cache stay out of the user's folders."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CFLIB_URI", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
