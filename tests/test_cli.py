@@ -10,14 +10,12 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import typer
-from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
@@ -27,64 +25,16 @@ from perchctl.cli import app
 from perchctl.cli.app import reported
 from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
 from perchctl.flight.session import PLAIN_SEED
-from perchctl.log.read import read_log
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.handle import SimProcess
-from tests.helpers.flights import ROOT, SEED, SHORT
+from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
+from tests.helpers.flights import ROOT, SHORT
 from tests.helpers.recording import write_pictures
 from tests.helpers.weights_data import known
 from tests.helpers.weights_data import write as write_session
 
 HEAVY = ("cv2", "numpy", "cflib", "matplotlib", "mujoco", "pydantic", "filterpy", "scipy")
 NOWHERE = "udp://127.0.0.1:9"
-ESCAPE = "\x1b"
-
-
-@dataclass(frozen=True)
-class Said:
-    code: int
-    stdout: str
-    stderr: str
-
-    @property
-    def complaint(self) -> str:
-        """The one sentence on stderr."""
-        lines = [s for s in self.stderr.splitlines() if not s.startswith("perchctl: connecting")]
-        assert len(lines) == 1, self.stderr
-        assert lines[0].startswith("perchctl: ")
-        return lines[0].removeprefix("perchctl: ")
-
-
-def run(*arguments: str) -> Said:
-    """The application in this process."""
-    result = CliRunner().invoke(app, arguments)
-    assert "Traceback" not in result.output
-    return Said(result.exit_code, result.stdout, result.stderr)
-
-
-def run_apart(*arguments: str, **environment: str) -> Said:
-    """The application in a process of its own, on pipes, without a terminal."""
-    clean = {k: v for k, v in os.environ.items() if k not in ("CFLIB_URI", "NO_COLOR")}
-    done = subprocess.run(
-        [sys.executable, "-m", "perchctl", *arguments],
-        env=clean | {"PYTHONPATH": str(ROOT)} | environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert "Traceback" not in done.stderr
-    return Said(done.returncode, done.stdout, done.stderr)
-
-
-@pytest.fixture(autouse=True)
-def _elsewhere(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    """Logs and the table cache stay out of the user's folders."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("CFLIB_URI", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 
 
 @pytest.fixture
@@ -128,7 +78,8 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_the_help_lists_the_commands_in_the_order_of_use() -> None:
-    commands = ["make-target", "calibrate", "fit-weights", "track", "fly", "simulate"]
+    commands = ["make-target", "calibrate", "new-profile", "profile"]
+    commands += ["fit-weights", "track", "fly", "simulate"]
     assert re.findall(rf"^\W*({'|'.join(commands)}) ", run("--help").stdout, re.M) == commands
 
 
@@ -264,6 +215,19 @@ def test_dry_run_tells_the_plan_and_connects_nothing(tmp_path: Path) -> None:
     assert said.stderr == ""
     for word in ("sim://, seed 7", "DICT_4X4_1000/997", "1 APPROACH", "7 COMPLETE", "short.yaml"):
         assert word in said.stdout
+    for line in (
+        "gear         tip at 0 0 30 mm",
+        "mounting     camera at 30 0 5 mm, rpy 0 0 0 deg",
+        "             picture's right is the front, bottom the left side",
+        "latency      75 ms",
+        "fence        2 m",
+        "height       at most 3 m",
+        "battery      at least 3.8 V at rest, 3 V in flight",
+    ):
+        assert f"\n{line}" in said.stdout
+    assert "warn" not in said.stdout
+    real = run("fly", "-p", SHORT, "-u", "usb://0", "--source", "camera:0", "--dry-run")
+    assert "\nwarn         calibration file: example_640x480.yaml" in real.stdout
     assert list(tmp_path.iterdir()) == []  # no log either
 
 
@@ -492,86 +456,7 @@ def test_a_note_stands_before_the_sentence_of_a_failure(
     ]
 
 
-# --- Campaigns ----------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The campaign's."""
-    return tmp_path_factory.mktemp("campaign") / "logs"
-
-
-@pytest.fixture(scope="module")
-def campaign(logs: Path) -> Said:
-    """Two seeds, two at a time, with their logs."""
-    arguments = ("-p", SHORT, "-n", "2", "--seed", str(SEED), "--jobs", "2", "--json")
-    return run_apart("simulate", *arguments, "--log-dir", str(logs))
-
-
-def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
-    assert campaign.code == 0
-    said = json.loads(campaign.stdout)
-    assert set(said) == {
-        "flights", "perched", "landed", "aborted", "locked", "fell",
-        "miss_m", "realtime_factor", "worst_seeds",
-    }  # fmt: skip
-    assert set(said["miss_m"]) == {"median", "p95", "max"}
-    assert [said[k] for k in ("flights", "perched", "landed", "aborted", "locked", "fell")] == [
-        2, 2, 0, 0, 0, 0,
-    ]  # fmt: skip
-    assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
-    assert said["realtime_factor"] > 0
-    assert said["worst_seeds"] == []
-    assert campaign.complaint == f"the flights' logs are in {logs}"
-
-
-@pytest.fixture(scope="module")
-def repeated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, Path]:
-    """The one flight of the seed, told for people, with its log."""
-    folder = tmp_path_factory.mktemp("only") / "made"
-    arguments = ("-p", SHORT, "--only", str(SEED), "--log-dir", str(folder))
-    return run_apart("simulate", *arguments, PYTHONHASHSEED="7"), folder
-
-
-def test_one_seed_is_the_flight_that_it_was_in_the_campaign(
-    campaign: Said, repeated: tuple[Said, Path], logs: Path
-) -> None:
-    """The same log, from another process."""
-    name = f"flight_seed{SEED}.jsonl"
-    assert (repeated[1] / name).read_bytes() == (logs / name).read_bytes()
-    assert sorted(path.name for path in logs.iterdir()) == [name, f"flight_seed{SEED + 1}.jsonl"]
-    misses = [read_log(path).summary["miss_m"] for path in logs.iterdir()]  # type: ignore[index]
-    assert json.loads(campaign.stdout)["miss_m"]["max"] == pytest.approx(max(misses), abs=1e-6)
-
-
-def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Path]) -> None:
-    said, folder = repeated
-    assert said.code == 0
-    assert said.stderr == ""
-    lines = said.stdout.splitlines()
-    assert lines[0] == "[   0.00 s] APPROACH: start"
-    assert re.fullmatch(r"\[ +\d+\.\d\d s\] COMPLETE: contact proven by .*", lines[6])
-    assert lines[8] == "PERCHED: hanging still with the motors off"
-    words = dict(line.split(":", 1) for line in lines[9:])
-    assert set(words) == {"miss", "flight", "phases", "battery", "log", "plot"}
-    assert "ALIGN 0.4 s > ASCEND" in words["phases"]
-    assert Path(words["log"].strip()) == folder / f"flight_seed{SEED}.jsonl"
-    assert Path(words["plot"].strip()) == folder / f"flight_seed{SEED}.png"
-    assert {path.suffix for path in folder.iterdir()} == {".jsonl", ".png"}
-
-
-def test_one_seed_as_json_is_its_flight_logged_where_the_profile_says(tmp_path: Path) -> None:
-    profile = tmp_path / "mine.yaml"
-    profile.write_text(
-        f"extends: {SHORT}\nplanner: {{perching_time_s: 0.3}}\n"
-        "log: {directory: here, plot: false}\n"
-    )
-    said = run("simulate", "-p", str(profile), "--only", "5", "--json")
-    record = json.loads(said.stdout)
-    assert (said.code, record["seed"], record["outcome"]) == (0, 5, "landed")
-    assert record["reason"] == "the perching time is over; motors off"
-    assert (record["log"], record["plot"]) == ("here/flight_seed5.jsonl", None)
-    assert read_log(tmp_path / record["log"]).header["seed"] == 5
+# --- Options that would not be heeded -------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -593,6 +478,30 @@ def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str])
     assert list(Path().iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("pictures --view", ["pictures is no live camera", "--view does not apply"]),
+        ("pictures --check c.yaml -o d.yaml", ["--check", "--output does not apply"]),
+        ("pictures --check c.yaml --model fisheye", ["--check", "--model does not apply"]),
+        ("--convert c.yaml -o d.yaml --model fisheye", ["--convert", "--model does not apply"]),
+        ("--convert c.yaml -o d.yaml --view", ["--convert", "--view does not apply"]),
+    ],
+)
+def test_calibrate_refuses_what_it_would_not_heed(arguments: str, words: list[str]) -> None:
+    Path("pictures").mkdir()
+    said = run("calibrate", *arguments.split())
+    assert said.code == 2
+    for word in words:
+        assert word in said.complaint
+
+
+def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:
+    at = ("--uri", "usb://0", "--source", "camera:0", "--dry-run")
+    assert "--seed 7" in run("fly", "--seed", "7", *at).complaint
+    assert run("fly", *at).stderr == ""
+
+
 @pytest.mark.parametrize("where", ["afile", "afile/logs"])
 @pytest.mark.parametrize("command", ["simulate --only 1", "simulate", "fly"])
 def test_a_file_in_the_place_of_the_logs_is_named_with_what_to_do(command: str, where: str) -> None:
@@ -603,12 +512,7 @@ def test_a_file_in_the_place_of_the_logs_is_named_with_what_to_do(command: str, 
     assert "name another folder with --log-dir" in said.complaint
 
 
-def test_a_pipe_gets_no_colour(repeated: tuple[Said, Path], campaign: Said) -> None:
-    said, _ = repeated
-    for text in (said.stdout, said.stderr, campaign.stdout, campaign.stderr):
-        assert ESCAPE not in text
-
-
+@pytest.mark.long
 def test_the_library_s_tracebacks_stay_away(profile: str, eyes: str, tmp_path: Path) -> None:
     """cflib logs them to the terminal unless it is told not to: seen by a process of its own."""
     for uri, cause in (

@@ -28,7 +28,16 @@ from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import FlightReport
 from tests.helpers.flights import ROOT
 
-COMMANDS = ("make-target", "calibrate", "fit-weights", "track", "fly", "simulate")
+COMMANDS = (
+    "make-target",
+    "calibrate",
+    "new-profile",
+    "profile",
+    "fit-weights",
+    "track",
+    "fly",
+    "simulate",
+)
 
 
 @pytest.fixture(autouse=True)

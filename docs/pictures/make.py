@@ -40,6 +40,7 @@ from perchctl.display.page.live import LivePage  # noqa: E402
 from perchctl.display.page.sketch import Sketch, draw  # noqa: E402
 from perchctl.display.panel import panel  # noqa: E402
 from perchctl.display.status import FlightStatus, status_rows  # noqa: E402
+from perchctl.flight.session import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
 from perchctl.log.plot import plot_flight  # noqa: E402
 from perchctl.log.read import FlightLog, read_log  # noqa: E402
@@ -390,7 +391,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--into", type=Path, default=Path(__file__).parent, help="folder")
     parser.add_argument("--only", nargs="+", choices=sorted(PICTURES), default=list(PICTURES))
     parser.add_argument("--profile", default="sim")
-    parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=PLAIN_SEED)
     parser.add_argument("--log", type=Path, help="a lockstep flight's log, instead of flying")
     given = parser.parse_args(words)
     with tempfile.TemporaryDirectory() as folder:

@@ -5,9 +5,12 @@ Nothing here loads a library before a command runs, so that the help is quick.
 
 from perchctl.cli.app import EXIT_TABLE, app, main
 from perchctl.cli.calibrate import calibrate
+from perchctl.cli.check import check
 from perchctl.cli.fit_weights import fit_weights
 from perchctl.cli.fly import fly
 from perchctl.cli.make_target import make_target
+from perchctl.cli.new_profile import new_profile
+from perchctl.cli.profile import profile
 from perchctl.cli.simulate import simulate
 from perchctl.cli.track import track
 
@@ -17,8 +20,11 @@ __all__ = ["app", "main"]
 for _name, _command in (
     ("make-target", make_target),
     ("calibrate", calibrate),
+    ("new-profile", new_profile),
+    ("profile", profile),
     ("fit-weights", fit_weights),
     ("track", track),
+    ("check", check),
     ("fly", fly),
     ("simulate", simulate),
 ):

@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from perchctl import __version__
-from perchctl.cli.complete import complete_profile
+from perchctl.cli.complete import complete_profile, complete_source
 from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
@@ -62,6 +62,23 @@ ProfileOption = Annotated[
     str,
     typer.Option(
         "--profile", "-p", help="Profile by name or path.", autocompletion=complete_profile
+    ),
+]
+UriOption = Annotated[
+    str | None,
+    typer.Option(
+        "--uri",
+        "-u",
+        envvar="CFLIB_URI",
+        help="Vehicle: sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT.",
+    ),
+]
+SourceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--source",
+        help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:.",
+        autocompletion=complete_source,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]

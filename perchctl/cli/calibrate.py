@@ -16,7 +16,7 @@ from perchctl.cli.app import (
     perform,
     reported,
 )
-from perchctl.cli.complete import complete_source
+from perchctl.cli.complete import complete_profile, complete_source
 
 
 # long: a list of options
@@ -52,7 +52,8 @@ def calibrate(
             "--output",
             "-o",
             help="Calibration file; the report goes beside it as .png. "
-            "Default: calib/NAME_WIDTHxHEIGHT.yaml.",
+            "Default: calib/NAME_WIDTHxHEIGHT.yaml. With --mount the report, .png; the recording "
+            "goes beside it.",
         ),
     ] = None,
     name: Annotated[str, typer.Option("--name", help="The camera's name.")] = "camera",
@@ -99,14 +100,67 @@ def calibrate(
     as_json: JsonOption = False,
     view: ViewOption = False,
     view_port: ViewPortOption = 0,
+    mount: Annotated[
+        bool,
+        typer.Option(
+            "--mount",
+            help="Measure instead how the camera is mounted, how late it is, and where the gear's "
+            "tip is, with the vehicle in your hand and its motors off. The options below go "
+            "with it.",
+        ),
+    ] = False,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile", "-p", help="The vehicle's profile.", autocompletion=complete_profile
+        ),
+    ] = None,
+    uri: Annotated[
+        str | None,
+        typer.Option(
+            "--uri", "-u", help="Vehicle, only read from. Default: CFLIB_URI, the profile's."
+        ),
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--source", help="Its camera; else the profile's.", autocompletion=complete_source
+        ),
+    ] = None,
+    part: Annotated[
+        str | None,
+        typer.Option(
+            "--part",
+            metavar="carry|pivot|both",
+            help="carry: turn and latency; pivot: the gear's tip, by the camera alone.",
+        ),
+    ] = None,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option("--from", help="Measure from this recording of an earlier run."),
+    ] = None,
+    truth: Annotated[
+        str | None,
+        typer.Option("--truth", metavar="sim", help="A simulated vehicle in a simulated hand."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of --truth sim.")] = None,
+    write: Annotated[
+        bool,
+        typer.Option(
+            "--write", help="Put the numbers into the profile; the old file is kept beside it."
+        ),
+    ] = False,
 ) -> None:
     """Calibrate the camera, and report what its error means in mm at the target.
 
     A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
     by more than 5 times its view's spread; both are named. --check exits with 1 on a fail.
+
+    --mount measures the mounting instead: the vehicle is turned in the hand in view of the target
+    (carry), then tilted around the tip of its gear (pivot). Nothing arms.
     """
     with reported(as_json):
-        from perchctl.commands.calibrate import CalibrateRequest, run
+        from perchctl.commands.calibrate import CalibrateRequest, MountRequest, run
 
         request = CalibrateRequest(
             sources=tuple(source or ()),
@@ -128,5 +182,16 @@ def calibrate(
             as_json=as_json,
             view=view,
             view_port=view_port,
+            mount=mount,
+            mounting=MountRequest(
+                profile=profile,
+                uri=uri,
+                source=camera,
+                part=part,
+                logs=tuple(logs or ()),
+                truth=truth,
+                seed=seed,
+                write=write,
+            ),
         )
         perform(run, request)

@@ -7,30 +7,24 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ProfileOption, ViewOption, ViewPortOption, perform, reported
-from perchctl.cli.complete import complete_source
+from perchctl.cli.app import (
+    ProfileOption,
+    SourceOption,
+    UriOption,
+    ViewOption,
+    ViewPortOption,
+    perform,
+    reported,
+)
 
 
 def fly(
     profile: ProfileOption = "sim",
-    uri: Annotated[
-        str | None,
-        typer.Option(
-            "--uri",
-            "-u",
-            envvar="CFLIB_URI",
-            help="Vehicle: sim://, radio://0/80/2M/E7E7E7E7E7, usb://0, udp://HOST:PORT.",
-        ),
+    uri: UriOption = None,
+    source: SourceOption = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Seed of the simulated scenario; 11 by default.")
     ] = None,
-    source: Annotated[
-        str | None,
-        typer.Option(
-            "--source",
-            help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:.",
-            autocompletion=complete_source,
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of the simulated scenario.")] = 11,
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Folder for the flight log and its plot.")
     ] = None,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, ProfileOption, perform, reported
+from perchctl.cli.app import ForceOption, JsonOption, ProfileOption, perform, reported
 
 
 def simulate(
@@ -42,6 +42,7 @@ def simulate(
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Log the flights, into this folder.")
     ] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Fly many seeded scenarios in lockstep, faster than real time, and count."""
@@ -58,5 +59,6 @@ def simulate(
             as_json=as_json,
             faults=faults,
             heat_map=heat_map,
+            force=force,
         )
         perform(run, request)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from perchctl.calibration.check import check
@@ -21,10 +21,12 @@ from perchctl.calibration.seen import larger_than, seen_instead
 from perchctl.calibration.solve import AUTO, calibrate
 from perchctl.calibration.types import Calibration, Rejection, View
 from perchctl.calibration.writing import calibration_text, camera_text
+from perchctl.camera.open import is_live
 from perchctl.camera.source import check_size
 from perchctl.commands.calibrate_board import board_of
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mask import write_mask
+from perchctl.commands.calibrate_mount_request import MountRequest
 from perchctl.commands.calibrate_source import Source, source_of
 from perchctl.commands.interrupt import drawn
 from perchctl.commands.output import print_record, say
@@ -35,6 +37,8 @@ from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target.boards import Board
 
 FOLDER = Path("calib")
+_TYPED = {"reject": "no-reject"}
+_WITH_MOUNT = ("mount", "mounting", "output", "force", "as_json", "view", "view_port")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
 
 
@@ -61,6 +65,8 @@ class CalibrateRequest:
     as_json: bool = False
     view: bool = False
     view_port: int = 0
+    mount: bool = False
+    mounting: MountRequest = field(default_factory=MountRequest)
 
 
 @dataclass(frozen=True)
@@ -76,16 +82,22 @@ class _Found:
 
 
 def run(request: CalibrateRequest) -> int:
-    """Calibrate, check, convert or learn a mask; returns the exit code.
+    """Calibrate, check, convert, learn a mask or measure the mounting; returns the exit code.
 
-    Errors: NotFound, InvalidValue, UsageError, TimedOut (a silent camera).
+    Errors: NotFound, InvalidValue, UsageError, TimedOut (a silent camera); those of
+    `measure_mount`.
     """
+    if request.mount:
+        return _mount(request)
+    if (given := request.mounting.given()) is not None:
+        raise UsageError(f"{given} goes with --mount, which measures how the camera is mounted")
     measured = request.measured_width is not None or request.measured_height is not None
     if measured and not (request.convert is request.mask is None):
         raise UsageError("--measured-* are a board's sides, and --convert and --mask look for none")
     if request.convert is not None:
         if request.sources or not (request.check is request.mask is None):
             raise UsageError("--convert takes a file and no source, --check or --mask")
+        _refuse_beside("--convert takes over the file's lens model", request, "--model", "--view")
         return _convert(request, request.convert)
     if request.cam is not None and request.check is None:
         raise UsageError("--cam names a camera of the file of --check or --convert: give one")
@@ -94,6 +106,10 @@ def run(request: CalibrateRequest) -> int:
             "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N or http://..."
         )
     source = source_of(request.sources)
+    if not is_live(source.spec):
+        _refuse_beside(f"{source} is no live camera", request, "--view")
+    if request.check is not None:
+        _refuse_beside("--check judges a calibration as it is", request, "--model", "--output")
     if request.mask is not None:
         if request.check is not None or request.output is not None:
             raise UsageError("--mask names its file itself, and takes no --output or --check")
@@ -105,6 +121,39 @@ def run(request: CalibrateRequest) -> int:
     if request.check is not None:
         return _check(request, request.check, source, board)
     return _calibrate(request, source, board)
+
+
+def _refuse_beside(asked: str, request: CalibrateRequest, *options: str) -> None:
+    """Raises UsageError for an option that would be ignored."""
+    given = {
+        "--model": request.model != AUTO,
+        "--output": request.output is not None,
+        "--view": request.view,
+    }
+    for option in options:
+        if given[option]:
+            raise UsageError(f"{asked}: {option} does not apply; leave it out")
+
+
+def _mount(request: CalibrateRequest) -> int:
+    from perchctl.commands.calibrate_mount import measure_mount
+
+    if request.sources:
+        raise UsageError(
+            f"with --mount the camera is the profile's or named by --source {request.sources[0]}"
+        )
+    for each in fields(request):
+        if each.name not in _WITH_MOUNT and getattr(request, each.name) != each.default:
+            name = _TYPED.get(each.name, each.name.replace("_", "-"))
+            raise UsageError(f"--{name} does not go with --mount: leave one of them out")
+    return measure_mount(
+        request.mounting,
+        request.output,
+        request.force,
+        request.as_json,
+        request.view,
+        request.view_port,
+    )
 
 
 def _check_request(request: CalibrateRequest) -> None:

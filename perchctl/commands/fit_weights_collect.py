@@ -18,7 +18,7 @@ from perchctl.camera.source import FrameSource
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
-from perchctl.errors import InvalidValue, UsageError
+from perchctl.errors import InvalidValue, UsageError, no_simulator
 from perchctl.profile import Profile, load_profile
 from perchctl.vision.types import CameraModel
 from perchctl.weights.collect import (
@@ -71,10 +71,7 @@ def _collect_simulated(
     try:
         from perchctl.weights.simulated import Stand
     except ImportError as error:
-        raise UsageError(
-            f"the simulator is not installed ({error.name} is missing); install it with: "
-            f"{sys.executable} -m pip install 'perchctl[sim]'"
-        ) from None
+        raise no_simulator(error.name) from None
 
     session = _open_session(path, request.frames)
     stand = Stand(profile, camera, request.positions, request.seed, request.noise, request.blur)
@@ -114,7 +111,7 @@ def _collect_with_person(
         truth = _truth(request, profile, now)
         stack.callback(truth.close)
         source: FrameSource = open_source(
-            spec, config.latency_s, camera.size_px, now, config.start_timeout_s
+            spec, config.start_latency_s, camera.size_px, now, config.start_timeout_s
         )
         stack.callback(source.close)
         if config.mirrored:

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import camera_of
+from perchctl.check import quick
 from perchctl.commands.flight_plot import plot_of
+from perchctl.commands.fly_plan import plan, plan_text, weights_text
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port
@@ -39,14 +41,7 @@ from perchctl.log.summary import FlightSummary, summary_text
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import Event, EventKind, Watcher
-from perchctl.profile import (
-    find_calibration,
-    find_profile,
-    find_weights,
-    load_profile,
-    read_weights,
-)
-from perchctl.profile.mask import find_mask
+from perchctl.profile import find_profile, load_profile
 
 EXIT_CODE_OF: dict[Outcome, int] = {
     Outcome.PERCHED: 0,
@@ -65,7 +60,7 @@ class FlyRequest:
     profile: str = "sim"
     uri: str | None = None
     source: str | None = None
-    seed: int = PLAIN_SEED
+    seed: int | None = None
     log_dir: Path | None = None
     dry_run: bool = False
     yes: bool = False
@@ -86,6 +81,8 @@ def run(request: FlyRequest) -> int:
         else:
             print(plan_text(options))
         return 0
+    for warning in quick.warnings(options):
+        say(f"check: {warning}")
     if not (request.yes or options.simulated):
         ask_before_arming(options.uri)
     return fly(options, request.as_json, page_port(request.view, request.view_port))
@@ -100,10 +97,12 @@ def resolve(request: FlyRequest) -> FlyOptions:
         # An empty URI or source is an unset shell variable: not the profile's, but an error.
         uri=profile.link.uri if request.uri is None else request.uri,
         source=profile.camera.source if request.source is None else request.source,
-        seed=request.seed,
+        seed=PLAIN_SEED if request.seed is None else request.seed,
         log_dir=request.log_dir or Path(profile.log.directory),
     )
     check_options(options)
+    if request.seed is not None and not options.simulated:
+        say(f"--seed {request.seed} is of simulated flights: it changes nothing at {options.uri}")
     return options
 
 
@@ -120,74 +119,6 @@ def ask_before_arming(uri: str) -> None:
         answer = ""
     if answer.strip().lower() not in ("y", "yes"):
         raise UsageError("not confirmed: nothing was started")
-
-
-def plan(options: FlyOptions) -> dict[str, Any]:
-    """What would be flown, fully resolved; nothing is connected."""
-    calibration = find_calibration(options.profile.camera.calibration)
-    mask = options.profile.camera.mask
-    return {
-        "uri": options.uri,
-        "source": options.source,
-        "seed": options.seed if options.simulated else None,
-        "profile_file": str(options.profile_path),
-        "calibration_file": str(calibration),
-        "mask_file": None if mask is None else str(find_mask(mask)),
-        "log_directory": str(options.log_dir),
-        "profile": options.profile.model_dump(mode="json"),
-    }
-
-
-def plan_text(options: FlyOptions) -> str:
-    """The plan for people: what, where, and the phases with their numbers."""
-    resolved, planner = plan(options), options.profile.planner
-    search, ascend, perch = planner.search, planner.ascend, planner.perch
-    target = options.profile.target
-    merge = options.profile.merge
-    how = weights_text(options) if merge.method == "weights" else "joint solve"
-    press = (
-        f"raw thrust {perch.thrust}" if perch.mode == "raw" else f"press {perch.press_m} m above"
-    )
-    lines = [
-        f"vehicle      {resolved['uri']}" + (f", seed {options.seed}" if options.simulated else ""),
-        f"camera       {resolved['source']}, calibration {resolved['calibration_file']}"
-        + (f" {options.profile.camera.cam}" if options.profile.camera.cam else "")
-        + (f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""),
-        f"profile      {resolved['profile_file']}: {options.profile.description}".rstrip(": "),
-        f"target       {target.large.side_m * 1e3:g} mm {target.large.dictionary}/"
-        f"{target.large.id} around {target.small.side_m * 1e3:g} mm "
-        f"{target.small.dictionary}/{target.small.id}",
-        f"merge        {how}",
-        f"1 APPROACH   take off to {planner.takeoff_height_m:g} m",
-        f"2 SEARCH     {search.attempts} attempts of {search.wait_s:g} s, {search.step_m:g} m "
-        f"higher each, at most {search.max_height_m:g} m",
-        f"3 ESTIMATE   {planner.estimate.dwell_s:g} s of steady pose",
-        f"4 ALIGN      within {planner.align.xy_m * 1e3:g} mm and {planner.align.yaw_deg:g} deg "
-        f"for {planner.align.dwell_s:g} s",
-        f"5 ASCEND     at {ascend.speed_mps:g} m/s to {ascend.standoff_m * 1e3:g} mm under the "
-        f"target, settle within {ascend.settle_xy_m * 1e3:g} mm",
-        f"6 PERCH      {press}, at most {perch.timeout_s:g} s",
-        f"7 COMPLETE   release in {planner.complete.steps} steps, watch for "
-        f"{planner.complete.watch_s:g} s",
-        f"attempts     {planner.attempts}, perching time {planner.perching_time_s:g} s",
-        f"log          {resolved['log_directory']}",
-    ]
-    return "\n".join(lines)
-
-
-def weights_text(options: FlyOptions) -> str:
-    """Which merge weights fly, and where they are from: date, method, data."""
-    merge = options.profile.merge
-    numbers = ", ".join(f"{axis} {w:g}" for axis, w in merge.weights.model_dump().items())
-    if merge.weights_file is None:
-        return f"weights {numbers} (of the profile)"
-    path = find_weights(merge.weights_file)
-    fitted = read_weights(path)
-    origin = [fitted.date and f"of {fitted.date}", fitted.method]
-    if fitted.data.sha256:
-        origin.append(f"data {fitted.data.sha256[:12]}")
-    details = ", ".join(part for part in origin if part)
-    return f"weights {numbers} (from {path}{': ' + details if details else ''})"
 
 
 def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:

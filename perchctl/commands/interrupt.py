@@ -99,11 +99,18 @@ def drawn(draw: Callable[[], Path | None]) -> Path | None:
     """What `draw` returns, the path of a picture or None; None too where Ctrl-C or SIGTERM
     ends it: a picture comes after the result, and does not take its place."""
     try:
-        with signals_to(_interrupt):
+        with interruptible():
             return draw()
     except KeyboardInterrupt:
         say("Ctrl-C: the plot is not drawn; the result stands")
         return None
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Ctrl-C and SIGTERM are a KeyboardInterrupt."""
+    with signals_to(_interrupt):
+        yield
 
 
 def _interrupt(_signal: int, _frame: FrameType | None) -> None:

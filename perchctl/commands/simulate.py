@@ -13,7 +13,7 @@ from perchctl.commands.simulate_request import (
     stop_once,
     tell_logs,
 )
-from perchctl.errors import PerchError, UsageError
+from perchctl.errors import PerchError, no_simulator
 from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
 from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.write import make_log_folder
@@ -29,9 +29,7 @@ def run(request: SimulateRequest) -> int:
     """
     request.check()
     if find_spec("mujoco") is None:
-        raise UsageError(
-            "the simulator is not installed (mujoco is missing): pip install 'perchctl[sim]'"
-        )
+        raise no_simulator()
     with uninterrupted():  # a library that is half loaded fails with words of its own
         from perchctl.commands.simulate_faults import run_faults
         from perchctl.commands.simulate_only import run_only

@@ -14,7 +14,8 @@ from typing import Any, Protocol, TypeVar
 
 from perchctl.commands.output import say
 from perchctl.commands.progress import Ended, progress_bar
-from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
+from perchctl.errors import Interrupted, PerchError, UsageError
+from perchctl.files import check_output
 from perchctl.profile import Profile
 
 AGAIN_S = 0.5
@@ -47,6 +48,7 @@ class SimulateRequest:
     as_json: bool = False
     faults: str | None = None
     heat_map: Path | None = None
+    force: bool = False
 
     @property
     def seeds(self) -> list[int]:
@@ -76,10 +78,8 @@ class SimulateRequest:
         elif self.only is not None:
             one = f"--only {self.only} repeats the one flight of seed {self.only}"
             _refuse(one, many, ", or --only")
-        if self.heat_map is not None and (
-            self.heat_map.is_dir() or not self.heat_map.parent.is_dir()
-        ):
-            raise InvalidValue(f"--heat-map {self.heat_map}: name a PNG file in an existing folder")
+        if self.heat_map is not None:
+            check_output(self.heat_map, (".png",), self.force)
 
 
 def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) -> None:

@@ -28,11 +28,11 @@ from perchctl.display.page.sketch import Sketch
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
 from perchctl.profile import Profile, find_calibration, load_profile
+from perchctl.target.print_check import PrintCheck
 from perchctl.track.outputs import OutputOptions, Outputs
 from perchctl.track.result import Tracked
 from perchctl.track.tracker import (
     Notes,
-    PrintCheck,
     Tally,
     Tracker,
     camera_pipeline,
@@ -204,7 +204,8 @@ def _open(
 ) -> _Input:
     config = options.profile.camera
     pictures_hz = STILLS_HZ if options.stills else DEFAULT_RATE_HZ
-    raw = open_source(options.source, config.latency_s, size_px, now, pictures_hz=pictures_hz)
+    latency_s = config.start_latency_s
+    raw = open_source(options.source, latency_s, size_px, now, pictures_hz=pictures_hz)
     source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
     paths = raw.paths if isinstance(raw, ImagesSource) else None
     if isinstance(raw, Recording):

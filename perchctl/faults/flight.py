@@ -65,7 +65,7 @@ class FaultyFlight:
         radio.serves(vehicle.firmware)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
         assert vehicle.camera is not None
-        inner = LockstepSource(vehicle.camera, profile.camera.latency_s)
+        inner = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
         source = FaultyCamera(inner, scenario.seed)
         self._clock = FaultyClock(self._link, lambda: _cut(radio), LONGEST_FLIGHT_S)
         switch, disk = OperatorSwitch(listening=True, clock=self._clock.now), Disk()

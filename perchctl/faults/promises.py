@@ -52,7 +52,8 @@ PROMISES = (
     ),
     Promise(
         "camera mounted 90 or 180 deg off",
-        "landed as soon as the target moves with the vehicle, and the turn that fits named",
+        "stopped and landed within 0.3 m, as soon as the target moves with the vehicle, and the "
+        "turn that fits named",
         ("camera-turned",), names="camera.mount",
     ),
     Promise(

@@ -50,7 +50,7 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
         samples.append(sample)
     if samples:
         oldest = samples[-1].t_s - KEEP_S
-        first = bisect.bisect_left([s.t_s for s in samples], oldest)
+        first = bisect.bisect_left(samples, oldest, key=_time_s)
         samples = samples[first:]
     return History(tuple(samples), jumped, turned_rad, changed)
 
@@ -64,12 +64,11 @@ def attitude_at(history: History, t_s: float) -> Attitude | None:
     samples = history.samples
     if not samples:
         return None
-    times = [s.t_s for s in samples]
-    i = bisect.bisect_right(times, t_s)
+    i = bisect.bisect_right(samples, t_s, key=_time_s)
     if i == 0:
         return _attitude(samples[0], 0.0)
     if i == len(samples):
-        return _attitude(samples[-1], min(t_s - times[-1], 0.1))
+        return _attitude(samples[-1], min(t_s - samples[-1].t_s, 0.1))
     a, b = samples[i - 1], samples[i]
     part = (t_s - a.t_s) / (b.t_s - a.t_s)
     return Attitude(
@@ -85,9 +84,22 @@ def attitude_at(history: History, t_s: float) -> Attitude | None:
     )
 
 
+def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
+    """World axes, of the first sample from `t_s` on, or of the newest; at rest without one."""
+    samples = history.samples
+    if not samples:
+        return 0.0, 0.0, 0.0
+    i = bisect.bisect_left(samples, t_s, key=_time_s)
+    return samples[min(i, len(samples) - 1)].velocity_mps
+
+
 def attitude_of(sample: Telemetry) -> Attitude:
     """Attitude and position of a sample."""
     return _attitude(sample, 0.0)
+
+
+def _time_s(sample: Telemetry) -> float:
+    return sample.t_s
 
 
 def _attitude(s: Telemetry, ahead_s: float) -> Attitude:

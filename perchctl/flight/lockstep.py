@@ -154,7 +154,7 @@ def fly_lockstep(
     vehicle = SimulatedVehicle(scenario, camera, profile.target)
     link = MockLink(vehicle, profile.link.telemetry_period_s)
     assert vehicle.camera is not None
-    source = LockstepSource(vehicle.camera, profile.camera.latency_s)
+    source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
     truth = Truth(vehicle)
     watchers = (truth, *watchers)
     if log is not None:

@@ -21,6 +21,7 @@ from perchctl.flight.watchdog import Watchdog
 from perchctl.link.evidence import FRESH_S
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
+from perchctl.mission.findings import findings_of
 from perchctl.mission.state import (
     FLYING_PHASES,
     Observation,
@@ -34,6 +35,7 @@ from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, NO_BATTERY_READING_V, Command, Idle
+from perchctl.vision.consistency import Consistency
 
 HUNG_S = 0.25
 """A turn that takes longer was hung up somewhere: what it knew of the vehicle is old."""
@@ -126,6 +128,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
     state: PlannerState | None = None
     passed: list[Event] = []
     redone = log_noted = False
+    told = senses.noticed.newest  # to the log
     while True:
         now_s = clock.now()
         senses.take_in(now_s, look=not _is_blind(state))
@@ -155,12 +158,13 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
                 passed.append(event)
             for watcher in parts.watchers:
                 watcher.event(event)
-        tick = _tick(senses, state, command, obs)
+        tick = _tick(senses, state, command, obs, told)
+        told = senses.noticed.newest
         for watcher in parts.watchers:
             watcher.tick(tick)
         if planner.is_over(state):
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
-            return _report(state, obs, tuple(passed))
+            return _report(state, obs, tuple(passed), senses)
         due_s += period_s
         if due_s < now_s:
             due_s = now_s + period_s  # never try to catch up with a burst of old ticks
@@ -182,7 +186,14 @@ def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:
     return now_s
 
 
-def _tick(senses: Senses, state: PlannerState, command: Command, obs: Observation) -> Tick:
+def _tick(
+    senses: Senses,
+    state: PlannerState,
+    command: Command,
+    obs: Observation,
+    told: Consistency | None,
+) -> Tick:
+    newest = senses.noticed.newest
     return Tick(
         obs.t_s,
         obs.telemetry,
@@ -193,6 +204,8 @@ def _tick(senses: Senses, state: PlannerState, command: Command, obs: Observatio
         obs.loop_late_s,
         obs.camera_age_s,
         obs.t_s - obs.telemetry.t_s,
+        None if newest is told else newest,
+        obs.delay_s,
     )
 
 
@@ -220,6 +233,7 @@ def _observe(parts: FlightParts, senses: Senses, now_s: float, late_s: float) ->
         disagreeing_frames=senses.state.disagreeing_frames,
         operator=parts.operator(),
         log_problem=next((w.problem for w in parts.watchers if w.problem), None),
+        delay_s=senses.noticed.used_s,
     )
 
 
@@ -248,7 +262,10 @@ def _events(
     return events
 
 
-def _report(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) -> FlightReport:
+def _report(
+    state: PlannerState, obs: Observation, passed: tuple[Event, ...], senses: Senses
+) -> FlightReport:
+    seen, camera = senses.noticed_at_last(), senses.profile.camera
     return FlightReport(
         phase=state.phase,
         outcome=state.outcome or Outcome.SAFETY,
@@ -258,6 +275,7 @@ def _report(state: PlannerState, obs: Observation, passed: tuple[Event, ...]) ->
         # The telemetry at hand is older than an emergency stop, which always locks.
         locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
         history=passed,
+        findings=None if seen is None else findings_of(seen, camera),
     )
 
 

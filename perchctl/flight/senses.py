@@ -9,10 +9,13 @@ from perchctl.camera.health import HealthState, assess
 from perchctl.camera.mirror import MIRRORED
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import History, attitude_at, attitude_of, extended
+from perchctl.flight.noticed import Noticed, noticed
 from perchctl.link.protocol import Link
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile
+from perchctl.vision.consistency import Consistency, solved
 from perchctl.vision.fields import BLENDED, INTERLACED
+from perchctl.vision.tracks import surest_of
 from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineState, TargetEstimate
 
 MIRRORED_FRAMES = 5
@@ -38,6 +41,7 @@ class Senses:
     camera_problem: str | None = None
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
+    noticed: Noticed = field(default_factory=Noticed)
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
     _mirrored: int = 0
@@ -51,6 +55,9 @@ class Senses:
         self.history = extended(self.history, self.link.telemetry(), self.profile.safety)
         self.output, self.blind = None, not look
         frame = self.source.poll(now_s)
+        used_s = self.noticed.used_s
+        if frame is not None and used_s:
+            frame = replace(frame, t_s=frame.t_s - used_s)
         problem = self.source.problem(now_s)
         if frame is None:
             if problem is None and self.source.finished:
@@ -73,8 +80,32 @@ class Senses:
                 self.state, self.output = step(self.state, picture, attitude, self.pipeline)
                 self._mirrored = _mirrored_frames(self._mirrored, self.output.detections)
                 self._remark(self.output)
+                self._notice(self.output, used_s)
         mirrored = self._mirrored >= MIRRORED_FRAMES
         self.camera_problem = MIRRORED if mirrored else self._note
+
+    def _notice(self, output: PipelineOutput, used_s: float) -> None:
+        """Latency and mounting, from a picture whose pose was taken for the target's."""
+        pose = surest_of(self.state.measured)
+        if pose is None or output.target is None or not output.target.measured:
+            return
+        self.noticed = noticed(
+            self.noticed,
+            output.detections.t_s + used_s,
+            pose,
+            self.history,
+            self.pipeline.pose,
+            self.profile.camera,
+            self._attitude_sigma_rad,
+        )
+
+    def noticed_at_last(self) -> Consistency | None:
+        """Of the whole flight; None of one that saw too little."""
+        return solved(self.noticed.sums, self._attitude_sigma_rad)
+
+    @property
+    def _attitude_sigma_rad(self) -> float:
+        return math.radians(self.profile.kalman.attitude_sigma_deg)
 
     def take_remarks(self) -> list[str]:
         """What is new about the pictures since the last call."""

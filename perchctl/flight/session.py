@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -14,7 +13,7 @@ from perchctl.calibration.files import camera_of
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
 from perchctl.camera.source import FrameSource
-from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError
+from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError, no_simulator
 from perchctl.flight.clock import WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
@@ -95,12 +94,12 @@ def fly_session(
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
         if options.simulated:
-            simulated = stack.enter_context(_simulated_vehicle(options, camera))
+            simulated = stack.enter_context(simulated_vehicle(options, camera))
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         config = profile.camera
         source = open_source(
-            spec, config.latency_s, camera.size_px, clock.now, config.start_timeout_s
+            spec, config.start_latency_s, camera.size_px, clock.now, config.start_timeout_s
         )
         stack.callback(source.close)
         if config.mirrored:
@@ -153,12 +152,10 @@ def _true_miss_m(simulated: SimProcess | None) -> float | None:
     return None
 
 
-def _simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
+def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
+    """Started, with its camera's stream. Errors: UsageError without the simulator."""
     if find_spec("mujoco") is None:
-        raise UsageError(
-            f"sim:// needs the simulator, which is not installed (mujoco is missing); "
-            f"install it with: {sys.executable} -m pip install 'perchctl[sim]'"
-        )
+        raise no_simulator()
     from perchctl.sim.draw import draw_scenario
     from perchctl.sim.process.handle import SimProcess
 

@@ -22,6 +22,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
+from perchctl.vision.consistency import Consistency
 from perchctl.vision.types import MARKERS, MarkerPose, PipelineOutput, TargetEstimate
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
@@ -69,6 +70,18 @@ FIELDS: dict[str, str] = {
     },
     "lock_note": "why the frame's pose was not taken for the target's, or where it was taken anew",
     "cam_age_s": "since the last good frame",
+    # what the flight shows of latency and mounting, once a second
+    "delay_s": "by how much the pictures are later than the profile's camera.latency_s",
+    "delay_sigma_s": "standard deviation of delay_s",
+    **{
+        key: text
+        for axis in "xyz"
+        for key, text in (
+            (f"turn_{axis}_rad", f"the camera's turn from the profile's, about body {axis}"),
+            (f"turn_{axis}_sigma_rad", f"standard deviation of turn_{axis}_rad"),
+        )
+    },
+    "delay_used_s": "taken off the frames' times beyond camera.latency_s, where it is `measured`",
     # the target's estimate at t_s, which the planner steers by: the paper's error vector
     "ex_m": "target relative to the gear, level frame",
     "ey_m": "target relative to the gear, level frame",
@@ -145,6 +158,8 @@ def tick_record(
     loop_late_s: float = 0.0,
     camera_age_s: float | None = None,
     telemetry_age_s: float | None = None,
+    consistency: Consistency | None = None,
+    delay_used_s: float = 0.0,
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
@@ -168,7 +183,9 @@ def tick_record(
         "tel_age_s": telemetry_age_s,
         "cam_age_s": camera_age_s,
         "late_s": loop_late_s,
+        "delay_used_s": delay_used_s or None,
         "true_miss_m": true_miss_m,
+        **_consistency_values(consistency),
         **_xyz("true_", true_position_m),
         **_telemetry_values(telemetry),
         **_output_values(output),
@@ -176,6 +193,17 @@ def tick_record(
         **_command_values(command),
     }
     return {key: values.get(key) for key in FIELDS}
+
+
+def _consistency_values(seen: Consistency | None) -> dict[str, Any]:
+    if seen is None:
+        return {}
+    return {
+        "delay_s": seen.delay_s,
+        "delay_sigma_s": seen.delay_sigma_s,
+        **{f"turn_{axis}_rad": v for axis, v in zip("xyz", seen.turn_rad, strict=True)},
+        **{f"turn_{axis}_sigma_rad": v for axis, v in zip("xyz", seen.turn_sigma_rad, strict=True)},
+    }
 
 
 def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:

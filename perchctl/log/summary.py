@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.log.read import FlightLog, PhaseSpan
+from perchctl.mission.findings import Findings, latency_text, turn_text
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
@@ -35,6 +36,7 @@ class FlightSummary:
     locked: bool = False
     fell: bool = False
     phases: tuple[PhaseSpan, ...] = ()
+    findings: Findings | None = None
     lost_records: int = 0
     log_problem: str | None = None
 
@@ -51,7 +53,42 @@ class FlightSummary:
             "battery_min_v": self.battery_min_v,
             "locked": self.locked,
             "fell": self.fell,
+            **_found(self.findings),
         }
+
+
+def _found(findings: Findings | None) -> dict[str, Any]:
+    """What the flight showed of latency and mounting, with one standard deviation each."""
+    if findings is None:
+        return {}
+    return {
+        "latency_s": findings.latency_s,
+        "latency_sigma_s": findings.latency_sigma_s,
+        "mount_turn_deg": list(findings.turn_deg),
+        "mount_turn_sigma_deg": list(findings.turn_sigma_deg),
+        "advice": list(findings.advice),
+    }
+
+
+def _findings_in(end: Mapping[str, Any]) -> Findings | None:
+    if end.get("latency_s") is None:
+        return None
+    return Findings(
+        float(end["latency_s"]),
+        float(end["latency_sigma_s"]),
+        tuple(end["mount_turn_deg"]),
+        tuple(end["mount_turn_sigma_deg"]),
+        tuple(end.get("advice") or ()),
+    )
+
+
+def findings_lines(found: Findings) -> list[str]:
+    """With 95 % intervals, and what to change for the next flight."""
+    return [
+        f"latency:   {latency_text(found)}",
+        f"mounting:  turned by {turn_text(found)} (x, y, z)",
+        *(f"advice:    {sentence}" for sentence in found.advice),
+    ]
 
 
 def summary_of(log: FlightLog) -> FlightSummary:
@@ -76,6 +113,7 @@ def summary_of(log: FlightLog) -> FlightSummary:
         locked=bool(end.get("locked", False)),
         fell=bool(end.get("fell", False)),
         phases=phases,
+        findings=_findings_in(end),
         lost_records=int(end.get("lost_records") or 0),
         log_problem=end.get("problem"),
     )
@@ -102,6 +140,8 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
         lines.append(f"phases:    {phases_text(flight.phases)}")
     if flight.battery_min_v is not None:
         lines.append(f"battery:   {flight.battery_min_v:.2f} V at its lowest")
+    if flight.findings is not None:
+        lines += findings_lines(flight.findings)
     if flight.locked:
         lines.append("vehicle:   locked by its supervisor: inspect and restart it")
     if flight.fell:

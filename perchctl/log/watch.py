@@ -83,6 +83,7 @@ class LogWatcher:
             locked=report.locked,
             fell=fell,
             phases=spans_of(report),
+            findings=report.findings,
         )
         self.writer.close(summary.as_record())
         lost, problem = self.writer.lost_records, self.writer.problem
@@ -130,6 +131,8 @@ def flight_record(
         loop_late_s=tick.loop_late_s,
         camera_age_s=tick.camera_age_s,
         telemetry_age_s=tick.telemetry_age_s,
+        consistency=tick.consistency,
+        delay_used_s=tick.delay_used_s,
         true_position_m=true_position_m,
         true_miss_m=true_miss_m,
     )

@@ -134,7 +134,8 @@ class Context:
     @property
     def _fresh_limit_s(self) -> float:
         # A frame is as old as the camera's latency when it arrives.
-        return self.profile.planner.ascend.fresh_s + self.profile.camera.latency_s
+        latency_s = self.profile.camera.start_latency_s + self.obs.delay_s
+        return self.profile.planner.ascend.fresh_s + latency_s
 
     @property
     def contact_goal_z_m(self) -> float:

@@ -1,10 +1,10 @@
 """Whether the camera is mounted as the profile says: the target stands still in the world.
 
-Where `camera.mount` is turned by an angle a about the vertical, the target is placed
-T = p + M (t - p), with the vehicle's place p, the true target t and M the turn by -a: it
-moves with the vehicle, by (1 - M) of each motion. In the plane a turn is a complex number
-of length 1, so one least squares over a few decimetres of flight gives s = 1 - M
-(docs/architecture.md, "The mounting").
+Where `camera.mount` is turned by an angle a about the vehicle's upward axis, the target is
+placed T = p + M (t - p), with the true target t, M the turn by -a, and p the place where that
+axis meets the target's plane: it moves with the vehicle and with each of its tilts, by
+(1 - M) of the motion of p. In the plane a turn is a complex number of length 1, so one least
+squares over a decimetre of that motion gives s = 1 - M (docs/architecture.md, "The mounting").
 """
 
 from __future__ import annotations
@@ -13,23 +13,27 @@ import cmath
 import math
 from dataclasses import dataclass, replace
 
+from perchctl.geometry import Array, rotation_from_rpy
+from perchctl.vehicle import Telemetry
+
 WINDOW_S = 3.0
 """Older sights are left out: a drifting estimate moves both, slowly and together."""
 LEAST_SIGHTS = 10
-JUDGED_M = 0.1
-"""The vehicle's own motion from which on it is judged, and ..."""
-PROVEN_M = 0.25
+JUDGED_M = 0.12
+"""The vehicle's own motion, as its upward axis draws it at the target's height, from which on
+it is judged, and ..."""
+PROVEN_M = 0.3
 """... beyond which a target that has stood still ends the watch."""
 STANDS_STILL = 0.35
 MOVES_ALONG = 0.6
 """Of the vehicle's motion: below the first the target stands still, above the second it
 moves with it. Undisturbed flights show 0.25 at most, a quarter turn 1.4."""
-LEAST_SPREAD_M = 0.03
-MOST_UNEXPLAINED = 0.6
+LEAST_SPREAD_M = 0.05
+MOST_UNEXPLAINED = 0.45
 """Of the target's spread: more of it, and no turn explains how it moves."""
 LEAST_TURN = 0.5
 """Length of M. About 0 is a world that drifts under both, and no turn."""
-LEAST_TURN_RAD = math.radians(60.0)
+LEAST_TURN_RAD = math.radians(65.0)
 """A lesser turn leads to the target all the same, in a bow."""
 SIGHTS_IN_A_ROW = 4
 JUMPS = ((0.1, 0.1), (0.15, 0.2))
@@ -45,11 +49,26 @@ Turn = float
 
 @dataclass(frozen=True)
 class Sight:
-    """Vehicle and target in the plane of the estimate's world, x + iy, in metres."""
+    """Vehicle and target in the plane of the estimate's world, x + iy, in metres. `lean`: from
+    the vehicle to where its upward axis meets the target's plane."""
 
     t_s: float
     vehicle: complex
     target: complex
+    lean: complex = 0j
+
+    @property
+    def aim(self) -> complex:
+        return self.vehicle + self.lean
+
+
+def sight_of(t_s: float, telemetry: Telemetry, target_m: Array) -> Sight:
+    """Of a target at `target_m` (3,) in the estimate's world, by the vehicle's newest sample."""
+    x, y, z = telemetry.position_m
+    up = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)[:, 2]
+    lean_m = (float(target_m[2]) - z) * up
+    place = complex(float(target_m[0]), float(target_m[1]))
+    return Sight(t_s, complex(x, y), place, complex(float(lean_m[0]), float(lean_m[1])))
 
 
 @dataclass(frozen=True)
@@ -76,7 +95,7 @@ class MountWatch:
 
     @property
     def moved_m(self) -> float:
-        return max((abs(s.vehicle - self.sights[0].vehicle) for s in self.sights), default=0.0)
+        return max((abs(s.aim - self.sights[0].aim) for s in self.sights), default=0.0)
 
     @property
     def last_from(self) -> tuple[float, float] | None:
@@ -109,7 +128,7 @@ def _jumped(before: tuple[Sight, ...], sight: Sight) -> bool:
     if abs(sight.vehicle - last.vehicle) > far:
         return True
     return any(
-        abs(sight.target - s.target) > jump_m + 2.0 * abs(sight.vehicle - s.vehicle)
+        abs(sight.target - s.target) > jump_m + 2.0 * abs(sight.aim - s.aim)
         for s in before
         for jump_m, within_s in JUMPS
         if sight.t_s - s.t_s <= within_s
@@ -118,9 +137,9 @@ def _jumped(before: tuple[Sight, ...], sight: Sight) -> bool:
 
 def _judged(watch: MountWatch, against: int) -> MountWatch:
     n = len(watch.sights)
-    p0 = sum(s.vehicle for s in watch.sights) / n
+    p0 = sum(s.aim for s in watch.sights) / n
     q0 = sum(s.target for s in watch.sights) / n
-    pairs = [(s.vehicle - p0, s.target - q0) for s in watch.sights]
+    pairs = [(s.aim - p0, s.target - q0) for s in watch.sights]
     if (moved_m := watch.moved_m) < JUDGED_M:
         return watch
     along = sum(p.conjugate() * q for p, q in pairs) / sum(abs(p) ** 2 for p, _ in pairs)
@@ -148,6 +167,7 @@ def explained(watch: MountWatch) -> str:
     shown = quarter if near else 10.0 * round(turn_deg / 10.0)
     shown = 180.0 if shown == -180.0 else shown
     return (
-        f"the target moves with the vehicle: camera.mount is turned by about {shown:.0f} deg "
-        f"(add it to the last of camera.mount.rpy_deg)"
+        f"camera seems turned by about {shown:.0f} deg from what the profile says: the target "
+        f"moves with the vehicle; measure it with `perchctl calibrate --mount`, or add "
+        f"{shown:.0f} to the last of camera.mount.rpy_deg"
     )

@@ -15,7 +15,7 @@ from perchctl.mission.actions import act
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason, hovers
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
-from perchctl.mission.mounting import MountWatch, Sight, watched
+from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
 from perchctl.mission.state import (
     TERMINALS,
@@ -155,9 +155,7 @@ def _mount_watched(c: Context) -> MountWatch:
         return mount
     if target is None or not target.measured or target.world_m is None:
         return mount
-    x, y, _ = c.obs.telemetry.position_m
-    place = complex(float(target.world_m[0]), float(target.world_m[1]))
-    return watched(mount, Sight(c.obs.t_s, complex(x, y), place))
+    return watched(mount, sight_of(c.obs.t_s, c.obs.telemetry, target.world_m))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
@@ -222,6 +220,9 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
         case Phase.LANDING if old.phase is Phase.PERCH:
             # It may be in the magnet's reach: it has to be seen below before it counts as free.
             return replace(new, contact_z_m=obs.telemetry.position_m[2])
+        case Phase.LANDING if new.row == "mounting":
+            # The setpoint is ahead, and every centimetre there is one in a wrong direction.
+            return replace(new, setpoint=None)
         case Phase.ASCEND:
             return replace(new, searches=0)
         case Phase.SEARCH if old.setpoint is not None:

@@ -118,6 +118,7 @@ class Observation:
         loop_late_s: how late this tick began.
         disagreeing_frames: frames in a row in which the markers contradicted.
         log_problem: the flight log cannot be written.
+        delay_s: taken off the frames' times beyond the profile's latency (`measured`).
     """
 
     t_s: float
@@ -134,6 +135,7 @@ class Observation:
     disagreeing_frames: int = 0
     operator: Operator = Operator.NONE
     log_problem: str | None = None
+    delay_s: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
+from perchctl.mission.findings import Findings
 from perchctl.mission.state import Outcome, Phase, PlannerState, Severity
 from perchctl.vehicle import Command, Telemetry
+from perchctl.vision.consistency import Consistency
 from perchctl.vision.types import PipelineOutput, TargetEstimate
 
 
@@ -43,7 +45,8 @@ class Tick:
     """All that one turn of the loop knew and did, for the log and the display.
 
     `output` is what this tick's new frame gave, None without one; `target` the estimate
-    that the planner steered by.
+    that the planner steered by. `consistency`: what the flight shows of latency and mounting,
+    in the ticks in which that was worked out anew; `delay_used_s` is in the frames' times.
     """
 
     t_s: float
@@ -55,6 +58,8 @@ class Tick:
     loop_late_s: float
     camera_age_s: float
     telemetry_age_s: float
+    consistency: Consistency | None = None
+    delay_used_s: float = 0.0
 
 
 class Watcher(Protocol):
@@ -85,7 +90,8 @@ class EventKeeper:
 
 @dataclass(frozen=True)
 class FlightReport:
-    """How the flight ended; `history` are its phases' events, the first at the start."""
+    """How the flight ended; `history` are its phases' events, the first at the start.
+    `findings`: what it showed of latency and mounting, where it was long enough."""
 
     phase: Phase
     outcome: Outcome
@@ -94,3 +100,4 @@ class FlightReport:
     duration_s: float
     locked: bool
     history: tuple[Event, ...] = ()
+    findings: Findings | None = None

@@ -32,7 +32,9 @@ LEAST_ROWS = 5
 def read_flight_log(path: Path) -> Measurements:
     """The frames with both markers. Errors: NotFound, InvalidValue (no log, no truth)."""
     log = read_log(path)
-    scenario, ahead_s = _truth_of(log)
+    scenario, later_s = _truth_of(log)
+    # With `camera.latency_s: measured` the flight has taken some of it off already.
+    ahead_s = later_s + np.nan_to_num(log.column("delay_used_s"))
     t_s = log.column("t_s")
     frame_s = log.column("frame_t_s")
     poses = {name: _poses(log, name[0]) for name in ("large", "small", "joint")}
@@ -88,7 +90,7 @@ def _truth_of(log: FlightLog) -> tuple[Scenario, float]:
         raise InvalidValue(
             f"{log.path}: line 1: the profile and seed of the header do not give the scenario"
         ) from None
-    return scenario, profile.camera.latency_s - scenario.camera_latency_s
+    return scenario, profile.camera.start_latency_s - scenario.camera_latency_s
 
 
 def _poses(log: FlightLog, short: str) -> Array:

@@ -36,6 +36,8 @@ from tests.helpers.boards import (
     render_folder,
 )
 
+pytestmark = pytest.mark.long
+
 BOARD = CHARUCO.notation()
 Rendered = tuple[Path, CameraModel]
 

@@ -26,6 +26,8 @@ from perchctl.vision.camera_model import project
 from perchctl.vision.types import CameraModel
 from tests.helpers.boards import CHARUCO, CHESSBOARD, corner_views, draw_camera
 
+pytestmark = pytest.mark.long
+
 
 def drawn(seed: int, **options: float) -> tuple[list[View], CameraModel]:
     rng = np.random.default_rng(seed)

@@ -441,6 +441,7 @@ class Looking(io.StringIO):
         return super().write(text)
 
 
+@pytest.mark.long
 def test_track_serves_its_numbers_while_it_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -108,6 +108,7 @@ def test_the_operator_s_word_is_excused() -> None:
     assert result.counted == ()
 
 
+@pytest.mark.long
 def test_a_fault_that_begins_leaves_its_mark() -> None:
     result = flown("camera-silent", Phase.SEARCH, draw=1)
     assert result.begin_s is not None
@@ -115,6 +116,7 @@ def test_a_fault_that_begins_leaves_its_mark() -> None:
     assert result.parameters["CameraFault"]["kind"] == "silent"
 
 
+@pytest.mark.long
 def test_the_same_seed_is_the_same_flight() -> None:
     short = profile()
     one, two = (fly_fault_seed(short, SEED, ("operator-once",)) for _ in range(2))
@@ -184,6 +186,7 @@ def simulate(*arguments: str) -> Any:
 LOW = ("--faults", "low-bare-ceiling,hang-up")
 
 
+@pytest.mark.long
 def test_the_command_prints_one_object_and_draws(tmp_path: Path) -> None:
     options = (*LOW, "-n", "1", "--seed", str(SEED), "--json", "--log-dir", str(tmp_path))
     done = simulate(*options, "--heat-map", str(tmp_path / "map.png"))
@@ -197,6 +200,7 @@ def test_the_command_prints_one_object_and_draws(tmp_path: Path) -> None:
     assert (tmp_path / f"flight_seed{SEED}.jsonl").exists()
 
 
+@pytest.mark.long
 def test_one_seed_is_told_with_its_fault_log_and_plot(tmp_path: Path) -> None:
     done = simulate(*LOW, "--only", str(SEED), "--json", "--log-dir", str(tmp_path))
     assert done.exit_code == 0
@@ -217,4 +221,14 @@ def test_the_command_lists_and_refuses() -> None:
     refused = simulate("--faults", "hanged")
     assert refused.exit_code == 2
     assert "--faults list" in refused.stderr
-    assert simulate("--faults", "all", "--heat-map", "nowhere/x.png").exit_code == 30
+
+
+@pytest.mark.parametrize(("name", "words"), [("map.png", "add --force"), ("m.txt", ".png")])
+def test_a_heat_map_is_refused_before_anything_is_flown(
+    name: str, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "map.png").write_text("mine")
+    refused = simulate("--faults", "all", "--heat-map", str(tmp_path / name))
+    assert refused.exit_code == 30
+    assert words in refused.stderr
+    assert (tmp_path / "map.png").read_text() == "mine"

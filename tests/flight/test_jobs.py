@@ -37,6 +37,8 @@ from tests.helpers.jobs import (
     is_killed_later,
 )
 
+pytestmark = pytest.mark.long
+
 AT_ONCE_S = 20.0
 """Beside the time for which the flights would go on; on a busy machine, too."""
 

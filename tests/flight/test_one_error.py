@@ -25,6 +25,8 @@ from perchctl.sim.draw import draw_scenario
 from perchctl.vision import strategies
 from tests.helpers.flights import SEED, short_profile
 
+pytestmark = pytest.mark.long
+
 PROFILE = short_profile()
 SCENARIO = draw_scenario(PROFILE, SEED)
 

@@ -36,14 +36,11 @@ from perchctl.sim.process.handle import SimProcess
 from perchctl.vehicle import FLYING, LOCKED
 from tests.helpers.flights import ROOT, SEED, SHORT
 
+pytestmark = pytest.mark.long
+
 FLIGHT_LIMIT_S = 60.0
 LATE_S = 0.25
 """A loop, telemetry or vehicle that is later than this was starved of the processor."""
-
-
-def in_ci(test: Callable[..., None]) -> Callable[..., None]:
-    """Run by `.ci/run` behind the suite, which has no time for it."""
-    return pytest.mark.campaign(pytest.mark.guard(test))
 
 
 def say_fly(*arguments: str) -> tuple[list[str], dict[str, str]]:
@@ -196,7 +193,6 @@ def flying_until(phase: str, sim: SimProcess, folder: Path) -> Iterator[subproce
             process.kill()
 
 
-@in_ci
 def test_ctrl_c_in_flight_lands(tmp_path: Path) -> None:
     def once(folder: Path) -> tuple[int, str, dict[str, Any], FlightLog, bool]:
         with vehicle(folder) as own, flying_until("ALIGN", own.sim, folder) as process:
@@ -258,7 +254,6 @@ def test_kill_9_in_flight_leaves_a_log_and_a_vehicle_that_ends_by_itself(tmp_pat
     assert min(held) > 0.2  # until then it hovers
 
 
-@in_ci
 def test_a_terminal_that_is_closed_in_flight_lands(tmp_path: Path) -> None:
     """A hang-up, and from then on each write to the terminal fails."""
     with vehicle(tmp_path) as own:
@@ -297,7 +292,6 @@ def test_a_terminal_that_is_closed_in_flight_lands(tmp_path: Path) -> None:
     assert log.summary["cause"] == "operator"
 
 
-@in_ci
 def test_a_simulator_that_is_starved_is_named_for_the_abort(tmp_path: Path) -> None:
     """As on a busy computer: its process gets no time for a while."""
     command, environment = say_fly("--seed", str(SEED), "--log-dir", str(tmp_path))

@@ -29,6 +29,7 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
 )
+from perchctl.vision.consistency import Consistency
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held, note
 
@@ -155,6 +156,8 @@ def test_every_field_is_filled_by_something() -> None:
             hold="no picture",
             command=command,
             camera_age_s=0.1,
+            consistency=Consistency(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
+            delay_used_s=0.005,
             true_position_m=(0.0, 0.0, 1.0),
             true_miss_m=0.01,
         )

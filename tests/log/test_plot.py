@@ -17,6 +17,8 @@ from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> FlightLog:

@@ -134,6 +134,7 @@ def on_the_ceiling(seen: list[Observation]) -> bool:
     )
 
 
+@pytest.mark.long
 @settings(max_examples=400)
 @given(
     bits=st.lists(BITS, min_size=1, max_size=6),

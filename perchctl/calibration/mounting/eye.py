@@ -1,0 +1,55 @@
+"""A stream's pictures through the pipeline, as far as the mounting is measured by them."""
+
+from __future__ import annotations
+
+from perchctl.calibration.mounting.recording import SeenPose
+from perchctl.calibration.mounting.seen import seeing, seen_mirrored, seen_pose
+from perchctl.camera.health import HealthState, assess
+from perchctl.geometry import Array
+from perchctl.pipeline import FieldState, make_pipeline, pictures, step
+from perchctl.profile import Profile
+from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
+
+
+class Eye:
+    """Frame in, poses out; remembers what the pipeline must.
+
+    `mirrored` counts the pictures in which a target was seen mirrored only. `outlines` are
+    those of the newest picture, a marker's name and corners (4, 2) px; `trouble` is what keeps
+    it from being searched.
+    """
+
+    def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
+        self._pipeline = make_pipeline(seeing(profile), camera)
+        self._live = live
+        self._state = PipelineState()
+        self._fields = FieldState()
+        self._health = HealthState()
+        self.mirrored = 0
+        self.outlines: tuple[tuple[str, Array], ...] = ()
+        self.trouble = ""
+
+    def look(self, frame: Frame) -> list[SeenPose]:
+        """The target's pose in a frame, in each of its two fields where it has such."""
+        self._health, judged = assess(self._health, frame, self._live)
+        if judged.kind == "repeated":
+            return []
+        self.outlines, self.trouble = (), ""
+        if not judged.usable:
+            self.trouble = judged.text
+            if judged.kind in ("frozen", "snow"):
+                return []
+        self._fields, found = pictures(self._fields, frame, self._pipeline)
+        seen = []
+        for picture in found:
+            self._state, output = step(self._state, picture, None, self._pipeline)
+            self._remember(output)
+            pose = seen_pose(output, picture.t_s)
+            if pose is not None:
+                seen.append(pose)
+        return seen
+
+    def _remember(self, output: PipelineOutput) -> None:
+        self.mirrored += seen_mirrored(output)
+        found = ((name, output.detections.get(name)) for name in MARKERS)
+        self.outlines = tuple((name, d.corners_px) for name, d in found if d is not None)

@@ -1,0 +1,1 @@
+"""What can be known on the ground before a flight: one row for each question."""

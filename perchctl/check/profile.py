@@ -1,0 +1,222 @@
+"""What a profile tells about a flight before anything is opened: the check's rows of it.
+
+What no flight could end well with is refused when the profile is read; here is what is read, and
+was hardly meant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from perchctl.calibration.files import camera_of
+from perchctl.check.limits import DOUBTFUL
+from perchctl.check.row import Row, Verdict
+from perchctl.errors import PerchError
+from perchctl.geometry import Array
+from perchctl.profile import Profile, find_calibration
+from perchctl.profile.limits import Limit
+from perchctl.profile.places import data_folder
+from perchctl.target.blind import sees_small
+from perchctl.target.checks import check_target
+from perchctl.target.lengths import millimetres
+
+FAR_M = 0.15
+"""No gear and no camera is farther from the centre of a vehicle of 42 g."""
+APART_M = 0.003
+"""A camera is not where the gear is."""
+NEAR_AN_ANGLE_RAD = 0.02
+NOTABLE_RAD = tuple(sorted({k * math.pi / n for n in (4, 6) for k in range(1, 2 * n + 1)}))
+"""Eighths and twelfths of a circle."""
+LOOKS_UP = math.cos(math.radians(45.0))
+"""Of the view's upward part: with less the camera does not look at the ceiling."""
+
+
+def rows(profile: Profile, *, uri: str | None = None, source: str | None = None) -> tuple[Row, ...]:
+    """A row for each question, in the order in which they matter.
+
+    `uri` and `source` take the place of the profile's. Opens no link and no camera; reads the
+    calibration's file. Raises nothing.
+    """
+    uri = profile.link.uri if uri is None else uri
+    source = profile.camera.source if source is None else source
+    return (
+        _calibration(profile, source),
+        _gear_place(profile),
+        _camera_place(profile),
+        _camera_turn(profile),
+        _markers(profile),
+        _standoff(profile),
+        *(_limits(name, limits, profile) for name, limits in DOUBTFUL.items()),
+        _way(profile, simulated=uri.startswith("sim://")),
+    )
+
+
+def _calibration(profile: Profile, source: str) -> Row:
+    name = "calibration file"
+    try:
+        path = find_calibration(profile.camera.calibration)
+    except PerchError as error:
+        return Row(name, Verdict.FAIL, str(error), "make one with perchctl calibrate")
+    if not source.startswith("sim:") and _is_shipped_example(path):
+        return Row(
+            name,
+            Verdict.WARN,
+            f"{path.name} is the shipped example, and {source} a camera of your own",
+            "calibrate it (perchctl calibrate), and name the file in camera.calibration",
+        )
+    return Row(name, Verdict.PASS, path.name)
+
+
+def _is_shipped_example(path: Path) -> bool:
+    """By what is in it: a copy under another name fits no other lens."""
+    try:
+        text = path.read_bytes()
+        return any(text == file.read_bytes() for file in data_folder("calib").glob("example_*"))
+    except OSError:
+        return False
+
+
+def _gear_place(profile: Profile) -> Row:
+    return _place("gear place", "vehicle.gear_body_m", profile.vehicle.gear_body_m)
+
+
+def _camera_place(profile: Profile) -> Row:
+    mount, gear_m = profile.camera.mount, profile.vehicle.gear_body_m
+    row = _place("camera place", "camera.mount.position_m", mount.position_m)
+    if row.verdict is Verdict.PASS and math.dist(mount.position_m, gear_m) < APART_M:
+        return Row(
+            row.name,
+            Verdict.WARN,
+            f"{row.found}, where the gear's tip is",
+            "measure both: camera.mount.position_m, vehicle.gear_body_m",
+        )
+    return row
+
+
+def _place(name: str, key: str, place_m: Sequence[float]) -> Row:
+    """The place of a part in body axes."""
+    away_m = math.hypot(*place_m)
+    found = f"{_mm(place_m)} (forward, left, up)"
+    if away_m <= FAR_M:
+        return Row(name, Verdict.PASS, found)
+    return Row(
+        name,
+        Verdict.WARN,
+        f"{found}: {away_m * 1e2:.0f} cm from the vehicle's centre",
+        f"measure {key} anew: no part is farther than {FAR_M * 1e2:.0f} cm",
+    )
+
+
+def _mm(place_m: Sequence[float]) -> str:
+    return f"{' '.join(millimetres(part) for part in place_m)} mm"
+
+
+def _camera_turn(profile: Profile) -> Row:
+    name, mount = "camera turn", profile.camera.mount
+    found = f"rpy {' '.join(f'{angle:g}' for angle in mount.rpy_deg)} deg"
+    turned = [abs(angle) for angle in mount.rpy_deg if angle]
+    if turned and all(any(abs(a - n) <= NEAR_AN_ANGLE_RAD for n in NOTABLE_RAD) for a in turned):
+        meant = " ".join(f"{math.degrees(angle):.0f}" for angle in mount.rpy_deg)
+        return Row(
+            name,
+            Verdict.WARN,
+            f"{found}: this looks like radians, of {meant} deg",
+            f"if so write camera.mount.rpy_deg: [{', '.join(meant.split())}]",
+        )
+    up = float(_view(profile)[2])
+    if up < LOOKS_UP:
+        tilted_deg = math.degrees(math.acos(max(-1.0, up)))
+        return Row(
+            name,
+            Verdict.FAIL,
+            f"{found}: the camera looks {tilted_deg:.0f} deg away from straight up",
+            "camera.mount.rpy_deg: 0 0 0 looks up, the last angle turns the picture",
+        )
+    return Row(name, Verdict.PASS, found)
+
+
+def _view(profile: Profile) -> Array:
+    """Where the camera looks, body axes, (3,)."""
+    return profile.camera.mount.T_body_cam[:3, 2]
+
+
+def _markers(profile: Profile) -> Row:
+    large, small = profile.target.large, profile.target.small
+    found = (
+        f"{millimetres(large.side_m)} mm {large.dictionary}/{large.id} around "
+        f"{millimetres(small.side_m)} mm {small.dictionary}/{small.id}"
+    )
+    try:
+        # The magnet is no part of a profile: one that just covers the small marker.
+        check_target(profile.target, 1.01 * math.sqrt(2.0) * small.side_m, search=False)
+    except PerchError as error:
+        return Row("markers", Verdict.WARN, f"{found}: {error}", "print a target that can be read")
+    return Row("markers", Verdict.PASS, found)
+
+
+def _standoff(profile: Profile) -> Row:
+    """Settled counts only what shows the small marker."""
+    name, ascend = "stand-off", profile.planner.ascend
+    shown = f"at {millimetres(ascend.standoff_m)} mm under the target the small marker is"
+    try:
+        camera = camera_of(profile.camera)
+    except PerchError as error:
+        return Row(name, Verdict.SKIPPED, f"no calibration to tell by: {error}")
+    if sees_small(camera, profile, ascend.standoff_m):
+        return Row(name, Verdict.PASS, f"{shown} in the picture")
+    return Row(
+        name,
+        Verdict.FAIL,
+        f"{shown} not whole in the picture, and no ascent could settle",
+        "measure camera.mount and vehicle.gear_body_m, or raise planner.ascend.standoff_m",
+    )
+
+
+def _limits(name: str, limits: Sequence[Limit], profile: Profile) -> Row:
+    """One row for limits of a kind."""
+    if name == "thresholds" and profile.planner.perch.mode == "position":
+        limits = [limit for limit in limits if "planner.perch.thrust" not in limit.keys]
+    broken = [limit for limit in limits if not limit.holds(profile)]
+    if not broken:
+        return Row(name, Verdict.PASS, f"{len(limits)} fit each other")
+    keys = dict.fromkeys(key for limit in broken for key in limit.keys)
+    return Row(
+        name,
+        Verdict.WARN,
+        "; ".join(limit.sentence(profile) for limit in broken),
+        f"change {' or '.join(keys)}",
+    )
+
+
+def _way(profile: Profile, simulated: bool) -> Row:
+    """Whether the fence and the height limit leave room for the way to the target."""
+    safety, planner = profile.safety, profile.planner
+    found = f"fence {safety.fence_radius_m:g} m, height limit {safety.max_height_m:g} m"
+    if planner.approach_xy_m is not None:
+        away_m = math.hypot(*planner.approach_xy_m)
+        if away_m >= safety.fence_radius_m:
+            return Row(
+                "way",
+                Verdict.WARN,
+                f"{found}: planner.approach_xy_m is {away_m:.2f} m from the estimate's zero",
+                "raise safety.fence_radius_m unless it takes off near that place",
+            )
+    offset_m = math.hypot(*[profile.simulation.start_offset_m] * 2)
+    highest_m = profile.simulation.ceiling_z_m[1] - profile.vehicle.gear_body_m[2]
+    if simulated and offset_m >= safety.fence_radius_m:
+        return Row(
+            "way",
+            Verdict.WARN,
+            f"{found}: simulated flights start up to {offset_m:.2f} m aside of the target",
+            "raise safety.fence_radius_m, or lower simulation.start_offset_m",
+        )
+    if simulated and highest_m >= safety.max_height_m:
+        return Row(
+            "way",
+            Verdict.WARN,
+            f"{found}: simulated ceilings are touched at up to {highest_m:.2f} m",
+            "raise safety.max_height_m, or lower simulation.ceiling_z_m",
+        )
+    return Row("way", Verdict.PASS, found)

@@ -1,0 +1,171 @@
+"""The whole check, row by row as they come: vehicle, camera, computer, profile."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+
+from perchctl.calibration.files import camera_of
+from perchctl.camera.device import device_listing
+from perchctl.camera.mirror import UnmirroredSource
+from perchctl.camera.open import open_source
+from perchctl.camera.source import FrameSource
+from perchctl.check import camera, computer, gone, health, lift, link, quick, scan
+from perchctl.check.lift import WITHIN_S as LIFT_S
+from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
+from perchctl.check.row import Row, failed, passed, skipped
+from perchctl.errors import ConnectionFailed, PerchError
+from perchctl.flight.clock import WallClock
+from perchctl.flight.session import FlyOptions, check_options, simulated_vehicle
+from perchctl.link.probe import ProbeLink
+from perchctl.link.scan import Answering, address_of
+from perchctl.link.scan import scan as scan_for
+from perchctl.link.uri import check_uri
+from perchctl.pipeline import Pipeline, make_pipeline
+from perchctl.profile import Profile
+
+NO_VEHICLE = "the vehicle does not answer"
+AFTERWARDS = "the motor test ends by itself within 15 s: keep clear of the propellers"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is looked at beyond what can be seen at rest, and for how long, s.
+
+    `may_turn_motors` asks for leave when the moment has come; None: no motor is turned. `tell`
+    says what goes on. `other_vehicles` looks for those that answer.
+    """
+
+    may_turn_motors: Callable[[], bool] | None = None
+    lift: bool = False
+    listen_s: float = link.LISTEN_S
+    rehearse_s: float = REHEARSED_S
+    lift_s: float = LIFT_S
+    health_s: float | None = None
+    tell: Callable[[str], None] = lambda text: None
+    other_vehicles: Callable[[str], Answering] = lambda uri: scan_for([address_of(uri)])
+
+
+def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
+    """Rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
+    profile's files), UsageError."""
+    check_options(options)
+    profile = options.profile
+    calibrated = camera_of(profile.camera)
+    pipeline = make_pipeline(profile, calibrated)
+    rehearsal: Rehearsal | None = None
+    with contextlib.ExitStack() as stack:
+        uri, spec = options.uri, options.source
+        if options.simulated:
+            wanted.tell("starting the simulated vehicle")
+            simulated = stack.enter_context(simulated_vehicle(options, calibrated))
+            uri = simulated.uri
+            spec = simulated.stream_url if spec.startswith("sim:") else spec
+        probe = ProbeLink(uri, profile.link, time.monotonic)
+        stack.callback(probe.close)
+        heard: Listened = Silent()
+        wanted.tell(f"connecting to {options.uri}")
+        try:
+            probe.connect()
+        except ConnectionFailed as error:
+            yield from _no_vehicle(options, error, wanted)
+        else:
+            heard = probe
+            yield passed("address", f"{options.uri} answers")
+            yield from _vehicle(probe, options, wanted)
+        wanted.tell(f"opening the camera {options.source}")
+        try:
+            source = _source(spec, options, stack)
+        except PerchError as error:
+            yield from camera.refused(error, device_listing())
+        else:
+            rehearsal = yield from _camera(heard, source, pipeline, options, wanted)
+    yield computer.loop_row(rehearsal, profile)
+    yield computer.log_folder_row(options.log_dir)
+    yield from quick.rows(options)
+
+
+def found_by_scan(uri: str | None) -> list[Row]:
+    """`--scan`: what answers, at the usual address and at that of `uri`. Errors: InvalidValue."""
+    if uri is not None:
+        check_uri(uri)
+    return scan.rows(scan_for([address_of(uri or "")]))
+
+
+def _no_vehicle(options: FlyOptions, error: ConnectionFailed, wanted: Wanted) -> Iterator[Row]:
+    found, _, help_text = str(error).partition("\n")
+    advice = help_text
+    if not help_text:
+        wanted.tell("nothing answers there: looking who else does")
+        advice = scan.others(options.uri, wanted.other_vehicles(options.uri))
+    yield failed("address", found, advice)
+    for name in (*link.NAMES, lift.NAME, *health.NAMES):
+        yield skipped(name, NO_VEHICLE)
+
+
+def _vehicle(probe: ProbeLink, options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
+    profile = options.profile
+    wanted.tell(f"listening to the vehicle for {wanted.listen_s:g} s")
+    seen = link.look(probe, options.uri, wanted.listen_s)
+    if lost := probe.lost():
+        yield failed("packets", f"the link was lost: {lost}", "see address; restart the vehicle")
+        for name in (*link.NAMES[1:], lift.NAME, *health.NAMES):
+            yield skipped(name, NO_VEHICLE)
+        return
+    yield from link.rows(seen, profile)
+    yield from _with_a_hand(probe, profile, wanted)
+    yield from gone.rows(probe)
+
+
+def _with_a_hand(probe: ProbeLink, profile: Profile, wanted: Wanted) -> Iterator[Row]:
+    """What somebody has to lift it for, or to keep clear of; it may end with a dead vehicle."""
+    if wanted.lift:
+        wanted.tell(f"now, within {wanted.lift_s:g} s: {lift.HOW}")
+        yield lift.row(lift.lift_of(lift.watch(probe, time.sleep, wanted.lift_s)))
+    else:
+        yield lift.unasked()
+    if wanted.may_turn_motors is None:
+        yield from health.unasked()
+        return
+    if why := health.hindrance(probe.newest(), probe.age_s(), profile):
+        yield from health.unasked(f"not begun: {why}")
+    elif not wanted.may_turn_motors():
+        yield from health.unasked("not confirmed")
+    else:
+        wanted.tell("turning each propeller for a moment: keep clear")
+        try:
+            yield from health.run(probe, profile, time.sleep, wanted.health_s)
+        except KeyboardInterrupt:
+            wanted.tell(AFTERWARDS)
+            raise
+
+
+def _source(spec: str, options: FlyOptions, stack: contextlib.ExitStack) -> FrameSource:
+    config = options.profile.camera
+    size_px = camera_of(config).size_px
+    source = open_source(
+        spec, config.start_latency_s, size_px, time.monotonic, config.start_timeout_s
+    )  # fmt: skip
+    stack.callback(source.close)
+    return UnmirroredSource(source) if config.mirrored else source
+
+
+def _camera(
+    heard: Listened, source: FrameSource, pipeline: Pipeline, options: FlyOptions, wanted: Wanted
+) -> Generator[Row, None, Rehearsal | None]:
+    """Yields the rows; returns the rehearsal, None where there could be none."""
+    yield camera.opened_row(options.source, device_listing())
+    size = camera.size_row(source.size_px, pipeline.camera.size_px)
+    if size.verdict != "pass":
+        yield from camera.unseen("pictures of another size cannot be looked at", size)
+        return None
+    yield size
+    wanted.tell(f"rehearsing on live pictures for {wanted.rehearse_s:g} s")
+    profile = options.profile
+    done = rehearse(heard, source, pipeline, profile, WallClock(), wanted.rehearse_s)
+    optical = camera.optical_of(done, pipeline)
+    design = camera.design_of(done, optical, pipeline, profile)
+    yield from camera.rows(done, optical, design, profile)
+    return done

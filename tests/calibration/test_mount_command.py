@@ -1,0 +1,447 @@
+"""`perchctl calibrate --mount`: what it refuses, prints, draws and writes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.calibration.mounting.recording import Recording, read_recordings, write_recordings
+from perchctl.calibration.mounting.report import (
+    KEYS,
+    Comparison,
+    keys_text,
+    mounting_lines,
+    mounting_record,
+    turn_between_deg,
+    written_gear_cam_m,
+)
+from perchctl.calibration.mounting.result import Carried
+from perchctl.calibration.mounting.solve import solve_carry, solve_pivot
+from perchctl.cli import app
+from perchctl.commands import calibrate_mount
+from perchctl.geometry import Array, rpy_from_rotation
+from perchctl.profile import Mounting, load_profile
+from tests.helpers.mounting import hand, seen
+
+MINE = """# the one with the long legs
+extends: crazyflie
+camera:
+  latency_s: 0.08  # a guess
+  mount:
+    rpy_deg: [0, 0, 0]  # as it was built
+"""
+SEED = 1
+
+
+def mount(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, ["calibrate", "--mount", *map(str, words)])
+
+
+def refused(result: Result, code: int, *expected: str) -> None:
+    """One sentence, its code, and nothing on stdout."""
+    assert result.exit_code == code, result.output
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    assert not result.stdout
+    for words in expected:
+        assert words in result.stderr
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Recordings of both parts, of each one, and of a still vehicle."""
+    folder = tmp_path_factory.mktemp("logs")
+    carry, pivot = seen(hand("carry", SEED)), seen(hand("pivot", SEED))
+    still = replace(pivot, attitudes=(), poses=(pivot.poses[0],) * 200)
+    mirrored = replace(pivot, attitudes=(), poses=(), mirrored_pictures=200)
+    brief = replace(carry, attitudes=carry.attitudes[:300], poses=carry.poses[:40])
+    paths = {}
+    for name, parts in {
+        "both": (carry, pivot), "carry": (carry,), "pivot": (pivot,), "still": (still,),
+        "mirrored": (mirrored,), "brief": (brief,),
+    }.items():  # fmt: skip
+        paths[name] = folder / f"{name}.jsonl"
+        write_recordings(paths[name], parts)
+    return paths
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CFLIB_URI", raising=False)
+    (tmp_path / "mine.yaml").write_text(MINE, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For what is not about the report."""
+    monkeypatch.setattr(calibrate_mount, "_draw", lambda _comparison, picture: picture)
+
+
+# --- what it refuses -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "expected"),
+    [
+        ([], 2, ["-p", "compared"]),
+        (["-p", "no_such"], 20, ["no_such", "crazyflie"]),
+        (["-p", "mine.yaml", "--part", "both sides"], 30, ["carry, pivot, both"]),
+        (["-p", "mine.yaml", "-u", "nonsense://x"], 30, ["nonsense://x", "radio://"]),
+        (["-p", "mine.yaml", "-u", "sim://"], 2, ["--truth sim", "--part pivot"]),
+        (["-p", "sim"], 2, ["sim:", "--truth sim", "--source"]),
+        (["-p", "mine.yaml", "--source", "sim:"], 2, ["--truth sim"]),
+        (["-p", "mine.yaml", "--source", "video:no.mp4"], 2, ["--part pivot", "clock"]),
+        (["-p", "mine.yaml", "--source", "no.mp4"], 20, ["no.mp4"]),
+        (["-p", "mine.yaml", "--part", "pivot", "--source", "video:no.mp4"], 20, ["no.mp4"]),
+        (["-p", "mine.yaml", "--source", "camera:99"], 20, ["camera:99"]),
+        (["-p", "mine.yaml", "--truth", "mocap"], 30, ["mocap", "sim"]),
+        (["-p", "mine.yaml", "--truth", "sim", "--source", "camera:0"], 2, ["--source"]),
+        (["-p", "mine.yaml", "--truth", "sim", "-u", "usb://0"], 2, ["--uri"]),
+        (["-p", "mine.yaml", "--truth", "sim", "--from", "x.jsonl"], 2, ["--from"]),
+        (["-p", "mine.yaml", "--truth", "sim", "--view"], 2, ["--view"]),
+        (["-p", "mine.yaml", "--seed", "3"], 2, ["--truth sim"]),
+        (["-p", "mine.yaml", "--from", "no.jsonl"], 20, ["no.jsonl"]),
+        (["-p", "mine.yaml", "--from", "mine.yaml"], 30, ["mine.yaml", "line 1"]),
+        (["-p", "mine.yaml", "--from", "."], 30, ["."]),
+        (["-p", "mine.yaml", "--from", "x.jsonl", "-u", "usb://0"], 2, ["--uri"]),
+        (["-p", "mine.yaml", "--from", "x.jsonl", "--view"], 2, ["--view"]),
+        (["-p", "mine.yaml", "--write", "--truth", "sim"], 2, ["radio://", "leave --write out"]),
+        (["-p", "crazyflie", "--write", "--truth", "sim"], 30, ["shipped", "cp ", "-p my_"]),
+        (["-p", "mine.yaml", "-o", "x.pdf", "--truth", "sim"], 30, [".png"]),
+        (["-p", "mine.yaml", "-o", "mine.png/x.png", "--truth", "sim"], 30, ["mine.png"]),
+        (["-p", "mine.yaml", "--board", "chessboard:9x6:25mm"], 2, ["--board", "--mount"]),
+        (["-p", "mine.yaml", "--no-reject"], 2, ["--no-reject", "--mount"]),
+        (["-p", "mine.yaml", "camera:0"], 2, ["--source camera:0"]),
+    ],
+)  # fmt: skip
+def test_wrong_usage(place: Path, words: list[str], code: int, expected: list[str]) -> None:
+    (place / "mine.png").write_bytes(b"")
+    before = {path: path.read_bytes() for path in place.iterdir()}
+    refused(mount(*words), code, *expected)
+    assert {path: path.read_bytes() for path in place.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["-p", "sim"], ["-u", "usb://0"], ["--source", "camera:0"], ["--part", "carry"],
+     ["--from", "x"], ["--truth", "sim"], ["--seed", "0"], ["--write"]],
+)  # fmt: skip
+def test_its_options_go_with_it_only(words: list[str]) -> None:
+    result = CliRunner().invoke(app, ["calibrate", "images:board", *words])
+    refused(result, 2, "--mount")
+
+
+def test_a_carry_needs_a_vehicle_that_answers(place: Path) -> None:
+    """The camera is opened first: nobody shall wait for a radio to learn that it is not there."""
+    refused(mount("-p", "mine.yaml", "-u", "udp://127.0.0.1:9"), 20, "camera:0")
+
+
+def test_a_broken_recording_is_named_with_its_line(place: Path, logs: dict[str, Path]) -> None:
+    text = logs["pivot"].read_text(encoding="utf-8")
+    Path("cut.jsonl").write_text(text[: len(text) // 2], encoding="utf-8")
+    lines = len(text[: len(text) // 2].splitlines())
+    refused(mount("-p", "mine.yaml", "--from", "cut.jsonl"), 30, f"cut.jsonl, line {lines}")
+    Path("empty.jsonl").write_text("", encoding="utf-8")
+    refused(mount("-p", "mine.yaml", "--from", "empty.jsonl"), 30, "empty")
+
+
+def test_too_little_motion_says_what_to_add(place: Path, logs: dict[str, Path]) -> None:
+    refused(mount("-p", "mine.yaml", "--from", logs["still"]), 30, "lacks motion", "tilt")
+    refused(mount("-p", "mine.yaml", "--from", logs["mirrored"]), 30, "camera.mirrored")
+    assert not Path("calib").exists()
+
+
+def test_a_part_that_is_refused_does_not_hide_the_other(place: Path, logs: dict[str, Path]) -> None:
+    both = mount("-p", "mine.yaml", "--from", logs["brief"], "--from", logs["pivot"])
+    refused(both, 30, "the carry lacks motion", "--part pivot takes the pivot alone")
+
+
+def test_each_part_once(place: Path, logs: dict[str, Path]) -> None:
+    twice = mount("-p", "mine.yaml", "--from", logs["both"], "--from", logs["carry"])
+    refused(twice, 30, "carry", "name one")
+    other = mount("-p", "mine.yaml", "--from", logs["carry"], "--part", "pivot")
+    refused(other, 30, "no pivot", "a carry")
+
+
+# --- what it gives -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def measured(
+    logs: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Result]:
+    """Both parts, measured and written; the folder it was done in."""
+    folder = tmp_path_factory.mktemp("measured")
+    (folder / "mine.yaml").write_text(MINE, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        words = ["-p", "mine.yaml", "--from", logs["both"], "--write", "--json", "-o", "report.png"]
+        return folder, mount(*words)
+
+
+def test_both_parts_measure_all_and_say_what_was_written_before(
+    measured: tuple[Path, Result], logs: dict[str, Path]
+) -> None:
+    folder, result = measured
+    assert result.exit_code == 0, result.stderr
+    record = json.loads(result.stdout)
+    truth = hand("carry", SEED)
+    R = Mounting(rpy_deg=tuple(record["rpy_deg"])).T_body_cam[:3, :3]
+    assert turn_between_deg(R, truth.T_body_cam[:3, :3]) < 0.5
+    assert record["latency_s"] == pytest.approx(truth.latency_s, abs=0.008)
+    assert record["gear_cam_m"] == pytest.approx(truth.gear_cam_m, abs=0.0012)
+    assert set(record["sigma"]) == set(record["written"]) == set(KEYS)
+    assert np.shape(record["sigma"]["rpy_deg"]) == np.shape(record["sigma"]["gear_cam_m"]) == (3,)
+    assert 0.0 < record["sigma"]["latency_s"] < 0.01
+    assert record["written"]["rpy_deg"] == [0.0, 0.0, 0.0]
+    assert "true" not in record
+    assert record["recordings"] == [str(logs["both"])]
+    assert record["report"] == "report.png"
+    assert "you wrote 0 0 0: " in result.stderr
+    assert "deg away" in result.stderr
+    numbers = [line for line in result.stderr.splitlines() if not line.startswith("perchctl")]
+    assert max(map(len, numbers)) <= 80
+    drawn = cv2.imread(str(folder / "report.png"))
+    assert drawn is not None
+    assert drawn.shape[1] > 1000
+
+
+def test_an_existing_report_needs_force(place: Path, logs: dict[str, Path]) -> None:
+    Path("report.png").write_bytes(b"mine")
+    again = mount("-p", "mine.yaml", "--from", logs["both"], "-o", "report.png")
+    refused(again, 30, "report.png", "--force")
+    assert Path("report.png").read_bytes() == b"mine"
+
+
+def test_write_puts_the_numbers_into_the_profile_and_keeps_its_comments(
+    measured: tuple[Path, Result],
+) -> None:
+    folder, result = measured
+    record = json.loads(result.stdout)
+    text = (folder / "mine.yaml").read_text(encoding="utf-8")
+    assert [line.partition("#")[2] for line in MINE.splitlines() if "#" in line] == [
+        line.partition("#")[2] for line in text.splitlines() if "#" in line
+    ]
+    assert Path(record["profile_before"]).read_text(encoding="utf-8") == MINE
+    assert Path(record["profile_before"]).parent == Path(record["profile"]).parent
+    profile = load_profile(str(folder / "mine.yaml"))
+    assert list(profile.camera.mount.rpy_deg) == pytest.approx(record["rpy_deg"], abs=0.005)
+    assert profile.camera.latency_s == pytest.approx(record["latency_s"], abs=5e-5)
+    # What a flight rests on: the tip from the camera, in the camera's axes.
+    assert written_gear_cam_m(profile) == pytest.approx(record["gear_cam_m"], abs=3e-5)
+
+
+def test_the_pivot_alone_leaves_the_turn_open(place: Path, logs: dict[str, Path]) -> None:
+    result = mount("-p", "mine.yaml", "--from", logs["pivot"], "--json")
+    record = json.loads(result.stdout)
+    assert record["rpy_deg"] is record["latency_s"] is record["sigma"]["rpy_deg"] is None
+    assert list(record["profile_values"]) == ["vehicle.gear_body_m"]
+    assert "rests on the profile's camera.mount.rpy_deg" in result.stderr
+    assert cv2.imread("calib/mounting_mine.png") is not None
+    assert record["report"] == "calib/mounting_mine.png"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_numbers_that_cannot_be_written_are_still_reported(
+    place: Path, logs: dict[str, Path]
+) -> None:
+    odd = "extends: crazyflie\ncamera: {mount: {position_m: &a [0, 0, 0]}}\n"
+    odd += "vehicle: {gear_body_m: *a}\n"
+    Path("odd.yaml").write_text(odd, encoding="utf-8")
+    result = mount("-p", "odd.yaml", "--from", logs["pivot"], "--write")
+    assert result.exit_code == 30
+    assert "write them yourself: vehicle.gear_body_m: [" in result.stderr
+    assert result.stdout.startswith("vehicle.gear_body_m: [")
+    assert Path("odd.yaml").read_text(encoding="utf-8") == odd
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(
+    ("changed", "refuses"),
+    [
+        ("camera: {mount: {rpy_deg: [0, 0, 90]}}", True),
+        ("vehicle: {gear_body_m: [0, 0, 0.04]}", True),
+        ("camera: {latency_s: measured}", True),
+        ("safety: {max_height_m: 1.9}", False),
+    ],
+)
+def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
+    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, changed: str, refuses: bool
+) -> None:
+    """A gear by the old turn beside a new one would be a gear in another place."""
+    Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
+    text = f"extends: crazyflie\n{changed}\n"
+    solved = calibrate_mount.solved
+
+    def long_work(*given: Any) -> Comparison:
+        Path("mine.yaml").write_text(text, encoding="utf-8")
+        return solved(*given)
+
+    monkeypatch.setattr(calibrate_mount, "solved", long_work)
+    words = ["-p", "mine.yaml", "--from", str(logs["both"]), "--part", "pivot", "--write"]
+    result = mount(*words)
+    written = Path("mine.yaml").read_text(encoding="utf-8")
+    assert result.stdout.startswith("vehicle.gear_body_m: [")
+    if not refuses:
+        assert result.exit_code == 0, result.stderr
+        assert written.startswith(text)
+        return
+    assert result.exit_code == 30
+    assert written == text
+    assert not Path("mine.yaml.bak").exists()
+    assert "changed meanwhile, and nothing is written" in result.stderr
+    assert f"measure again: perchctl calibrate --mount {' '.join(words)}" in result.stderr
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_numbers_stand_where_the_profile_is_gone_meanwhile(
+    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = calibrate_mount.solved
+
+    def long_work(*given: Any) -> Comparison:
+        Path("mine.yaml").unlink()
+        return solved(*given)
+
+    monkeypatch.setattr(calibrate_mount, "solved", long_work)
+    result = mount("-p", "mine.yaml", "--from", logs["pivot"], "--write")
+    assert result.exit_code == 20
+    assert result.stdout.startswith("vehicle.gear_body_m: [")
+    assert not Path("mine.yaml").exists()
+
+
+def test_the_carry_alone_says_that_the_gear_is_still_to_do() -> None:
+    turned = Mounting(rpy_deg=(0.0, 0.0, 90.0)).T_body_cam[:3, :3]
+    assert turn_between_deg(turned, np.eye(3)) == pytest.approx(90.0)
+    c = Comparison(load_profile("crazyflie"), carried(turned), None)
+    lines = "\n".join(mounting_lines(c))
+    assert "0 0 90 +-" in lines
+    assert "you wrote 0 0 0: 90.0 deg away" in lines
+    assert "you wrote 80: within that" in lines
+    assert "do the pivot as well" in lines
+    assert keys_text(c) == "camera.mount.rpy_deg: [0, 0, 90]\ncamera.latency_s: 0.0803"
+
+
+def test_a_latency_that_flights_measure_stays_so() -> None:
+    profile = load_profile("crazyflie")
+    camera = profile.camera.model_copy(update={"latency_s": "measured"})
+    c = Comparison(profile.model_copy(update={"camera": camera}), carried(np.eye(3)), None)
+    assert "camera.latency_s" not in c.profile_values()
+    assert mounting_record(c)["written"]["latency_s"] is None
+    assert "you wrote measured: each flight measures it" in "\n".join(mounting_lines(c))
+
+
+def test_a_place_is_taken_only_where_it_is_known_better_than_by_a_ruler() -> None:
+    for sigma_m, taken in ((0.001, True), (0.01, False)):
+        known = replace(
+            carried(np.eye(3)), cam_body_m=np.array([0.031, 0.0, 0.012]),
+            cam_body_sigma_m=np.full(3, sigma_m),
+        )  # fmt: skip
+        c = Comparison(load_profile("crazyflie"), known, None)
+        assert ("camera.mount.position_m" in c.profile_values()) is taken
+        assert ("the profile's is kept" in "\n".join(mounting_lines(c))) is not taken
+
+
+def carried(R: Array) -> Carried:
+    """A solution with that turn."""
+    none, three = np.zeros((0, 3)), (0.05, 0.05, 0.05)
+    x, y, z = np.degrees(rpy_from_rotation(R))
+    return Carried(
+        R_body_cam=R, rpy_deg=(x, y, z), rpy_sigma_deg=three,
+        turn_cov_rad2=np.eye(3) * np.radians(0.05) ** 2, latency_s=0.0803, latency_sigma_s=0.001,
+        jitter_s=0.004, target_rpy_deg=three, target_rpy_sigma_deg=three,
+        gyro_bias_radps=np.zeros(3), attitude_bias_rad=np.zeros(3), cam_body_m=None,
+        cam_body_sigma_m=None, t_s=np.zeros(0), residual_rad=none, counted=np.zeros(0),
+        body_rpy_rad=none, poses=0,
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_the_simulator_tells_the_truth_beside(
+    place: Path, monkeypatch: pytest.MonkeyPatch, logs: dict[str, Path]
+) -> None:
+    """Without its pictures, which the solver's own tests render."""
+    parts = {r.part: r for r in read_recordings(logs["both"])}
+
+    def quick(held: Any, *_: Any, **__: Any) -> Recording:
+        return parts[held.part]
+
+    monkeypatch.setattr("perchctl.sim.hand.record", quick)
+    result = mount("--truth", "sim", "--seed", str(SEED), "--part", "pivot", "--json")
+    record = json.loads(result.stdout)
+    truth = hand("carry", SEED)
+    assert list(record["true"]) == list(KEYS)
+    assert record["true"]["rpy_deg"] == pytest.approx(truth.rpy_deg)
+    assert record["true"]["latency_s"] == truth.latency_s
+    assert record["true"]["gear_cam_m"] == pytest.approx(truth.gear_cam_m)
+    assert record["recordings"] == []
+    assert record["report"] == "calib/mounting_sim.png"
+
+
+def test_ctrl_c_in_the_drawing_leaves_the_numbers(
+    place: Path, logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pressed(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(calibrate_mount, "_draw", pressed)
+    result = mount("-p", "mine.yaml", "--from", logs["pivot"], "--json")
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["report"] is None
+
+
+def test_a_recording_goes_with_the_sizes_and_the_lens_that_it_was_seen_by(
+    logs: dict[str, Path], place: Path
+) -> None:
+    """Its poses are a larger sheet's, or another lens's: numbers from them would look fine."""
+    larger = "target: {large: {side_m: 0.16}, small: {side_m: 0.025}}\n"
+    (place / "larger.yaml").write_text(f"extends: mine.yaml\n{larger}")
+    refused(
+        mount("-p", "larger.yaml", "--from", logs["pivot"], "--write"), 30,
+        "seen by markers of 150 and 25 mm", "the profile has markers of 160 and 25 mm",
+    )  # fmt: skip
+    assert "rpy_deg" not in (place / "larger.yaml").read_text()
+
+
+def test_a_recording_that_does_not_say_what_it_was_seen_by_is_named(
+    logs: dict[str, Path], place: Path, undrawn: None
+) -> None:
+    (pivot,) = read_recordings(logs["pivot"])
+    write_recordings(place / "old.jsonl", [replace(pivot, seen_by="")])
+    said = mount("-p", "mine.yaml", "--from", "old.jsonl")
+    assert said.exit_code == 0
+    assert "does not say by which sizes and lens it was seen: unchecked" in said.stderr
+
+
+def test_the_simulator_s_truth_is_told_beside_what_was_measured(
+    place: Path, undrawn: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true = {"rpy_deg": [1.0, -2.0, 90.0], "latency_s": 0.07, "gear_cam_m": [0.03, 0.0, 0.04]}
+    monkeypatch.setattr(
+        calibrate_mount, "_simulated", lambda _: ([seen(hand("pivot", SEED))], true)
+    )
+    said = mount("-p", "sim", "--truth", "sim", "--part", "pivot")
+    assert said.exit_code == 0
+    assert (
+        "true in the simulator: 1.00 -2.00 90.00 deg; 70.0 ms; 30.00 0.00 40.00 mm" in said.stderr
+    )
+
+
+def test_the_report_names_only_what_was_measured(logs: dict[str, Path]) -> None:
+    carry, pivot = (read_recordings(logs[part])[0] for part in ("carry", "pivot"))
+    carried, pivoted = solve_carry(carry), solve_pivot(pivot)
+    sim = load_profile("sim")
+    assert Comparison(sim, None, pivoted).camera_label == ""
+    assert Comparison(sim, carried, None).camera_label == "camera, turn as measured"
+    placed = replace(carried, cam_body_m=np.zeros(3), cam_body_sigma_m=np.full(3, 1e-4))
+    assert Comparison(sim, placed, None).camera_label == "camera, as measured"

@@ -1,0 +1,292 @@
+"""`perchctl calibrate --mount` on a live camera and vehicle: read, guided, kept, never armed."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.calibration.files import load_calibration
+from perchctl.calibration.mounting.capture import (
+    LEAST_S,
+    MOST_S,
+    Moment,
+    Sensors,
+    Tape,
+    capture,
+)
+from perchctl.calibration.mounting.eye import Eye
+from perchctl.calibration.mounting.recording import AttitudeSample, SeenPose, read_recordings
+from perchctl.cli import app
+from perchctl.commands import calibrate_mount_live
+from perchctl.commands.calibrate_mount_live import guide, page_state
+from perchctl.errors import InvalidValue, TimedOut
+from perchctl.geometry import R_MARKER_TARGET
+from perchctl.link.motion import MotionLink
+from perchctl.profile import load_profile
+from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.scenario import Scenario
+from perchctl.vision.types import Frame
+from tests.helpers.mounting import hand, seen
+from tests.helpers.relay import relayed
+from tests.helpers.target_picture import CAMERA, pose_of, render
+
+RPY_RAD = (0.1, 0.2, 0.5)
+STILL = Scenario(ceiling_z_m=1.4)
+
+
+@pytest.fixture(scope="module")
+def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
+    """A vehicle that a hand holds still, 0.8 m under the target."""
+    camera = load_calibration("example_640x480.yaml")
+    with pytest.MonkeyPatch.context() as patch, SimProcess.start(STILL, camera=camera) as process:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+        process.set_pose((0.0, 0.0, 0.6), RPY_RAD, hold=True)
+        yield process
+
+
+def press_after(poses: int) -> Callable[[], contextlib.AbstractContextManager[object]]:
+    """In the guide's place: Ctrl-C once so many poses are there."""
+
+    @contextlib.contextmanager
+    def pressing() -> Iterator[Callable[[Moment], None]]:
+        pressed: list[bool] = []
+
+        def tell(moment: Moment) -> None:
+            if moment.poses >= poses and not pressed:
+                pressed.append(True)
+                os.kill(os.getpid(), signal.SIGINT)
+
+        yield tell
+
+    return pressing
+
+
+def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
+    sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(calibrate_mount_live, "guide", press_after(10))
+    Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
+    with relayed(sim.uri) as relay:
+        words = ["-p", "mine.yaml", "-u", relay.uri, "--source", sim.stream_url, "--part", "carry"]
+        said = CliRunner().invoke(app, ["calibrate", "--mount", *words])
+        assert relay.up
+        assert relay.commands() == []
+        assert relay.writes() == []
+    assert max(sim.truth()["motors"]) == 0
+    assert said.exit_code == 130, said.stderr
+    log = Path("calib/mounting_mine.jsonl")
+    assert f"kept the recording: {log}" in said.stderr
+    assert f"perchctl calibrate --mount -p mine.yaml --from {log}" in said.stderr
+    (recording,) = read_recordings(log)
+    assert len(recording.poses) >= 10
+    newest = recording.attitudes[-1]
+    rpy_rad = (newest.roll_rad, newest.pitch_rad, newest.yaw_rad)
+    assert rpy_rad == pytest.approx(sim.truth()["rpy_rad"], abs=0.05)
+    assert newest.position_m is not None
+    assert newest.position_m == pytest.approx([0.0, 0.0, 0.6], abs=0.1)
+    ages_s = np.diff([a.t_s for a in recording.attitudes])
+    assert np.median(ages_s) == pytest.approx(0.01, abs=1e-4)
+    assert abs(recording.poses[-1].t_s - newest.t_s) < 0.5  # one clock
+    again = CliRunner().invoke(app, ["calibrate", "--mount", "-p", "mine.yaml", "--from", str(log)])
+    assert again.exit_code == 30
+    assert "lacks motion" in again.stderr
+
+
+def test_a_vehicle_that_does_not_answer(
+    sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
+        mute.bind(("127.0.0.1", 0))
+        uri = f"udp://127.0.0.1:{mute.getsockname()[1]}"
+        Path("mine.yaml").write_text(
+            "extends: crazyflie\nlink: {connect_timeout_s: 0.5}\n", encoding="utf-8"
+        )
+        words = ["-p", "mine.yaml", "-u", uri, "--source", sim.stream_url]
+        said = CliRunner().invoke(app, ["calibrate", "--mount", *words])
+    assert said.exit_code == 10
+    assert f"no Crazyflie at {uri}: no answer" in said.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
+
+
+def test_turning_motors_end_it(
+    sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vehicle in a hand must not have them on."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(MotionLink, "motors_run", True)
+    words = ["-p", "crazyflie", "-u", sim.uri, "--source", sim.stream_url]
+    said = CliRunner().invoke(app, ["calibrate", "--mount", *words])
+    assert said.exit_code == 52
+    assert "motors" in said.stderr
+    assert not list(tmp_path.iterdir())
+
+
+# --- the guided recording, without a clock -------------------------------------------------
+
+
+class _Film:
+    """A live source that runs by `now`: one picture each 1/15 s, until `ends_s`."""
+
+    live = True
+    finished = False
+    size_px = (640, 480)
+
+    def __init__(self, ends_s: float = np.inf, flooding: bool = False) -> None:
+        self.now_s, self._ends_s, self._count = 0.0, ends_s, 0
+        self._flooding = flooding  # pictures faster than they are looked at
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+    def poll(self, now_s: float) -> Frame | None:
+        if now_s > self._ends_s or (now_s * 15.0 < self._count and not self._flooding):
+            return None
+        self._count += 1
+        self.now_s += 0.01 * self._flooding
+        return Frame(self._count, now_s, np.zeros((480, 640), np.uint8), now_s)
+
+    def problem(self, now_s: float) -> str | None:
+        return "camera:0 is unplugged" if now_s > self._ends_s else None
+
+    def describe(self) -> str:
+        return "camera:0"
+
+    def close(self) -> None:
+        return None
+
+
+class _Looks(Eye):
+    """Gives the poses of a recording at their times, or none."""
+
+    def __init__(self, poses: tuple[SeenPose, ...], mirrored: bool = False) -> None:
+        self._poses, self._is_mirrored = list(poses), mirrored
+        self.mirrored, self.outlines, self.trouble = 0, (), ""
+
+    def look(self, frame: Frame) -> list[SeenPose]:
+        self.mirrored += self._is_mirrored
+        found = [pose for pose in self._poses if pose.t_s <= frame.t_s]
+        del self._poses[: len(found)]
+        return found
+
+
+def feed(attitudes: tuple[AttitudeSample, ...], film: _Film) -> Callable[[], list[AttitudeSample]]:
+    left = list(attitudes)
+
+    def arrived() -> list[AttitudeSample]:
+        due = [a for a in left if a.t_s <= film.now_s]
+        del left[: len(due)]
+        return due
+
+    return arrived
+
+
+def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
+    whole = seen(hand("carry", seconds=LEAST_S["carry"] + 3.0))
+    film, tape, moments = _Film(), Tape("carry"), []
+    capture(
+        tape, film, _Looks(whole.poses), Sensors(feed(whole.attitudes, film)), moments.append,
+        film.clock, film.sleep,
+    )  # fmt: skip
+    assert film.now_s == pytest.approx(LEAST_S["carry"], abs=0.5)
+    assert moments[0].missing
+    assert moments[-1].missing == ()
+    assert moments[-1].advice.startswith("enough")
+    turns = {word for moment in moments for m in moment.missing for word in m.split(":")[:1]}
+    assert {"yaw", "longer"} & turns
+    assert tape.recording().poses[:100] == whole.poses[:100]
+
+
+def test_the_advice_names_what_is_in_the_way_first() -> None:
+    film, moments = _Film(), []
+    ended = lambda: film.now_s > 2.0  # noqa: E731
+    capture(
+        Tape("pivot"), film, _Looks(()), Sensors(), moments.append, film.clock, film.sleep, ended
+    )
+    assert moments[-1].advice == "no target in view"
+    film = _Film()
+    capture(
+        Tape("pivot"), film, _Looks((), mirrored=True), Sensors(), moments.append, film.clock,
+        film.sleep, ended,
+    )  # fmt: skip
+    assert "mirrored" in moments[-1].advice
+    assert "camera.mirrored" in moments[-1].advice
+
+
+def test_a_mirrored_picture_ends_it_soon() -> None:
+    film, tape = _Film(), Tape("carry")
+    with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
+        capture(
+            tape, film, _Looks((), mirrored=True), Sensors(), lambda _: None, film.clock,
+            film.sleep,
+        )  # fmt: skip
+    assert film.now_s < 5.0
+
+
+def test_pictures_become_poses_or_are_counted_as_mirrored() -> None:
+    rvec, tvec = pose_of(0.02, -0.01, 0.6, yaw_rad=0.4)
+    picture = render(rvec, tvec, CAMERA)
+    eye = Eye(load_profile("sim"), CAMERA, live=True)
+    (pose,) = eye.look(Frame(0, 1.25, picture, 1.25))
+    assert pose.t_s == 1.25
+    assert pose.position_cam_target_m == pytest.approx(tvec, abs=1e-3)
+    wanted = cv2.Rodrigues(rvec)[0] @ R_MARKER_TARGET
+    assert pose.rotation_cam_target == pytest.approx(wanted, abs=0.02)
+    assert pose.covariance is not None
+    assert [name for name, _ in eye.outlines] == ["large", "small"]
+    assert eye.look(Frame(1, 1.3, picture, 1.3)) == []  # the receiver repeats it
+    assert eye.mirrored == 0
+    flipped = Eye(load_profile("sim"), CAMERA, live=True)
+    assert flipped.look(Frame(0, 1.0, np.ascontiguousarray(picture[:, ::-1]), 1.0)) == []
+    assert flipped.mirrored == 1
+
+
+def test_nobody_records_for_ever() -> None:
+    film = _Film()
+    capture(Tape("pivot"), film, _Looks(()), Sensors(), lambda _: None, film.clock, film.sleep)
+    assert film.now_s == pytest.approx(MOST_S, abs=1.0)
+
+
+def test_a_camera_or_a_vehicle_that_goes_ends_it_and_the_tape_keeps_what_was() -> None:
+    whole = seen(hand("pivot"))
+    film, tape = _Film(ends_s=3.0), Tape("pivot")
+    with pytest.raises(TimedOut, match="camera:0 is unplugged"):
+        capture(tape, film, _Looks(whole.poses), Sensors(), lambda _: None, film.clock, film.sleep)
+    assert len(tape.poses) > 20
+    film, tape = _Film(flooding=True), Tape("pivot")
+    silent = Sensors(problem=lambda now_s: "nothing heard for 2 s" if now_s > 1.0 else None)
+    with pytest.raises(TimedOut, match="the vehicle is gone: nothing heard for 2 s"):
+        capture(tape, film, _Looks(whole.poses), silent, lambda _: None, film.clock, film.sleep)
+    assert tape
+
+
+def test_a_pipe_gets_one_line_an_advice_and_the_page_its_bars() -> None:
+    moment = Moment(
+        0, np.zeros((4, 4), np.uint8), (), "carry", 3.0, 20, 0.5, ("yaw: turn it",), "a"
+    )
+    out = io.StringIO()
+    with guide(out) as tell:
+        for advice in ("a", "a", "b"):
+            tell(replace(moment, advice=advice))
+    assert out.getvalue().splitlines() == ["perchctl: carry, 3 s: a", "perchctl: carry, 3 s: b"]
+    state = page_state(moment)
+    assert state["phase"] == "a"
+    assert ["target", "50 %", 0.5] in state["rows"]
+    assert ["missing", "yaw: turn it"] in state["rows"]

@@ -1,0 +1,49 @@
+"""One simulated vehicle with its camera, and a wire to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+if TYPE_CHECKING:
+    from perchctl.sim.process.handle import SimProcess
+    from tests.helpers.relay import Relay
+
+
+@pytest.fixture
+def elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Logs and the table cache stay out of the user's folders; the ranges come at once."""
+    from perchctl.check import camera
+    from perchctl.target.design import Ranges
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("CFLIB_URI", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+    # By trial, for a second or two; tests/target has them.
+    ranges = Ranges(3.0, 0.5, 0.16, 0.12, 0.03, 20.0, 20.0, 380.0)
+    monkeypatch.setattr(camera, "design_ranges", lambda *_: ranges)
+
+
+@pytest.fixture(scope="module")
+def sim() -> Iterator[SimProcess]:
+    from perchctl.calibration.files import camera_of
+    from perchctl.sim.process.handle import SimProcess
+    from tests.helpers.checks import PROFILE
+
+    with SimProcess.start(camera=camera_of(PROFILE.camera)) as process:
+        yield process
+
+
+@pytest.fixture
+def relay(sim: SimProcess) -> Iterator[Relay]:
+    from tests.helpers.relay import relayed
+
+    with relayed(sim.uri) as wire:
+        yield wire

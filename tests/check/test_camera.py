@@ -1,0 +1,336 @@
+"""Each fault that the simulated camera can have makes its row fail or warn; in lockstep, so that
+no time of the computer's decides."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.calibration.files import camera_of
+from perchctl.camera.health import MEANING
+from perchctl.check import camera, computer
+from perchctl.check.camera import Optical
+from perchctl.check.pictures import Blur, Light
+from perchctl.check.rehearsal import Rehearsal, Silent, rehearse
+from perchctl.check.row import Row, Verdict
+from perchctl.errors import NotFound
+from perchctl.faults.camera import FaultyCamera
+from perchctl.faults.effects import FOR_EVER, CameraFault
+from perchctl.flight.lockstep import LockstepClock, LockstepSource
+from perchctl.link.mock import MockLink
+from perchctl.pipeline import make_pipeline
+from perchctl.profile import load_profile
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.target.blind import Blind, Mounted
+from perchctl.target.design import GearRanges, Ranges, make_design
+from perchctl.target.limits import Optics
+from tests.helpers.mission import target_at
+
+PROFILE = load_profile("sim")
+CAMERA = camera_of(PROFILE.camera)
+PIPELINE = make_pipeline(PROFILE, CAMERA)
+RANGES = Ranges(3.0, 0.5, 0.16, 0.12, 0.03, 20.0, 20.0, 380.0)
+DESIGN = make_design(PROFILE.target, CAMERA, Optics(), PROFILE, ranges=RANGES)
+NEAR_M = 0.45
+"""From the gear to the target: both markers are seen."""
+FAR_FOR_BOTH_M = 1.4
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _one_core() -> Iterator[None]:
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(threads)
+
+
+class Stopwatch:
+    """Each turn's work takes so long."""
+
+    def __init__(self, work_s: float) -> None:
+        self._work_s, self._now_s, self._odd = work_s, 0.0, False
+
+    def __call__(self) -> float:
+        self._now_s, self._odd = self._now_s + self._work_s * self._odd, not self._odd
+        return self._now_s
+
+
+def rehearsed(
+    fault: CameraFault | None = None,
+    away_m: float = NEAR_M,
+    duration_s: float = 0.4,
+    **scenario: Any,
+) -> Rehearsal:
+    """On the pictures of a vehicle that is held under the target."""
+    changed = {"camera_noise_sigma": 4.0, "camera_jitter_s": 0.002} | scenario
+    vehicle = SimulatedVehicle(Scenario(**changed), CAMERA, PROFILE.target)
+    z_m = vehicle.scenario.ceiling_z_m - away_m - 0.03
+    vehicle.world.set_pose((0.0, 0.0, z_m), hold=True)
+    link = MockLink(vehicle)
+    link.advance_to(0.3)
+    assert vehicle.camera is not None
+    source = FaultyCamera(LockstepSource(vehicle.camera, PROFILE.camera.latency_s), seed=1)
+    if fault is not None:
+        source.begin(fault, 0.4)
+    clock = LockstepClock(link)
+    return rehearse(link, source, PIPELINE, PROFILE, clock, duration_s, Stopwatch(0.005))
+
+
+def rows_of(done: Rehearsal, optical: Optical | None = None) -> dict[str, Row]:
+    optical = optical or camera.optical_of(done, PIPELINE)
+    found = camera.rows(done, optical, DESIGN, PROFILE)
+    assert [row.name for row in found] == list(camera.PICTURE_NAMES)
+    return {row.name: row for row in [*found, computer.loop_row(done, PROFILE)]}
+
+
+FAULTS: dict[str, dict[str, Any]] = {
+    "none": {"duration_s": 0.6},
+    "frozen": {"fault": CameraFault("frozen", FOR_EVER), "duration_s": 0.8},
+    "snow": {"fault": CameraFault("snow", FOR_EVER)},
+    "dark": {"fault": CameraFault("dark", FOR_EVER)},
+    "mirrored": {"fault": CameraFault("mirrored", FOR_EVER)},
+    "lossy, and a wrong print": {"camera_drop_rate": 0.35, "small_side_m": 0.024,
+                                 "duration_s": 0.8},
+    "slow and noisy": {"camera_rate_hz": 6.0, "camera_noise_sigma": 22.0, "duration_s": 0.8},
+    "out of focus": {"camera_defocus_px": 3.2},
+    "bare": {"no_target": True},
+    "silent": {"fault": CameraFault("silent", FOR_EVER), "duration_s": 0.8},
+    "out of order": {"fault": CameraFault("out-of-order", FOR_EVER)},
+}  # fmt: skip
+
+
+@cache
+def shown(fault: str) -> tuple[Rehearsal, dict[str, Row]]:
+    done = rehearsed(**FAULTS[fault])
+    return done, rows_of(done)
+
+
+def good() -> tuple[Rehearsal, dict[str, Row]]:
+    return shown("none")
+
+
+def test_a_good_camera_fails_nothing() -> None:
+    _, rows = good()
+    assert [row for row in rows.values() if row.verdict in ("warn", "fail", "skipped")] == []
+    assert "0.45 m from the gear" in rows["target"].found
+
+
+@pytest.mark.parametrize(("fault", "name", "verdict", "words"), [
+    ("frozen", "pictures", "fail", "stands still"),
+    ("snow", "pictures", "fail", "snow"),
+    ("dark", "pictures", "fail", "dark"),
+    ("dark", "light", "warn", "mean"),
+    ("mirrored", "mirrored", "fail", "mirrored"),
+    ("lossy, and a wrong print", "lost frames", "warn", "longest gap"),
+    ("lossy, and a wrong print", "print", "fail", "print error"),
+    ("slow and noisy", "frame rate", "fail", "6 Hz"),
+    ("slow and noisy", "noise", "warn", "sigma"),
+    ("out of focus", "focus", "fail", "blur sigma 3"),
+    ("bare", "target", "skipped", "not in view"),
+    ("silent", "lost frames", "fail", "none for the last 0."),
+    ("out of order", "pictures", "fail", "came after newer ones"),
+])  # fmt: skip
+def test_a_fault_of_the_simulated_camera_makes_its_row(
+    fault: str, name: str, verdict: str, words: str
+) -> None:
+    row = shown(fault)[1][name]
+    assert row.verdict == verdict, row
+    assert words in row.found
+    assert row.advice
+    assert good()[1][name].verdict is Verdict.PASS
+
+
+def test_what_a_target_would_tell_is_not_known_without_one() -> None:
+    for name in ("target", "focus", "mirrored", "print", "ranges"):
+        assert shown("bare")[1][name].verdict is Verdict.SKIPPED, name
+
+
+def test_a_print_is_judged_by_both_markers_only() -> None:
+    far = rehearsed(away_m=FAR_FOR_BOTH_M, duration_s=0.2)
+    assert rows_of(far)["print"].verdict is Verdict.SKIPPED
+
+
+def test_a_camera_that_falls_silent_at_once_fails_and_nothing_passes() -> None:
+    rows = rows_of(rehearsed(CameraFault("silent", FOR_EVER), duration_s=0.0))
+    assert rows["frame rate"].verdict is Verdict.FAIL
+    assert {r.verdict for r in rows.values() if r.name != "frame rate"} == {Verdict.SKIPPED}
+
+
+# --- Rows by figures --------------------------------------------------------------------
+
+
+def altered(**changes: Any) -> Rehearsal:
+    """The good rehearsal with other figures."""
+    return replace(good()[0], **changes)
+
+
+def gaps(*gaps_s: float) -> list[tuple[int, float]]:
+    t_s, out = 0.0, [(0, 0.0)]
+    for number, gap_s in enumerate(gaps_s, start=1):
+        t_s += gap_s
+        out.append((number, t_s))
+    return out
+
+
+@pytest.mark.parametrize(("name", "verdict", "changes"), [
+    ("lost frames", "fail", {"arrivals": gaps(*[0.03] * 20, 0.7)}),
+    ("lost frames", "fail", {"arrivals": gaps(*[0.03] * 12, *[0.12] * 9)}),
+    ("lost frames", "skipped", {"arrivals": gaps(0.03, 0.03)}),
+    ("lost frames", "skipped", {"live": False}),
+    ("frame rate", "warn", {"arrivals": gaps(*[0.08] * 20)}),
+    ("frame rate", "skipped", {"live": False}),
+    ("picture age", "warn", {"ages_s": [0.3] * 20}),
+    ("picture age", "fail", {"ages_s": [0.5] * 20}),
+    ("picture age", "skipped", {"live": False}),
+    ("pictures", "warn", {"problems": Counter({MEANING["repeated"]: 2})}),
+    ("target", "warn", {"found": 3, "target": None}),
+    ("target", "fail", {"target": target_at(1.0, (0.0, 0.0, 0.23), (0.0, 0.0, 0.0))}),
+    ("loop", "warn", {"work_s": [0.028] * 20}),
+    ("loop", "fail", {"work_s": [0.050] * 20}),
+    ("loop", "warn", {"late_s": [0.0] * 90 + [0.02] * 10}),
+    ("loop", "fail", {"late_s": [0.0] * 99 + [0.3]}),
+    ("loop", "skipped", {"work_s": [0.01] * 5}),
+    ("loop", "skipped", {"live": False}),
+])  # fmt: skip
+def test_figures_make_their_row(name: str, verdict: str, changes: dict[str, Any]) -> None:
+    done = altered(**changes)
+    assert rows_of(done, Optical())[name].verdict == verdict
+
+
+@pytest.mark.parametrize(("name", "verdict", "optical"), [
+    ("light", "warn", Optical(light=Light(200.0, 0.5, 0.0))),
+    ("light", "warn", Optical(light=Light(30.0, 0.0, 0.2))),
+    ("light", "skipped", Optical()),
+    ("noise", "fail", Optical(noise=40.0)),
+    ("noise", "skipped", Optical()),
+    ("focus", "warn", Optical(blur=Blur(2.0, 2.0))),
+    ("focus", "warn", Optical(blur=Blur(0.8, 2.5))),
+    ("ranges", "skipped", Optical()),
+])  # fmt: skip
+def test_what_a_picture_is_like_makes_its_row(name: str, verdict: str, optical: Optical) -> None:
+    assert rows_of(good()[0], optical)[name].verdict == verdict
+
+
+def test_a_gap_in_the_target_s_ranges_is_told() -> None:
+    blind = Mounted(Blind(None, None))
+    gap = replace(DESIGN, warnings=("gap between the markers",), gear=GearRanges(None, None),
+                  mount=blind)  # fmt: skip
+    rows = {r.name: r for r in camera.rows(good()[0], Optical(blur=Blur(1.0, 1.0)), gap, PROFILE)}
+    assert rows["ranges"].verdict is Verdict.WARN
+    assert "gap between the markers" in rows["ranges"].found
+
+
+def test_the_better_turn_of_the_camera_is_told() -> None:
+    """As `make-target` tells it: with the gear beside the picture's height."""
+    profile = PROFILE.model_copy(update={"camera": PROFILE.camera.model_copy(update={
+        "mount": PROFILE.camera.mount.model_copy(update={
+            "position_m": (0.0, 0.03, 0.03), "rpy_deg": (0.0, 0.0, 0.0)})})})  # fmt: skip
+    design = make_design(profile.target, CAMERA, Optics(), profile, ranges=RANGES)
+    (row,) = (r for r in camera.rows(good()[0], Optical(), design, profile) if r.name == "blind")
+    assert row.verdict is Verdict.WARN
+    assert "camera.mount.rpy_deg" in row.advice
+
+
+def test_the_ranges_are_those_of_these_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Optics] = []
+
+    def ranges(target: Any, model: Any, optics: Optics, trials: int) -> Ranges:
+        asked.append(optics)
+        return RANGES
+
+    monkeypatch.setattr(camera, "design_ranges", ranges)
+    done = altered(target=target_at(1.0, (0.0, 0.0, 2.2), (0.0, 0.0, 0.0)), height_m=0.0)
+    optical = Optical(noise=9.3, blur=Blur(1.4, 1.6))
+    design = camera.design_of(done, optical, PIPELINE, PROFILE)
+    assert asked == [Optics(1.5, 9.0)]
+    assert design.search_range_m == pytest.approx(2.2 - 1.3 - 0.005, abs=0.01)
+
+
+def test_an_unknown_height_says_nothing_of_the_ceiling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen from 1 m, and without telemetry: that is no ceiling at 1 m."""
+    monkeypatch.setattr(camera, "design_ranges", lambda *_: RANGES)
+    near = target_at(1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
+    optical = Optical(noise=4.0, blur=Blur(1.0, 1.0))
+    design = camera.design_of(altered(target=near, height_m=None), optical, PIPELINE, PROFILE)
+    assert design.search_range_m is None
+    assert design.warnings == DESIGN.warnings  # those of no ceiling
+    on_the_floor = camera.design_of(altered(target=near, height_m=0.0), optical, PIPELINE, PROFILE)
+    assert len(on_the_floor.warnings) > len(design.warnings)
+
+
+def test_pictures_of_another_size_are_not_looked_at() -> None:
+    row = camera.size_row((320, 240), (640, 480))
+    assert row.verdict is Verdict.FAIL
+    assert "320x240" in row.found
+    assert camera.size_row((640, 480), (640, 480)).verdict is Verdict.PASS
+    assert camera.size_row(None, (640, 480)).verdict is Verdict.SKIPPED
+    rest = camera.unseen("of another size", row)
+    assert [r.name for r in rest] == ["size", *camera.PICTURE_NAMES]
+    assert {r.verdict for r in rest[1:]} == {Verdict.SKIPPED}
+
+
+def test_a_missing_camera_names_those_that_are_there() -> None:
+    error = NotFound("camera:7 was not found; there are camera:0; plug in the camera")
+    first, *rest = camera.refused(error, ["camera:0"])
+    assert (first.name, first.verdict) == ("camera", Verdict.FAIL)
+    assert "camera:0" in first.found
+    assert first.advice == "plug in the camera"
+    assert {r.verdict for r in rest} == {Verdict.SKIPPED}
+    told = camera.refused(NotFound("http://x: no answer"), ["camera:2"])[0]
+    assert "camera:2" in told.advice
+
+
+# --- The rehearsal itself, and the computer ---------------------------------------------
+
+
+class Shouting(Silent):
+    """A link that may only be listened to."""
+
+    def send(self, command: Any) -> None:
+        raise AssertionError("nothing is sent in a rehearsal")
+
+
+def test_a_rehearsal_sends_nothing_and_needs_no_vehicle() -> None:
+    vehicle = SimulatedVehicle(Scenario(), CAMERA, PROFILE.target)
+    clock = LockstepClock(MockLink(vehicle))
+    assert vehicle.camera is not None
+    source = LockstepSource(vehicle.camera, 0.07)
+    done = rehearse(Shouting(), source, PIPELINE, PROFILE, clock, 0.3, time.perf_counter)
+    assert done.pictures > 3
+    assert done.height_m is None
+
+
+def test_the_log_s_folder_is_not_made(tmp_path: Path) -> None:
+    folder = tmp_path / "a" / "b"
+    assert computer.log_folder_row(folder).verdict is Verdict.PASS
+    assert computer.disk_row(folder).verdict is not Verdict.SKIPPED
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_log_folder_that_is_a_file_fails(tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    row = computer.log_folder_row(tmp_path / "taken")
+    assert row.verdict is Verdict.FAIL
+    assert "is a file" in row.found
+
+
+@pytest.mark.parametrize(("free", "verdict"), [
+    (10_000_000, "fail"), (200_000_000, "warn"), (5_000_000_000, "pass"),
+])  # fmt: skip
+def test_a_full_disk_is_told(
+    free: int, verdict: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = type("Usage", (), {"free": free, "total": 10**12})
+    monkeypatch.setattr(computer.shutil, "disk_usage", lambda path: usage)
+    assert computer.disk_row(tmp_path).verdict == verdict

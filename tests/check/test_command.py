@@ -1,0 +1,184 @@
+"""`perchctl check`: its table, its JSON, its exit codes, Ctrl-C; and what `fly` takes from it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.check import camera, gone, session
+from perchctl.check.row import Row, Verdict, failed, passed, skipped, warned
+from perchctl.check.session import Wanted
+from perchctl.cli import app
+from perchctl.commands import check as command
+from perchctl.commands.check import CheckRequest, exit_code, run, table
+from perchctl.errors import UsageError
+from perchctl.sim.process.handle import SimProcess
+from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed
+from tests.helpers.flights import ROOT
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+# --- The command ------------------------------------------------------------------------
+
+
+def invoke(*words: str) -> Any:
+    return CliRunner().invoke(app, ["check", *words])
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "_wanted", lambda request: Wanted(**QUICK))
+
+
+def test_json_is_a_list_of_rows(quick: None) -> None:
+    (Path.cwd() / "mine.yaml").write_text(
+        "extends: sim\nlink: {connect_timeout_s: 0.4}\n", encoding="utf-8"
+    )
+    said = invoke("-p", "mine.yaml", "-u", NOWHERE, "--source", "camera:97", "--json")
+    rows = json.loads(said.stdout)
+    assert all(set(row) == {"name", "verdict", "found", "advice"} for row in rows)
+    assert {row["verdict"] for row in rows} <= {v.value for v in Verdict}
+    assert said.exit_code == 10
+    named = {row["name"]: row for row in rows}
+    assert named["camera"]["verdict"] == "fail"
+    assert len(named) == len(rows)
+
+
+@pytest.mark.parametrize(("words", "code", "complaint"), [
+    (("-p", "none"), 20, "profile 'none' not found"),
+    (("-u", "radio:/0"), 30, "is not one of a vehicle"),
+    (("--scan", "-u", "radio:/0"), 30, "is not one of a vehicle"),
+    (("--source", "nonsense:1"), 30, "camera source"),
+    (("-u", NOWHERE), 2, "belongs to the simulated vehicle"),
+    (("-u", NOWHERE, "--source", "video:old.mp4"), 2, "is a recording"),
+    (("--seed", "-1"), 30, "seed -1 is negative"),
+    (("--prop-test",), 2, "nobody to ask"),
+    (("--yes",), 2, "--yes answers --prop-test"),
+    (("--scan", "--lift"), 2, "--scan only shows"),
+    (("--scan", "--prop-test", "--yes"), 2, "--scan only shows"),
+])  # fmt: skip
+def test_bad_input_is_one_sentence(words: tuple[str, ...], code: int, complaint: str) -> None:
+    said = invoke(*words)
+    assert said.exit_code == code
+    assert said.stdout == ""
+    lines = [line for line in said.stderr.splitlines() if "scanning" not in line]
+    assert len(lines) == 1
+    assert complaint in lines[0]
+
+
+def test_a_broken_calibration_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "broken.yaml").write_text("no: calibration\n", encoding="utf-8")
+    (tmp_path / "p.yaml").write_text("extends: sim\ncamera: {calibration: broken.yaml}\n")
+    said = invoke("-p", "p.yaml")
+    assert said.exit_code == 30
+    assert len(said.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("stage", ["starting", "connecting", "opening"])
+def test_ctrl_c_ends_with_what_was_found(
+    stage: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], sim: SimProcess
+) -> None:
+    def tell(text: str) -> None:
+        if text.startswith(stage):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
+    code = run(CheckRequest(), Wanted(**QUICK, tell=tell))
+    printed = capsys.readouterr()
+    assert code == 130
+    assert "Ctrl-C" in printed.err
+    assert ("supervisor" in printed.out) is (stage == "opening")
+    assert not printed.out or "not finished" in printed.out
+    assert "nothing fails" not in printed.out
+
+
+def test_a_motor_test_needs_somebody_to_ask() -> None:
+    with pytest.raises(UsageError, match="add --yes"):
+        run(CheckRequest(prop_test=True))
+
+
+@pytest.mark.parametrize(("answer", "leave"), [("y", True), ("yes", True), ("", False),
+                                               ("no", False), (None, False)])  # fmt: skip
+def test_only_yes_is_a_yes(
+    answer: str | None, leave: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def typed() -> str:
+        if answer is None:
+            raise EOFError
+        return answer
+
+    monkeypatch.setattr("builtins.input", typed)
+    assert command._confirmed() is leave
+
+
+ROWS = [
+    passed("address", "sim:// answers"),
+    warned("lost frames", "22 %, longest gap 111 ms " + "and more " * 12, "bring it nearer " * 8),
+    failed("battery", "the battery rests at 3.50 V", "charge it"),
+    skipped("print", "both markers must be in view", "hold it nearer"),
+    skipped("radio", "none in sim://"),
+    skipped("signal", "the vehicle does not answer"),
+    skipped("packets", "the vehicle does not answer"),
+]
+
+
+def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
+    lines = table(ROWS).splitlines()
+    assert max(map(len, lines)) <= 80
+    text = re.sub(r"\s+", " ", " ".join(lines))
+    assert "FAIL battery the battery rests at 3.50 V -> charge it" in text
+    assert "skip signal, packets: the vehicle does not answer" in text
+    assert lines[-1] == "1 pass, 1 warn, 1 FAIL, 4 skip: not fit to fly: battery"
+    assert table(ROWS[:2]).splitlines()[-1].endswith("nothing fails")
+    assert "not finished" in table(ROWS[:2], finished=False).splitlines()[-1]
+
+
+@pytest.mark.parametrize(("rows", "code"), [
+    (ROWS[:2], 0),
+    (ROWS, 52),
+    ([failed("address", "", "")], 10),
+    ([failed("camera", "", ""), failed("battery", "", "")], 20),
+    ([skipped("address", "")], 0),
+])  # fmt: skip
+def test_the_exit_code_is_the_first_failing_row_s(rows: list[Row], code: int) -> None:
+    assert exit_code(rows) == code
+
+
+# --- The quick part before a flight -----------------------------------------------------
+
+
+def test_a_flight_is_refused_for_what_the_profile_or_the_disk_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = type("Usage", (), {"free": 1_000_000, "total": 10**12})
+    monkeypatch.setattr("perchctl.check.computer.shutil.disk_usage", lambda path: usage)
+    said = CliRunner().invoke(app, ["fly", "-u", NOWHERE, "--source", "camera:97", "--yes"])
+    assert said.exit_code == 52
+    assert "disk: 1 MB free" in said.stderr
+    assert "connecting" not in said.stderr
+
+
+def test_a_flight_says_what_its_profile_makes_doubtful(tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_text(
+        "extends: sim\nvehicle: {gear_body_m: [0.2, 0, 0.03]}\n"
+        "camera: {mount: {position_m: [0.2, 0.0, 0.0]}}\nlink: {connect_timeout_s: 0.4}\n"
+    )
+    words = ["fly", "-p", "p.yaml", "-u", NOWHERE, "--source", "camera:97", "--yes"]
+    said = CliRunner().invoke(app, words)
+    warned_of = [line for line in said.stderr.splitlines() if line.startswith("perchctl: check: ")]
+    assert any("gear place" in line for line in warned_of)
+    assert said.exit_code in (10, 20)
+
+
+def test_every_row_is_on_its_page() -> None:
+    page = (ROOT / "docs" / "check.md").read_text(encoding="utf-8")
+    for name in (*VEHICLE, gone.NAME, *camera.NAMES, "loop", "disk", "log folder"):
+        assert f"`{name}`" in page, name

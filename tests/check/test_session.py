@@ -1,0 +1,196 @@
+"""The check as a whole: what goes out on the wire, one that does not answer, who else does."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.check import camera, health, session
+from perchctl.check.row import Row, Verdict
+from perchctl.check.session import Wanted, check
+from perchctl.commands.check import exit_code
+from perchctl.link.scan import Answering, address_of, scan
+from perchctl.profile import Profile
+from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.scenario import Scenario
+from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
+from tests.helpers.relay import Relay
+
+pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+# --- What goes out ----------------------------------------------------------------------
+
+
+def test_nothing_arms_flies_or_turns_without_a_yes(sim: SimProcess, relay: Relay) -> None:
+    """The whole check, from the first packet to the last, through the wire."""
+    asked: list[str] = []
+
+    def no() -> bool:
+        asked.append("?")
+        return False
+
+    wait_for(sim, 1.5)
+    rows = list(check(options(relay.uri, sim.stream_url), Wanted(no, lift=True, **QUICK)))
+    by_name = {row.name: row for row in rows}
+    assert by_name["address"].verdict is Verdict.PASS
+    assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
+    assert set(camera.NAMES) | {"loop", "disk", "log folder", "markers"} <= set(by_name)
+    assert asked == ["?"]
+    assert by_name["propellers"].found == "not confirmed"
+    assert len(relay.up) > 100
+    assert relay.commands() == []
+    assert relay.writes() == []
+
+
+def test_a_yes_starts_the_motor_test_and_nothing_else(sim: SimProcess, relay: Relay) -> None:
+    wait_for(sim, 1.5)
+    rows = {row.name: row for row in check(options(relay.uri), Wanted(lambda: True, **QUICK))}
+    begun = [packet.data[2:] for packet in relay.writes()]
+    assert begun == [b"\1"]  # no result within 0.2 s: it may still run, and no other beside it
+    assert rows["propellers"].verdict is Verdict.WARN
+    assert "not begun" in rows["battery sag"].found
+    assert "keep clear" in rows["propellers"].advice
+    assert relay.commands() == []
+    assert rows["camera"].verdict is Verdict.FAIL
+    sim.replace_vehicle(Scenario())  # the test goes on in this one, which is deaf meanwhile
+
+
+def test_a_flying_vehicle_s_motors_are_not_even_asked_for(sim: SimProcess, relay: Relay) -> None:
+    asked: list[str] = []
+    wait_for(sim, 1.5)
+    sim.set_pose((0.0, 0.0, 0.5), hold=True)
+    try:
+        wait_for(sim, 0.3)
+        wanted = Wanted(lambda: bool(asked.append("?")) or True, **QUICK)
+        rows = {row.name: row for row in check(options(relay.uri), wanted)}
+    finally:
+        sim.set_pose((0.0, 0.0, 0.012))
+        sim.let_go()
+    assert asked == []
+    assert "not begun: the state estimate places" in rows["propellers"].found
+    assert relay.writes() == []
+
+
+# --- A vehicle that does not answer, and who else does ----------------------------------
+
+
+def nobody(**profile: Any) -> Profile:
+    return Profile.model_validate({"link": {"connect_timeout_s": 0.4}} | profile)
+
+
+def test_a_vehicle_that_does_not_answer_leaves_its_rows_skipped() -> None:
+    there = Answering(("radio://0/60/2M", NOWHERE))
+    wanted = Wanted(**(QUICK | {"other_vehicles": lambda uri: there}))
+    rows = list(check(options(NOWHERE, profile=nobody()), wanted))
+    assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
+    assert rows[0].verdict is Verdict.FAIL
+    assert "radio://0/60/2M" in rows[0].advice
+    assert NOWHERE not in rows[0].advice
+    assert {row.verdict for row in rows[1 : len(VEHICLE)]} == {Verdict.SKIPPED}
+    assert exit_code(rows) == 10
+
+
+def test_pictures_of_another_size_fail_their_row(
+    sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), np.full((240, 320), 99, np.uint8))
+    monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
+    simulated = options("sim://", f"images:{tmp_path}")
+    rows = {row.name: row for row in check(simulated, Wanted(**QUICK))}
+    assert rows["size"].verdict is Verdict.FAIL
+    assert rows["propellers"].advice == "add --prop-test"  # and nobody was asked
+    assert rows["lifted"].advice.startswith("add --lift")
+    assert rows["loop"].verdict is rows["target"].verdict is Verdict.SKIPPED
+
+
+@pytest.mark.long
+def test_a_link_that_is_lost_on_the_way_is_told() -> None:
+    with SimProcess.start() as passing:
+
+        def tell(text: str) -> None:
+            if text.startswith("listening"):
+                passing.stop()
+
+        wanted = Wanted(**(QUICK | {"listen_s": 0.5}), tell=tell)
+        rows = {row.name: row for row in check(options(passing.uri), wanted)}
+    assert rows["packets"].verdict is Verdict.FAIL
+    assert "the link was lost" in rows["packets"].found
+    assert rows["decks"].verdict is rows["battery"].verdict is Verdict.SKIPPED
+
+
+def test_ctrl_c_in_the_motor_test_says_that_it_goes_on(
+    sim: SimProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def interrupted(*_: object) -> list[Row]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(health, "run", interrupted)
+    wait_for(sim, 1.5)
+    rows = check(options(sim.uri), Wanted(lambda: True, **QUICK, tell=said.append))
+    with pytest.raises(KeyboardInterrupt):
+        list(rows)
+    assert "keep clear" in said[-1]
+
+
+class Answerer:
+    """Something that answers a scan on one of the ports that cflib asks."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        for port in range(19859, 19849, -1):
+            try:
+                self.socket.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            self.uri = f"udp://127.0.0.1:{port}"
+            threading.Thread(target=self._run, daemon=True).start()
+            return
+        pytest.skip("all ports of the scan are taken")
+
+    def _run(self) -> None:
+        while True:
+            try:
+                datagram, address = self.socket.recvfrom(64)
+                self.socket.sendto(datagram, address)
+            except OSError:
+                return
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_scan_names_what_answers() -> None:
+    """cflib leaves the sockets of its scan open."""
+    answerer = Answerer()
+    try:
+        found = scan([None, 0xE7E7E7E701])
+        rows = {row.found: row for row in session.found_by_scan(None)}
+    finally:
+        answerer.socket.close()
+    assert answerer.uri in found.uris
+    assert rows[f"{answerer.uri} answers"].verdict is Verdict.PASS
+    radio = next(row for row in rows.values() if row.name == "radio")
+    if found.radio:  # where there is none, it is said
+        assert radio.verdict is Verdict.SKIPPED
+        assert "Crazyradio" in radio.found
+        assert "udev" in radio.advice
+
+
+@pytest.mark.parametrize(("uri", "address"), [
+    ("radio://0/80/2M/E7E7E7E701", 0xE7E7E7E701),
+    ("radio://0/80/2M/E7E7E7E7E7", None),
+    ("radio://0/80/2M/0000000001?rate_limit=100", 0x01),
+    ("radio://0", None),
+    ("usb://0", None),
+])  # fmt: skip
+def test_a_radio_s_own_address_is_scanned_too(uri: str, address: int | None) -> None:
+    assert address_of(uri) == address

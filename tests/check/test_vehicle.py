@@ -1,0 +1,230 @@
+"""Each fault that the simulated Crazyflie can have makes its row fail or warn: by the real cflib
+over UDP, and each alone. Nothing is armed, flown or turned without a yes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.check import link
+from perchctl.check.link import Vehicle
+from perchctl.check.row import Row, Verdict
+from perchctl.link.probe import Echoes, ProbeLink
+from perchctl.profile import LinkConfig, Profile
+from perchctl.sim.crtp.server import LinkOptions
+from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.scenario import Scenario
+from perchctl.vehicle import (
+    CAN_FLY,
+    CRASHED,
+    DECK_FAULT,
+    FLYING,
+    LOCKED,
+    LOW_POWER,
+    TUMBLED,
+)
+from tests.helpers.checks import AT_REST, PROFILE, said, wait_for
+from tests.helpers.mission import READY
+
+pytestmark = pytest.mark.long
+
+LISTEN_S = 0.4
+BAD = Scenario(
+    battery_rest_v=3.5,
+    rssi_dbm=-97.0,
+    parameters={
+        "system.selftestPassed": 0,
+        "stabilizer.stop": 1,  # locked from the start
+        "stabilizer.estimator": 1,
+    },
+    estimate_tilt_bias_rad=(0.0, 0.35),
+    extra={"external_position": 1.0},  # no deck; and nobody sends positions
+)
+OLD = LinkOptions(protocol_version=11, missing_log_variables=("acc.z", "radio.rssi"))
+
+
+def looked_at(sim: SimProcess, silent_s: float = 0.0) -> dict[str, Row]:
+    """`silent_s`: for so long, of its echoes, the link carries nothing."""
+    probe = ProbeLink(sim.uri, LinkConfig(connect_timeout_s=30.0), time.monotonic)
+    probe.connect()
+    try:
+        seen = link.look(probe, sim.uri, LISTEN_S)
+        if silent_s:
+            sim.silence(silent_s)
+            seen = replace(seen, echoes=probe.echoes(LISTEN_S))
+    finally:
+        probe.close()
+    found = link.rows(seen, PROFILE)
+    assert [row.name for row in found] == list(link.NAMES)
+    return {row.name: row for row in found}
+
+
+@pytest.fixture(scope="module")
+def vehicles(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, dict[str, Row]]]:
+    """The rows of a good vehicle, of one with a dozen faults, and of one behind a bad link."""
+    found = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+        with SimProcess.start() as sim:
+            wait_for(sim, 1.2)  # the estimator settles
+            found["good"] = looked_at(sim)
+            found["lossy"] = looked_at(sim, 0.2)
+            sim.replace_vehicle(BAD)
+            sim.set_pose((0.0, 0.0, 0.6), hold=True)
+            found["bad"] = looked_at(sim)
+        with SimProcess.start(link=OLD) as sim:
+            found["old"] = looked_at(sim)
+        yield found
+
+
+FAULTS = [
+    ("packets", "lossy", "fail", "% of 20 lost"),
+    ("signal", "bad", "fail", "-97 dBm"),
+    ("self-test", "bad", "fail", "failed at boot"),
+    ("supervisor", "bad", "fail", "locked (supervisor 0x"),
+    ("decks", "bad", "warn", "none"),
+    ("positioning", "bad", "fail", "no deck, and no position comes"),
+    ("ground", "bad", "fail", "places the vehicle at 0.6"),
+    ("level", "bad", "fail", "pitch 20"),
+    ("parameters", "bad", "warn", "stabilizer.estimator 1, profile 2"),
+    ("battery", "bad", "fail", "rests at 3.5"),
+    ("firmware", "old", "fail", "protocol 11"),
+    ("variables", "old", "fail", "not logged: acc.z"),
+    ("telemetry", "old", "fail", "none comes"),
+]
+
+
+@pytest.mark.parametrize(("name", "which", "verdict", "words"), FAULTS)
+def test_a_fault_of_the_simulated_crazyflie_makes_its_row(
+    name: str, which: str, verdict: str, words: str, vehicles: dict[str, dict[str, Row]]
+) -> None:
+    row = vehicles[which][name]
+    assert vehicles["good"][name].verdict is Verdict.PASS
+    assert row.verdict == verdict
+    assert words in row.found
+    assert row.advice
+
+
+def test_a_good_vehicle_fails_nothing(vehicles: dict[str, dict[str, Row]]) -> None:
+    rows = vehicles["good"].values()
+    # How fast packets come back is the computer's, not the vehicle's.
+    timed = ("round trip", "telemetry")
+    bad = [r for r in rows if r.verdict in ("fail", "warn") and r.name not in timed]
+    assert bad == []
+    assert vehicles["good"]["radio"].verdict is Verdict.SKIPPED
+    assert "2026.08, protocol 12" in vehicles["good"]["firmware"].found
+
+
+def test_without_telemetry_nothing_that_hangs_on_it_passes(
+    vehicles: dict[str, dict[str, Row]],
+) -> None:
+    for name in ("supervisor", "estimator", "ground", "level", "still", "battery"):
+        assert vehicles["old"][name].verdict is Verdict.SKIPPED
+
+
+# --- Each fault alone -------------------------------------------------------------------
+
+GOOD = Vehicle(
+    uri="radio://0/80/2M/E7E7E7E7E7",
+    firmware="2026.08",
+    parameters={
+        "system.selftestPassed": 1, "deck.bcFlow2": 1, "stabilizer.estimator": 2,
+        "health.startPropTest": 0,
+    },
+    echoes=Echoes(100, (0.004,) * 100),
+    quality=99.0,
+    telemetry=AT_REST,
+    age_s=0.01,
+    samples_hz=100.0,
+    rssi_dbm=-50.0,
+    external=False,
+)  # fmt: skip
+
+
+def parameters(**changes: float | None) -> dict[str, float]:
+    named = {key.replace("__", "."): value for key, value in changes.items()}
+    return {k: v for k, v in ({**GOOD.parameters, **named}).items() if v is not None}
+
+
+ALONE: list[tuple[str, str, dict[str, Any]]] = [
+    ("packets", "warn", {"echoes": Echoes(100, (0.004,) * 97)}),
+    ("packets", "fail", {"echoes": Echoes(100, (0.004,) * 80)}),
+    ("packets", "warn", {"quality": 80.0}),
+    ("packets", "fail", {"quality": 40.0}),
+    ("round trip", "warn", {"echoes": Echoes(100, (0.05,) * 100)}),
+    ("round trip", "fail", {"echoes": Echoes(100, (0.2,) * 100)}),
+    ("telemetry", "warn", {"samples_hz": 80.0}),
+    ("telemetry", "fail", {"samples_hz": 40.0}),
+    ("telemetry", "fail", {"age_s": 0.5}),
+    ("radio", "warn", {"uri": "radio://0/80/250K"}),
+    ("radio", "skipped", {"uri": "usb://0", "rssi_dbm": None}),
+    ("signal", "warn", {"rssi_dbm": -80.0}),
+    ("signal", "fail", {"rssi_dbm": -95.0}),
+    ("signal", "skipped", {"rssi_dbm": None}),
+    ("firmware", "fail", {"protocol": 11}),
+    ("firmware", "fail", {"protocol": -1}),
+    ("variables", "fail", {"missing": ("stateEstimate.x",)}),
+    ("variables", "warn", {"lacking": ("battery",)}),
+    ("self-test", "fail", {"parameters": parameters(system__selftestPassed=0)}),
+    ("self-test", "skipped", {"parameters": parameters(system__selftestPassed=None)}),
+    *(
+        ("supervisor", "fail", {"telemetry": said(supervisor=bits)})
+        for bits in (
+            READY | LOCKED, READY | CRASHED, READY | TUMBLED, READY | DECK_FAULT, READY | FLYING,
+            READY | 1 << 12, READY & ~CAN_FLY,
+        )
+    ),
+    ("positioning", "skipped", {"parameters": parameters(deck__bcBuzzer=1, deck__bcFlow2=0),
+                                "external": None}),
+    ("positioning", "fail", {"parameters": parameters(deck__bcBuzzer=1, deck__bcFlow2=0)}),
+    ("estimator", "fail", {"telemetry": said(position_variance_m2=0.5)}),
+    ("estimator", "fail", {"telemetry": said(position_variance_m2=math.nan)}),
+    ("estimator", "skipped", {"telemetry": said(position_variance_m2=None)}),
+    ("estimator", "warn", {"moved_m": 0.2}),
+    ("ground", "fail", {"telemetry": said(position_m=(0.0, 0.0, 2.1))}),
+    ("ground", "fail", {"telemetry": said(position_m=(math.nan, 0.0, 0.0))}),
+    ("level", "warn", {"telemetry": said(roll_rad=math.radians(5.0))}),
+    ("level", "fail", {"telemetry": said(pitch_rad=math.radians(-20.0))}),
+    ("level", "fail", {"telemetry": said(pitch_rad=math.nan)}),
+    ("still", "fail", {"telemetry": said(acc_z_g=0.7)}),
+    ("parameters", "warn", {"parameters": parameters(stabilizer__estimator=1)}),
+    ("parameters", "fail", {"parameters": parameters(stabilizer__estimator=None)}),
+    ("battery", "fail", {"telemetry": said(battery_v=3.5)}),
+    ("battery", "warn", {"telemetry": said(battery_v=3.85)}),
+    ("battery", "fail", {"telemetry": said(battery_state=LOW_POWER)}),
+    ("battery", "skipped", {"telemetry": said(battery_v=0.0)}),
+    ("battery", "skipped", {"telemetry": said(battery_v=math.nan)}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "verdict", "changes"), ALONE)
+def test_a_fault_alone_makes_its_row_and_no_other(
+    name: str, verdict: str, changes: dict[str, Any]
+) -> None:
+    before = {row.name: row.verdict for row in link.rows(GOOD, PROFILE)}
+    assert set(before.values()) == {Verdict.PASS}
+    after = {row.name: row for row in link.rows(replace(GOOD, **changes), PROFILE)}
+    assert after[name].verdict == verdict
+    others = {n for n, row in after.items() if row.verdict in ("warn", "fail")} - {name}
+    assert others == set()
+
+
+def test_a_position_that_slides_at_rest_is_seen() -> None:
+    slid = [said(t_s=0.01 * k, position_m=(0.001 * k, 0.0, 0.0)) for k in range(200)]
+    assert link._moved_m(slid) == pytest.approx(0.18, abs=0.001)
+    assert link._moved_m([]) == 0.0
+
+
+def test_an_old_profile_s_limit_is_the_flight_s() -> None:
+    """One home for each criterion: what `check` allows, `fly` takes off with."""
+    strict = Profile.model_validate({"safety": {"min_rest_v": 4.1, "start_tilt_deg": 1.0}})
+    vehicle = replace(GOOD, telemetry=said(battery_v=4.0, roll_rad=math.radians(2.0)))
+    rows = {row.name: row.verdict for row in link.rows(vehicle, strict)}
+    assert rows["battery"] is rows["level"] is Verdict.FAIL

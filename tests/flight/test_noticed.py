@@ -1,0 +1,112 @@
+"""What a flight does with the latency that it measures: slowly, surely, within bounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from perchctl.flight.history import History
+from perchctl.flight.noticed import (
+    SLEW,
+    USED_SIGMA_S,
+    Noticed,
+    noticed,
+)
+from perchctl.mission.context import Context
+from perchctl.mission.state import Phase
+from perchctl.profile import CameraConfig
+from perchctl.profile.vision import USED_LATENCY_S
+from perchctl.vision.consistency import Consistency
+from perchctl.vision.pose import make_pose_setup
+from perchctl.vision.types import CameraModel, MarkerPose
+from tests.helpers.mission import PROFILE, observation, state_in, telemetry
+
+FRAME_S = 1 / 30
+CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
+SETUP = make_pose_setup(
+    PROFILE.pose, PROFILE.target, PROFILE.camera.mount.T_body_cam,
+    PROFILE.vehicle.gear_body_m, CAMERA,
+)  # fmt: skip
+MEASURED, TOLD = CameraConfig(latency_s="measured"), CameraConfig(latency_s=0.07)
+POSE = MarkerPose(
+    "joint", 0.0, np.array([math.pi, 0.0, 0.0]), np.array([0.0, 0.0, 1.2]), np.zeros(3), 0.0,
+    np.full(3, 1e-3), 1e-3, 0.1, cov=np.diag([1e-6] * 4),
+)  # fmt: skip
+
+
+def _seen(delay_s: float, sigma_s: float) -> Consistency:
+    return Consistency(delay_s, sigma_s, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
+
+
+def _frames(start: Noticed, camera: CameraConfig, count: int, pose: MarkerPose = POSE) -> Noticed:
+    """At rest under the target, without a new solve."""
+    history = History(tuple(telemetry(10.0 + 0.01 * k) for k in range(-40, 40)))
+    state = replace(start, solved_s=1e9, seen_s=10.0)
+    for k in range(1, count + 1):
+        t_s = 10.0 + k * FRAME_S
+        state = noticed(state, t_s, pose, history, SETUP, camera, 0.005)
+    return state
+
+
+def test_a_sure_latency_is_taken_over_slowly() -> None:
+    """20 ms a second: what the target's place makes of that is what it makes of a drift."""
+    start = Noticed(newest=_seen(0.04, 0.004))
+    assert _frames(start, MEASURED, 1).used_s == pytest.approx(SLEW * FRAME_S)
+    assert _frames(start, MEASURED, 45).used_s == pytest.approx(0.03, rel=0.01)
+    assert _frames(start, MEASURED, 200).used_s == pytest.approx(0.04)
+
+
+def test_an_unsure_latency_changes_nothing() -> None:
+    unsure = Noticed(newest=_seen(0.04, 1.01 * USED_SIGMA_S), used_s=0.01)
+    assert _frames(unsure, MEASURED, 30).used_s == 0.01
+    assert _frames(Noticed(), MEASURED, 30).used_s == 0.0
+
+
+def test_a_number_in_the_profile_is_not_overruled() -> None:
+    assert _frames(Noticed(newest=_seen(0.04, 0.004)), TOLD, 200).used_s == 0.0
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "bound_s"), [(-0.3, USED_LATENCY_S[0]), (0.5, USED_LATENCY_S[1])]
+)
+def test_what_is_used_stays_within_bounds(delay_s: float, bound_s: float) -> None:
+    used_s = _frames(Noticed(newest=_seen(delay_s, 0.004)), MEASURED, 600).used_s
+    assert MEASURED.start_latency_s + used_s == pytest.approx(bound_s)
+
+
+def test_what_is_no_number_teaches_nothing() -> None:
+    """A covariance that broke down, and an interval that did."""
+    history = History(tuple(telemetry(10.0 + 0.01 * k) for k in range(-40, 40)))
+    broken = replace(POSE, cov=np.full((4, 4), math.nan))
+    learned = noticed(Noticed(), 10.0, broken, history, SETUP, MEASURED, 0.005)
+    assert learned.newest is None
+    assert learned.sums.level is None
+    unknown = Noticed(newest=_seen(math.nan, math.nan), used_s=0.01)
+    assert _frames(unknown, MEASURED, 30).used_s == 0.01
+
+
+def test_after_a_gap_nothing_jumps() -> None:
+    start = replace(Noticed(newest=_seen(0.1, 0.004)), solved_s=1e9, seen_s=2.0)
+    history = History((telemetry(9.9), telemetry(10.1)))
+    assert noticed(start, 10.0, POSE, history, SETUP, MEASURED, 0.005).used_s <= SLEW * 0.1
+
+
+def test_nothing_is_learned_right_under_the_target() -> None:
+    near = replace(POSE, tvec_m=np.array([0.0, 0.0, 0.1]))
+    assert _frames(Noticed(), MEASURED, 20, near).sums.level is None
+    assert _frames(Noticed(), MEASURED, 20).sums.level is not None
+
+
+def test_a_later_picture_is_as_fresh_as_it_can_be() -> None:
+    """ASCEND climbs by fresh pictures, and one cannot be newer than the latency that is used."""
+    state = state_in(Phase.ASCEND)
+    old = observation(10.02)
+    assert old.target is not None
+    limit_s = PROFILE.planner.ascend.fresh_s + PROFILE.camera.start_latency_s
+    target = replace(old.target, measured_s=10.02 - limit_s - 0.03)
+    stale = replace(old, target=target)
+    assert not Context(state, stale, PROFILE).fresh
+    assert Context(state, replace(stale, delay_s=0.05), PROFILE).fresh

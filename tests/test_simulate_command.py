@@ -1,0 +1,105 @@
+"""`perchctl simulate`: a campaign, and one flight of it told for people."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.log.read import read_log
+from tests.helpers.commands import Said, elsewhere, run, run_apart  # noqa: F401
+from tests.helpers.flights import SEED, SHORT
+
+pytestmark = pytest.mark.long
+
+ESCAPE = "\x1b"
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The campaign's."""
+    return tmp_path_factory.mktemp("campaign") / "logs"
+
+
+@pytest.fixture(scope="module")
+def campaign(logs: Path) -> Said:
+    """Two seeds, two at a time, with their logs."""
+    arguments = ("-p", SHORT, "-n", "2", "--seed", str(SEED), "--jobs", "2", "--json")
+    return run_apart("simulate", *arguments, "--log-dir", str(logs))
+
+
+def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
+    assert campaign.code == 0
+    said = json.loads(campaign.stdout)
+    assert set(said) == {
+        "flights", "perched", "landed", "aborted", "locked", "fell",
+        "miss_m", "realtime_factor", "worst_seeds",
+    }  # fmt: skip
+    assert set(said["miss_m"]) == {"median", "p95", "max"}
+    assert [said[k] for k in ("flights", "perched", "landed", "aborted", "locked", "fell")] == [
+        2, 2, 0, 0, 0, 0,
+    ]  # fmt: skip
+    assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
+    assert said["realtime_factor"] > 0
+    assert said["worst_seeds"] == []
+    assert campaign.complaint == f"the flights' logs are in {logs}"
+
+
+@pytest.fixture(scope="module")
+def repeated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Said, Path]:
+    """The one flight of the seed, told for people, with its log."""
+    folder = tmp_path_factory.mktemp("only") / "made"
+    arguments = ("-p", SHORT, "--only", str(SEED), "--log-dir", str(folder))
+    return run_apart("simulate", *arguments, PYTHONHASHSEED="7"), folder
+
+
+def test_one_seed_is_the_flight_that_it_was_in_the_campaign(
+    campaign: Said, repeated: tuple[Said, Path], logs: Path
+) -> None:
+    """The same log, from another process."""
+    name = f"flight_seed{SEED}.jsonl"
+    assert (repeated[1] / name).read_bytes() == (logs / name).read_bytes()
+    assert sorted(path.name for path in logs.iterdir()) == [name, f"flight_seed{SEED + 1}.jsonl"]
+    misses = [read_log(path).summary["miss_m"] for path in logs.iterdir()]  # type: ignore[index]
+    assert json.loads(campaign.stdout)["miss_m"]["max"] == pytest.approx(max(misses), abs=1e-6)
+
+
+def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Path]) -> None:
+    said, folder = repeated
+    assert said.code == 0
+    assert said.stderr == ""
+    lines = said.stdout.splitlines()
+    assert lines[0] == "[   0.00 s] APPROACH: start"
+    assert re.fullmatch(r"\[ +\d+\.\d\d s\] COMPLETE: contact proven by .*", lines[6])
+    assert lines[8] == "PERCHED: hanging still with the motors off"
+    words = dict(line.split(":", 1) for line in lines[9:])
+    always = {"miss", "flight", "phases", "battery", "latency", "mounting", "log", "plot"}
+    assert set(words) - {"advice"} == always
+    assert "ALIGN 0.4 s > ASCEND" in words["phases"]
+    assert Path(words["log"].strip()) == folder / f"flight_seed{SEED}.jsonl"
+    assert Path(words["plot"].strip()) == folder / f"flight_seed{SEED}.png"
+    assert {path.suffix for path in folder.iterdir()} == {".jsonl", ".png"}
+
+
+def test_one_seed_as_json_is_its_flight_logged_where_the_profile_says(tmp_path: Path) -> None:
+    profile = tmp_path / "mine.yaml"
+    profile.write_text(
+        f"extends: {SHORT}\nplanner: {{perching_time_s: 0.3}}\n"
+        "log: {directory: here, plot: false}\n"
+    )
+    said = run("simulate", "-p", str(profile), "--only", "5", "--json")
+    record = json.loads(said.stdout)
+    assert (said.code, record["seed"], record["outcome"]) == (0, 5, "landed")
+    assert record["reason"] == "the perching time is over; motors off"
+    assert (record["log"], record["plot"]) == ("here/flight_seed5.jsonl", None)
+    assert read_log(tmp_path / record["log"]).header["seed"] == 5
+
+
+def test_a_pipe_gets_no_colour(repeated: tuple[Said, Path], campaign: Said) -> None:
+    said, _ = repeated
+    for text in (said.stdout, said.stderr, campaign.stdout, campaign.stderr):
+        assert ESCAPE not in text
