@@ -42,6 +42,18 @@ class Telemetry:
 
 
 @dataclass(frozen=True)
+class ExternalPosition:
+    """Where the vehicle is, measured from outside: for its estimator, and no command.
+
+    In the world of the state estimate. `quaternion` (w, x, y, z) turns body axes to world
+    axes; None where only the position is known.
+    """
+
+    position_m: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Idle:
     """Send nothing (on the ground, or while the vehicle lands by itself)."""
 

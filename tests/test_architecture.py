@@ -45,7 +45,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.mission",),
     ("perchctl.pipeline",),
     ("perchctl.target",),
-    ("perchctl.camera",),
+    ("perchctl.camera", "perchctl.positioning"),
     ("perchctl.calibration",),
     ("perchctl.sim",),
     ("perchctl.link", "perchctl.log"),

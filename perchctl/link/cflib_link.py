@@ -7,13 +7,21 @@ zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints s
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.connection import Connection, open_connection, send_packets
-from perchctl.link.encode import ARM, UNLOCK_PERIOD_S, UNLOCK_THRUST, UNLOCK_TIMES, encode
+from perchctl.link.encode import (
+    ARM,
+    UNLOCK_PERIOD_S,
+    UNLOCK_THRUST,
+    UNLOCK_TIMES,
+    encode,
+    encode_external,
+)
 from perchctl.link.evidence import is_known, may_fly
 from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.prepare import check_firmware, set_parameters
@@ -21,7 +29,16 @@ from perchctl.link.protocol import Guard
 from perchctl.link.sender import Sender
 from perchctl.link.uri import check_uri
 from perchctl.profile import LinkConfig
-from perchctl.vehicle import ARMED, FLYING, Command, EmergencyStop, Idle, Land, Telemetry
+from perchctl.vehicle import (
+    ARMED,
+    FLYING,
+    Command,
+    EmergencyStop,
+    ExternalPosition,
+    Idle,
+    Land,
+    Telemetry,
+)
 
 SILENCE_S = 1.5
 SENDER_STUCK_S = 0.5
@@ -69,6 +86,12 @@ class CflibLink:
     def send(self, command: Command) -> None:
         if self._sender is not None and not isinstance(command, Idle):
             self._sender.put(command)
+
+    def external(self, place: ExternalPosition) -> None:
+        connection = self.connection
+        if connection is not None and connection.lost is None:
+            with contextlib.suppress(Exception):  # the library's; commands report their own
+                send_packets(connection.cf, (encode_external(place),))
 
     def guard(self, guard: Guard) -> None:
         self._guard = guard

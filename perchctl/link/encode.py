@@ -16,6 +16,7 @@ from perchctl.sim.crtp.codec import Packet, Port
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
+    ExternalPosition,
     Idle,
     Land,
     PositionSetpoint,
@@ -31,6 +32,9 @@ _NOTIFY_SETPOINT_STOP = 0
 # Port 8.
 _LAND_2 = 8
 _ALL_GROUPS = 0
+# Port 6: the channels, then the generic one's types.
+_EXTERNAL_POSITION, _LOCALISATION = 0, 1
+_EXTERNAL_POSE = 8
 # Port 9, channel 1.
 _REQUEST = 1
 _ARM, _EMERGENCY_STOP = 1, 3
@@ -66,6 +70,20 @@ def _packets(command: Command) -> tuple[Packet, ...]:
             return stop, _NOTIFY
         case EmergencyStop():
             return (Packet(Port.SUPERVISOR, _REQUEST, bytes((_EMERGENCY_STOP,))),)
+
+
+def encode_external(place: ExternalPosition) -> Packet:
+    """Raises InvalidValue for a number that its field cannot hold."""
+    try:
+        if place.quaternion is None:
+            return Packet(
+                Port.LOCALIZATION, _EXTERNAL_POSITION, struct.pack("<fff", *place.position_m)
+            )
+        w, x, y, z = place.quaternion
+        data = struct.pack("<Bfffffff", _EXTERNAL_POSE, *place.position_m, x, y, z, w)
+        return Packet(Port.LOCALIZATION, _LOCALISATION, data)
+    except (struct.error, OverflowError) as error:
+        raise InvalidValue(f"{place} does not fit into a packet: {error}") from None
 
 
 def _raw(thrust: int) -> Packet:

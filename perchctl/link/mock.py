@@ -15,12 +15,18 @@ from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
 from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
-from perchctl.link.encode import UNLOCK_PERIOD_S, UNLOCK_THRUST, UNLOCK_TIMES, encode
+from perchctl.link.encode import (
+    UNLOCK_PERIOD_S,
+    UNLOCK_THRUST,
+    UNLOCK_TIMES,
+    encode,
+    encode_external,
+)
 from perchctl.link.protocol import Guard
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
-from perchctl.vehicle import FLYING, Command, Telemetry
+from perchctl.vehicle import FLYING, Command, ExternalPosition, Telemetry
 
 if TYPE_CHECKING:
     from perchctl.sim.vehicle import SimulatedVehicle
@@ -119,6 +125,9 @@ class MockLink:
     def send(self, command: Command) -> None:
         self._hand_over(encode(command))
 
+    def external(self, place: ExternalPosition) -> None:
+        self._hand_over((encode_external(place),))
+
     def problem(self, now_s: float) -> str | None:
         return None
 
@@ -153,6 +162,7 @@ class ScriptedLink:
         self._dies_at_s = dies_at_s
         self.now_s = 0.0
         self.sent: list[tuple[float, Command]] = []
+        self.places: list[tuple[float, ExternalPosition]] = []
         self.closed = False
 
     def advance_to(self, t_s: float) -> None:
@@ -173,6 +183,9 @@ class ScriptedLink:
 
     def problem(self, now_s: float) -> str | None:
         return "the script ended the link" if now_s >= self._dies_at_s else None
+
+    def external(self, place: ExternalPosition) -> None:
+        self.places.append((self.now_s, place))
 
     def guard(self, guard: Guard) -> None:
         self.watchdog = guard

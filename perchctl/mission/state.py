@@ -119,6 +119,9 @@ class Observation:
         disagreeing_frames: frames in a row in which the markers contradicted.
         log_problem: the flight log cannot be written.
         delay_s: taken off the frames' times beyond the profile's latency (`measured`).
+        position_age_s: of the newest position from outside that was sent to the vehicle; 0 where
+            its decks measure it.
+        position_problem: why none is sent, None while they are.
     """
 
     t_s: float
@@ -136,6 +139,8 @@ class Observation:
     operator: Operator = Operator.NONE
     log_problem: str | None = None
     delay_s: float = 0.0
+    position_age_s: float = 0.0
+    position_problem: str | None = None
 
 
 @dataclass(frozen=True, eq=False)

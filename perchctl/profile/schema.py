@@ -15,6 +15,7 @@ from perchctl.profile.base import Range, Section
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.old_keys import with_present_keys
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.profile.vision import (
     CameraConfig,
     DetectorConfig,
@@ -116,6 +117,7 @@ class Profile(Section):
     planner: PlannerConfig = PlannerConfig()
     safety: SafetyConfig = SafetyConfig()
     link: LinkConfig = LinkConfig()
+    positioning: PositioningConfig = PositioningConfig()
     simulation: SimulationConfig = SimulationConfig()
     log: LogConfig = LogConfig()
 

@@ -1,0 +1,65 @@
+"""The profile's section on where the state estimate gets its position from."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from perchctl.profile.base import BodyVector3, Section, Vector3
+
+CAPTURE_SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")
+
+
+class PositioningConfig(Section):
+    """`deck`: the vehicle's own decks do it, and nothing is sent. `mocap`: a motion-capture
+    system measures a rigid body on the vehicle, and its place is sent by the link.
+
+    The body's frame, as the system defines it, is turned by `body_rpy_deg` and lies at
+    `body_position_m`, both in the vehicle's body axes.
+    """
+
+    by: Literal["deck", "mocap"] = Field("deck", description="what measures the position")
+    system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = Field(
+        "vicon", description="kind of motion capture"
+    )
+    host: str = Field("", description="name or address of its computer")
+    body: str = Field("crazyflie", min_length=1, description="the vehicle's rigid body there")
+    body_rpy_deg: Vector3 = Field(
+        (0.0, 0.0, 0.0), description="the rigid body's axes in the vehicle's: roll, pitch, yaw"
+    )
+    body_position_m: BodyVector3 = Field(
+        (0.0, 0.0, 0.0), description="the rigid body's origin in the vehicle's axes"
+    )
+    send: Literal["position", "pose"] = Field(
+        "position", description="position alone, or position and attitude"
+    )
+    rate_hz: float = Field(100.0, ge=10, le=100, description="at most so many are sent a second")
+    latency_s: float = Field(
+        0.01, ge=0, le=0.2, description="from the cameras' exposure to arrival, as far as known"
+    )
+    position_sigma_m: float = Field(
+        0.005, gt=0, le=0.2, description="what the vehicle takes it for: `locSrv.extPosStdDev`"
+    )
+    attitude_sigma_rad: float = Field(
+        0.05, gt=0, le=1, description="what the vehicle takes it for: `locSrv.extQuatStdDev`"
+    )
+    hold_s: float = Field(
+        0.15, gt=0, le=0.5, description="without a fresh position it is held in place"
+    )
+    land_s: float = Field(0.7, gt=0, le=2, description="without a fresh position it is landed")
+    connect_timeout_s: float = Field(5.0, gt=0, le=60, description="for the first frame")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_word(cls, values: Any) -> Any:
+        """`positioning: mocap` names what measures, and leaves the rest as it is."""
+        return {"by": values} if isinstance(values, str) else values
+
+    @model_validator(mode="after")
+    def _fits(self) -> PositioningConfig:
+        if self.land_s <= self.hold_s:
+            raise ValueError(
+                f"land_s ({self.land_s:g}) must be longer than hold_s ({self.hold_s:g})"
+            )
+        return self
