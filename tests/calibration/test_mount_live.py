@@ -54,6 +54,7 @@ def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
     with pytest.MonkeyPatch.context() as patch, SimProcess.start(STILL, camera=camera) as process:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
         process.set_pose((0.0, 0.0, 0.6), RPY_RAD, hold=True)
+        process.reboot()  # its attitude is the hand's from the start, not drawn to it in seconds
         yield process
 
 
