@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from perchctl.sim.process.control import Channel
+from perchctl.children import Channel
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
