@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from perchctl.profile import TargetConfig
+from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.scenario import Scenario
 from perchctl.vision.types import CameraModel
@@ -19,7 +20,8 @@ LINGER_S = 12.0
 class HostSetup:
     """How the simulated vehicle's process is set up.
 
-    `camera` None: no camera and no stream. Ports 0: chosen by the operating system.
+    `camera` None: no camera and no stream; `capture` None: no motion capture. Ports 0: chosen
+    by the operating system.
     `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
     parent has ended. `linger_s`: how long the vehicle then runs on, in wall-clock time.
     """
@@ -28,8 +30,10 @@ class HostSetup:
     pace: Pace = "realtime"
     camera: CameraModel | None = None
     target: TargetConfig | None = None
+    capture: CaptureSettings | None = None
     link: LinkOptions = field(default_factory=LinkOptions)
     port: int = 0
     http_port: int = 0
+    capture_port: int = 0
     truth_file: str | None = None
     linger_s: float = LINGER_S

@@ -8,6 +8,7 @@ child does not share its terminal's Ctrl-C and outlives a killed parent by a few
 from __future__ import annotations
 
 import contextlib
+import math
 import subprocess
 import tempfile
 import threading
@@ -27,6 +28,7 @@ from perchctl.children import (
 )
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
+from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.control import LINGER_S, START_TIMEOUT_S, HostSetup, Pace
 from perchctl.sim.scenario import Scenario
@@ -42,9 +44,10 @@ _CHILD = "from perchctl.sim.process.child import serve_parent; serve_parent()"
 class SimProcess:
     """Handle of a running simulated vehicle; a context manager.
 
-    `uri` is for cflib, `stream_url` for a network camera ("" without a camera). All
-    methods may be called from any thread; they raise `ConnectionFailed` when the child
-    is gone and `TimedOut` when it does not answer.
+    `uri` is for cflib, `stream_url` for a network camera ("" without a camera), `capture` the
+    motion capture's kind and address for `motioncapture` (None without one). All methods may be
+    called from any thread; they raise `ConnectionFailed` when the child is gone and `TimedOut`
+    when it does not answer.
     """
 
     def __init__(self, child: subprocess.Popen[bytes], channel: Channel, stderr: IO[bytes]) -> None:
@@ -55,6 +58,7 @@ class SimProcess:
         self._stopped = False
         self.uri = ""
         self.stream_url = ""
+        self.capture: tuple[str, str] | None = None
 
     @classmethod
     def start(
@@ -64,9 +68,11 @@ class SimProcess:
         *,
         camera: CameraModel | None = None,
         target: TargetConfig | None = None,
+        capture: CaptureSettings | None = None,
         link: LinkOptions | None = None,
         port: int = 0,
         http_port: int = 0,
+        capture_port: int = 0,
         truth_file: Path | None = None,
         linger_s: float = LINGER_S,
         timeout_s: float = START_TIMEOUT_S,
@@ -85,9 +91,11 @@ class SimProcess:
             pace=pace,
             camera=camera,
             target=target,
+            capture=capture,
             link=link or LinkOptions(),
             port=port,
             http_port=http_port,
+            capture_port=capture_port,
             truth_file=str(truth_file) if truth_file is not None else None,
             linger_s=linger_s,
         )
@@ -109,7 +117,7 @@ class SimProcess:
         if isinstance(answer, str):
             process.stop()
             raise ConnectionFailed(f"the simulated vehicle could not start: {answer}")
-        process.uri, process.stream_url = answer
+        process.uri, process.stream_url, process.capture = answer
         return process
 
     @property
@@ -158,6 +166,10 @@ class SimProcess:
     def silence(self, duration_s: float) -> None:
         """The link receives and sends nothing for `duration_s` of simulated time."""
         self._ask("silence", duration_s=duration_s)
+
+    def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
+        """Something goes wrong in the motion capture for so long; None ends all that does."""
+        self._ask("capture_fault", fault=fault, for_s=for_s)
 
     def reboot(self) -> None:
         """Restart the firmware, as the power button does; log blocks are lost."""
