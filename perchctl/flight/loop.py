@@ -33,6 +33,7 @@ from perchctl.mission.state import (
 )
 from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
 from perchctl.pipeline import Pipeline
+from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, NO_BATTERY_READING_V, Command, Idle
 from perchctl.vision.consistency import Consistency
@@ -44,7 +45,7 @@ HUNG_S = 0.25
 @dataclass(frozen=True, eq=False)
 class FlightParts:
     """The edges. `simulated` says what the scenario of a simulated flight did that explains
-    an event."""
+    an event; `positions` how it goes with those from outside, None where decks measure them."""
 
     link: Link
     source: FrameSource
@@ -54,6 +55,7 @@ class FlightParts:
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
     simulated: Callable[[Event], str] = lambda event: ""
+    positions: Callable[[float], FeedStatus] | None = None
 
 
 def fly(parts: FlightParts) -> FlightReport:

@@ -171,7 +171,7 @@ def test_a_hidden_body_is_not_sent_and_the_others_are_named() -> None:
     assert len(rig.places) == 1
     assert status.age_s == pytest.approx(0.16)
     assert status.problem == (
-        "motion capture vicon:lab does not see the rigid body 'cf'; it sees cf2, wand"
+        "motion capture at vicon:lab does not see the rigid body 'cf'; it sees cf2, wand"
     )
     assert rig.at(1.0).problem is None
 
@@ -320,7 +320,7 @@ def test_silence_and_a_source_that_is_gone_are_named() -> None:
     assert rig.feed.status(rig.now_s).problem is not None
     rig.at(1.0)
     assert "for 0.3 s" in (rig.idle(0.3).problem or "")
-    rig.capture.trouble = "motion capture vicon:lab has ended"
+    rig.capture.trouble = "motion capture at vicon:lab has ended"
     assert rig.idle(0.01).problem == rig.capture.trouble
 
 

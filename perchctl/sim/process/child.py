@@ -14,11 +14,12 @@ from collections.abc import Sequence
 import cv2
 
 from perchctl.calibration.files import load_calibration
+from perchctl.children import connect_back
 from perchctl.errors import PerchError
 from perchctl.profile.places import data_file
 from perchctl.sim.capture.natnet import COMMAND_PORT
 from perchctl.sim.capture.settings import CaptureSettings
-from perchctl.sim.process.control import START_TIMEOUT_S, HostSetup, connect
+from perchctl.sim.process.control import START_TIMEOUT_S, HostSetup
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.process.runner import Runner
 from perchctl.sim.scenario import Scenario
@@ -28,8 +29,7 @@ def serve_parent() -> None:
     """Run the vehicle that the parent describes, until it sends stop or is gone."""
     cv2.setNumThreads(1)  # the picture must not take the physics' core
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    port, token = sys.stdin.readline().split()
-    channel = connect(int(port), token)
+    channel = connect_back()
     setup = channel.receive(START_TIMEOUT_S)
     realtime = setup.pace == "realtime"
     try:

@@ -9,29 +9,28 @@ from __future__ import annotations
 
 import contextlib
 import math
-import secrets
 import subprocess
-import sys
 import tempfile
 import threading
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, get_args
 
+from perchctl.children import (
+    Channel,
+    accept,
+    end,
+    introduce,
+    last_line,
+    listen,
+    new_token,
+    spawn,
+)
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.control import (
-    LINGER_S,
-    START_TIMEOUT_S,
-    TOKEN_BYTES,
-    Channel,
-    HostSetup,
-    Pace,
-    accept,
-    listen,
-)
+from perchctl.sim.process.control import LINGER_S, START_TIMEOUT_S, HostSetup, Pace
 from perchctl.sim.scenario import Scenario
 from perchctl.vision.types import CameraModel
 
@@ -39,12 +38,7 @@ ANSWER_TIMEOUT_S = 15.0
 SLOWEST_PACE = 20.0
 """Wall-clock seconds allowed for one simulated second of `advance`."""
 _STOP_TIMEOUT_S = 5.0
-# -P and the path at the end: an installed package is found as usual, a checkout too,
-# and nothing in the working directory can shadow a module.
-_CHILD = (
-    "import sys; sys.path.append(sys.argv[1]); "
-    "from perchctl.sim.process.child import serve_parent; serve_parent()"
-)
+_CHILD = "from perchctl.sim.process.child import serve_parent; serve_parent()"
 
 
 class SimProcess:
@@ -105,13 +99,11 @@ class SimProcess:
             truth_file=str(truth_file) if truth_file is not None else None,
             linger_s=linger_s,
         )
-        token = secrets.token_hex(TOKEN_BYTES)
+        token = new_token()
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
         with listen() as listener:
-            child = _spawn(stderr)
-            assert child.stdin is not None
-            with contextlib.suppress(OSError), child.stdin:
-                child.stdin.write(f"{listener.getsockname()[1]} {token}\n".encode())
+            child = spawn(_CHILD, stderr)
+            introduce(child, listener, token)
             channel = accept(listener, token, timeout_s, lambda: child.poll() is None)
         if channel is None:
             raise _gave_up(child, stderr, f"did not come up within {timeout_s:.0f} s")
@@ -195,7 +187,7 @@ class SimProcess:
         with contextlib.suppress(PerchError):
             self._ask("stop", _STOP_TIMEOUT_S)
         self._channel.close()
-        _end(self._child)
+        end(self._child, _STOP_TIMEOUT_S)
         self._stderr.close()
 
     def __enter__(self) -> SimProcess:
@@ -220,32 +212,11 @@ class SimProcess:
                 ) from None
             except (EOFError, OSError):
                 raise ConnectionFailed(
-                    f"the simulated vehicle has ended{_last_line(self._stderr)}"
+                    f"the simulated vehicle has ended{last_line(self._stderr)}"
                 ) from None
         if not good:
             raise InvalidValue(f"the simulated vehicle refused {name!r}: {result}")
         return result
-
-
-def _spawn(stderr: IO[bytes]) -> subprocess.Popen[bytes]:
-    root = str(Path(__file__).resolve().parents[3])
-    command = [sys.executable, "-P", "-c", _CHILD, root]
-    if sys.platform == "win32":
-        flags = subprocess.CREATE_NEW_PROCESS_GROUP
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=stderr, stderr=stderr, creationflags=flags
-        )
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=stderr, stderr=stderr, start_new_session=True
-    )
-
-
-def _end(child: subprocess.Popen[bytes]) -> None:
-    try:
-        child.wait(_STOP_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        child.wait()
 
 
 def _gave_up(child: subprocess.Popen[bytes], stderr: IO[bytes], why: str) -> ConnectionFailed:
@@ -253,15 +224,6 @@ def _gave_up(child: subprocess.Popen[bytes], stderr: IO[bytes], why: str) -> Con
     child.kill()
     child.wait()
     what = f"ended with code {code}" if code is not None else why
-    error = ConnectionFailed(f"the simulated vehicle {what}{_last_line(stderr)}")
+    error = ConnectionFailed(f"the simulated vehicle {what}{last_line(stderr)}")
     stderr.close()
     return error
-
-
-def _last_line(stderr: IO[bytes]) -> str:
-    """The last line of the child's error output, for a message."""
-    if stderr.closed:
-        return ""
-    stderr.seek(0)
-    lines = stderr.read().decode(errors="replace").strip().splitlines()
-    return f": {lines[-1]}" if lines else ""

@@ -16,8 +16,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from perchctl.children import Channel
 from perchctl.sim.capture.settings import CaptureFault
-from perchctl.sim.process.control import Channel
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
