@@ -39,8 +39,8 @@ class Silent:
     def send(self, command: Command) -> None:
         return None
 
-    def external(self, place: ExternalPosition) -> None:
-        return None
+    def external(self, place: ExternalPosition) -> bool:
+        return False
 
     def problem(self, now_s: float) -> str | None:
         return None

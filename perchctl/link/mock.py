@@ -125,8 +125,9 @@ class MockLink:
     def send(self, command: Command) -> None:
         self._hand_over(encode(command))
 
-    def external(self, place: ExternalPosition) -> None:
+    def external(self, place: ExternalPosition) -> bool:
         self._hand_over((encode_external(place),))
+        return True
 
     def problem(self, now_s: float) -> str | None:
         return None
@@ -184,8 +185,9 @@ class ScriptedLink:
     def problem(self, now_s: float) -> str | None:
         return "the script ended the link" if now_s >= self._dies_at_s else None
 
-    def external(self, place: ExternalPosition) -> None:
+    def external(self, place: ExternalPosition) -> bool:
         self.places.append((self.now_s, place))
+        return True
 
     def guard(self, guard: Guard) -> None:
         self.watchdog = guard

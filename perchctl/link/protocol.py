@@ -33,9 +33,10 @@ class Link(Protocol):
     def send(self, command: Command) -> None:
         """Hand one command to the vehicle. Never blocks for long."""
 
-    def external(self, place: ExternalPosition) -> None:
+    def external(self, place: ExternalPosition) -> bool:
         """Hand a position from outside to the vehicle's estimator, at once or not at all: it is
-        never queued behind anything, and raises nothing. Called from a thread of its own."""
+        never queued behind anything, and raises nothing. Whether it went out. Called from a
+        thread of its own."""
 
     def problem(self, now_s: float) -> str | None:
         """None while the link works, otherwise one sentence with the cause."""

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from perchctl.positioning.judge import Judge, label
+from perchctl.positioning.judge import Judge, Placed, label
 from perchctl.positioning.types import CaptureSource
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition
@@ -61,6 +61,7 @@ class PositionFeed:
         self._turned_s: float | None = None
         self._framed_s = -math.inf
         self._exposed_s = -math.inf
+        self._placed: Placed | None = None
         self._pose: ExternalPosition | None = None
         self._measured: ExternalPosition | None = None
         self._count = 0
@@ -76,6 +77,11 @@ class PositionFeed:
             problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
         with self._lock:
             self._turned_s, self._problem = now_s, problem
+
+    def place(self) -> Placed | None:
+        """The newest that was handed to the link, with its attitude also where only the
+        position was sent."""
+        return self._placed
 
     def status(self, now_s: float) -> FeedStatus:
         with self._lock:
@@ -109,7 +115,7 @@ class PositionFeed:
         # A turn that comes late must not slow the next ones down, and none makes up for it.
         self._due_s = max(self._due_s + self._period_s, now_s)
         with self._lock:
-            self._exposed_s, self._pose = placed.t_s, place
+            self._placed, self._exposed_s, self._pose = placed, placed.t_s, place
             self._count += 1
             self._times_s.append(now_s)
             while now_s - self._times_s[0] > RATE_OVER_S:
