@@ -21,7 +21,9 @@ from perchctl.flight.watchdog import Watchdog
 from perchctl.link.evidence import FRESH_S
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
+from perchctl.mission.context import Context
 from perchctl.mission.findings import findings_of
+from perchctl.mission.hold import unplaced
 from perchctl.mission.state import (
     FLYING_PHASES,
     Observation,
@@ -31,7 +33,7 @@ from perchctl.mission.state import (
     PlannerState,
     Severity,
 )
-from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
+from perchctl.mission.watch import Event, EventKind, FlightReport, Outside, Tick, Watcher
 from perchctl.pipeline import Pipeline
 from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
@@ -136,7 +138,8 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
         senses.take_in(now_s, look=not _is_blind(state))
         now_s = _present(parts, senses, now_s)
         late_s = max(0.0, now_s - due_s)
-        obs = _observe(parts, senses, now_s, late_s)
+        outside = None if parts.positions is None else parts.positions(now_s)
+        obs = _observe(parts, senses, now_s, late_s, outside)
         before = state
         new, command = planner.step(before or planner.start(obs), obs, parts.profile)
         overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
@@ -160,7 +163,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
                 passed.append(event)
             for watcher in parts.watchers:
                 watcher.event(event)
-        tick = _tick(senses, state, command, obs, told)
+        tick = _tick(senses, state, command, obs, told, outside)
         told = senses.noticed.newest
         for watcher in parts.watchers:
             watcher.tick(tick)
@@ -194,6 +197,7 @@ def _tick(
     command: Command,
     obs: Observation,
     told: Consistency | None,
+    outside: FeedStatus | None,
 ) -> Tick:
     newest = senses.noticed.newest
     return Tick(
@@ -208,7 +212,12 @@ def _tick(
         obs.t_s - obs.telemetry.t_s,
         None if newest is told else newest,
         obs.delay_s,
+        None if outside is None else _told_of(outside),
     )
+
+
+def _told_of(status: FeedStatus) -> Outside:
+    return Outside(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)
 
 
 def _is_blind(state: PlannerState | None) -> bool:
@@ -216,7 +225,9 @@ def _is_blind(state: PlannerState | None) -> bool:
     return state is not None and state.phase is Phase.COMPLETE
 
 
-def _observe(parts: FlightParts, senses: Senses, now_s: float, late_s: float) -> Observation:
+def _observe(
+    parts: FlightParts, senses: Senses, now_s: float, late_s: float, outside: FeedStatus | None
+) -> Observation:
     newest = senses.history.newest
     assert newest is not None
     changed_s = senses.history.battery_changed_s
@@ -236,6 +247,8 @@ def _observe(parts: FlightParts, senses: Senses, now_s: float, late_s: float) ->
         operator=parts.operator(),
         log_problem=next((w.problem for w in parts.watchers if w.problem), None),
         delay_s=senses.noticed.used_s,
+        position_age_s=0.0 if outside is None else outside.age_s,
+        position_problem=None if outside is None else outside.problem,
     )
 
 
@@ -261,6 +274,10 @@ def _events(
         events.append(
             Event(obs.t_s, EventKind.HOLD, state.hold, state.phase, severity=Severity.HOLD)
         )
+    elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
+        # Where it is not held for it the pilot is told all the same.
+        text = unplaced(Context(state, obs, profile))
+        events.append(Event(obs.t_s, EventKind.NOTE, text, state.phase))
     return events
 
 

@@ -35,7 +35,8 @@ class FeedStatus:
 
     `age_s`: of the newest position that was handed to the link, from its exposure; inf before
     the first. `problem`: None while they are sent, otherwise one sentence with the cause.
-    `rate_hz`: of the last second.
+    `rate_hz`: of the last second. `measured`: the newest that was believed, with its attitude,
+    whichever of both is sent.
     """
 
     age_s: float = math.inf
@@ -43,6 +44,7 @@ class FeedStatus:
     sent: int = 0
     pose: ExternalPosition | None = None
     rate_hz: float = 0.0
+    measured: ExternalPosition | None = None
 
 
 class PositionFeed:
@@ -61,6 +63,7 @@ class PositionFeed:
         self._exposed_s = -math.inf
         self._placed: Placed | None = None
         self._pose: ExternalPosition | None = None
+        self._measured: ExternalPosition | None = None
         self._count = 0
         self._times_s: deque[float] = deque()
         self._problem: str | None = None
@@ -90,6 +93,7 @@ class PositionFeed:
                 sent=self._count,
                 pose=self._pose,
                 rate_hz=sum(now_s - t_s < RATE_OVER_S for t_s in times) / RATE_OVER_S,
+                measured=self._measured,
             )
 
     def _one(self, now_s: float) -> str | None:
@@ -100,6 +104,9 @@ class PositionFeed:
             return trouble or (None if silent else self._judge.problem)
         self._framed_s = now_s
         placed = self._judge.judge(frame, now_s)
+        if placed is not None:
+            with self._lock:
+                self._measured = placed.external(pose=True)
         if placed is None or now_s < self._due_s - 1e-6:
             return trouble or self._judge.problem
         place = placed.external(pose=self._config.send == "pose")
