@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from importlib.util import find_spec
+from typing import Any
 
 from perchctl.children import Channel, accept, end, introduce, listen, new_token, spawn
 from perchctl.errors import ConnectionFailed, InvalidValue, no_motion_capture
@@ -71,7 +72,7 @@ def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) 
     if find_spec("motioncapture") is None:
         raise no_motion_capture(needed_by)
     # Unchecked, since `check_reachable` has the sentence for a kind that is none.
-    named = {"by": "mocap", "system": kind, "host": host, "body": body}
+    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
     return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import (
@@ -24,6 +24,7 @@ from perchctl.positioning.types import BodyPose, CaptureFrame
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 
+FEW = settings(max_examples=20)  # each example is a flight
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf", latency_s=0.01)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 angles = st.floats(-3.0, 3.0)
@@ -140,6 +141,7 @@ def test_position_alone_or_with_the_attitude() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 30.0, 70.0, 100.0])
+@FEW
 @given(st.lists(st.floats(0.001, 0.1), min_size=3, max_size=8))
 def test_never_more_than_the_rate(rate_hz: float, steps_s: list[float]) -> None:
     rig = Rig(CONFIG.model_copy(update={"rate_hz": rate_hz}))
@@ -249,6 +251,7 @@ def test_what_is_no_pose_is_not_sent(pose: BodyPose) -> None:
     assert "a pose that is none" in (status.problem or "")
 
 
+@FEW
 @given(st.floats(0.2, 5.0), st.floats(-0.4, 0.4), st.floats(0.1, 2.0))
 def test_another_body_is_not_believed_however_long_it_stays(
     aside_m: float, speed_mps: float, lasting_s: float
@@ -282,6 +285,7 @@ def test_a_body_that_turns_over_in_one_frame_is_not_believed() -> None:
     assert len(rig.places) == 2
 
 
+@FEW
 @given(st.floats(-3.0, 3.0), st.floats(-4.0, 4.0))
 def test_a_body_in_flight_is_believed(speed_mps: float, turning_radps: float) -> None:
     rig = Rig()
