@@ -18,7 +18,7 @@ from perchctl.link.protocol import Guard
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.target.print_check import PrintCheck, PrintVerdict
-from perchctl.vehicle import Command, ExternalPosition, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 from perchctl.vision.types import Detections, Frame, TargetEstimate
 
 REHEARSED_S = 3.0
@@ -32,6 +32,9 @@ class Silent:
 
     def connect(self) -> None:
         return None
+
+    def measured_by(self) -> MeasuredBy:
+        return MeasuredBy()
 
     def telemetry(self) -> list[Telemetry]:
         return []

@@ -14,7 +14,12 @@ from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
 from perchctl.flight.history import extended
-from perchctl.flight.preflight import refuse, still_waiting_for
+from perchctl.flight.preflight import (
+    refuse,
+    refuse_strange,
+    refuse_unmeasured,
+    still_waiting_for,
+)
 from perchctl.flight.rescue import rescue
 from perchctl.flight.senses import Senses
 from perchctl.flight.watchdog import Watchdog
@@ -103,6 +108,7 @@ def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
 
 
 def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
+    refuse_unmeasured(parts.link, parts.profile, positions=parts.positions is not None)
     started_s = parts.clock.now()
     while True:
         now_s = parts.clock.now()
@@ -111,9 +117,12 @@ def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
         senses.take_in(now_s)
         newest = senses.history.newest
         refuse(newest, parts.profile)
+        outside = None if parts.positions is None else parts.positions(now_s)
+        refuse_strange(outside, newest, parts.profile)
         waiting = still_waiting_for(
             newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
             senses.target(now_s), 0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
+            outside,
         )  # fmt: skip
         if parts.source.finished:
             raise NotFound(

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 
 from perchctl.errors import no_motion_capture
 from perchctl.flight.clock import Clock
+from perchctl.flight.preflight import refuse_strange
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.outside import check_parameters
 from perchctl.positioning.capture import check_reachable, open_capture
@@ -16,6 +17,9 @@ from perchctl.positioning.thread import FeedThread
 from perchctl.positioning.types import CaptureSource
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
+
+STRANGE_S = 0.5
+"""For so long it is looked whether positions are of another world, before they are used."""
 
 
 def check_positioning(profile: Profile, *, simulated: bool) -> None:
@@ -56,16 +60,28 @@ def started_feed(
     link: CflibLink,
     config: PositioningConfig,
     clock: Clock,
+    profile: Profile,
 ) -> Callable[[float], FeedStatus] | None:
     """The vehicle's estimate settled on what the capture says, and positions on their way until
     `stack` ends: the link is closed before that, since a vehicle that lands still needs them.
 
-    Errors: those of `CflibLink.settle`."""
+    Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
     if capture is None:
         return None
     feed = PositionFeed(capture, link.external, config)
     thread = FeedThread(feed, clock.now)
     stack.callback(thread.close)
     thread.start()
+    _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed.status
+
+
+def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:
+    """Before an estimate is set to them, and before their scatter or their place is taken for
+    something else. What is late is left to those who wait for it."""
+    end_s, newest = clock.now() + STRANGE_S, None
+    while (now_s := clock.now()) < end_s:
+        newest = next(reversed(link.telemetry()), newest)
+        refuse_strange(feed.status(now_s), newest, profile)
+        clock.wait_until(now_s + 0.02)

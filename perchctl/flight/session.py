@@ -117,7 +117,7 @@ def fly_session(
         link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
             link.connect()
-            positions = started_feed(stack, capture, link, positioning, clock)
+            positions = started_feed(stack, capture, link, positioning, clock, profile)
             switch.listening = True
             pace, lag_s = PaceWatcher(), _lag_s(simulated, clock)
             watched = (*watchers, pace)

@@ -33,6 +33,7 @@ from perchctl.link.prepare import check_firmware, set_parameters
 from perchctl.link.protocol import Guard
 from perchctl.link.sender import Sender
 from perchctl.link.uri import check_uri
+from perchctl.link.variables import measured_by
 from perchctl.profile import LinkConfig
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import (
@@ -43,6 +44,7 @@ from perchctl.vehicle import (
     ExternalPosition,
     Idle,
     Land,
+    MeasuredBy,
     Telemetry,
 )
 
@@ -88,6 +90,9 @@ class CflibLink:
             # As long as nothing is known of the vehicle, it may be flying for another.
             self._leave(farewell=self._may_say_farewell())
             raise
+
+    def measured_by(self) -> MeasuredBy:
+        return MeasuredBy() if self.connection is None else measured_by(self.connection.cf)
 
     def telemetry(self) -> list[Telemetry]:
         return self._blocks.take()

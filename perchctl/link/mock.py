@@ -23,10 +23,11 @@ from perchctl.link.encode import (
     encode_external,
 )
 from perchctl.link.protocol import Guard
+from perchctl.link.variables import EXTERNAL, decks_of
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
-from perchctl.vehicle import FLYING, Command, ExternalPosition, Telemetry
+from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
 
 if TYPE_CHECKING:
     from perchctl.sim.vehicle import SimulatedVehicle
@@ -106,6 +107,11 @@ class MockLink:
             self._hand_over(UNLOCK_THRUST)
             self.advance_to(self.now_s + UNLOCK_PERIOD_S)
 
+    def measured_by(self) -> MeasuredBy:
+        firmware = self.vehicle.firmware
+        told = {n: firmware.get_parameter(n) for n in firmware.PARAMETERS if n.startswith("deck.")}
+        return MeasuredBy(decks_of(told), external=firmware.log_value(EXTERNAL) > 0)
+
     def telemetry(self) -> list[Telemetry]:
         self._collect()
         samples, self._arrived = self._arrived, []
@@ -181,6 +187,9 @@ class ScriptedLink:
     def connect(self) -> None:
         if self._refuse:
             raise ConnectionFailed(self._refuse)
+
+    def measured_by(self) -> MeasuredBy:
+        return MeasuredBy(("bcFlow2",))
 
     def telemetry(self) -> list[Telemetry]:
         arrived = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from perchctl.vehicle import Command, ExternalPosition, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 
 
 class Guard(Protocol):
@@ -26,6 +26,10 @@ class Link(Protocol):
 
     def connect(self) -> None:
         """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
+
+    def measured_by(self) -> MeasuredBy:
+        """What tells the vehicle where it is. Once connected, on the ground: bounded, but it may
+        take a second."""
 
     def telemetry(self) -> list[Telemetry]:
         """Samples that arrived since the last call, oldest first."""

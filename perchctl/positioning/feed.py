@@ -35,8 +35,8 @@ class FeedStatus:
 
     `age_s`: of the newest position that was handed to the link, from its exposure; inf before
     the first. `problem`: None while they are sent, otherwise one sentence with the cause.
-    `rate_hz`: of the last second. `measured`: the newest that was believed, with its attitude,
-    whichever of both is sent.
+    `rate_hz`: of the last second. `measured`: `pose` with its attitude, also where only the
+    position is sent.
     """
 
     age_s: float = math.inf
@@ -63,7 +63,6 @@ class PositionFeed:
         self._exposed_s = -math.inf
         self._placed: Placed | None = None
         self._pose: ExternalPosition | None = None
-        self._measured: ExternalPosition | None = None
         self._count = 0
         self._times_s: deque[float] = deque()
         self._problem: str | None = None
@@ -93,7 +92,7 @@ class PositionFeed:
                 sent=self._count,
                 pose=self._pose,
                 rate_hz=sum(now_s - t_s < RATE_OVER_S for t_s in times) / RATE_OVER_S,
-                measured=self._measured,
+                measured=None if self._placed is None else self._placed.external(pose=True),
             )
 
     def _one(self, now_s: float) -> str | None:
@@ -104,9 +103,6 @@ class PositionFeed:
             return trouble or (None if silent else self._judge.problem)
         self._framed_s = now_s
         placed = self._judge.judge(frame, now_s)
-        if placed is not None:
-            with self._lock:
-                self._measured = placed.external(pose=True)
         if placed is None or now_s < self._due_s - 1e-6:
             return trouble or self._judge.problem
         place = placed.external(pose=self._config.send == "pose")
