@@ -158,7 +158,7 @@ def fly_lockstep(
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
     link = MockLink(vehicle, profile.link.telemetry_period_s)
-    feed_lockstep(link, profile)
+    positions = feed_lockstep(link, profile)
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
     truth = Truth(vehicle)
@@ -172,6 +172,7 @@ def fly_lockstep(
     parts = FlightParts(
         link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
         lambda event: tell(event, event.t_s),  # the clock is the simulation's
+        positions,
     )  # fmt: skip
     link.connect()
     report = fly(parts)

@@ -84,7 +84,9 @@ def test_noise_is_what_the_settings_say_and_the_seed_s() -> None:
     x = [frame.bodies["crazyflie"].position_m[0] for frame in frames]
     assert statistics.fmean(x) == pytest.approx(AT[0], abs=2e-4)
     assert statistics.stdev(x) == pytest.approx(0.001, rel=0.15)
-    assert watched(SimCapture(settings), 1.0, Room()) == [frame for frame in frames if frame.t_s <= 1.0]
+    assert watched(SimCapture(settings), 1.0, Room()) == [
+        frame for frame in frames if frame.t_s <= 1.0
+    ]
     other = watched(SimCapture(replace(settings, seed=5)), 1.0, Room())
     assert other[0].bodies != frames[0].bodies
 
