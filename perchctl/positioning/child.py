@@ -116,6 +116,7 @@ def _body(body: Any) -> Body:
 
 def _end_with(channel: Channel) -> None:
     """The parent never speaks again: what is read is its end. The library may be anywhere."""
+    channel.socket.settimeout(None)  # its setup was waited for with a limit; a flight has none
     with contextlib.suppress(OSError):
         channel.socket.recv(1)
     os._exit(0)
