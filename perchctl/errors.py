@@ -30,9 +30,17 @@ def no_simulator(missing: str | None = "mujoco") -> UsageError:
     )
 
 
+def no_motion_capture(needed_by: str = "positioning by motion capture") -> UsageError:
+    """Where the extra ``mocap`` is not installed."""
+    return UsageError(
+        f"{needed_by} needs the library motioncapture; install it with: "
+        f"{sys.executable} -m pip install 'perchctl[mocap]'"
+    )
+
+
 class ConnectionFailed(PerchError):
     exit_code = 10
-    meaning = "no connection to the vehicle"
+    meaning = "no connection to the vehicle or the motion capture"
 
 
 class NotFound(PerchError):

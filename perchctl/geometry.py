@@ -74,6 +74,41 @@ def yaw_of(R: Array) -> float:
     return math.atan2(R[1, 0], R[0, 0])
 
 
+def rotation_from_quaternion(quaternion: tuple[float, float, float, float]) -> Array:
+    """Of a unit quaternion (w, x, y, z), shape (3, 3)."""
+    w, x, y, z = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) with w >= 0: the inverse of `rotation_from_quaternion`.
+
+    Row `k` of the products below is the quaternion times four times its own part `k`; the
+    longest row is the one that no cancellation has spoilt.
+    """
+    d0, d1, d2 = R[0, 0], R[1, 1], R[2, 2]
+    a, b, c = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    e, f, g = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    products = np.array(
+        [
+            [1.0 + d0 + d1 + d2, a, b, c],
+            [a, 1.0 + d0 - d1 - d2, e, f],
+            [b, e, 1.0 - d0 + d1 - d2, g],
+            [c, f, g, 1.0 - d0 - d1 + d2],
+        ]
+    )
+    row = products[int(np.argmax(products.diagonal()))]
+    row = row / math.copysign(float(np.linalg.norm(row)), row[0])
+    w, x, y, z = (float(part) for part in row)
+    return w, x, y, z
+
+
 def make_T(R: Array, t_m: Array | tuple[float, float, float]) -> Array:
     """Homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)

@@ -53,6 +53,23 @@ class ExternalPosition:
     quaternion: tuple[float, float, float, float] | None = None
 
 
+POSITION_DECKS = ("bcFlow2", "bcFlow", "bcLighthouse4", "bcLoco", "bcDWM1000")
+"""Those that measure a position, or a speed over ground, by the firmware's `deck` parameters."""
+
+
+@dataclass(frozen=True)
+class MeasuredBy:
+    """What tells a vehicle where it is: all its decks, by the firmware's names, and whether it
+    is told from outside (None: not known)."""
+
+    decks: tuple[str, ...] = ()
+    external: bool | None = None
+
+    @property
+    def position_decks(self) -> tuple[str, ...]:
+        return tuple(deck for deck in self.decks if deck in POSITION_DECKS)
+
+
 @dataclass(frozen=True)
 class Idle:
     """Send nothing (on the ground, or while the vehicle lands by itself)."""

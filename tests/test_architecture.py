@@ -21,7 +21,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "filterpy": ("perchctl.vision.filter",),
     "mujoco": ("perchctl.sim",),
     "matplotlib": ("*.plot",),
-    "motioncapture": ("perchctl.weights.truth",),
+    "motioncapture": ("perchctl.positioning",),
     "av": ("perchctl.track.files",),
 }
 
@@ -38,7 +38,7 @@ CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
 # before it; rooms in one line do not know of each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.errors", "perchctl.startup"),
-    ("perchctl.geometry", "perchctl.files", "perchctl.vehicle"),
+    ("perchctl.geometry", "perchctl.files", "perchctl.vehicle", "perchctl.children"),
     ("perchctl.plot",),
     ("perchctl.profile",),
     ("perchctl.vision",),

@@ -14,8 +14,10 @@ from perchctl.flight import criteria
 from perchctl.flight.criteria import Problem
 from perchctl.link.prepare import NEEDED_PROTOCOL
 from perchctl.link.probe import Echoes, ProbeLink
+from perchctl.link.variables import EXTERNAL, decks_of
+from perchctl.positioning.judge import label
 from perchctl.profile import Profile
-from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, Telemetry
+from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
 
 LISTEN_S = 5.0
 LOST_WARN, LOST_FAIL = 0.01, 0.05
@@ -27,11 +29,10 @@ RATE_WARN, RATE_FAIL = 0.9, 0.5
 """Share of the telemetry's wanted rate."""
 SPARE_V = 0.1
 LEVEL_WARN_DEG = 3.0
-POSITION_DECKS = ("bcFlow2", "bcFlow", "bcLighthouse4", "bcLoco", "bcDWM1000")
 KALMAN = 2
 MOVED_WARN_M = 0.05
 """At rest, while it is listened to: a flight's estimate drifts by a fifth of it."""
-RSSI, EXTERNAL = "radio.rssi", "locSrv.tick"
+RSSI = "radio.rssi"
 SELF_TEST, ESTIMATOR = "system.selftestPassed", "stabilizer.estimator"
 OPTIONAL = {"pm.vbat": "battery", "kalman.varPX": "estimator's variance", RSSI: "radio's strength"}
 
@@ -55,6 +56,10 @@ class Vehicle:
     rssi_dbm: float | None = None
     external: bool | None = None
     moved_m: float = 0.0
+
+    @property
+    def measured_by(self) -> MeasuredBy:
+        return MeasuredBy(decks_of(self.parameters), self.external)
 
 
 NAMES = (
@@ -214,7 +219,7 @@ def _self_test(vehicle: Vehicle) -> Row:
 def _at_rest(vehicle: Vehicle, profile: Profile) -> list[Row]:
     """What needs telemetry, and around it what belongs there."""
     t = vehicle.telemetry
-    around = _decks(vehicle), _positioning(vehicle)
+    around = _decks(vehicle), _positioning(vehicle, profile)
     told = _parameters(vehicle, profile)
     if t is None:
         names = ("supervisor", "estimator", "ground", "level", "still", "battery")
@@ -246,27 +251,23 @@ def _supervisor(t: Telemetry) -> Row:
 
 
 def _decks(vehicle: Vehicle) -> Row:
-    decks = _present(vehicle.parameters)
+    decks = vehicle.measured_by.decks
     if not decks:
         return warned("decks", "none", "mounted ones: take them off and put them on again")
     return passed("decks", ", ".join(decks))
 
 
-def _present(parameters: Mapping[str, float]) -> list[str]:
-    names = (n.removeprefix("deck.") for n, v in parameters.items() if v and n.startswith("deck."))
-    return sorted(names)
-
-
-def _positioning(vehicle: Vehicle) -> Row:
-    decks = [d for d in _present(vehicle.parameters) if d in POSITION_DECKS]
-    if decks:
-        return passed("positioning", f"by {', '.join(decks)}")
-    if vehicle.external:
-        return passed("positioning", "by positions from outside")
-    if vehicle.external is None:
-        return skipped("positioning", "no deck; whether positions come from outside is not told")
-    advice = "mount a positioning deck, or start what sends the positions"
-    return failed("positioning", "no deck, and no position comes from outside", advice)
+def _positioning(vehicle: Vehicle, profile: Profile) -> Row:
+    by = vehicle.measured_by
+    problem = criteria.unmeasured(by, profile)
+    if problem is not None and by.external is None:
+        return skipped("positioning", problem.found, problem.advice)
+    if problem is not None:
+        return failed("positioning", problem.found, problem.advice)
+    if profile.positioning.by == "mocap":
+        return passed("positioning", f"by {label(profile.positioning)}, see its rows")
+    decks = by.position_decks
+    return passed("positioning", f"by {', '.join(decks)}" if decks else "by positions from outside")
 
 
 def _estimator(vehicle: Vehicle, t: Telemetry, profile: Profile) -> Row:

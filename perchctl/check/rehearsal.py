@@ -18,7 +18,7 @@ from perchctl.link.protocol import Guard
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.target.print_check import PrintCheck, PrintVerdict
-from perchctl.vehicle import Command, ExternalPosition, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 from perchctl.vision.types import Detections, Frame, TargetEstimate
 
 REHEARSED_S = 3.0
@@ -33,14 +33,17 @@ class Silent:
     def connect(self) -> None:
         return None
 
+    def measured_by(self) -> MeasuredBy:
+        return MeasuredBy()
+
     def telemetry(self) -> list[Telemetry]:
         return []
 
     def send(self, command: Command) -> None:
         return None
 
-    def external(self, place: ExternalPosition) -> None:
-        return None
+    def external(self, place: ExternalPosition) -> bool:
+        return False
 
     def problem(self, now_s: float) -> str | None:
         return None

@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from perchctl import __version__
-from perchctl.cli.complete import complete_profile, complete_source
+from perchctl.cli.complete import complete_positioning, complete_profile, complete_source
 from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
@@ -79,6 +79,14 @@ SourceOption = Annotated[
         "--source",
         help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:.",
         autocompletion=complete_source,
+    ),
+]
+PositioningOption = Annotated[
+    str | None,
+    typer.Option(
+        "--positioning",
+        help="What measures the position: deck or mocap; by default the profile's.",
+        autocompletion=complete_positioning,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]

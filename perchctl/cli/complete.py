@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 
+def complete_positioning(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import positionings
+
+    return positionings(incomplete)
+
+
 def complete_profile(incomplete: str) -> list[str]:
     from perchctl.commands.complete import profiles
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from perchctl.cli.app import (
+    PositioningOption,
     ProfileOption,
     SourceOption,
     UriOption,
@@ -22,6 +23,7 @@ def fly(
     profile: ProfileOption = "sim",
     uri: UriOption = None,
     source: SourceOption = None,
+    positioning: PositioningOption = None,
     seed: Annotated[
         int | None, typer.Option("--seed", help="Seed of the simulated scenario; 11 by default.")
     ] = None,
@@ -50,6 +52,7 @@ def fly(
             profile=profile,
             uri=uri,
             source=source,
+            positioning=positioning,
             seed=seed,
             log_dir=log_dir,
             dry_run=dry_run,

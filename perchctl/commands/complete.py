@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from perchctl.camera.files import IMAGE_SUFFIXES
+from perchctl.commands.positioning import POSITIONINGS
 from perchctl.profile.places import listing
 
 _DEVICES = Path("/dev")
@@ -19,6 +20,10 @@ _PICTURES = (*IMAGE_SUFFIXES, ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 def profiles(begun: str) -> list[str]:
     """Names that go on from what was typed, then profile files and folders."""
     return [*_that_begin(begun, listing("profiles")), *_files(begun, _YAML)]
+
+
+def positionings(begun: str) -> list[str]:
+    return _that_begin(begun, POSITIONINGS)
 
 
 def sources(begun: str) -> list[str]:

@@ -16,6 +16,7 @@ from perchctl.commands.fly_plan import plan, plan_text, weights_text
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port
+from perchctl.commands.positioning import positioned
 from perchctl.display.page.flight import FlightPage, flight_page
 from perchctl.display.panel import make_reporter
 from perchctl.display.watch import DisplayWatcher
@@ -60,6 +61,7 @@ class FlyRequest:
     profile: str = "sim"
     uri: str | None = None
     source: str | None = None
+    positioning: str | None = None
     seed: int | None = None
     log_dir: Path | None = None
     dry_run: bool = False
@@ -90,7 +92,7 @@ def run(request: FlyRequest) -> int:
 
 def resolve(request: FlyRequest) -> FlyOptions:
     """The command line on top of the profile. Errors: NotFound, InvalidValue, UsageError."""
-    profile = load_profile(request.profile)
+    profile = positioned(load_profile(request.profile), request.positioning)
     options = FlyOptions(
         profile=profile,
         profile_path=find_profile(request.profile),

@@ -184,7 +184,8 @@ def make_reporter(interactive: bool | None = None, stream: TextIO | None = None)
 
 
 def panel(status: FlightStatus) -> Panel:
-    """The status as a panel of at most `WIDTH` columns and eight lines."""
+    """The status as a panel of at most `WIDTH` columns and eight lines; nine with positions from
+    outside."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True, min_width=7)
     table.add_column(no_wrap=True, overflow="ellipsis")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from perchctl.mission.watch import Event, EventKind
+from perchctl.mission.watch import Event, EventKind, Outside
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class FlightStatus:
         loop_late_s: how late this tick began.
         attempts: failed perching attempts so far.
         reason: why the phase was entered; `hold`: why the vehicle is held, or empty.
+        outside: how it goes with positions from outside; None where decks measure them.
     """
 
     t_s: float
@@ -40,6 +41,7 @@ class FlightStatus:
     attempts: int
     reason: str
     hold: str = ""
+    outside: Outside | None = None
 
 
 def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
@@ -61,8 +63,15 @@ def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
         ("markers", f"{status.stage}   attempts {status.attempts}"),
         ("height", f"{status.height_m:.2f} m   battery {status.battery_v:.2f} V"),
         ("ages", ages),
+        *([] if status.outside is None else [("outside", _outside_text(status.outside))]),
         ("held" if status.hold else "reason", status.hold or status.reason),
     ]
+
+
+def _outside_text(outside: Outside) -> str:
+    if outside.problem is not None:
+        return outside.problem
+    return f"position {outside.rate_hz:.0f} Hz   {_age(outside.age_s)}"
 
 
 def event_text(event: Event) -> str:

@@ -51,4 +51,5 @@ def status_of(tick: Tick) -> FlightStatus:
         attempts=state.attempts,
         reason=state.reason,
         hold=state.hold,
+        outside=tick.outside,
     )

@@ -17,6 +17,7 @@ from perchctl.vehicle import (
     LOCKED,
     NO_BATTERY_READING_V,
     TUMBLED,
+    MeasuredBy,
     Telemetry,
 )
 from perchctl.vision.types import TargetEstimate
@@ -82,6 +83,18 @@ def unsettled(telemetry: Telemetry, profile: Profile) -> Problem | None:
     return Problem(
         f"variance {variance:.3g} m^2, at most {most:g} allowed", "is there a positioning system?"
     )
+
+
+def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
+    """Nothing tells the vehicle where it is: it would fly by a sum of accelerations."""
+    if profile.positioning.by == "mocap" or by.position_decks or by.external:
+        return None
+    if by.external is None:
+        found = "no positioning deck; whether positions come from outside is not told"
+    else:
+        found = "no positioning deck, and no position comes from outside"
+    advice = "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap"
+    return Problem(found, advice)
 
 
 def off_the_ground(telemetry: Telemetry, profile: Profile) -> Problem | None:

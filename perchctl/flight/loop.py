@@ -14,14 +14,21 @@ from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
 from perchctl.flight.history import extended
-from perchctl.flight.preflight import refuse, still_waiting_for
+from perchctl.flight.preflight import (
+    refuse,
+    refuse_strange,
+    refuse_unmeasured,
+    still_waiting_for,
+)
 from perchctl.flight.rescue import rescue
 from perchctl.flight.senses import Senses
 from perchctl.flight.watchdog import Watchdog
 from perchctl.link.evidence import FRESH_S
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
+from perchctl.mission.context import Context
 from perchctl.mission.findings import findings_of
+from perchctl.mission.hold import unplaced
 from perchctl.mission.state import (
     FLYING_PHASES,
     Observation,
@@ -31,8 +38,9 @@ from perchctl.mission.state import (
     PlannerState,
     Severity,
 )
-from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
+from perchctl.mission.watch import Event, EventKind, FlightReport, Outside, Tick, Watcher
 from perchctl.pipeline import Pipeline
+from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, NO_BATTERY_READING_V, Command, Idle
 from perchctl.vision.consistency import Consistency
@@ -44,7 +52,7 @@ HUNG_S = 0.25
 @dataclass(frozen=True, eq=False)
 class FlightParts:
     """The edges. `simulated` says what the scenario of a simulated flight did that explains
-    an event."""
+    an event; `positions` how it goes with those from outside, None where decks measure them."""
 
     link: Link
     source: FrameSource
@@ -54,6 +62,7 @@ class FlightParts:
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
     simulated: Callable[[Event], str] = lambda event: ""
+    positions: Callable[[float], FeedStatus] | None = None
 
 
 def fly(parts: FlightParts) -> FlightReport:
@@ -99,6 +108,7 @@ def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
 
 
 def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
+    refuse_unmeasured(parts.link, parts.profile, positions=parts.positions is not None)
     started_s = parts.clock.now()
     while True:
         now_s = parts.clock.now()
@@ -107,9 +117,12 @@ def _wait_until_ready(parts: FlightParts, senses: Senses) -> None:
         senses.take_in(now_s)
         newest = senses.history.newest
         refuse(newest, parts.profile)
+        outside = None if parts.positions is None else parts.positions(now_s)
+        refuse_strange(outside, newest, parts.profile)
         waiting = still_waiting_for(
             newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
             senses.target(now_s), 0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
+            outside,
         )  # fmt: skip
         if parts.source.finished:
             raise NotFound(
@@ -134,7 +147,8 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
         senses.take_in(now_s, look=not _is_blind(state))
         now_s = _present(parts, senses, now_s)
         late_s = max(0.0, now_s - due_s)
-        obs = _observe(parts, senses, now_s, late_s)
+        outside = None if parts.positions is None else parts.positions(now_s)
+        obs = _observe(parts, senses, now_s, late_s, outside)
         before = state
         new, command = planner.step(before or planner.start(obs), obs, parts.profile)
         overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
@@ -158,7 +172,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
                 passed.append(event)
             for watcher in parts.watchers:
                 watcher.event(event)
-        tick = _tick(senses, state, command, obs, told)
+        tick = _tick(senses, state, command, obs, told, outside)
         told = senses.noticed.newest
         for watcher in parts.watchers:
             watcher.tick(tick)
@@ -192,6 +206,7 @@ def _tick(
     command: Command,
     obs: Observation,
     told: Consistency | None,
+    outside: FeedStatus | None,
 ) -> Tick:
     newest = senses.noticed.newest
     return Tick(
@@ -206,7 +221,12 @@ def _tick(
         obs.t_s - obs.telemetry.t_s,
         None if newest is told else newest,
         obs.delay_s,
+        None if outside is None else _told_of(outside),
     )
+
+
+def _told_of(status: FeedStatus) -> Outside:
+    return Outside(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)
 
 
 def _is_blind(state: PlannerState | None) -> bool:
@@ -214,7 +234,9 @@ def _is_blind(state: PlannerState | None) -> bool:
     return state is not None and state.phase is Phase.COMPLETE
 
 
-def _observe(parts: FlightParts, senses: Senses, now_s: float, late_s: float) -> Observation:
+def _observe(
+    parts: FlightParts, senses: Senses, now_s: float, late_s: float, outside: FeedStatus | None
+) -> Observation:
     newest = senses.history.newest
     assert newest is not None
     changed_s = senses.history.battery_changed_s
@@ -234,6 +256,8 @@ def _observe(parts: FlightParts, senses: Senses, now_s: float, late_s: float) ->
         operator=parts.operator(),
         log_problem=next((w.problem for w in parts.watchers if w.problem), None),
         delay_s=senses.noticed.used_s,
+        position_age_s=0.0 if outside is None else outside.age_s,
+        position_problem=None if outside is None else outside.problem,
     )
 
 
@@ -259,6 +283,10 @@ def _events(
         events.append(
             Event(obs.t_s, EventKind.HOLD, state.hold, state.phase, severity=Severity.HOLD)
         )
+    elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
+        # Where it is not held for it the pilot is told all the same.
+        text = unplaced(Context(state, obs, profile))
+        events.append(Event(obs.t_s, EventKind.NOTE, text, state.phase))
     return events
 
 

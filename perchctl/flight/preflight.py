@@ -11,9 +11,13 @@ from perchctl.flight.criteria import (
     not_allowed,
     off_the_ground,
     tilted,
+    unmeasured,
     unsettled,
     within_reach,
 )
+from perchctl.flight.outside import apart, missing, strange
+from perchctl.link.protocol import Link
+from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import TargetEstimate
@@ -27,6 +31,26 @@ def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
     _refuse(battery_low(telemetry, profile))
 
 
+def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
+    """Raises SafetyAbort where nothing would tell the vehicle its position. `positions`: those
+    of the profile's motion capture are being sent."""
+    if profile.positioning.by != "mocap":
+        _refuse(unmeasured(link.measured_by(), profile))
+    elif not positions:
+        raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
+
+
+def refuse_strange(
+    status: FeedStatus | None, telemetry: Telemetry | None, profile: Profile
+) -> None:
+    """Raises SafetyAbort for positions in another unit, or of another world. Held askew or moved
+    it is not judged: capture and attitude are not of one moment."""
+    if status is None or status.measured is None or telemetry is None:
+        return
+    if tilted(telemetry, profile) is None and moving(telemetry) is None:
+        _refuse(strange(status.measured, telemetry, profile))
+
+
 def still_waiting_for(
     telemetry: Telemetry | None,
     has_frame: bool,
@@ -35,6 +59,7 @@ def still_waiting_for(
     profile: Profile,
     target: TargetEstimate | None = None,
     age_s: float = 0.0,
+    outside: FeedStatus | None = None,
 ) -> str:
     """What is missing yet, or empty when ready. Errors: TimedOut past the bound, and
     SafetyAbort off the ground."""
@@ -43,8 +68,14 @@ def still_waiting_for(
         return _bounded("telemetry", waited_s, limit_s)
     if age_s > profile.safety.telemetry_hold_s:
         return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
+    if outside is not None and (problem := missing(outside, profile)):
+        return _bounded(f"positions of the motion capture ({problem.sentence})", waited_s, limit_s)
     if problem := unsettled(telemetry, profile):
         what = f"the state estimate to settle ({problem.found}; {problem.advice})"
+        return _bounded(what, waited_s, limit_s)
+    seen = None if outside is None else outside.measured
+    if seen is not None and (problem := apart(seen, telemetry)):
+        what = f"the state estimate to agree with the motion capture ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)
     _refuse(off_the_ground(telemetry, profile))
     if problem := tilted(telemetry, profile):

@@ -18,6 +18,12 @@ from perchctl.flight.clock import WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.pace import PaceWatcher, judged
+from perchctl.flight.positions import (
+    at_hand,
+    check_positioning,
+    opened_capture,
+    started_feed,
+)
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.uri import check_uri
 from perchctl.mission.watch import Event, FlightReport, Watcher
@@ -60,6 +66,7 @@ class SessionResult:
 def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
+    check_positioning(options.profile, simulated=options.simulated)
     if scheme_of(options.source) not in SCHEMES:
         raise InvalidValue(f"camera source {options.source!r} is unknown; allowed are {ALLOWED}")
     if options.source.startswith("sim:") and not options.simulated:
@@ -105,15 +112,18 @@ def fly_session(
         if config.mirrored:
             source = UnmirroredSource(source)
         source = watch_source(source)
-        link = CflibLink(uri, profile.link, clock.now)
+        positioning = at_hand(profile.positioning, simulated.capture if simulated else None)
+        capture = opened_capture(stack, positioning, clock)
+        link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
             link.connect()
+            positions = started_feed(stack, capture, link, positioning, clock, profile)
             switch.listening = True
             pace, lag_s = PaceWatcher(), _lag_s(simulated, clock)
             watched = (*watchers, pace)
             parts = FlightParts(
                 link, source, clock, profile, pipeline, watched, switch.read,
-                _teller(options, lag_s),
+                _teller(options, lag_s), positions,
             )  # fmt: skip
             report = fly(parts)
             if simulated is not None:
@@ -156,8 +166,12 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
     """Started, with its camera's stream. Errors: UsageError without the simulator."""
     if find_spec("mujoco") is None:
         raise no_simulator()
-    from perchctl.sim.draw import draw_scenario
+    from perchctl.sim.draw import draw_capture, draw_scenario
     from perchctl.sim.process.handle import SimProcess
 
-    scenario = draw_scenario(options.profile, options.seed)
-    return SimProcess.start(scenario, camera=camera, target=options.profile.target)
+    return SimProcess.start(
+        draw_scenario(options.profile, options.seed),
+        camera=camera,
+        target=options.profile.target,
+        capture=draw_capture(options.profile, options.seed),
+    )

@@ -7,13 +7,17 @@ zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints s
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link.connection import Connection, open_connection, send_packets
+from perchctl.link.connection import (
+    Connection,
+    open_connection,
+    send_at_once,
+    send_packets,
+)
 from perchctl.link.encode import (
     ARM,
     UNLOCK_PERIOD_S,
@@ -24,11 +28,14 @@ from perchctl.link.encode import (
 )
 from perchctl.link.evidence import is_known, may_fly
 from perchctl.link.log_blocks import LogBlocks
+from perchctl.link.outside import Feed, Settling, parameters_of
 from perchctl.link.prepare import check_firmware, set_parameters
 from perchctl.link.protocol import Guard
 from perchctl.link.sender import Sender
 from perchctl.link.uri import check_uri
+from perchctl.link.variables import measured_by
 from perchctl.profile import LinkConfig
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import (
     ARMED,
     FLYING,
@@ -37,6 +44,7 @@ from perchctl.vehicle import (
     ExternalPosition,
     Idle,
     Land,
+    MeasuredBy,
     Telemetry,
 )
 
@@ -50,7 +58,8 @@ class CflibLink:
     """`perchctl.link.protocol.Link` on an unmodified cflib.
 
     `connection` is None before `connect` and after `close`. `landing_wait_s`: how long
-    `close` waits for a vehicle that still flies.
+    `close` waits for a vehicle that still flies. `positioning` by motion capture sets the
+    vehicle's estimator to it.
     """
 
     def __init__(
@@ -59,8 +68,10 @@ class CflibLink:
         config: LinkConfig,
         clock: Callable[[], float],
         landing_wait_s: float = LANDING_WAIT_S,
+        positioning: PositioningConfig | None = None,
     ) -> None:
         check_uri(uri)
+        self._positioning = positioning or PositioningConfig()
         self._uri = uri
         self._config = config
         self._clock = clock
@@ -80,6 +91,9 @@ class CflibLink:
             self._leave(farewell=self._may_say_farewell())
             raise
 
+    def measured_by(self) -> MeasuredBy:
+        return MeasuredBy() if self.connection is None else measured_by(self.connection.cf)
+
     def telemetry(self) -> list[Telemetry]:
         return self._blocks.take()
 
@@ -87,11 +101,27 @@ class CflibLink:
         if self._sender is not None and not isinstance(command, Idle):
             self._sender.put(command)
 
-    def external(self, place: ExternalPosition) -> None:
+    def external(self, place: ExternalPosition) -> bool:
         connection = self.connection
-        if connection is not None and connection.lost is None:
-            with contextlib.suppress(Exception):  # the library's; commands report their own
-                send_packets(connection.cf, (encode_external(place),))
+        if connection is None or connection.lost is not None:
+            return False
+        try:
+            return send_at_once(connection.cf, encode_external(place))
+        except Exception:  # the library's; commands report their own
+            return False
+
+    def settle(self, feed: Feed) -> None:
+        """Start the estimator where the capture that `feed` is of sees the vehicle. On the
+        ground, after `connect`; bounded. Errors: those of `perchctl.link.outside.Settling`."""
+        if self.connection is None:
+            raise ConnectionFailed(f"{self._uri} is not connected")
+        Settling(
+            self.connection.cf,
+            self._uri,
+            self._positioning,
+            lambda: self._blocks.newest,
+            self._clock,
+        ).settle(feed)
 
     def guard(self, guard: Guard) -> None:
         self._guard = guard
@@ -131,7 +161,13 @@ class CflibLink:
         set_parameters(connection.cf, self._uri, self._config.parameters)
         self._start_logging(connection)
         self._arm_if_needed(connection)
-        self._unlock_thrust(connection)
+        self._unlock_thrust(connection)  # from here on it is known to be on the ground
+        set_parameters(
+            connection.cf,
+            self._uri,
+            parameters_of(self._positioning),
+            needed_by="positioning from outside",
+        )
         self._sender = Sender(self._hand_over, self._ask_guard, self._clock)
 
     def _start_logging(self, connection: Connection) -> None:

@@ -147,13 +147,42 @@ def ready_cflib() -> None:
 
 def send_packets(cf: Any, packets: Iterable[Packet]) -> None:
     """Send them as they are, through the lock and the driver of cflib's `Crazyflie`."""
+    for packet in packets:
+        cf.send_packet(_as_cflib(packet))
+
+
+def send_at_once(cf: Any, packet: Packet) -> bool:
+    """Send it now, or not at all: whether it went out.
+
+    What is true only now must not wait behind another packet, in cflib's lock or in the one
+    place of its radio's queue, and go out later: the newer one is sent instead. What the radio
+    has already taken, and repeats until it is acknowledged, cannot be called back.
+    """
+    outgoing = _as_cflib(packet)
+    lock = cf._send_lock
+    if not lock.acquire(blocking=False):
+        return False
+    try:
+        driver = cf.link
+        if driver is None:
+            return False
+        waiting = getattr(driver, "out_queue", None)
+        if waiting is not None and waiting.full():
+            return False
+        driver.send_packet(outgoing)
+        cf.packet_sent.call(outgoing)
+        return True
+    finally:
+        lock.release()
+
+
+def _as_cflib(packet: Packet) -> Any:
     from cflib.crtp.crtpstack import CRTPPacket
 
-    for packet in packets:
-        outgoing = CRTPPacket()
-        outgoing.set_header(packet.port, packet.channel)
-        outgoing.data = packet.data
-        cf.send_packet(outgoing)
+    outgoing = CRTPPacket()
+    outgoing.set_header(packet.port, packet.channel)
+    outgoing.data = packet.data
+    return outgoing
 
 
 def plain_cause(message: str) -> str:

@@ -10,7 +10,7 @@ import heapq
 import itertools
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
@@ -23,10 +23,11 @@ from perchctl.link.encode import (
     encode_external,
 )
 from perchctl.link.protocol import Guard
+from perchctl.link.variables import EXTERNAL, decks_of
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
-from perchctl.vehicle import FLYING, Command, ExternalPosition, Telemetry
+from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
 
 if TYPE_CHECKING:
     from perchctl.sim.vehicle import SimulatedVehicle
@@ -75,6 +76,8 @@ class MockLink:
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
         self._watched_s = -math.inf
+        self._turn: Callable[[float], object] = lambda now_s: None
+        self._turn_due_s = self._turn_period_s = math.inf
 
     @property
     def now_s(self) -> float:
@@ -82,20 +85,32 @@ class MockLink:
 
     def advance_to(self, t_s: float) -> None:
         """Step the vehicle until `t_s`, sending its telemetry on the way."""
-        while (due_s := min(self._due_s.values())) <= t_s:
+        while (due_s := min(self._turn_due_s, *self._due_s.values())) <= t_s:
             self.vehicle.advance_to(due_s)
             for name, block_due_s in self._due_s.items():
                 if block_due_s <= due_s + 1e-9:
                     self._send_down(name)
                     self._due_s[name] = block_due_s + self._periods_s[name]
             self._ask_guard()
+            if self._turn_due_s <= due_s + 1e-9:
+                self._turn_due_s += self._turn_period_s
+                self._turn(self.now_s)
         self.vehicle.advance_to(t_s)
+
+    def each(self, period_s: float, turn: Callable[[float], object]) -> None:
+        """Calls `turn` with the time every `period_s` from now on: a thread's stand-in."""
+        self._turn, self._turn_period_s, self._turn_due_s = turn, period_s, self.now_s
 
     def connect(self) -> None:
         self.advance_to(self.now_s + SETTLE_S)
         for _ in range(UNLOCK_TIMES):
             self._hand_over(UNLOCK_THRUST)
             self.advance_to(self.now_s + UNLOCK_PERIOD_S)
+
+    def measured_by(self) -> MeasuredBy:
+        firmware = self.vehicle.firmware
+        told = {n: firmware.get_parameter(n) for n in firmware.PARAMETERS if n.startswith("deck.")}
+        return MeasuredBy(decks_of(told), external=firmware.log_value(EXTERNAL) > 0)
 
     def telemetry(self) -> list[Telemetry]:
         self._collect()
@@ -125,8 +140,9 @@ class MockLink:
     def send(self, command: Command) -> None:
         self._hand_over(encode(command))
 
-    def external(self, place: ExternalPosition) -> None:
+    def external(self, place: ExternalPosition) -> bool:
         self._hand_over((encode_external(place),))
+        return True
 
     def problem(self, now_s: float) -> str | None:
         return None
@@ -172,6 +188,9 @@ class ScriptedLink:
         if self._refuse:
             raise ConnectionFailed(self._refuse)
 
+    def measured_by(self) -> MeasuredBy:
+        return MeasuredBy(("bcFlow2",))
+
     def telemetry(self) -> list[Telemetry]:
         arrived = []
         while self._script and self._script[0].t_s <= self.now_s:
@@ -184,8 +203,9 @@ class ScriptedLink:
     def problem(self, now_s: float) -> str | None:
         return "the script ended the link" if now_s >= self._dies_at_s else None
 
-    def external(self, place: ExternalPosition) -> None:
+    def external(self, place: ExternalPosition) -> bool:
         self.places.append((self.now_s, place))
+        return True
 
     def guard(self, guard: Guard) -> None:
         self.watchdog = guard

@@ -36,19 +36,37 @@ def missing_variables(cf: Any) -> list[str]:
     return [name for name in NEEDED if toc.get_element_by_complete_name(name) is None]
 
 
-def set_parameters(cf: Any, uri: str, parameters: Mapping[str, float]) -> None:
+def set_parameters(
+    cf: Any, uri: str, parameters: Mapping[str, float], needed_by: str | None = None
+) -> None:
     """Set each parameter and verify it.
 
-    Raises NotFound for an unknown name, InvalidValue for a value that the vehicle does
-    not keep, TimedOut without an answer.
+    `needed_by`: what they are for, where they are not the user's own. Raises NotFound for an
+    unknown name, InvalidValue for a value that the vehicle does not keep, TimedOut without an
+    answer.
     """
     for name, wanted in parameters.items():
-        if cf.param.toc.get_element_by_complete_name(name) is None:
-            raise NotFound(
-                f"the firmware at {uri} has no parameter {name}: correct "
-                f"link.parameters in the profile"
-            )
+        _check_known(cf, uri, name, needed_by)
         _set_parameter(cf.param, name, wanted)
+
+
+def order_parameter(cf: Any, uri: str, name: str, value: float, needed_by: str) -> None:
+    """Set one that is an order, and is not to be read back. Raises as `set_parameters`."""
+    _check_known(cf, uri, name, needed_by)
+    try:
+        cf.param.set_value(name, str(value))
+    except (AttributeError, ValueError, KeyError) as error:
+        raise InvalidValue(f"parameter {name} cannot be set to {value}: {error}") from None
+
+
+def _check_known(cf: Any, uri: str, name: str, needed_by: str | None) -> None:
+    if cf.param.toc.get_element_by_complete_name(name) is not None:
+        return
+    if needed_by is None:
+        remedy = ": correct link.parameters in the profile"
+    else:
+        remedy = f", which {needed_by} needs: update the firmware to release 2026.08 or later"
+    raise NotFound(f"the firmware at {uri} has no parameter {name}{remedy}")
 
 
 def _set_parameter(parameters: Any, name: str, wanted: float) -> None:

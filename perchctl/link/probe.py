@@ -18,6 +18,7 @@ from perchctl.errors import NotFound, TimedOut
 from perchctl.link.connection import Connection, send_packets
 from perchctl.link.estimate import EstimateLink
 from perchctl.link.prepare import missing_variables
+from perchctl.link.variables import has_variable, parameters, variables
 from perchctl.profile import LinkConfig
 from perchctl.sim.crtp.codec import Packet, Port
 from perchctl.vehicle import Telemetry
@@ -26,7 +27,6 @@ ANSWER_S = 0.5
 ASKED_TIMES = 3
 ECHO_PERIOD_S = 0.02
 _ECHO_MARK = 1  # cflib's own pings begin with 0
-_BLOCK_BYTES = 26
 _VERSION_CHANNEL, _GET_FIRMWARE = 1, 1
 HealthTest = Literal["startPropTest", "startBatTest"]
 
@@ -88,11 +88,7 @@ class ProbeLink(EstimateLink):
 
     def parameters(self) -> dict[str, float]:
         """All, as they were read when the link was opened."""
-        return {
-            f"{group}.{name}": float(value)
-            for group, values in self.cf.param.values.items()
-            for name, value in values.items()
-        }
+        return parameters(self.cf)
 
     def age_s(self) -> float:
         """Of the newest sample, in the older of its parts; infinite without one."""
@@ -107,15 +103,11 @@ class ProbeLink(EstimateLink):
         return self._blocks.newest
 
     def has_variable(self, name: str) -> bool:
-        return self.cf.log.toc.get_element_by_complete_name(name) is not None
+        return has_variable(self.cf, name)
 
     def variables(self, names: Iterable[str]) -> dict[str, float]:
         """The newest values of log variables; without those that are missing or do not come."""
-        known = [name for name in names if self.has_variable(name)]
-        values: dict[str, float] = {}
-        for block in _blocks(known):
-            values |= self._read(block)
-        return values
+        return variables(self.cf, names)
 
     def echoes(self, duration_s: float, period_s: float = ECHO_PERIOD_S) -> Echoes:
         """Send packets to come back for so long, and wait `ANSWER_S` for the last."""
@@ -174,35 +166,5 @@ class ProbeLink(EstimateLink):
             self.cf.remove_header_callback(on_packet, question.port, question.channel)
         return None
 
-    def _read(self, names: list[str]) -> dict[str, float]:
-        from cflib.crazyflie.log import LogConfig
-
-        arrived = threading.Event()
-        values: dict[str, float] = {}
-
-        def on_data(_stamp: int, data: dict[str, float], _block: Any) -> None:
-            values.update(data)
-            arrived.set()
-
-        block = LogConfig(name="perch_probe", period_in_ms=50)
-        for name in names:
-            block.add_variable(name)
-        block.data_received_cb.add_callback(on_data)
-        try:
-            self.cf.log.add_config(block)
-            block.start()
-        except (KeyError, AttributeError):  # cflib's ways to say that the link is gone
-            return {}
-        arrived.wait(ASKED_TIMES * ANSWER_S)
-        block.stop()
-        block.delete()
-        return values
-
 
 _ECHO = struct.Struct("<BQ")  # as long as cflib's own, which it takes all of them for
-
-
-def _blocks(names: list[str]) -> list[list[str]]:
-    """So many as fit into a log block each, whatever their types."""
-    each = _BLOCK_BYTES // 4
-    return [names[at : at + each] for at in range(0, len(names), each)]

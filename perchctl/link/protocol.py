@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from perchctl.vehicle import Command, ExternalPosition, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 
 
 class Guard(Protocol):
@@ -27,15 +27,20 @@ class Link(Protocol):
     def connect(self) -> None:
         """Connect, check the firmware, set parameters, unlock the thrust. Bounded."""
 
+    def measured_by(self) -> MeasuredBy:
+        """What tells the vehicle where it is. Once connected, on the ground: bounded, but it may
+        take a second."""
+
     def telemetry(self) -> list[Telemetry]:
         """Samples that arrived since the last call, oldest first."""
 
     def send(self, command: Command) -> None:
         """Hand one command to the vehicle. Never blocks for long."""
 
-    def external(self, place: ExternalPosition) -> None:
+    def external(self, place: ExternalPosition) -> bool:
         """Hand a position from outside to the vehicle's estimator, at once or not at all: it is
-        never queued behind anything, and raises nothing. Called from a thread of its own."""
+        never queued behind anything, and raises nothing. Whether it went out. Called from a
+        thread of its own."""
 
     def problem(self, now_s: float) -> str | None:
         """None while the link works, otherwise one sentence with the cause."""

@@ -8,10 +8,11 @@ itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
-from perchctl.mission.watch import Event
+from perchctl.mission.watch import Event, Outside
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -52,6 +53,18 @@ FIELDS: dict[str, str] = {
     "supervisor": "supervisor bits",
     "var_m2": "largest of the estimator's position variances",
     "tel_age_s": "age of the telemetry sample",
+    # positions from outside, as they are sent to the vehicle; None where its decks measure them
+    "pos_age_s": "of the newest position from outside that was sent, since its exposure",
+    "pos_note": "why none is sent now",
+    "pos_sent": "how many were sent so far",
+    "pos_hz": "how many were sent in the last second",
+    "pos_x_m": "the newest that was sent, world of the state estimate",
+    "pos_y_m": "the newest that was sent",
+    "pos_z_m": "the newest that was sent",
+    "pos_qw": "its attitude, where that is sent, too: w of the quaternion from body to world",
+    "pos_qx": "as pos_qw: x",
+    "pos_qy": "as pos_qw: y",
+    "pos_qz": "as pos_qw: z",
     # the camera; None in a tick without a new frame
     "frame": "number of the frame that this tick processed",
     "frame_t_s": "its time of exposure on the loop's clock",
@@ -160,6 +173,7 @@ def tick_record(
     telemetry_age_s: float | None = None,
     consistency: Consistency | None = None,
     delay_used_s: float = 0.0,
+    outside: Outside | None = None,
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
@@ -187,6 +201,7 @@ def tick_record(
         "true_miss_m": true_miss_m,
         **_consistency_values(consistency),
         **_xyz("true_", true_position_m),
+        **_outside_values(outside),
         **_telemetry_values(telemetry),
         **_output_values(output),
         **_target_values(target),
@@ -204,6 +219,23 @@ def _consistency_values(seen: Consistency | None) -> dict[str, Any]:
         **{f"turn_{axis}_rad": v for axis, v in zip("xyz", seen.turn_rad, strict=True)},
         **{f"turn_{axis}_sigma_rad": v for axis, v in zip("xyz", seen.turn_sigma_rad, strict=True)},
     }
+
+
+def _outside_values(outside: Outside | None) -> dict[str, Any]:
+    if outside is None:
+        return {}
+    values: dict[str, Any] = {
+        "pos_age_s": outside.age_s if math.isfinite(outside.age_s) else None,
+        "pos_note": outside.problem,
+        "pos_sent": outside.sent,
+        "pos_hz": outside.rate_hz,
+    }
+    place = outside.place
+    if place is not None:
+        values |= _xyz("pos_", place.position_m)
+        if place.quaternion is not None:
+            values |= {f"pos_q{c}": q for c, q in zip("wxyz", place.quaternion, strict=True)}
+    return values
 
 
 def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:

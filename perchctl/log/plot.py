@@ -153,11 +153,20 @@ def _plot_height(ax: Axes, log: FlightLog, t_s: Array) -> None:
     setpoint = np.where(_commands(log) == "position", log.column("cmd_z_m"), np.nan)
     if np.isfinite(setpoint).any():
         ax.plot(t_s, setpoint, color=VERMILLION, linestyle="--", linewidth=1.2, label="setpoint")
+    outside_m = log.column("pos_z_m")
+    if np.isfinite(outside_m).any():
+        shown_m = np.where(_is_stale(log), np.nan, outside_m)
+        ax.plot(t_s, shown_m, color=ORANGE, linewidth=0.9, label="from outside")
     true_m = log.column("true_z_m")
     if np.isfinite(true_m).any():
         ax.plot(t_s, true_m, color=GREY, linestyle=":", linewidth=1.4, label="truth")
     ax.set_ylabel("height [m]")
     ax.legend(loc="best", ncols=3, fontsize=8)
+
+
+def _is_stale(log: FlightLog) -> Array:
+    """Where no position from outside is sent: a gap in its line."""
+    return np.array([record.get("pos_note") is not None for record in log.records])
 
 
 def _plot_power(ax: Axes, log: FlightLog, t_s: Array) -> None:

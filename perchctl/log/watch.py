@@ -133,6 +133,7 @@ def flight_record(
         telemetry_age_s=tick.telemetry_age_s,
         consistency=tick.consistency,
         delay_used_s=tick.delay_used_s,
+        outside=tick.outside,
         true_position_m=true_position_m,
         true_miss_m=true_miss_m,
     )

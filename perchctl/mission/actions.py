@@ -54,7 +54,8 @@ def act(c: Context) -> Acted:
     """The phase's command for this tick."""
     falls = c.state.phase is Phase.RECOVER and not c.state.caught
     if c.state.hold and c.state.setpoint is not None and not falls:
-        return _fly_to(c, c.state.setpoint)
+        lift = c.state.phase is not Phase.APPROACH or c.height_m > LIFTED_M
+        return _fly_to(c, c.state.setpoint, lift=lift)
     return ACTIONS[c.state.phase](c)
 
 

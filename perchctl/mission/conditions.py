@@ -1,4 +1,4 @@
-"""The named conditions that the mission's table debounces, and why a vehicle is held.
+"""The named conditions that the mission's table debounces.
 
 A condition is true or false in one tick; `PlannerState.since` holds since when it has been
 true without a break, and `Context.held(name)` tells for how long.
@@ -27,7 +27,6 @@ LITTLE_LEFT = 0.93
 """A hover thrust above this part of the largest: full thrust is no sign of pressing then."""
 PROVABLE = 0.99
 """Of the thrust that presses: so much at most is asked of a contact."""
-NO_PICTURE = "no picture for"
 STILL_MOTORS_THRUST = 5000
 """At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
@@ -96,6 +95,7 @@ def hovers(c: Context) -> bool:
     stuck = setpoint is not None and setpoint.z_m - tel.position_m[2] > PRESSED_M and vz < 0.05
     return (
         c.proves
+        and c.placed
         and 1000 <= tel.thrust < SATURATED * FULL_THRUST
         and c.speed_mps < 0.3
         and abs(vz) < HARD_CLIMB_MPS
@@ -106,8 +106,13 @@ def hovers(c: Context) -> bool:
 
 def _magnet_holds(c: Context) -> bool:
     """The vehicle stays up on a thrust that could not carry it."""
-    complete = c.profile.planner.complete
-    return c.obs.telemetry.thrust <= complete.hold_ratio * c.state.hover_thrust and not _slipping(c)
+    held = c.obs.telemetry.thrust <= _most_held(c) and not _slipping(c)
+    return held and (c.placed or _still(c))
+
+
+def _most_held(c: Context) -> float:
+    """A thrust that could not carry the vehicle."""
+    return c.profile.planner.complete.hold_ratio * c.state.hover_thrust
 
 
 def _slipping(c: Context) -> bool:
@@ -118,16 +123,18 @@ def _slipping(c: Context) -> bool:
     complete, tel = c.profile.planner.complete, c.obs.telemetry
     if c.state.contact_z_m is None:
         return False
+    if not c.sinks(complete.slip_mps):
+        return False
     above_m = tel.position_m[2] - c.state.contact_z_m
-    sinking = tel.velocity_mps[2] < -complete.slip_mps
-    return sinking and (above_m < DRIFTED_M or tel.acc_z_g < complete.slip_acc_g)
+    return not c.placed or above_m < DRIFTED_M or tel.acc_z_g < complete.slip_acc_g
 
 
 def _still(c: Context) -> bool:
-    """Not moving, and carried by something: the accelerometer reads one g."""
+    """Not moving, and carried by something: the accelerometer reads one g. It alone tells while
+    no position corrects the speed."""
     tel = c.obs.telemetry
     at_rest = abs(tel.acc_z_g - 1.0) <= c.profile.planner.perch.contact_acc_g
-    return at_rest and abs(tel.velocity_mps[2]) < 0.05
+    return at_rest and (abs(tel.velocity_mps[2]) < 0.05 or not c.placed)
 
 
 def _weight_hangs(c: Context) -> bool:
@@ -142,8 +149,13 @@ def _weight_hangs(c: Context) -> bool:
 
 def _hanging(c: Context) -> bool:
     """Held up by the magnet, wherever the mission is: still, at the target's height, on
-    a thrust that could not carry the vehicle."""
+    a thrust that could not carry the vehicle.
+
+    Where no position comes from outside nothing tells a magnet from the floor. Either carries
+    it, and what follows, a slow release under watch, suits both."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
+    if not c.placed:
+        return c.state.hover_thrust > 0 and tel.thrust <= _most_held(c) and _still(c)
     at_contact = (
         c.state.contact_z_m is not None
         and abs(tel.position_m[2] - c.state.contact_z_m) <= complete.slip_m
@@ -157,7 +169,7 @@ def _hanging(c: Context) -> bool:
     )
     return (
         c.state.hover_thrust > 0
-        and tel.thrust <= complete.hold_ratio * c.state.hover_thrust
+        and tel.thrust <= _most_held(c)
         and c.height_m > 0.3
         and (at_contact or at_target or stayed)
         and _still(c)
@@ -196,10 +208,7 @@ def _down(c: Context) -> bool:
 def _on_floor(c: Context) -> bool:
     """Low, or come down from where the landing began, since a drifting estimate has the floor
     anywhere; not moving, and on a thrust that could not carry the vehicle."""
-    complete = c.profile.planner.complete
-    carried = c.state.hover_thrust > 0 and (
-        c.obs.telemetry.thrust <= complete.hold_ratio * c.state.hover_thrust
-    )
+    carried = c.state.hover_thrust > 0 and c.obs.telemetry.thrust <= _most_held(c)
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
     came_down_m = c.state.entry_m[2] - c.obs.telemetry.position_m[2]
     came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
@@ -274,6 +283,10 @@ PROOFS = frozenset(
 )
 """What may stop the motors or end a flight: it counts over fresh telemetry only."""
 
+BY_PLACE = frozenset({Condition.HANGING, Condition.CONTACT, Condition.ON_FLOOR})
+"""Proofs that say where the vehicle is: where its position comes from outside they count only
+while it does. The others have the accelerometer to go by."""
+
 
 def conditions_since(c: Context) -> dict[Condition, float]:
     """`PlannerState.since` of this tick. A condition seen while the vehicle is held
@@ -290,27 +303,8 @@ def _counts(c: Context, name: Condition) -> bool:
     if name is Condition.HANGING and c.state.phase is Phase.LANDING:
         # It begins a release, which goes on over fresh telemetry only: late telemetry may do
         # that, where the vehicle would else hang there until it is cut.
+        # By the same right it goes on without a position.
         return c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+    if name in BY_PLACE and not c.placed:
+        return False
     return c.proves or name not in PROOFS
-
-
-def hold_reason(c: Context) -> str:
-    """Why the vehicle must stay where it is in this tick, or the empty string."""
-    safety = c.profile.safety
-    if c.state.phase not in _HOLDABLE:
-        return ""
-    if c.telemetry_age_s > safety.telemetry_hold_s:
-        return f"telemetry is {c.telemetry_age_s:.1f} s old"
-    if c.state.jump_s is not None:
-        return "the state estimate jumped"
-    if c.variance_m2 > safety.flight_variance_m2:
-        return f"the state estimate is unsure (variance {c.variance_m2:.2g} m^2)"
-    if c.obs.loop_late_s > safety.loop_late_hold_s:
-        return f"the control loop is {c.obs.loop_late_s:.1f} s late"
-    if c.state.phase in _CAMERA_PHASES and c.obs.camera_age_s > safety.camera_hold_s:
-        return c.obs.camera_problem or f"{NO_PICTURE} {c.obs.camera_age_s:.1f} s"
-    return ""
-
-
-_CAMERA_PHASES = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND})
-_HOLDABLE = _CAMERA_PHASES | {Phase.RECOVER}

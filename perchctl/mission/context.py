@@ -14,6 +14,9 @@ from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, HL_ACTIVE, LOW_POWER, NO_BATTERY_READING_V
 
 FAR_BELOW_M = 0.5
+PUT_RIGHT_S = 0.5
+"""Once positions from outside come again, the estimate is drawn back to them for so long: its
+steps and its speed are not the vehicle's."""
 HANGING_S = 1.0
 """For how long a thrust below the weight must be enough before it proves the magnet."""
 
@@ -55,6 +58,23 @@ class Context:
     def proves(self) -> bool:
         """Whether the telemetry is new enough to prove anything. What is old is unknown."""
         return self.telemetry_age_s <= self.profile.safety.proof_age_s
+
+    @property
+    def placed(self) -> bool:
+        """Whether the estimated position and speed can prove anything: not where they come from
+        outside and do not, or have only just come again. With decks always."""
+        if self.obs.position_age_s > self.profile.positioning.hold_s:
+            return False
+        stale_s = self.state.stale_s
+        return stale_s is None or self.obs.t_s - stale_s > PUT_RIGHT_S
+
+    def sinks(self, mps: float) -> bool:
+        """Faster than that. A speed that drifts, since no position corrects it, counts only where
+        the accelerometer shows, too, that something less than its weight carries the vehicle."""
+        tel = self.obs.telemetry
+        if tel.velocity_mps[2] >= -mps:
+            return False
+        return self.placed or tel.acc_z_g < 1.0 - self.profile.planner.perch.contact_acc_g
 
     @property
     def variance_m2(self) -> float:

@@ -6,6 +6,7 @@ import math
 
 from perchctl.mission.conditions import SATURATED, press_thrust
 from perchctl.mission.context import Context
+from perchctl.mission.hold import unplaced
 from perchctl.mission.mounting import explained
 from perchctl.mission.state import Condition, Phase
 
@@ -13,6 +14,10 @@ CATCHABLE_M = 1.0
 """Hanging lower, a slip from still motors reaches the floor (docs/firmware.md, "Catching a
 slip": up to 0.8 m at 42 g)."""
 FALLING_MPS = -0.05
+LIFTED_M, SIDEWAYS_M = 0.05, 0.12
+LOW_M, ASTRAY_LOW_M, ASTRAY_M = 0.3, 0.25, 0.8
+"""At take-off a vehicle stays within a few centimetres of its place; later a setpoint is walked
+ahead of it, and a blow may carry it half a metre."""
 HUNG_WITHIN_M = 0.3
 HIGH_M, STAYED_M = 0.45, 0.15
 BELOW_S = 0.3
@@ -52,6 +57,22 @@ def too_weak(c: Context) -> bool:
     return near and c.state.hover_thrust > SATURATED * press_thrust(c)
 
 
+def is_astray(c: Context) -> bool:
+    """Position control leads away from its setpoint: at take-off sideways, where only a climb was
+    ordered, and later farther off than any draught carries it.
+
+    Positions from outside in other axes than the vehicle's do that: those that a vehicle at rest
+    does not tell from true ones (fault 11)."""
+    setpoint = c.state.setpoint
+    if c.profile.positioning.by != "mocap" or setpoint is None or not c.placed:
+        return False
+    x_m, y_m, _ = c.obs.telemetry.position_m
+    away_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
+    if c.state.phase is Phase.APPROACH and c.height_m < LIFTED_M:
+        return away_m > SIDEWAYS_M
+    return away_m > (ASTRAY_LOW_M if c.height_m < LOW_M else ASTRAY_M)
+
+
 def stopped_for_s(c: Context) -> float:
     return -1.0 if c.state.stopped_s is None else c.obs.t_s - c.state.stopped_s
 
@@ -71,14 +92,17 @@ def hangs_where_it_did(c: Context) -> bool:
 
 def hangs_stopped(c: Context) -> bool:
     """The motors were stopped where it hung, and there it still is."""
-    return c.state.stopped_s is not None and still_at_contact(c)
+    stopped_s, hangs_s = c.state.stopped_s, c.state.since.get(Condition.WEIGHT_HANGS)
+    if stopped_s is None:
+        return False
+    return still_at_contact(c) or (hangs_s is not None and hangs_s <= stopped_s)
 
 
 def still_at_contact(c: Context) -> bool:
-    """Where the magnet has it: a slip ends the contact at once, and what the estimate drifts
-    while it hangs blind is less than this."""
+    """Where the magnet has it, by a position: a slip ends the contact at once, and what the
+    estimate drifts while it hangs blind is less than this."""
     contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
-    if contact_z_m is None or not c.proves:
+    if contact_z_m is None or not c.proves or not c.placed:
         return False
     falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
     return not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M
@@ -90,7 +114,7 @@ def hangs_in_landing(c: Context) -> bool:
     z_m, ground = c.obs.telemetry.position_m[2], c.state.ground_m
     began_m = c.state.entry_m[2]
     high = began_m - (ground[2] if ground else 0.0) > HIGH_M
-    stayed = c.proves and high and not c.far_below_target and began_m - z_m < STAYED_M
+    stayed = c.proves and c.placed and high and not c.far_below_target and began_m - z_m < STAYED_M
     return stayed or still_at_contact(c)
 
 
@@ -133,6 +157,37 @@ def why_mounted_wrong(c: Context) -> str:
         f"the target seems to lie {-c.error_z_m:.1f} m below the vehicle: camera.mount does not "
         f"look up"
     )
+
+
+def why_unplaced(c: Context) -> str:
+    return f"{unplaced(c)}; landing by what is left of the estimate"
+
+
+def why_astray(c: Context) -> str:
+    x_m, y_m, _ = c.obs.telemetry.position_m
+    setpoint = c.state.setpoint
+    away_m = 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
+    return (
+        f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: the motion "
+        f"capture's axes or the body's heading are not the vehicle's, see perchctl check --lift"
+    )
+
+
+def why_fell_unseen(c: Context) -> str:
+    if c.placed:
+        return "it is not where it hung before"
+    return f"whether it still hangs is not known ({unplaced(c)})"
+
+
+def why_landed(c: Context) -> str:
+    if c.placed or is_low_by_eye(c):
+        return "motors off"
+    return "motors off; without a position it is not known whether it stands or hangs"
+
+
+def is_low_by_eye(c: Context) -> bool:
+    """The camera, and nothing else, still tells that it is not at the ceiling."""
+    return c.tracked and c.far_below_target
 
 
 def why_not_found(c: Context) -> str:

@@ -106,7 +106,7 @@ def _hang_on(c: Context) -> Acted:
 def _drops(c: Context) -> bool:
     """Peeled off with too little thrust left to go on down slowly."""
     at_ceiling = c.state.contact_z_m is not None and c.state.orders == 0
-    return at_ceiling and c.proves and c.obs.telemetry.velocity_mps[2] < DROPPING_MPS
+    return at_ceiling and c.proves and c.sinks(-DROPPING_MPS)
 
 
 def _caught_again(c: Context) -> Acted:

@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.mission.actions import act
-from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hold_reason, hovers
-from perchctl.mission.context import Context
+from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hovers
+from perchctl.mission.context import PUT_RIGHT_S, Context
 from perchctl.mission.guidance import presses
+from perchctl.mission.hold import hold_reason
 from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
 from perchctl.mission.state import (
@@ -67,6 +68,8 @@ def is_over(state: PlannerState) -> bool:
 
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     state = _with_target(state, obs)
+    if obs.position_age_s > profile.positioning.hold_s:
+        state = replace(state, stale_s=obs.t_s)
     if obs.jumped:
         state = _jumped(state, obs)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
@@ -89,7 +92,8 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
 def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
     """The estimate's world has moved, the vehicle has not: ground, contact and what else is
     remembered are where the estimate has them now, and it is held where it is. Where samples
-    are missing before the step, it may be the vehicle that has moved, even to the floor."""
+    are missing before the step, it may be the vehicle that has moved, even to the floor; where
+    positions from outside have come again, the step ends a drift, and what was true before is."""
     tel, last = obs.telemetry, state.last
     if last is None:
         return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
@@ -98,7 +102,8 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
     dt_s = tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
     lx, ly, lz = last.position_m
     step = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
-    if dt_s > UNSEEN_S:
+    put_right = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
+    if dt_s > UNSEEN_S or put_right:
         step = (0.0, 0.0, 0.0)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
     if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
@@ -220,6 +225,11 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
         case Phase.LANDING if old.phase is Phase.PERCH:
             # It may be in the magnet's reach: it has to be seen below before it counts as free.
             return replace(new, contact_z_m=obs.telemetry.position_m[2])
+        case Phase.LANDING if new.row == "position-astray":
+            # In a climb the accelerometer tells by how much the thrust is above the weight.
+            g = min(1.5, max(0.75, obs.telemetry.acc_z_g))
+            hover = old.hover_thrust or obs.telemetry.thrust / g
+            return replace(new, heading_lost=True, hover_thrust=hover)
         case Phase.LANDING if new.row == "mounting":
             # The setpoint is ahead, and every centimetre there is one in a wrong direction.
             return replace(new, setpoint=None)

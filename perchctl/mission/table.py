@@ -13,6 +13,7 @@ from perchctl.mission.guards import (
     hangs_stopped,
     hangs_where_it_did,
     has_slipped,
+    is_astray,
     is_blocked,
     is_watched,
     left_jump_hold,
@@ -21,9 +22,13 @@ from perchctl.mission.guards import (
     settling_too_long,
     too_weak,
     unsure,
+    why_astray,
     why_contact,
+    why_fell_unseen,
+    why_landed,
     why_mounted_wrong,
     why_not_found,
+    why_unplaced,
 )
 from perchctl.mission.row import Row
 from perchctl.mission.state import (
@@ -100,6 +105,14 @@ TABLE: tuple[Row, ...] = (
     Row(
         "heading-lost", BEFORE_CONTACT, lambda c: c.state.heading_lost, P.LANDING,
         "the estimated heading jumped: down level, by thrust alone", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "position-astray", IN_THE_OPEN, is_astray, P.LANDING, why_astray, S.LAND, O.SAFETY,
+    ),
+    Row(
+        "position-lost", IN_THE_OPEN | {P.PERCH},
+        lambda c: c.obs.position_age_s > c.profile.positioning.land_s, P.LANDING,
+        why_unplaced, S.LAND, O.SAFETY,
     ),
     Row(
         "estimator-jump", BEFORE_CONTACT, left_jump_hold, P.LANDING,
@@ -281,7 +294,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "fell-unseen", _only(P.COMPLETE), is_watched, P.LANDING,
-        "it is not where it hung before", S.LAND, O.SAFETY,
+        why_fell_unseen, S.LAND, O.SAFETY,
     ),
     # --- the failed attempt --------------------------------------------------
     Row(
@@ -308,7 +321,7 @@ TABLE: tuple[Row, ...] = (
         "the magnet holds: hanging with the motors off",
     ),
     Row(
-        "landed", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1, P.LANDED, "motors off",
+        "landed", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1, P.LANDED, why_landed,
     ),
     Row(
         "landing-timeout", _only(P.LANDING),

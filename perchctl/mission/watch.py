@@ -8,7 +8,7 @@ from typing import Protocol
 
 from perchctl.mission.findings import Findings
 from perchctl.mission.state import Outcome, Phase, PlannerState, Severity
-from perchctl.vehicle import Command, Telemetry
+from perchctl.vehicle import Command, ExternalPosition, Telemetry
 from perchctl.vision.consistency import Consistency
 from perchctl.vision.types import PipelineOutput, TargetEstimate
 
@@ -40,6 +40,18 @@ class Event:
     simulated: str = ""
 
 
+@dataclass(frozen=True)
+class Outside:
+    """Positions from outside, as the vehicle is handed them: how old the newest is, why none is
+    sent now (None while they are), how many were sent, and how many a second, and the newest."""
+
+    age_s: float
+    problem: str | None
+    sent: int
+    rate_hz: float
+    place: ExternalPosition | None
+
+
 @dataclass(frozen=True, eq=False)
 class Tick:
     """All that one turn of the loop knew and did, for the log and the display.
@@ -47,6 +59,7 @@ class Tick:
     `output` is what this tick's new frame gave, None without one; `target` the estimate
     that the planner steered by. `consistency`: what the flight shows of latency and mounting,
     in the ticks in which that was worked out anew; `delay_used_s` is in the frames' times.
+    `outside`: None where the vehicle's decks measure its position.
     """
 
     t_s: float
@@ -60,6 +73,7 @@ class Tick:
     telemetry_age_s: float
     consistency: Consistency | None = None
     delay_used_s: float = 0.0
+    outside: Outside | None = None
 
 
 class Watcher(Protocol):

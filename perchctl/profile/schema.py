@@ -92,6 +92,12 @@ class SimulationConfig(Section):
         0.1, ge=0, le=1, description="share of flights in which the first contact does not hold"
     )
     no_target: bool = Field(False, description="a bare ceiling")
+    capture_delay_s: float = Field(
+        0.01, ge=0, le=1, description="motion capture: from exposure to arrival"
+    )
+    capture_noise_m: float = Field(
+        0.001, gt=0, le=0.1, description="motion capture: of a position, one sigma"
+    )
 
 
 class LogConfig(Section):

@@ -10,6 +10,7 @@ import numpy as np
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile
 from perchctl.profile.schema import SimulationConfig
+from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.scenario import Scenario
 
 _STREAM = 1  # the scenario's own random stream
@@ -69,7 +70,33 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         magnet_force_n=sim.magnet_force_n,
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         no_target=sim.no_target,
+        extra=_extra(profile),
     )
+
+
+def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
+    """The motion capture of that seed's flight; None where the vehicle's decks do it."""
+    config, sim = profile.positioning, profile.simulation
+    if config.by != "mocap":
+        return None
+    roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
+    return CaptureSettings(
+        body=config.body,
+        body_rpy_rad=(roll, pitch, yaw),
+        body_position_m=config.body_position_m,
+        delay_s=sim.capture_delay_s,
+        position_noise_m=sim.capture_noise_m,
+        seed=seed,
+    )
+
+
+def _extra(profile: Profile) -> dict[str, float]:
+    extra = {}
+    if profile.simulation.camera_analogue:
+        extra["analogue"] = profile.simulation.camera_analogue
+    if profile.positioning.by == "mocap":
+        extra["external_position"] = 1.0  # and no deck
+    return extra
 
 
 def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
@@ -85,7 +112,6 @@ def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
         "camera_readout_s": sim.camera_readout_s,
         "camera_flicker": sim.camera_flicker,
         "camera_pumping": sim.camera_pumping,
-        "extra": {"analogue": sim.camera_analogue} if sim.camera_analogue else {},
     }
 
 

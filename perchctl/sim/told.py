@@ -4,7 +4,7 @@ who sees the target lost should not look for the fault in the program."""
 from __future__ import annotations
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission.conditions import NO_PICTURE
+from perchctl.mission.hold import NO_PICTURE
 from perchctl.mission.watch import Event, EventKind
 from perchctl.sim.scenario import Scenario
 

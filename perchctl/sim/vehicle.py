@@ -1,4 +1,5 @@
-"""World, firmware and camera as one simulated vehicle, advanced by simulated time."""
+"""World, firmware, camera and motion capture as one simulated vehicle, advanced by simulated
+time."""
 
 from __future__ import annotations
 
@@ -6,6 +7,8 @@ from collections import deque
 
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
+from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.sim.capture.system import SimCapture
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -14,13 +17,15 @@ from perchctl.vision.types import CameraModel
 
 
 class SimulatedVehicle:
-    """One simulated Crazyflie. Without a camera model it has no camera."""
+    """One simulated Crazyflie. Without a camera model it has no camera, without a capture's
+    settings nobody measures it from outside."""
 
     def __init__(
         self,
         scenario: Scenario,
         camera: CameraModel | None = None,
         target: TargetConfig | None = None,
+        capture: CaptureSettings | None = None,
     ) -> None:
         self.scenario = scenario
         self.world = World(scenario)
@@ -29,6 +34,7 @@ class SimulatedVehicle:
         if camera is not None:
             renderer = Renderer(scenario, camera, target or TargetConfig(), scenario.seed)
             self.camera = SimCamera(scenario, renderer)
+        self.capture = None if capture is None else SimCapture(capture)
         # The past that an exposure may need.
         exposed_s = 0.0 if self.camera is None else self.camera.exposed_s
         steps = int(exposed_s / CONTROL_PERIOD_S) + 8
@@ -45,10 +51,16 @@ class SimulatedVehicle:
 
     def step(self) -> None:
         """One control period, and the exposures that fall into it."""
-        self.firmware.step()
+        self.step_blindly()
         if self.camera is not None:
             self._past.append(self.world.state())
             self.camera.advance(self.firmware.t_s, self._state_at)
+
+    def step_blindly(self) -> None:
+        """One control period without the camera, which somebody else exposes."""
+        self.firmware.step()
+        if self.capture is not None:
+            self.capture.advance(self.world)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
         """The target and its magnet hang there from now on."""

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_rpy
+from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_quaternion, rotation_from_rpy
 from perchctl.sim.body import build_model
 from perchctl.sim.magnet import MAGNET_RANGE_M, Magnet
 from perchctl.sim.powertrain import Powertrain
@@ -174,7 +174,7 @@ class World:
             self.t_s,
             position,
             velocity,
-            _rotation(self.quaternion),
+            rotation_from_quaternion(self.quaternion),
             rates,
             force,
             ceiling_n,
@@ -257,14 +257,3 @@ class World:
                 mujoco.mj_contactForce(self._model, self._data, i, wrench)
                 ceiling_n += float(wrench[0])
         return ceiling_n, floor
-
-
-def _rotation(quaternion: tuple[float, float, float, float]) -> Array:
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -19,6 +19,7 @@ from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEEL_BLIND_S
 from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
+from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
@@ -213,6 +214,7 @@ class Rig:
     profile: Profile = PROFILE
     setup: Pipeline = SETUP
     operator: Callable[[], Operator] = lambda: Operator.NONE
+    positions: Callable[[float], FeedStatus] | None = None
 
     def parts(self) -> FlightParts:
         return FlightParts(
@@ -223,6 +225,7 @@ class Rig:
             self.setup,
             (self.watcher,),
             self.operator,
+            positions=self.positions,
         )
 
     def fly(self) -> FlightReport:

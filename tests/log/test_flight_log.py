@@ -21,8 +21,10 @@ from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.jsonl import to_plain
 from perchctl.log.read import read_log
 from perchctl.log.write import FlightLogWriter, log_path
+from perchctl.mission.watch import Outside
 from perchctl.vehicle import (
     EmergencyStop,
+    ExternalPosition,
     Idle,
     Land,
     PositionSetpoint,
@@ -158,6 +160,13 @@ def test_every_field_is_filled_by_something() -> None:
             camera_age_s=0.1,
             consistency=Consistency(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
             delay_used_s=0.005,
+            outside=Outside(
+                0.012,
+                "hidden",
+                7,
+                99.0,
+                ExternalPosition((1.0, 2.0, 0.5), (1.0, 0.0, 0.0, 0.0)),
+            ),
             true_position_m=(0.0, 0.0, 1.0),
             true_miss_m=0.01,
         )

@@ -74,6 +74,10 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=9.9)),
         1.5, FLYING_PHASES, LAND, Outcome.SAFETY,
     ),
+    "position-lost": (
+        _obs(position_age_s=0.8, position_problem="occluded"), 0.1,
+        CAMERA_PHASES | {Phase.APPROACH, Phase.PERCH}, LAND, Outcome.SAFETY,
+    ),
     "estimator-jump": (_obs(jumped=True), 0.8, BEFORE_CONTACT, LAND, Outcome.SAFETY),
     "estimate-unsure": (
         _tel(position_variance_m2=0.08), 1.2, CAMERA_PHASES | {Phase.APPROACH}, LAND,
@@ -192,8 +196,9 @@ def test_ctrl_c_once_lands_and_twice_stops(phase: Phase) -> None:
         _obs(loop_late_s=0.4),
         lambda o: replace(o, telemetry=replace(o.telemetry, t_s=o.t_s - 0.5)),
         _tel(position_variance_m2=0.08),
+        _obs(position_age_s=0.3),
     ],
-    ids=["camera-silent", "loop-late", "telemetry-late", "estimate-unsure"],
+    ids=["camera-silent", "loop-late", "telemetry-late", "estimate-unsure", "position-stale"],
 )
 def test_a_short_fault_never_climbs(phase: Phase, event: Event) -> None:
     state = state_in(phase)

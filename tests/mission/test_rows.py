@@ -134,6 +134,9 @@ def blind(look: Look) -> Look:
     return lambda t_s: replace(look(t_s), target=None)
 
 
+MOCAP = PROFILE.model_copy(
+    update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
+)
 LAND_ON_LOG = PROFILE.model_copy(
     update={"safety": PROFILE.safety.model_copy(update={"land_on_log_error": True})}
 )
@@ -163,6 +166,12 @@ CASES: dict[str, Case] = {
     "telemetry-stale": Case(P.ALIGN, P.LANDING, old(seen(), START_S), 1.5, O.SAFETY),
     "heading-lost": Case(
         P.ALIGN, P.LANDING, seen(jumped=True, turned_rad=1.5), 0.1, O.SAFETY, RawThrust
+    ),
+    "position-astray": Case(
+        P.APPROACH, P.LANDING, aside(0.2, 0.01), 0.1, O.SAFETY, RawThrust, z_m=0.3, profile=MOCAP
+    ),
+    "position-lost": Case(
+        P.ALIGN, P.LANDING, seen(position_age_s=0.8, position_problem="occluded"), 0.1, O.SAFETY
     ),
     "estimator-jump": Case(P.ALIGN, P.LANDING, seen(jumped=True), 0.8, O.SAFETY),
     "estimate-unsure": Case(

@@ -1,8 +1,8 @@
 """The state estimate: the truth with the errors of a flow deck or of motion capture.
 
-Drift runs from the moment the motors first turn. With outside positions (scenario
-`extra["external_position"]` and parameter `stabilizer.estimator` = 2) the estimate
-follows those instead, and slides away once they stop coming.
+Drift runs from the moment the motors first turn. A vehicle without a deck (scenario
+`extra["external_position"]`) has what it is sent from outside instead, which counts with
+parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
 The attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
 the filter's other measurements can: a vehicle that is put on its back by hand, faster
@@ -19,6 +19,13 @@ import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, cap_deg
+from perchctl.sim.firmware.outside import (
+    SETTINGS,
+    OutsideFilter,
+    Quaternion,
+    Vector,
+    multiplied,
+)
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 _STREAM = 2
@@ -33,9 +40,6 @@ _ACC_NOISE_G = 0.004
 _ACC_VIBRATION_G = 0.04  # added by turning motors
 _ACC_CUTOFF_HZ = 30.0
 _ATTITUDE_GAIN = CONTROL_PERIOD_S / _ATTITUDE_MEMORY_S
-_EXTERNAL_GAIN = 0.3
-_EXTERNAL_STALE_S = 0.2
-_EXTERNAL_SLIDE_MPS2 = 0.04
 _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
 
 
@@ -65,7 +69,7 @@ class Estimator:
         self._rng = np.random.default_rng([scenario.seed, _STREAM])
         self._white: list[float] = []
         self.now = Estimate()
-        self.quaternion: tuple[float, float, float, float] | None = None
+        self.gyro: Quaternion | None = None
         self.acc_g = (0.0, 0.0, 1.0)
         self._steps = 0
         self._drift = (0.0, 0.0, 0.0)
@@ -75,69 +79,62 @@ class Estimator:
         self._position_keep = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / _POSITION_MEMORY_S)
         self._velocity_keep = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / _VELOCITY_MEMORY_S)
         self._acc_lag = 1.0 - math.exp(-2 * math.pi * _ACC_CUTOFF_HZ * CONTROL_PERIOD_S)
-        self._has_external = bool(scenario.extra.get("external_position"))
-        self._external_error = (0.0, 0.0, 0.0)
-        self._external_s: float | None = None
+        self.outside: OutsideFilter | None = None
+        if scenario.extra.get("external_position"):
+            self.outside = OutsideFilter(scenario.seed)
+        self._reset_due = True
         self._reset_s = 0.0
-        heading = float(self._rng.uniform(-math.pi, math.pi))
-        self._slide = (math.cos(heading), math.sin(heading))
+        self._rng.uniform()  # keeps the flights of all seeds as they were
         self.external_count = 0
+        self.hears_outside = True
+        self._true_m: Vector = (0.0, 0.0, 0.0)
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
     def reset(self, t_s: float) -> None:
         """`kalman.resetEstimation`: drift and outside corrections are forgotten."""
         self._reset_s = t_s
         self._drift_s = 0.0
-        self._external_error = (0.0, 0.0, 0.0)
+        self._reset_due = True
 
-    def external_position(self, position_m: tuple[float, float, float], t_s: float) -> None:
-        """One measurement from outside; counted always, used when configured."""
+    def external_position(self, position_m: Vector) -> None:
+        """One measurement from outside; counted always, used by a vehicle without a deck."""
         self.external_count += 1
-        now = self.now
-        ex, ey, ez = self._external_error
-        self._external_error = (
-            ex + _EXTERNAL_GAIN * (position_m[0] - now.x_m),
-            ey + _EXTERNAL_GAIN * (position_m[1] - now.y_m),
-            ez + _EXTERNAL_GAIN * (position_m[2] - now.z_m),
-        )
-        self._external_s = t_s
+        if self.outside is not None and self.hears_outside:
+            self.outside.position(position_m, self._true_m)
+
+    def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
+        """The same with an attitude: w, x, y, z, body to world."""
+        if self.outside is not None and self.hears_outside and self.gyro is not None:
+            self.outside.attitude(quaternion, self.gyro)
+        self.external_position(position_m)
+
+    def set_outside(self, name: str, value: float) -> None:
+        """A parameter of `SETTINGS`."""
+        if self.outside is not None:
+            setattr(self.outside, SETTINGS[name], value)
 
     def variance(self, t_s: float) -> float:
-        """Position variance in m^2: falls after a reset, grows while blind."""
-        value = _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
+        """Position variance in m^2: falls after a reset; grows while nothing comes from outside
+        where there is no deck."""
+        if self.outside is not None:
+            return self.outside.variance_m2
+        return _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
             -(t_s - self._reset_s) / _VARIANCE_FALL_S
         )
-        if self._has_external:
-            since_s = t_s - (self._reset_s if self._external_s is None else self._external_s)
-            value += 1e-3 * max(0.0, since_s - _EXTERNAL_STALE_S) ** 2
-        return value
 
     def update(
-        self, world: Sensed, t_s: float, *, flown: bool, spinning: bool, external: bool
+        self, world: Sensed, t_s: float, *, flown: bool, spinning: bool, pressed: bool = False
     ) -> None:
         if self._steps % _NOISE_EVERY == 0:
             self._walk()
         self._steps += 1
-        drift = self._scenario.drift_mps
-        if external and self._has_external:
-            bx, by, bz = self._slid(t_s)
-            dx = dy = dz = 0.0
+        self.gyro = w, x, y, z = self._integrate(world)
+        if self.outside is not None:
+            self._move_outside(self.outside, world, spinning=spinning, pressed=pressed)
+            w, x, y, z = multiplied(self.outside.turn, self.gyro)
         else:
-            if flown:
-                self._drift_s += CONTROL_PERIOD_S
-                dx, dy, dz = drift
-            else:
-                dx = dy = dz = 0.0
-            s = self._drift_s
-            bx, by, bz = drift[0] * s, drift[1] * s, drift[2] * s
+            self._move_by_deck(world, flown=flown)
         now = self.now
-        nx, ny, nz = self._position_noise
-        now.x_m, now.y_m, now.z_m = world.x_m + bx + nx, world.y_m + by + ny, world.z_m + bz + nz
-        nx, ny, nz = self._velocity_noise
-        now.vx_mps = world.vx_mps + dx + nx
-        now.vy_mps = world.vy_mps + dy + ny
-        now.vz_mps = world.vz_mps + dz + nz
-        w, x, y, z = self._integrate(world)
         bias = self._scenario.estimate_tilt_bias_rad
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - x * z))))
@@ -165,10 +162,9 @@ class Estimator:
     def _integrate(self, world: Sensed) -> tuple[float, float, float, float]:
         """The attitude after one more control period of turning."""
         truth = world.quaternion
-        if self.quaternion is None:
-            self.quaternion = truth
+        if self.gyro is None:
             return truth
-        w, x, y, z = self.quaternion
+        w, x, y, z = self.gyro
         tw, tx, ty, tz = truth
         half = 0.5 * CONTROL_PERIOD_S
         p, q, r = half * world.p_radps, half * world.q_radps, half * world.r_radps
@@ -180,8 +176,7 @@ class Estimator:
         ny = keep * (y + w * q + z * p - x * r) + gain * ty
         nz = keep * (z + w * r + x * q - y * p) + gain * tz
         scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
-        self.quaternion = turned = (scale * nw, scale * nx, scale * ny, scale * nz)
-        return turned
+        return (scale * nw, scale * nx, scale * ny, scale * nz)
 
     def _walk(self) -> None:
         sigma = self._scenario.estimate_noise_m
@@ -205,13 +200,35 @@ class Estimator:
             keep * z + kick * take(),
         )
 
-    def _slid(self, t_s: float) -> tuple[float, float, float]:
-        """The estimate's error while it follows outside positions."""
-        x, y, z = self._external_error
-        last_s = self._reset_s if self._external_s is None else self._external_s
-        blind_s = t_s - last_s - _EXTERNAL_STALE_S
-        if blind_s <= 0.0:
-            return x, y, z
-        # Integrated accelerometer error: half a t squared.
-        metres = 0.5 * _EXTERNAL_SLIDE_MPS2 * blind_s * blind_s
-        return x + self._slide[0] * metres, y + self._slide[1] * metres, z
+    def _move_by_deck(self, world: Sensed, *, flown: bool) -> None:
+        drift = self._scenario.drift_mps
+        dx = dy = dz = 0.0
+        if flown:
+            self._drift_s += CONTROL_PERIOD_S
+            dx, dy, dz = drift
+        s = self._drift_s
+        bx, by, bz = drift[0] * s, drift[1] * s, drift[2] * s
+        now = self.now
+        nx, ny, nz = self._position_noise
+        now.x_m, now.y_m, now.z_m = world.x_m + bx + nx, world.y_m + by + ny, world.z_m + bz + nz
+        nx, ny, nz = self._velocity_noise
+        now.vx_mps = world.vx_mps + dx + nx
+        now.vy_mps = world.vy_mps + dy + ny
+        now.vz_mps = world.vz_mps + dz + nz
+
+    def _move_outside(
+        self, outside: OutsideFilter, world: Sensed, *, spinning: bool, pressed: bool
+    ) -> None:
+        assert self.gyro is not None
+        place = self._true_m = (world.x_m, world.y_m, world.z_m)
+        speed = (world.vx_mps, world.vy_mps, world.vz_mps)
+        if self._reset_due:
+            self._reset_due = False
+            outside.reset(place, speed, self.gyro)
+        elif not outside.predict(place, speed, spinning=spinning, pressed=pressed):
+            self._reset_due = True
+        now = self.now
+        ex, ey, ez = outside.position_error_m
+        now.x_m, now.y_m, now.z_m = place[0] + ex, place[1] + ey, place[2] + ez
+        ex, ey, ez = outside.velocity_error_mps
+        now.vx_mps, now.vy_mps, now.vz_mps = speed[0] + ex, speed[1] + ey, speed[2] + ez

@@ -82,7 +82,9 @@ def _system(firmware: Logged) -> dict[str, Getter]:
         "radio.rssi": lambda: -firmware.scenario.rssi_dbm,
         "radio.isConnected": lambda: 1.0,
         "kalman.inFlight": _field(supervisor, "is_flying"),
-        "range.zrange": lambda: 1000.0 * max(0.0, firmware.world.z_m),
+        "range.zrange": lambda: (  # a deck's
+            1000.0 * max(0.0, firmware.world.z_m) if estimator.outside is None else 0.0
+        ),
         "locSrv.tick": _field(estimator, "external_count"),
     }
 

@@ -12,6 +12,7 @@ from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.health import BATTERY, PROPELLERS, Health
 from perchctl.sim.firmware.logs import log_getters
 from perchctl.sim.firmware.motors import MOTORS_OFF, MotorDriver
+from perchctl.sim.firmware.outside import SETTINGS
 from perchctl.sim.firmware.parameters import apply_parameter
 from perchctl.sim.firmware.planner import Planner
 from perchctl.sim.firmware.power import PowerMonitor
@@ -67,7 +68,7 @@ class Firmware:
         self.power = PowerMonitor(self.world.battery_v)
         self.health = Health(self.scenario)
         self._getters: dict[str, Callable[[], float]] = log_getters(self)
-        self._external_positions = True
+        self._pressed = False
         if self.scenario.extra.get("external_position"):
             self._parameters["deck.bcFlow2"] = 0.0  # outside positions instead of a deck
         self._parameters |= self.scenario.parameters
@@ -92,10 +93,12 @@ class Firmware:
             t_s,
             flown=self._flown,
             spinning=self.motors is not MOTORS_OFF,
-            external=self._external_positions,
+            pressed=self._pressed,
         )
         if step % PLANNER_EVERY == 0:
             self._consult_planner(t_s)
+            if self.estimator.outside is not None:
+                self._pressed = self.world.contacts()[0] > 0.0
         if step % SUPERVISOR_EVERY == 0:
             ended = supervisor.update(
                 t_s,
@@ -181,15 +184,16 @@ class Firmware:
 
     def external_position(self, position_m: tuple[float, float, float]) -> None:
         """A position from outside, m; see `Estimator`."""
-        self.estimator.external_position(position_m, self.t_s)
+        self.estimator.external_position(position_m)
 
     def external_pose(
         self,
         position_m: tuple[float, float, float],
         quaternion_xyzw: tuple[float, float, float, float],
     ) -> None:
-        """A pose from outside; the attitude is taken from the gyroscope all the same."""
-        self.external_position(position_m)
+        """A pose from outside: m, and body to world."""
+        x, y, z, w = quaternion_xyzw
+        self.estimator.external_pose(position_m, (w, x, y, z))
 
     def reboot(self) -> None:
         """Everything but the world, the battery and persistent parameters starts again."""
@@ -240,7 +244,9 @@ class Firmware:
             if value == 1.0:
                 self.estimator.reset(self.t_s)
         elif name == "stabilizer.estimator":
-            self._external_positions = value == ESTIMATOR_KALMAN
+            self.estimator.hears_outside = value == ESTIMATOR_KALMAN
+        elif name in SETTINGS:
+            self.estimator.set_outside(name, value)
         elif name in (f"health.{PROPELLERS}", f"health.{BATTERY}"):
             if value:
                 self.health.start(name.removeprefix("health."))

@@ -14,9 +14,12 @@ from collections.abc import Sequence
 import cv2
 
 from perchctl.calibration.files import load_calibration
+from perchctl.children import connect_back
 from perchctl.errors import PerchError
 from perchctl.profile.places import data_file
-from perchctl.sim.process.control import START_TIMEOUT_S, HostSetup, connect
+from perchctl.sim.capture.natnet import COMMAND_PORT
+from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.sim.process.control import START_TIMEOUT_S, HostSetup
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.process.runner import Runner
 from perchctl.sim.scenario import Scenario
@@ -26,8 +29,7 @@ def serve_parent() -> None:
     """Run the vehicle that the parent describes, until it sends stop or is gone."""
     cv2.setNumThreads(1)  # the picture must not take the physics' core
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    port, token = sys.stdin.readline().split()
-    channel = connect(int(port), token)
+    channel = connect_back()
     setup = channel.receive(START_TIMEOUT_S)
     realtime = setup.pace == "realtime"
     try:
@@ -36,7 +38,8 @@ def serve_parent() -> None:
         channel.send(f"{type(error).__name__}: {error}")
         return
     with contextlib.closing(host):
-        channel.send((host.uri, host.stream.url if host.stream is not None else ""))
+        stream_url = host.stream.url if host.stream is not None else ""
+        channel.send((host.uri, stream_url, host.capture))
         Runner(host, channel, realtime=realtime, linger_s=setup.linger_s).run()
 
 
@@ -48,15 +51,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--port", type=int, default=19850, help="UDP port of the vehicle")
     parser.add_argument("--http-port", type=int, default=8080, help="port of the camera's stream")
+    parser.add_argument(
+        "--capture",
+        action="store_true",
+        help=f"no deck; motion capture on 127.0.0.1:{COMMAND_PORT}, as OptiTrack's",
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of noise and drops")
     options = parser.parse_args(arguments)
 
     calibration = data_file("calib", "example_640x480")
     setup = HostSetup(
-        scenario=Scenario(seed=options.seed),
+        scenario=Scenario(
+            seed=options.seed, extra={"external_position": 1.0} if options.capture else {}
+        ),
+        capture=CaptureSettings(seed=options.seed) if options.capture else None,
         camera=load_calibration(calibration) if calibration is not None else None,
         port=options.port,
         http_port=options.http_port,
+        capture_port=COMMAND_PORT if options.capture else 0,
     )
     # A shell starts what runs in its background with Ctrl-C ignored, and children inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -67,7 +79,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     with contextlib.closing(host):
         stream = host.stream.url if host.stream is not None else "none"
-        print(f"vehicle {host.uri}\ncamera  {stream}\nCtrl-C ends it", flush=True)
+        positions = " ".join(host.capture or ("none",))
+        print(
+            f"vehicle {host.uri}\ncamera  {stream}\ncapture {positions}\nCtrl-C ends it",
+            flush=True,
+        )
         with contextlib.suppress(KeyboardInterrupt):
             Runner(host, None, realtime=True, linger_s=0.0).run()
     return 0

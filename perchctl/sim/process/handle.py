@@ -8,28 +8,29 @@ child does not share its terminal's Ctrl-C and outlives a killed parent by a few
 from __future__ import annotations
 
 import contextlib
-import secrets
+import math
 import subprocess
-import sys
 import tempfile
 import threading
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, get_args
 
+from perchctl.children import (
+    Channel,
+    accept,
+    end,
+    introduce,
+    last_line,
+    listen,
+    new_token,
+    spawn,
+)
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
+from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.control import (
-    LINGER_S,
-    START_TIMEOUT_S,
-    TOKEN_BYTES,
-    Channel,
-    HostSetup,
-    Pace,
-    accept,
-    listen,
-)
+from perchctl.sim.process.control import LINGER_S, START_TIMEOUT_S, HostSetup, Pace
 from perchctl.sim.scenario import Scenario
 from perchctl.vision.types import CameraModel
 
@@ -37,20 +38,16 @@ ANSWER_TIMEOUT_S = 15.0
 SLOWEST_PACE = 20.0
 """Wall-clock seconds allowed for one simulated second of `advance`."""
 _STOP_TIMEOUT_S = 5.0
-# -P and the path at the end: an installed package is found as usual, a checkout too,
-# and nothing in the working directory can shadow a module.
-_CHILD = (
-    "import sys; sys.path.append(sys.argv[1]); "
-    "from perchctl.sim.process.child import serve_parent; serve_parent()"
-)
+_CHILD = "from perchctl.sim.process.child import serve_parent; serve_parent()"
 
 
 class SimProcess:
     """Handle of a running simulated vehicle; a context manager.
 
-    `uri` is for cflib, `stream_url` for a network camera ("" without a camera). All
-    methods may be called from any thread; they raise `ConnectionFailed` when the child
-    is gone and `TimedOut` when it does not answer.
+    `uri` is for cflib, `stream_url` for a network camera ("" without a camera), `capture` the
+    motion capture's kind and address for `motioncapture` (None without one). All methods may be
+    called from any thread; they raise `ConnectionFailed` when the child is gone and `TimedOut`
+    when it does not answer.
     """
 
     def __init__(self, child: subprocess.Popen[bytes], channel: Channel, stderr: IO[bytes]) -> None:
@@ -61,6 +58,7 @@ class SimProcess:
         self._stopped = False
         self.uri = ""
         self.stream_url = ""
+        self.capture: tuple[str, str] | None = None
 
     @classmethod
     def start(
@@ -70,9 +68,11 @@ class SimProcess:
         *,
         camera: CameraModel | None = None,
         target: TargetConfig | None = None,
+        capture: CaptureSettings | None = None,
         link: LinkOptions | None = None,
         port: int = 0,
         http_port: int = 0,
+        capture_port: int = 0,
         truth_file: Path | None = None,
         linger_s: float = LINGER_S,
         timeout_s: float = START_TIMEOUT_S,
@@ -91,19 +91,19 @@ class SimProcess:
             pace=pace,
             camera=camera,
             target=target,
+            capture=capture,
             link=link or LinkOptions(),
             port=port,
             http_port=http_port,
+            capture_port=capture_port,
             truth_file=str(truth_file) if truth_file is not None else None,
             linger_s=linger_s,
         )
-        token = secrets.token_hex(TOKEN_BYTES)
+        token = new_token()
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
         with listen() as listener:
-            child = _spawn(stderr)
-            assert child.stdin is not None
-            with contextlib.suppress(OSError), child.stdin:
-                child.stdin.write(f"{listener.getsockname()[1]} {token}\n".encode())
+            child = spawn(_CHILD, stderr)
+            introduce(child, listener, token)
             channel = accept(listener, token, timeout_s, lambda: child.poll() is None)
         if channel is None:
             raise _gave_up(child, stderr, f"did not come up within {timeout_s:.0f} s")
@@ -117,7 +117,7 @@ class SimProcess:
         if isinstance(answer, str):
             process.stop()
             raise ConnectionFailed(f"the simulated vehicle could not start: {answer}")
-        process.uri, process.stream_url = answer
+        process.uri, process.stream_url, process.capture = answer
         return process
 
     @property
@@ -167,6 +167,10 @@ class SimProcess:
         """The link receives and sends nothing for `duration_s` of simulated time."""
         self._ask("silence", duration_s=duration_s)
 
+    def capture_fault(self, fault: CaptureFault | None, for_s: float = math.inf) -> None:
+        """Something goes wrong in the motion capture for so long; None ends all that does."""
+        self._ask("capture_fault", fault=fault, for_s=for_s)
+
     def reboot(self) -> None:
         """Restart the firmware, as the power button does; log blocks are lost."""
         self._ask("reboot")
@@ -183,7 +187,7 @@ class SimProcess:
         with contextlib.suppress(PerchError):
             self._ask("stop", _STOP_TIMEOUT_S)
         self._channel.close()
-        _end(self._child)
+        end(self._child, _STOP_TIMEOUT_S)
         self._stderr.close()
 
     def __enter__(self) -> SimProcess:
@@ -208,32 +212,11 @@ class SimProcess:
                 ) from None
             except (EOFError, OSError):
                 raise ConnectionFailed(
-                    f"the simulated vehicle has ended{_last_line(self._stderr)}"
+                    f"the simulated vehicle has ended{last_line(self._stderr)}"
                 ) from None
         if not good:
             raise InvalidValue(f"the simulated vehicle refused {name!r}: {result}")
         return result
-
-
-def _spawn(stderr: IO[bytes]) -> subprocess.Popen[bytes]:
-    root = str(Path(__file__).resolve().parents[3])
-    command = [sys.executable, "-P", "-c", _CHILD, root]
-    if sys.platform == "win32":
-        flags = subprocess.CREATE_NEW_PROCESS_GROUP
-        return subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=stderr, stderr=stderr, creationflags=flags
-        )
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=stderr, stderr=stderr, start_new_session=True
-    )
-
-
-def _end(child: subprocess.Popen[bytes]) -> None:
-    try:
-        child.wait(_STOP_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        child.wait()
 
 
 def _gave_up(child: subprocess.Popen[bytes], stderr: IO[bytes], why: str) -> ConnectionFailed:
@@ -241,15 +224,6 @@ def _gave_up(child: subprocess.Popen[bytes], stderr: IO[bytes], why: str) -> Con
     child.kill()
     child.wait()
     what = f"ended with code {code}" if code is not None else why
-    error = ConnectionFailed(f"the simulated vehicle {what}{_last_line(stderr)}")
+    error = ConnectionFailed(f"the simulated vehicle {what}{last_line(stderr)}")
     stderr.close()
     return error
-
-
-def _last_line(stderr: IO[bytes]) -> str:
-    """The last line of the child's error output, for a message."""
-    if stderr.closed:
-        return ""
-    stderr.seek(0)
-    lines = stderr.read().decode(errors="replace").strip().splitlines()
-    return f": {lines[-1]}" if lines else ""

@@ -1,4 +1,5 @@
-"""The simulated vehicle behind its link and its video: what runs in a process of its own."""
+"""The simulated vehicle behind its link, its video and the room's motion capture: what runs in a
+process of its own."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from perchctl.geometry import rpy_from_rotation
+from perchctl.sim.capture.server import SYSTEM, CaptureServer
 from perchctl.sim.crtp.server import CrtpServer
 from perchctl.sim.crtp.udp import UdpEndpoint
 from perchctl.sim.process.control import HostSetup
@@ -23,7 +25,7 @@ _WAKE_EVERY = 5  # control periods between two wake-ups of the renderer
 
 
 class VehicleHost:
-    """One vehicle, its CRTP endpoint and its video stream.
+    """One vehicle, its CRTP endpoint, its video stream and the server of a motion capture.
 
     `live` moves the rendering into a thread of its own, so that a picture never holds
     up the physics; otherwise pictures are rendered within the steps, exactly in order.
@@ -33,15 +35,18 @@ class VehicleHost:
         self._setup = setup
         self._live = live
         self._steps = 0
-        self.vehicle = SimulatedVehicle(setup.scenario, setup.camera, setup.target)
+        self.vehicle = self._new_vehicle(setup.scenario)
         self.server = CrtpServer(self.vehicle.firmware, setup.link)
         self.endpoint = UdpEndpoint(setup.port, setup.link)
         self.stream: MjpegServer | None = None
+        self.positions: CaptureServer | None = None
         self._truth: TextIO | None = None
         self._feed: _PictureFeed | None = None
         try:
             if setup.camera is not None:
                 self.stream = MjpegServer(setup.http_port)
+            if setup.capture is not None:
+                self.positions = CaptureServer(setup.capture.names, setup.capture_port)
             if setup.truth_file is not None:
                 self._truth = Path(setup.truth_file).open("w", encoding="utf-8")  # noqa: SIM115
         except BaseException:
@@ -52,6 +57,11 @@ class VehicleHost:
     @property
     def uri(self) -> str:
         return f"udp://127.0.0.1:{self.endpoint.port}"
+
+    @property
+    def capture(self) -> tuple[str, str] | None:
+        """The motion capture's kind, as `motioncapture` calls it, and its address."""
+        return None if self.positions is None else (SYSTEM, self.positions.host)
 
     @property
     def elapsed_s(self) -> float:
@@ -66,11 +76,12 @@ class VehicleHost:
         """Packets that have arrived, one control period, then what is due to be sent."""
         self.endpoint.serve(self.server, self.elapsed_s)
         if self._feed is not None:
-            self.vehicle.firmware.step()
+            self.vehicle.step_blindly()
             self._feed.add(self.vehicle.world.state())
         else:
             self.vehicle.step()
             self._publish_arrived()
+        self._publish_seen()
         self._steps += 1
         self.endpoint.send_due(self.server, self.elapsed_s)
         if self._truth is not None and self._steps % TRUTH_EVERY == 0:
@@ -103,7 +114,7 @@ class VehicleHost:
     def replace_vehicle(self, scenario: Scenario) -> None:
         """A new vehicle under the same link: connection and log blocks stay."""
         self._close_feed()
-        self.vehicle = SimulatedVehicle(scenario, self._setup.camera, self._setup.target)
+        self.vehicle = self._new_vehicle(scenario)
         self.server.replace_firmware(self.vehicle.firmware, keep_blocks=True)
         self._feed = self._new_feed()
 
@@ -112,6 +123,8 @@ class VehicleHost:
         self.endpoint.close()
         if self.stream is not None:
             self.stream.close()
+        if self.positions is not None:
+            self.positions.close()
         if self._truth is not None:
             self._truth.close()
 
@@ -121,6 +134,16 @@ class VehicleHost:
         arrived = self.vehicle.camera.take()
         if arrived:
             self.stream.publish(arrived[-1].image)
+
+    def _publish_seen(self) -> None:
+        if self.vehicle.capture is None or self.positions is None:
+            return
+        for frame in self.vehicle.capture.take():
+            self.positions.publish(frame)
+
+    def _new_vehicle(self, scenario: Scenario) -> SimulatedVehicle:
+        setup = self._setup
+        return SimulatedVehicle(scenario, setup.camera, setup.target, setup.capture)
 
     def _new_feed(self) -> _PictureFeed | None:
         if not self._live or self.vehicle.camera is None or self.stream is None:

@@ -16,7 +16,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from perchctl.sim.process.control import Channel
+from perchctl.children import Channel
+from perchctl.sim.capture.settings import CaptureFault
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
@@ -57,6 +58,7 @@ class Runner:
             "replace_vehicle": host.replace_vehicle,
             "set_battery": self._set_battery,
             "push": self._push,
+            "capture_fault": self._capture_fault,
             "stop": self._stop,
         }
 
@@ -136,6 +138,15 @@ class Runner:
 
     def _push(self, force_n: tuple[float, float, float]) -> None:
         self._host.vehicle.world.external_force_n = force_n
+
+    def _capture_fault(self, fault: CaptureFault | None, for_s: float) -> None:
+        capture = self._host.vehicle.capture
+        if capture is None:
+            raise RuntimeError("it was started without a motion capture")
+        if fault is None:
+            capture.heal()
+        else:
+            capture.lay(fault, for_s)
 
     def _stop(self) -> None:
         self._stopped = True

@@ -1,0 +1,23 @@
+"""`--positioning`: what measures the position, on top of the profile."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+from perchctl.errors import InvalidValue
+from perchctl.profile import Profile
+from perchctl.profile.positioning import PositioningConfig
+
+POSITIONINGS: tuple[str, ...] = get_args(PositioningConfig.model_fields["by"].annotation)
+
+
+def positioned(profile: Profile, by: str | None) -> Profile:
+    """`by` None: as the profile has it. Errors: InvalidValue."""
+    if by is None:
+        return profile
+    if by not in POSITIONINGS:
+        raise InvalidValue(
+            f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
+        )
+    config = profile.positioning.model_copy(update={"by": by})
+    return profile.model_copy(update={"positioning": config})

@@ -1,0 +1,144 @@
+"""What is asked of positions from outside before a flight, by `fly` and by `check`. Pure.
+
+Of a vehicle at rest two things are known without any capture: where the ground is, and which way
+is up. A world with another axis up, or a body whose axes are turned, shows against the second as
+soon as the vehicle stands in another heading than the one in which its body was defined; a height
+in millimetres against the first. What a vehicle at rest cannot tell is told by a hand that lifts
+and turns it (`perchctl check --lift`), or by its first centimetres in the air
+(`perchctl.mission.guards.is_astray`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perchctl.flight.criteria import Problem
+from perchctl.geometry import (
+    Array,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    wrap_rad,
+    yaw_of,
+)
+from perchctl.positioning.feed import FeedStatus
+from perchctl.profile import Profile
+from perchctl.vehicle import ExternalPosition, Telemetry
+
+ROOM_M = 50.0
+"""No capture is larger: what is farther off is told in another unit."""
+HIGH_M = 4.0
+"""Of a vehicle that stands where it takes off: higher it is told in another unit."""
+UPRIGHT_DEG = 20.0
+"""What attitude and capture may differ by: the attitude of a rigid body is defined by eye."""
+AXIS_DEG = 30.0
+"""Within it of an axis, up is that axis."""
+AGREE_M, AGREE_DEG = 0.1, 15.0
+"""Estimate and capture, once positions are fused and the heading was set by them."""
+
+
+def strange(place: ExternalPosition, telemetry: Telemetry, profile: Profile) -> Problem | None:
+    """What waiting will not mend: another unit, another axis up, another place."""
+    return (
+        in_millimetres(place, profile)
+        or with_another_up(place, telemetry)
+        or off_the_ground(place, profile)
+    )
+
+
+def in_millimetres(place: ExternalPosition, profile: Profile) -> Problem | None:
+    safety, (x, y, z) = profile.safety, place.position_m
+    far_m = max(abs(v) for v in place.position_m)
+    on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
+    if not far_m >= ROOM_M and not (z >= HIGH_M and on_ground):
+        return None
+    return Problem(
+        f"the motion capture has the vehicle at x {x:.0f}, y {y:.0f}, z {z:.0f} m: these look "
+        f"like millimetres",
+        "set the unit of its stream to metres",
+    )
+
+
+def with_another_up(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
+    """By the vehicle's own attitude, which knows gravity."""
+    if place.quaternion is None:
+        return None
+    up = up_in_capture(place.quaternion, telemetry)
+    off_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(up[2])))))
+    if not off_deg > UPRIGHT_DEG:
+        return None
+    axis = nearest_axis(up)
+    if axis is None:
+        return Problem(
+            f"the motion capture has the vehicle tilted by {off_deg:.0f} deg against its own "
+            f"attitude",
+            "is it the right rigid body? set its axes level in the capture, or "
+            "positioning.body_rpy_deg; perchctl check --lift tells by how much",
+        )
+    return Problem(
+        f"swapped axes: up is {axis} in the motion capture",
+        "set its world to z up; if only the rigid body's own axes lie so, define them anew "
+        "with the vehicle level, or set positioning.body_rpy_deg",
+    )
+
+
+def up_in_capture(quaternion: tuple[float, float, float, float], telemetry: Telemetry) -> Array:
+    """The world's vertical as the capture has it, if its body's axes are the vehicle's: (3,)."""
+    R_own = rotation_from_rpy(telemetry.roll_rad, telemetry.pitch_rad, telemetry.yaw_rad)
+    return np.asarray(rotation_from_quaternion(quaternion) @ R_own.T[:, 2])
+
+
+def nearest_axis(direction: Array) -> str | None:
+    """The axis that lies within `AXIS_DEG` of a unit vector, such as ``-y``; None where none."""
+    i = int(np.argmax(np.abs(direction)))
+    if abs(float(direction[i])) < math.cos(math.radians(AXIS_DEG)):
+        return None
+    return f"{'-' if direction[i] < 0 else ''}{'xyz'[i]}"
+
+
+def off_the_ground(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """Elsewhere than where it takes off."""
+    safety, z_m = profile.safety, place.position_m[2]
+    if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
+        return None
+    found = (
+        f"the motion capture has the vehicle at {z_m:.2f} m, and the ground is at "
+        f"{safety.ground_z_m:.2f} m"
+    )
+    level = [
+        axis
+        for axis, v in zip("xy", place.position_m[:2], strict=True)
+        if abs(v - safety.ground_z_m) <= safety.ground_tolerance_m
+    ]
+    perhaps = f"swapped axes (is its {' or its '.join(level)} up?)" if level else "swapped axes"
+    return Problem(
+        found,
+        f"{perhaps}, another rigid body or zero: perchctl check --lift tells; "
+        f"safety.ground_z_m is the height that it has where it stands",
+    )
+
+
+def missing(status: FeedStatus, profile: Profile) -> Problem | None:
+    """None while fresh positions are sent."""
+    if status.problem is not None:
+        return Problem(status.problem, "see perchctl check")
+    if status.age_s <= profile.positioning.hold_s:
+        return None
+    age = f"{status.age_s:.2f} s old" if math.isfinite(status.age_s) else "none was sent yet"
+    return Problem(age, "see perchctl check")
+
+
+def apart(place: ExternalPosition, telemetry: Telemetry) -> Problem | None:
+    """The vehicle's estimate is not where the capture has it, or has another heading."""
+    away_m = math.dist(place.position_m, telemetry.position_m)
+    turned_deg = 0.0
+    if place.quaternion is not None:
+        yaw_rad = yaw_of(rotation_from_quaternion(place.quaternion))
+        turned_deg = abs(math.degrees(wrap_rad(telemetry.yaw_rad - yaw_rad)))
+    if away_m <= AGREE_M and turned_deg <= AGREE_DEG:
+        return None
+    return Problem(
+        f"they are {away_m:.2f} m and {turned_deg:.0f} deg of heading apart",
+        "do the positions arrive at this vehicle, and is it this rigid body?",
+    )

@@ -1,0 +1,87 @@
+"""Positions from outside for one flight in real time: capture, feed, and the thread between."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from importlib.util import find_spec
+
+from perchctl.errors import no_motion_capture
+from perchctl.flight.clock import Clock
+from perchctl.flight.preflight import refuse_strange
+from perchctl.link.cflib_link import CflibLink
+from perchctl.link.outside import check_parameters
+from perchctl.positioning.capture import check_reachable, open_capture
+from perchctl.positioning.feed import FeedStatus, PositionFeed
+from perchctl.positioning.thread import FeedThread
+from perchctl.positioning.types import CaptureSource
+from perchctl.profile import Profile
+from perchctl.profile.positioning import PositioningConfig
+
+STRANGE_S = 0.5
+"""For so long it is looked whether positions are of another world, before they are used."""
+
+
+def check_positioning(profile: Profile, *, simulated: bool) -> None:
+    """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
+    config = profile.positioning
+    if config.by != "mocap":
+        return
+    check_parameters(profile.link.parameters, config)
+    if not simulated:
+        check_reachable(config)
+    elif find_spec("motioncapture") is None:  # its room has a capture of its own
+        raise no_motion_capture()
+
+
+def opened_capture(
+    stack: contextlib.ExitStack, config: PositioningConfig, clock: Clock
+) -> CaptureSource | None:
+    """The capture, None with decks. Errors: InvalidValue, UsageError, ConnectionFailed."""
+    if config.by != "mocap":
+        return None
+    capture = open_capture(config, clock.now)
+    stack.callback(capture.close)
+    return capture
+
+
+def at_hand(config: PositioningConfig, simulated: tuple[str, str] | None) -> PositioningConfig:
+    """With the capture that measures this vehicle: a simulated one's is at `simulated`, its kind
+    and address, and in no lab."""
+    if simulated is None:
+        return config
+    system, host = simulated
+    return config.model_copy(update={"system": system, "host": host})
+
+
+def started_feed(
+    stack: contextlib.ExitStack,
+    capture: CaptureSource | None,
+    link: CflibLink,
+    config: PositioningConfig,
+    clock: Clock,
+    profile: Profile,
+) -> Callable[[float], FeedStatus] | None:
+    """The vehicle's estimate settled on what the capture says, and positions on their way until
+    `stack` ends: the link is closed before that, since a vehicle that lands still needs them.
+
+    Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
+    if capture is None:
+        return None
+    feed = PositionFeed(capture, link.external, config)
+    thread = FeedThread(feed, clock.now)
+    stack.callback(thread.close)
+    thread.start()
+    _refuse_strange(feed, link, clock, profile)
+    link.settle(feed)
+    return feed.status
+
+
+def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:
+    """Before an estimate is set to them, and before their scatter or their place is taken for
+    something else. What is late is left to those who wait for it."""
+    end_s, newest = clock.now() + STRANGE_S, None
+    while (now_s := clock.now()) < end_s:
+        newest = next(reversed(link.telemetry()), newest)
+        refuse_strange(feed.status(now_s), newest, profile)
+        clock.wait_until(now_s + 0.02)

@@ -1,0 +1,47 @@
+"""Why a vehicle is held in place: what is not known in this tick, and may be in the next."""
+
+from __future__ import annotations
+
+import math
+
+from perchctl.mission.context import Context
+from perchctl.mission.state import Phase
+
+NO_PICTURE = "no picture for"
+
+
+def hold_reason(c: Context) -> str:
+    """Why the vehicle must stay where it is in this tick, or the empty string."""
+    safety = c.profile.safety
+    # A take-off goes on, on what is known; without a position nothing is.
+    if c.state.phase in _HOLDABLE | {Phase.APPROACH} and is_unplaced(c):
+        return unplaced(c)
+    if c.state.phase not in _HOLDABLE:
+        return ""
+    if c.telemetry_age_s > safety.telemetry_hold_s:
+        return f"telemetry is {c.telemetry_age_s:.1f} s old"
+    if c.state.jump_s is not None:
+        return "the state estimate jumped"
+    if c.variance_m2 > safety.flight_variance_m2:
+        return f"the state estimate is unsure (variance {c.variance_m2:.2g} m^2)"
+    if c.obs.loop_late_s > safety.loop_late_hold_s:
+        return f"the control loop is {c.obs.loop_late_s:.1f} s late"
+    if c.state.phase in _CAMERA_PHASES and c.obs.camera_age_s > safety.camera_hold_s:
+        return c.obs.camera_problem or f"{NO_PICTURE} {c.obs.camera_age_s:.1f} s"
+    return ""
+
+
+def is_unplaced(c: Context) -> bool:
+    """No position from outside is fresh (fault 10)."""
+    return c.obs.position_age_s > c.profile.positioning.hold_s
+
+
+def unplaced(c: Context) -> str:
+    """For how long none was sent, and why."""
+    age_s, why = c.obs.position_age_s, c.obs.position_problem
+    text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has come"
+    return f"{text}: {why}" if why else text
+
+
+_CAMERA_PHASES = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND})
+_HOLDABLE = _CAMERA_PHASES | {Phase.RECOVER}

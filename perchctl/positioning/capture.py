@@ -1,0 +1,229 @@
+"""A motion-capture system behind the library `motioncapture`, in a process of its own.
+
+What "not seen" means differs: Vicon, OptiTrack and Qualisys send each frame whole and leave a
+hidden body out; VRPN sends one body at a time, nothing of a hidden one, and does not say when
+its server is gone. So with VRPN silence is all that can be told.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any
+
+from perchctl.children import Channel, accept, end, introduce, listen, new_token, spawn
+from perchctl.errors import ConnectionFailed, InvalidValue, no_motion_capture
+from perchctl.positioning.child import Arrived, CaptureSetup, Connected, Failed
+from perchctl.positioning.judge import label
+from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.profile.positioning import CAPTURE_SYSTEMS, PositioningConfig
+
+SILENT_S = 0.3
+KEPT = 64
+"""Frames that wait to be read; older ones fall out."""
+LONGEST_LINE = 300
+UP_TIMEOUT_S = 15.0
+"""For the child's Python to start: of its own, so that a busy computer is not taken for a
+motion capture that does not answer."""
+_END_TIMEOUT_S = 2.0
+_PORT_OPTION = {"qualisys": "port", "optitrack": "port_command"}
+_CHILD = "from perchctl.positioning.child import serve_parent; serve_parent()"
+# One clock for all processes. Elsewhere the moment at which this one reads a frame is its time.
+_SHARED_CLOCK = sys.platform == "linux"
+
+
+def check_reachable(config: PositioningConfig) -> None:
+    """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
+    if config.system not in CAPTURE_SYSTEMS:
+        raise InvalidValue(
+            f"motion capture {config.system!r} is unknown; allowed are {', '.join(CAPTURE_SYSTEMS)}"
+        )
+    if not config.host.strip():
+        raise InvalidValue(
+            f"the computer of the motion capture ({config.system}) is not named: write its name "
+            f"or address into the profile, as in positioning: {{by: mocap, host: 192.168.1.2}}"
+        )
+    if find_spec("motioncapture") is None:
+        raise no_motion_capture()
+
+
+def setup_of(config: PositioningConfig) -> CaptureSetup:
+    """Vicon and VRPN take a port with the name; the others want it apart."""
+    host, options = config.host.strip(), {}
+    name, colon, port = host.rpartition(":")
+    if colon and config.system in _PORT_OPTION and port.isdecimal():
+        host, options = name, {_PORT_OPTION[config.system]: port}
+    return CaptureSetup(
+        config.system,
+        {"hostname": host, **options},
+        partial=config.system == "vrpn",
+        timeout_s=config.connect_timeout_s,
+    )
+
+
+def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) -> MotionCapture:
+    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
+    kind, _, host = system.partition(":")
+    if find_spec("motioncapture") is None:
+        raise no_motion_capture(needed_by)
+    # Unchecked, since `check_reachable` has the sentence for a kind that is none.
+    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
+    return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))
+
+
+def open_capture(
+    config: PositioningConfig, clock: Callable[[], float] = time.monotonic
+) -> MotionCapture:
+    """Connected, and its first frame has come.
+
+    Errors: InvalidValue, UsageError without the library, ConnectionFailed without an answer in
+    `config.connect_timeout_s`.
+    """
+    check_reachable(config)
+    return MotionCapture.start(setup_of(config), label(config), config.body, clock)
+
+
+class MotionCapture:
+    """`perchctl.positioning.types.CaptureSource`; its process ends with it."""
+
+    def __init__(
+        self,
+        child: subprocess.Popen[bytes],
+        who: str,
+        body: str,
+        partial: bool,
+        clock: Callable[[], float],
+    ) -> None:
+        self._child, self._who, self._body = child, who, body
+        self._partial, self._clock = partial, clock
+        self._channel: Channel | None = None
+        self._frames: deque[CaptureFrame] = deque(maxlen=KEPT)
+        self._framed_s: float | None = None
+        self._settled = threading.Event()
+        self._connected, self._closed = False, False
+        self._ended: str | None = None
+        self._last_line = ""
+        self._printing = threading.Thread(target=self._read_output, daemon=True)
+        self._printing.start()
+        self._reading = threading.Thread(
+            target=self._read_frames, name="perchctl-capture", daemon=True
+        )
+
+    @classmethod
+    def start(
+        cls, setup: CaptureSetup, who: str, body: str, clock: Callable[[], float] = time.monotonic
+    ) -> MotionCapture:
+        """`who`: for sentences. `body`: a frame in which it is goes before one in which it is
+        not. Errors: ConnectionFailed."""
+        token = new_token()
+        with listen() as listener:
+            child = spawn(_CHILD, subprocess.PIPE)
+            capture = cls(child, who, body, setup.partial, clock)
+            try:
+                introduce(child, listener, token)
+                channel = accept(listener, token, UP_TIMEOUT_S, lambda: child.poll() is None)
+                capture._begin(channel, setup)
+            except BaseException:
+                capture.close()
+                raise
+        return capture
+
+    def poll(self, now_s: float) -> CaptureFrame | None:
+        """The newest of those since the last call that has the body in it; without one, the
+        newest."""
+        frames = self.frames()
+        return next((f for f in reversed(frames) if self._body in f.bodies), None) or (
+            frames[-1] if frames else None
+        )
+
+    def frames(self) -> list[CaptureFrame]:
+        """All since the last call or poll, oldest first."""
+        return [self._frames.popleft() for _ in range(len(self._frames))]
+
+    def problem(self, now_s: float) -> str | None:
+        if self._ended is not None:
+            return self._ended
+        silent_s = 0.0 if self._framed_s is None else now_s - self._framed_s
+        if silent_s <= SILENT_S:
+            return None
+        what = "no body" if self._partial else "no frame"
+        return f"{self._who} has sent {what} for {silent_s:.1f} s"
+
+    def close(self) -> None:
+        """Ends the child, wherever in its library it is. Bounded."""
+        self._closed = True
+        if self._child.poll() is None:
+            self._child.kill()
+        end(self._child, _END_TIMEOUT_S)
+        for thread in (self._printing, self._reading):
+            if thread.ident is not None:
+                thread.join(_END_TIMEOUT_S)
+        if self._channel is not None:
+            self._channel.close()
+        for pipe in (self._child.stdin, self._child.stdout):
+            if pipe is not None and not self._printing.is_alive():
+                pipe.close()
+
+    def _begin(self, channel: Channel | None, setup: CaptureSetup) -> None:
+        if channel is None:
+            raise ConnectionFailed(f"no {self._who}: its reader did not start{self._words()}")
+        self._channel = channel
+        channel.send(setup)
+        self._reading.start()
+        if not self._settled.wait(setup.timeout_s):
+            connected = self._connected and not setup.partial
+            raise ConnectionFailed(
+                f"no {self._who}: {'connected, but no frame' if connected else 'no answer'} within "
+                f"{setup.timeout_s:g} s (does it stream, is the address right?){self._words()}"
+            )
+        if self._ended is not None:
+            raise ConnectionFailed(self._ended)
+
+    def _read_frames(self) -> None:
+        assert self._channel is not None
+        while True:
+            try:
+                message = self._channel.receive()
+            except (EOFError, OSError):
+                break
+            match message:
+                case Arrived(t_s, bodies):
+                    now_s = self._clock()
+                    t_s = min(t_s, now_s) if _SHARED_CLOCK else now_s
+                    poses = {name: BodyPose(*body) for name, body in bodies.items()}
+                    self._frames.append(CaptureFrame(t_s, poses))
+                    self._framed_s = now_s
+                    self._settled.set()
+                case Connected():
+                    self._connected = True
+                case Failed(text):
+                    self._ended = self._gone("" if self._framed_s is None else " failed", text)
+        if self._ended is None and not self._closed:
+            end(self._child, _END_TIMEOUT_S)
+            self._printing.join(_END_TIMEOUT_S)
+            self._ended = self._gone("", f"its reader ended{_code(self._child)}{self._words()}")
+        self._settled.set()
+
+    def _gone(self, how: str, why: str) -> str:
+        return f"{'no ' if self._framed_s is None else ''}{self._who}{how}: {why}"
+
+    def _read_output(self) -> None:
+        """All of it, so that the child never waits; its last line is kept for a message."""
+        output = self._child.stdout
+        assert output is not None
+        for raw in iter(lambda: output.readline(LONGEST_LINE), b""):
+            line = raw.decode(errors="replace").strip()
+            self._last_line = line or self._last_line
+
+    def _words(self) -> str:
+        return f": {self._last_line}" if self._last_line else ""
+
+
+def _code(child: subprocess.Popen[bytes]) -> str:
+    code = child.poll()
+    return "" if code is None else f" with code {code}"

@@ -1,0 +1,133 @@
+"""Hands the vehicle its position from outside, or says why not.
+
+What if a position is the last one, late, or sent twice? The vehicle's estimator takes each for
+the place where it is now. So nothing is repeated, nothing waits in a queue, and what the judge
+does not believe is not sent: the age grows, and the planner holds and lands by it (fault 10).
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from perchctl.positioning.judge import Judge, Placed, label
+from perchctl.positioning.types import CaptureSource
+from perchctl.profile.positioning import PositioningConfig
+from perchctl.vehicle import ExternalPosition
+
+QUIET_S = 0.1
+"""Without a position for so long, or for two periods, it is said why. One frame that is missing
+among good ones is none of the pilot's business."""
+HANGS_S = 0.2
+"""The turns come every 10 ms, or as often as a simulated flight's loop turns."""
+RATE_OVER_S = 1.0
+
+Send = Callable[[ExternalPosition], object]
+"""`Link.external`; False: it did not go out."""
+
+
+@dataclass(frozen=True)
+class FeedStatus:
+    """What the flight loop reads in each turn.
+
+    `age_s`: of the newest position that was handed to the link, from its exposure; inf before
+    the first. `problem`: None while they are sent, otherwise one sentence with the cause.
+    `rate_hz`: of the last second. `measured`: `pose` with its attitude, also where only the
+    position is sent.
+    """
+
+    age_s: float = math.inf
+    problem: str | None = None
+    sent: int = 0
+    pose: ExternalPosition | None = None
+    rate_hz: float = 0.0
+    measured: ExternalPosition | None = None
+
+
+class PositionFeed:
+    """No thread and no clock: `turn` is called about 100 times a second, by a `FeedThread` or
+    in lockstep; `status` from any thread."""
+
+    def __init__(self, source: CaptureSource, send: Send, config: PositioningConfig) -> None:
+        self._source, self._send, self._config = source, send, config
+        self._judge = Judge(config)
+        self._period_s = 1.0 / config.rate_hz
+        self._quiet_s = max(QUIET_S, 2.0 * self._period_s)
+        self._due_s = -math.inf
+        self._lock = threading.Lock()
+        self._turned_s: float | None = None
+        self._framed_s = -math.inf
+        self._exposed_s = -math.inf
+        self._placed: Placed | None = None
+        self._pose: ExternalPosition | None = None
+        self._count = 0
+        self._times_s: deque[float] = deque()
+        self._problem: str | None = None
+
+    def turn(self, now_s: float) -> None:
+        """Poll, judge, send one position at most. Raises nothing: what goes wrong shows as an
+        age that grows, with the cause."""
+        try:
+            problem = self._one(now_s)
+        except Exception as error:  # of a source or a link: the flight is ended by the age
+            problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
+        with self._lock:
+            self._turned_s, self._problem = now_s, problem
+
+    def place(self) -> Placed | None:
+        """The newest that was handed to the link, with its attitude also where only the
+        position was sent."""
+        return self._placed
+
+    def status(self, now_s: float) -> FeedStatus:
+        with self._lock:
+            times = list(self._times_s)
+            quiet = not times or now_s - times[-1] > self._quiet_s
+            return FeedStatus(
+                age_s=now_s - self._exposed_s,
+                problem=self._why(now_s) if quiet else None,
+                sent=self._count,
+                pose=self._pose,
+                rate_hz=sum(now_s - t_s < RATE_OVER_S for t_s in times) / RATE_OVER_S,
+                measured=None if self._placed is None else self._placed.external(pose=True),
+            )
+
+    def _one(self, now_s: float) -> str | None:
+        frame = self._source.poll(now_s)
+        trouble = self._source.problem(now_s)
+        if frame is None:
+            silent = now_s - self._framed_s > QUIET_S
+            return trouble or (None if silent else self._judge.problem)
+        self._framed_s = now_s
+        placed = self._judge.judge(frame, now_s)
+        if placed is None or now_s < self._due_s - 1e-6:
+            return trouble or self._judge.problem
+        place = placed.external(pose=self._config.send == "pose")
+        if self._send(place) is False:
+            return "the link is busy with something else, and a position does not wait"
+        # A turn that comes late must not slow the next ones down, and none makes up for it.
+        self._due_s = max(self._due_s + self._period_s, now_s)
+        with self._lock:
+            self._placed, self._exposed_s, self._pose = placed, placed.t_s, place
+            self._count += 1
+            self._times_s.append(now_s)
+            while now_s - self._times_s[0] > RATE_OVER_S:
+                self._times_s.popleft()
+        return None
+
+    def _why(self, now_s: float) -> str:
+        who = label(self._config)
+        if self._turned_s is None:
+            return f"nothing has been asked of {who} yet"
+        if now_s - self._turned_s > HANGS_S:
+            return (
+                f"the positions of {who} have not been passed on for {now_s - self._turned_s:.1f} s"
+            )
+        if self._problem is not None:
+            return self._problem
+        if self._framed_s == -math.inf:
+            return f"no frame has come from {who} yet"
+        return f"no frame has come from {who} for {now_s - self._framed_s:.1f} s"

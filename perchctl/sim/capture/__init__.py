@@ -1,0 +1,1 @@
+"""A simulated motion-capture system: what its cameras see, and its server on loopback."""

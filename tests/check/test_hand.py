@@ -1,0 +1,201 @@
+"""A hand finds what a vehicle at rest cannot tell of its motion capture, and says which."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.check import hand
+from perchctl.check.row import Row, Verdict
+from perchctl.geometry import Array, rot_z, rotation_from_rpy
+from perchctl.positioning.judge import Placed
+from perchctl.positioning.types import BodyPose
+from perchctl.profile.positioning import PositioningConfig
+from perchctl.vehicle import Telemetry
+from tests.helpers.capture import TURNS, UPRIGHT, named_up
+from tests.helpers.mission import telemetry
+
+CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
+LASTS_S, DELAY_S = 8.0, 0.015
+I3 = np.eye(3)
+
+
+def bump(t_s: float, from_s: float, to_s: float) -> float:
+    """0 outside, 1 in the middle, smooth."""
+    if not from_s < t_s < to_s:
+        return 0.0
+    return math.sin(math.pi * (t_s - from_s) / (to_s - from_s)) ** 2
+
+
+def motion(
+    t_s: float, lift: float = 1.0, turn: float = 1.0, tilt: float = 1.0
+) -> tuple[Array, Array]:
+    """Lifted by 30 cm, turned by 80 deg, tilted forward and aside by 30 deg, put back."""
+    place = np.array([0.02, 0.01, 0.3]) * lift * bump(t_s, 1.0, 7.0)
+    yaw = math.radians(80.0) * turn * bump(t_s, 1.5, 4.0)
+    pitch = math.radians(30.0) * tilt * bump(t_s, 4.0, 5.5)
+    roll = math.radians(30.0) * tilt * bump(t_s, 5.0, 6.5)
+    return place, rotation_from_rpy(roll, pitch, yaw)
+
+
+def recorded(
+    seed: int = 0,
+    world: Array = I3,
+    body: Array = I3,
+    scale: float = 1.0,
+    own: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    seen: tuple[float, float, float] | None = None,
+    mirror: Array = I3,
+    config: PositioningConfig = CONFIG,
+) -> Row:
+    """The row of what a capture says that has the vehicle as ``world R body``, and of what the
+    vehicle says itself, from a heading of its own: both with noise, the capture late."""
+    from perchctl.geometry import quaternion_from_rotation
+    from perchctl.positioning.judge import place_of
+
+    rng = np.random.default_rng(seed)
+    heading = rng.uniform(-math.pi, math.pi)
+    origin = np.array([0.4, -0.2, 0.01])
+    samples: list[Telemetry] = []
+    places: list[Placed] = []
+    for t_s in np.arange(0.0, LASTS_S, 0.025):
+        _, R = motion(t_s, *own)
+        roll, pitch, yaw = (float(a) for a in _rpy(rot_z(heading) @ R))
+        noise = rng.normal(0.0, 0.004, 4)
+        shake = 0.1 * (own[0] > 0) * bump(t_s, 1.0, 2.0)
+        samples.append(telemetry(
+            float(t_s), 0.0, roll_rad=roll + noise[0], pitch_rad=pitch + noise[1],
+            yaw_rad=yaw + noise[2], acc_z_g=1.0 + shake + 0.5 * noise[3],
+        ))  # fmt: skip
+        place, R = motion(t_s - DELAY_S, *(own if seen is None else seen))
+        R = mirror @ R @ mirror.T if np.linalg.det(mirror) < 0 else R
+        R_seen = world @ R @ body @ rotation_from_rpy(*rng.normal(0.0, 0.005, 3))
+        place = scale * (mirror @ world @ (origin + place + rng.normal(0.0, 0.001, 3)))
+        pose = BodyPose(tuple(place), quaternion_from_rotation(R_seen))
+        places.append(place_of(pose, config, float(t_s)))
+    return hand.row(hand.paired(samples, places), config)
+
+
+def _rpy(R: Array) -> tuple[float, float, float]:
+    from perchctl.geometry import rpy_from_rotation
+
+    return rpy_from_rotation(R)
+
+
+def test_a_true_capture_passes() -> None:
+    row = recorded()
+    assert row.verdict is Verdict.PASS, row
+    assert "rose by 0.30 m" in row.found
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from(TURNS), st.integers(0, 99), st.floats(-3.1, 3.1))
+def test_each_of_the_axes_is_found_and_named(turn: Array, seed: int, yaw: float) -> None:
+    """A world in other axes, in whatever heading, its body defined along them."""
+    row = recorded(seed, turn @ rot_z(yaw), rot_z(-yaw) @ turn.T)
+    if named_up(turn) != "z":
+        assert row.verdict is Verdict.FAIL
+        assert f"swapped axes: up is {named_up(turn)} in" in row.found
+    elif np.allclose(turn @ rot_z(yaw), rot_z(yaw)) and np.allclose(turn, I3):
+        assert abs(yaw) < math.radians(5.5) or row.verdict is not Verdict.PASS
+
+
+@pytest.mark.parametrize("turn", UPRIGHT)
+def test_a_body_turned_about_the_vertical_is_told_by_how_much(turn: Array) -> None:
+    row = recorded(1, turn, turn.T)
+    if np.allclose(turn, I3):
+        assert row.verdict is Verdict.PASS
+        return
+    off_deg = round(math.degrees(math.acos((np.trace(turn) - 1.0) / 2.0)))
+    assert row.verdict is Verdict.FAIL
+    told = re.search(r"turned by (\d+) deg", row.found)
+    assert told is not None
+    assert abs(int(told[1]) - off_deg) <= 3
+    assert "set positioning.body_rpy_deg: [" in row.advice
+
+
+@pytest.mark.parametrize("rpy_deg", [(0.0, 0.0, 90.0), (0.0, 0.0, -40.0), (90.0, 0.0, 20.0)])
+def test_what_it_advises_mends_it(rpy_deg: tuple[float, float, float]) -> None:
+    body = rotation_from_rpy(*(math.radians(a) for a in rpy_deg))
+    row = recorded(2, body=body)
+    assert row.verdict is Verdict.FAIL
+    numbers = re.search(r"body_rpy_deg: \[([^\]]*)\]", row.advice)
+    assert numbers is not None
+    mended = CONFIG.model_copy(
+        update={"body_rpy_deg": tuple(float(v) for v in numbers[1].split(","))}
+    )
+    assert recorded(3, body=body, config=mended).verdict is Verdict.PASS
+
+
+@pytest.mark.parametrize("turn", UPRIGHT)
+def test_the_heading_of_the_capture_is_its_own_affair(turn: Array) -> None:
+    """The vehicle's is set by it."""
+    assert recorded(4, turn).verdict is Verdict.PASS
+
+
+@given(st.floats(0.3, 0.5), st.integers(0, 9))
+@settings(max_examples=5, deadline=None)
+def test_millimetres_are_named(lift: float, seed: int) -> None:
+    row = recorded(seed, scale=1000.0, own=(lift / 0.3, 1.0, 1.0))
+    assert row.verdict is Verdict.FAIL
+    assert "millimetres" in row.found
+
+
+@pytest.mark.parametrize(("own", "seen", "words"), [
+    ((1.0, 1.0, 1.0), (0.0, 0.0, 0.0), "the vehicle moves, and the rigid body 'cf2' stands"),
+    ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "the rigid body 'cf2' moves, and the vehicle stands"),
+    ((1.0, 1.0, 1.0), (1.0, -1.0, 0.6), "does not turn as the vehicle does"),
+    ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0), "does not turn as the vehicle does"),
+])  # fmt: skip
+def test_another_body_is_named(
+    own: tuple[float, float, float], seen: tuple[float, float, float], words: str
+) -> None:
+    row = recorded(5, own=own, seen=seen)
+    assert row.verdict is Verdict.FAIL
+    assert words in row.found
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_mirrored_world_is_named(axis: int) -> None:
+    mirror = np.eye(3)
+    mirror[axis, axis] = -1.0
+    row = recorded(6, mirror=mirror)
+    assert row.verdict is Verdict.FAIL
+    assert re.search("mirrored|swapped axes", row.found)
+
+
+@pytest.mark.parametrize(("own", "verdict", "words"), [
+    ((0.0, 0.0, 0.0), "skipped", "not moved"),
+    ((1.0, 0.0, 0.0), "warn", "too few axes"),
+    ((1.0, 1.0, 0.0), "warn", "too few axes"),
+    ((0.0, 1.0, 1.0), "warn", "not lifted"),
+])  # fmt: skip
+def test_what_too_small_a_motion_cannot_tell_is_no_pass(
+    own: tuple[float, float, float], verdict: str, words: str
+) -> None:
+    row = recorded(7, own=own)
+    assert row.verdict == verdict, row
+    assert words in row.found
+    assert row.advice == hand.HOW
+
+
+@pytest.mark.parametrize("own", [(1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
+def test_a_lift_or_a_turn_alone_finds_another_axis_up(own: tuple[float, float, float]) -> None:
+    y_up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    row = recorded(8, y_up, y_up.T, own=own)
+    assert row.verdict is Verdict.FAIL
+    assert "swapped axes" in row.found
+    assert "y" in row.found
+
+
+def test_without_moments_of_both_nothing_is_said() -> None:
+    assert hand.row(None, CONFIG).verdict is Verdict.SKIPPED
+    sample = telemetry(0.0)
+    assert hand.paired([sample, replace(sample, t_s=1.0)], []) is None
+    assert hand.paired([], []) is None

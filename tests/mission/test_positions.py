@@ -1,0 +1,358 @@
+"""Positions from outside that stay away, or are of another world (faults 10 and 11)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from perchctl.mission import planner
+from perchctl.mission.state import Observation, Outcome, Phase, PlannerState
+from perchctl.vehicle import LOCKED, Command, Land, PositionSetpoint, RawThrust, StopMotors
+from tests.helpers.mission import (
+    AIRBORNE,
+    HANG_Z_M,
+    HOVER_THRUST,
+    PROFILE,
+    READY,
+    observation,
+    state_in,
+    target_at,
+    telemetry,
+)
+
+MOCAP = PROFILE.model_copy(
+    update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
+)
+HOLD_S, LAND_S = MOCAP.positioning.hold_s, MOCAP.positioning.land_s
+HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
+TURN_S, BEGIN_S = 0.02, 10.0
+PRESSED = HOVER_THRUST * 1.12
+HELD_PHASES = (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
+
+
+def times(lasts_s: float) -> Iterator[float]:
+    for i in range(1, round(lasts_s / TURN_S) + 1):
+        yield BEGIN_S + TURN_S * i
+
+
+def hidden(age_s: float) -> dict[str, Any]:
+    return {"position_age_s": age_s, "position_problem": HIDDEN}
+
+
+def flown(
+    state: PlannerState, look: Callable[[float], Observation], lasts_s: float
+) -> tuple[PlannerState, list[Command]]:
+    """Until the time is over, or the phase is another."""
+    phase, sent = state.phase, []
+    for t_s in times(lasts_s):
+        state, command = planner.step(state, look(t_s), MOCAP)
+        sent.append(command)
+        if state.phase is not phase:
+            break
+    return state, sent
+
+
+# --- In the air --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", HELD_PHASES)
+def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
+    """0.3 s: the setpoint stands, then moves on, and nothing is landed for it."""
+    begin = state = state_in(phase, z_m=0.3 if phase is Phase.APPROACH else 1.0)
+    held = []
+    for t_s in times(0.5):
+        hidden_s = t_s - BEGIN_S if t_s - BEGIN_S <= 0.3 else 0.0
+        obs = observation(t_s, begin.entry_m[2], **hidden(hidden_s))
+        state, command = planner.step(state, obs, MOCAP)
+        if hidden_s > HOLD_S:
+            held.append((state.hold, state.setpoint, command))
+    assert state.phase in (*HELD_PHASES, Phase.PERCH)
+    assert not state.hold
+    assert len(held) >= 7
+    for why, setpoint, command in held:
+        assert HIDDEN in why
+        assert setpoint == held[0][1]
+        assert isinstance(command, PositionSetpoint)
+
+
+@pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
+def test_a_lasting_occlusion_lands_and_says_why(phase: Phase) -> None:
+    begin = state_in(phase)
+    state, sent = begin, []
+    for t_s in times(2.0):
+        obs = observation(t_s, begin.entry_m[2], new_frame=False, **hidden(t_s - BEGIN_S))
+        state, command = planner.step(state, obs, MOCAP)
+        sent.append(command)
+        if state.phase is not phase:
+            break
+    assert (state.phase, state.row, state.outcome) == (
+        Phase.LANDING, "position-lost", Outcome.SAFETY,
+    )  # fmt: skip
+    assert HIDDEN in state.reason
+    assert len(sent) * TURN_S == pytest.approx(LAND_S, abs=0.03)
+
+
+def test_what_was_never_measured_lands_at_once() -> None:
+    state, _ = planner.step(state_in(Phase.ALIGN), observation(10.02, **hidden(math.inf)), MOCAP)
+    assert state.phase is Phase.LANDING
+    assert "no position has come" in state.reason
+
+
+@pytest.mark.parametrize(("phase", "to"), [
+    (Phase.APPROACH, Phase.SEARCH), (Phase.ALIGN, Phase.ASCEND), (Phase.RECOVER, Phase.ESTIMATE),
+])  # fmt: skip
+def test_no_dwell_time_counts_without_a_position(phase: Phase, to: Phase) -> None:
+    """Hidden again and again for 0.3 s, never long enough to be landed for."""
+    z_m = 0.5 if phase is Phase.APPROACH else 1.0
+
+    def seen(t_s: float) -> Observation:
+        return observation(t_s, z_m)
+
+    def flickers(t_s: float) -> Observation:
+        since_s = (t_s - BEGIN_S) % 0.35
+        return observation(t_s, z_m, **hidden(since_s if since_s < 0.3 else 0.0))
+
+    assert flown(state_in(phase, z_m=z_m), seen, 1.2)[0].phase is to
+    assert flown(state_in(phase, z_m=z_m), flickers, 1.2)[0].phase is phase
+
+
+# --- At the ceiling ----------------------------------------------------------------------
+
+
+def pressed(t_s: float, **changes: Any) -> Observation:
+    return observation(t_s, telemetry=telemetry(t_s, HANG_Z_M, thrust=PRESSED), **changes)
+
+
+def test_no_contact_is_proven_without_a_position() -> None:
+    assert flown(state_in(Phase.PERCH, z_m=HANG_Z_M), pressed, 0.6)[0].phase is Phase.COMPLETE
+    state, _ = flown(
+        state_in(Phase.PERCH, z_m=HANG_Z_M), lambda t_s: pressed(t_s, **hidden(0.3)), 0.6
+    )
+    assert state.phase is Phase.PERCH
+
+
+def test_a_position_that_comes_again_proves_nothing_yet() -> None:
+    """The estimate is drawn back to it, and its speed is not the vehicle's."""
+
+    def back(t_s: float) -> Observation:
+        return pressed(t_s, **(hidden(0.3) if t_s < BEGIN_S + 0.1 else {}))
+
+    state, sent = flown(state_in(Phase.PERCH, z_m=HANG_Z_M), back, 2.0)
+    assert state.phase is Phase.COMPLETE
+    assert len(sent) * TURN_S > 0.1 + 0.5 + PROFILE.planner.perch.contact_dwell_s - 0.05
+
+
+class Hangs:
+    """A vehicle with its gear at the magnet, its body hidden, and an estimate that slides: down
+    by `drift_mps`, as one that is pressed and blind does (docs/firmware.md). `carries`: as long
+    as its thrust is above this part of the weight, the magnet holds."""
+
+    def __init__(self, drift_mps: float, carries: float = 0.0, hover: float = HOVER_THRUST):
+        self.thrust, self.drift_mps = hover, drift_mps
+        self.carries, self.hover = carries, hover
+        self.fell_s: float | None = None
+        self.estimated_m = HANG_Z_M
+
+    def look(self, t_s: float) -> Observation:
+        lifted = self.thrust / self.hover
+        if self.fell_s is None and lifted < self.carries:
+            self.fell_s = t_s - TURN_S
+        acc_g, sinks_mps = 1.0, 0.0
+        if self.fell_s is not None:
+            acc_g, sinks_mps = lifted, 9.81 * (1.0 - lifted) * (t_s - self.fell_s)
+        self.estimated_m = HANG_Z_M - self.drift_mps * (t_s - BEGIN_S)
+        off = self.thrust == 0.0
+        tel = telemetry(
+            t_s, self.estimated_m, acc_z_g=acc_g, thrust=self.thrust,
+            velocity_mps=(0.0, 0.0, -self.drift_mps - sinks_mps),
+            supervisor=READY if off else AIRBORNE,
+        )  # fmt: skip
+        return observation(t_s, telemetry=tel, target=None, **hidden(t_s - BEGIN_S + 1.0))
+
+    def obeys(self, command: Command) -> None:
+        match command:
+            case RawThrust(thrust):
+                self.thrust = float(thrust)
+            case StopMotors():
+                self.thrust = 0.0
+            case PositionSetpoint(z_m=z_m):
+                self.thrust = 20000.0 if z_m < self.estimated_m else 65535.0
+
+
+def released(it: Hangs, state: PlannerState, lasts_s: float = 12.0) -> tuple[PlannerState, list]:
+    sent = []
+    for t_s in times(lasts_s):
+        state, command = planner.step(state, it.look(t_s), MOCAP)
+        it.obeys(command)
+        sent.append((t_s, command))
+        if planner.is_over(state):
+            break
+    return state, sent
+
+
+def at_the_magnet(phase: Phase = Phase.COMPLETE) -> PlannerState:
+    return replace(state_in(phase, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
+
+
+@pytest.mark.parametrize("drift_mps", [0.0, 0.2, -0.2])
+def test_a_release_goes_on_by_the_accelerometer_when_the_body_is_hidden_for_good(
+    drift_mps: float,
+) -> None:
+    """To thrust again for a slide of the estimate would take a vehicle off its magnet."""
+    it = Hangs(drift_mps)
+    state, sent = released(it, replace(at_the_magnet(), released_s=BEGIN_S))
+    assert state.phase is Phase.PERCHED
+    stops = [t_s for t_s, command in sent if isinstance(command, StopMotors)]
+    still = next(t_s for t_s, c in sent if isinstance(c, RawThrust) and c.thrust <= 5000)
+    assert stops[0] - still >= PROFILE.planner.complete.hang_s - 0.05
+
+
+def test_the_same_slide_with_decks_is_a_slip() -> None:
+    """Their position is measured all the time: what sinks by it falls."""
+    it = Hangs(0.2)
+    state = replace(at_the_magnet(), released_s=BEGIN_S)
+    for t_s in times(0.3):
+        obs = replace(it.look(t_s), position_age_s=0.0)
+        state, _ = planner.step(state, obs, PROFILE)
+    assert state.row == "slipped"
+
+
+@pytest.mark.parametrize("carries", [0.05, 0.3])
+@pytest.mark.parametrize("drift_mps", [0.0, 0.2])
+def test_a_magnet_that_gives_way_is_noticed_without_a_position(
+    carries: float, drift_mps: float
+) -> None:
+    it = Hangs(drift_mps, carries)
+    state = replace(at_the_magnet(), released_s=BEGIN_S)
+    for t_s in times(4.0):
+        state, command = planner.step(state, it.look(t_s), MOCAP)
+        if state.phase is not Phase.COMPLETE:
+            break
+        assert not isinstance(command, StopMotors)
+        it.obeys(command)
+    assert it.fell_s is not None
+    assert t_s - it.fell_s < 0.15
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > it.look(t_s).telemetry.position_m[2] + 0.15  # caught
+
+
+def test_what_nobody_saw_hang_has_not_perched() -> None:
+    """Motors off, no position, and a gap in the telemetry: it may lie on the floor."""
+    state = replace(at_the_magnet(), stopped_s=BEGIN_S - 1.0, released_s=BEGIN_S - 3.0, orders=5)
+    ends = None
+    for t_s in times(3.0):
+        tel = telemetry(t_s, HANG_Z_M, thrust=0.0, supervisor=READY)
+        if t_s < BEGIN_S + 0.3:
+            tel = replace(tel, t_s=BEGIN_S - 0.5)
+        obs = observation(t_s, telemetry=tel, target=None, **hidden(5.0))
+        state, command = planner.step(state, obs, MOCAP)
+        assert not isinstance(command, Land | PositionSetpoint)
+        if planner.is_over(state):
+            break
+        ends = state.reason
+    assert state.phase is Phase.LANDED
+    assert ends is not None
+    assert "not known" in ends
+    assert "not known whether it stands or hangs" in state.reason
+
+
+@pytest.mark.parametrize("hung_s", [None, BEGIN_S - 3.0])
+def test_a_locked_vehicle_hangs_where_it_was_seen_to_all_the_time(hung_s: float | None) -> None:
+    from perchctl.mission.state import Condition
+
+    state = replace(
+        at_the_magnet(), stopped_s=BEGIN_S - 1.0, released_s=BEGIN_S - 4.0,
+        since={} if hung_s is None else {Condition.WEIGHT_HANGS: hung_s},
+    )  # fmt: skip
+    tel = telemetry(10.02, HANG_Z_M, thrust=0.0, supervisor=READY | LOCKED)
+    obs = observation(10.02, telemetry=tel, target=None, **hidden(5.0))
+    state, _ = planner.step(state, obs, MOCAP)
+    assert state.phase is (Phase.ABORTED if hung_s is None else Phase.PERCHED)
+
+
+# --- On the way down ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("contact", [True, False])
+def test_what_something_carries_is_put_down_gently_whatever_that_is(contact: bool) -> None:
+    """Magnet or floor: without a position nothing tells them apart. A stop at half of the
+    weight would drop it from a weak magnet; a slow release under watch suits both."""
+    it = Hangs(-0.1)
+    it.thrust = 20000.0
+    state = replace(at_the_magnet(Phase.LANDING), contact_z_m=HANG_Z_M if contact else None)
+    state, sent = released(it, state)
+    first = next(i for i, (_, command) in enumerate(sent) if isinstance(command, StopMotors))
+    still = [c for _, c in sent[:first] if isinstance(c, RawThrust) and c.thrust <= 5000]
+    assert len(still) * TURN_S >= PROFILE.planner.complete.hang_s - 0.05
+    assert state.phase is Phase.LANDED
+    assert "not known whether it stands or hangs" in state.reason
+
+
+def test_a_drifting_descent_is_no_floor() -> None:
+    """It seems to have come down by half a metre, and is held by the magnet."""
+    state = replace(state_in(Phase.LANDING, z_m=1.5))
+    for t_s in times(0.9):
+        tel = telemetry(t_s, 0.9, thrust=20000.0)
+        obs = observation(t_s, telemetry=tel, target=None, **hidden(1.0))
+        state, command = planner.step(state, obs, MOCAP)
+        assert not isinstance(command, StopMotors)
+
+
+def test_the_ground_stays_where_it_was_when_the_drift_ends() -> None:
+    """The estimate steps back to the truth: what was remembered before the drift is true."""
+    begin = replace(state_in(Phase.ALIGN), ground_m=(0.0, 0.0, 0.0))
+    state, _ = planner.step(begin, observation(10.02, 1.3, **hidden(0.5)), MOCAP)
+    back, _ = planner.step(state, observation(10.04, 1.0, jumped=True), MOCAP)
+    assert back.ground_m == (0.0, 0.0, 0.0)
+    without, _ = planner.step(replace(state, stale_s=None), observation(10.04, jumped=True), MOCAP)
+    assert without.ground_m != (0.0, 0.0, 0.0)
+
+
+# --- Another world -----------------------------------------------------------------------
+
+
+def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone() -> None:
+    """A world with another axis up: the vehicle lifts, its position slides, its height stands,
+    and each setpoint would be answered with more thrust."""
+    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
+    raw = []
+    for t_s in times(1.5):
+        aside_m = 0.3 * (t_s - BEGIN_S)
+        tel = telemetry(t_s, position_m=(0.0, aside_m, 0.0), thrust=60000.0, acc_z_g=1.1)
+        obs = observation(t_s, telemetry=tel, target=target_at(t_s, body_m=tel.position_m))
+        state, command = planner.step(state, obs, MOCAP)
+        if aside_m < 0.1:
+            assert isinstance(command, PositionSetpoint)
+        if isinstance(command, RawThrust):
+            raw.append(command.thrust)
+    assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
+    assert "perchctl check --lift" in state.reason
+    assert raw[0] < 60000 / 1.1
+    assert raw == sorted(raw, reverse=True)
+    assert raw[-1] < 0.85 * 60000 / 1.1
+
+
+@pytest.mark.parametrize("profile", [PROFILE, MOCAP])
+def test_only_positions_from_outside_go_astray(profile: Any) -> None:
+    tel = telemetry(10.02, position_m=(0.2, 0.0, 0.02))
+    state, _ = planner.step(
+        state_in(Phase.APPROACH, z_m=0.2), observation(10.02, telemetry=tel), profile
+    )
+    assert (state.phase is Phase.LANDING) is (profile is MOCAP)
+
+
+@pytest.mark.parametrize(("phase", "z_m", "aside_m", "lands"), [
+    (Phase.APPROACH, 0.02, 0.08, False), (Phase.APPROACH, 0.2, 0.2, False),
+    (Phase.APPROACH, 0.2, 0.3, True), (Phase.ALIGN, 1.0, 0.6, False), (Phase.ALIGN, 1.0, 0.9, True),
+])  # fmt: skip
+def test_a_draught_is_not_another_world(
+    phase: Phase, z_m: float, aside_m: float, lands: bool
+) -> None:
+    tel = telemetry(10.02, position_m=(aside_m, 0.0, z_m))
+    obs = observation(10.02, telemetry=tel)
+    state, _ = planner.step(state_in(phase, z_m=z_m), obs, MOCAP)
+    assert (state.row == "position-astray") is lands

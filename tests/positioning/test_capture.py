@@ -1,0 +1,284 @@
+"""The reader of motion capture in its own process: what it does there ends nothing here."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import perchctl
+from perchctl.children import Channel
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
+from perchctl.positioning import capture as capture_module
+from perchctl.positioning import child
+from perchctl.positioning.capture import MotionCapture, open_capture, setup_of
+from perchctl.positioning.child import CaptureSetup
+from perchctl.positioning.feed import PositionFeed
+from perchctl.positioning.thread import FeedThread
+from perchctl.profile.positioning import PositioningConfig
+from perchctl.vehicle import ExternalPosition
+from tests.positioning.fake_library import write_library
+
+ROOT = Path(perchctl.__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def faulty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., MotionCapture]]:
+    """Opens the reader on the library that is faulty by the host's name."""
+    write_library(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    paths = os.pathsep.join([str(tmp_path), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
+    monkeypatch.setenv("PYTHONPATH", paths)
+    opened: list[MotionCapture] = []
+
+    def start(fault: str, system: str = "vicon", timeout_s: float = 10.0) -> MotionCapture:
+        config = PositioningConfig(
+            by="mocap", system=system, host=fault, body="cf", connect_timeout_s=timeout_s
+        )
+        opened.append(open_capture(config))
+        return opened[-1]
+
+    yield start
+    for one in opened:
+        one.close()
+
+
+def until(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s, "waited in vain"
+        time.sleep(0.005)
+
+
+def problem(capture: MotionCapture) -> str:
+    return capture.problem(time.monotonic()) or ""
+
+
+def test_frames_come_with_the_time_of_their_arrival(faulty: Callable[..., MotionCapture]) -> None:
+    capture = faulty("good")
+    frame = None
+    before_s = time.monotonic()
+
+    def fresh() -> bool:
+        nonlocal frame
+        frame = capture.poll(time.monotonic()) or frame
+        return frame is not None and frame.t_s > before_s
+
+    until(fresh)
+    assert frame is not None
+    assert frame.t_s <= time.monotonic()
+    assert set(frame.bodies) == {"cf", "cf2"}
+    assert frame.bodies["cf"].quaternion == (1.0, 0.0, 0.0, 0.0)
+    assert frame.bodies["cf"].position_m[0] > 1.0
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("refuses", "no motion capture at vicon:refuses: Error connecting QTM"),
+        ("aborts", "its reader ended with code 134: what(): Network is unreachable"),
+        ("hangs", "no answer within 0.3 s"),
+        ("silent", "connected, but no frame within 0.3 s"),
+    ],
+)
+def test_none_is_one_sentence_in_bounded_time(
+    faulty: Callable[..., MotionCapture], fault: str, words: str
+) -> None:
+    with pytest.raises(ConnectionFailed) as caught:
+        faulty(fault, timeout_s=0.3 if "0.3" in words else 10.0)
+    assert words in str(caught.value)
+    assert caught.value.exit_code == 10
+    assert "\n" not in str(caught.value)
+
+
+def test_vrpn_answers_by_bodies_alone(faulty: Callable[..., MotionCapture]) -> None:
+    """Its loop turns also where nobody serves."""
+    with pytest.raises(ConnectionFailed, match="no answer within"):
+        faulty("empty", system="vrpn", timeout_s=0.3)
+    assert faulty("empty", system="vicon").problem(time.monotonic()) is None
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (
+            "dies",
+            "motion capture at vicon:dies: its reader ended with code 7: the camera burnt",
+        ),
+        ("raises", "motion capture at vicon:raises failed: subject table changed"),
+        ("stalls", "motion capture at vicon:stalls has sent no frame for 0."),
+    ],
+)
+def test_what_ends_on_the_way_is_named(
+    faulty: Callable[..., MotionCapture], fault: str, words: str
+) -> None:
+    capture = faulty(fault)
+    until(lambda: words in problem(capture))
+    capture.poll(time.monotonic())
+    assert capture.poll(time.monotonic()) is None
+
+
+def test_a_flood_of_frames_fills_nothing(faulty: Callable[..., MotionCapture]) -> None:
+    capture = faulty("floods")
+    until(lambda: len(capture._frames) == capture_module.KEPT)
+    assert len(capture.frames()) <= capture_module.KEPT
+    start_s = time.monotonic()
+    seen = 0
+    while time.monotonic() < start_s + 0.3:
+        seen += len(capture.frames())
+    assert seen < 0.3 * 600
+
+
+def test_a_library_that_prints_without_end_is_read_away(
+    faulty: Callable[..., MotionCapture], capfd: pytest.CaptureFixture[str]
+) -> None:
+    capture = faulty("prints")
+    for _ in range(20):
+        until(lambda: capture.poll(time.monotonic()))
+    assert problem(capture) == ""
+    assert len(capture._last_line) <= capture_module.LONGEST_LINE
+    assert capfd.readouterr() == ("", "")
+
+
+def test_bodies_that_come_one_by_one_do_not_hide_each_other(
+    faulty: Callable[..., MotionCapture],
+) -> None:
+    capture = faulty("turns", system="vrpn")
+    until(lambda: len(capture._frames) >= 9)
+    frame = capture.poll(time.monotonic())
+    assert frame is not None
+    assert set(frame.bodies) == {"cf"}
+
+
+def test_closing_ends_the_process_wherever_it_is(faulty: Callable[..., MotionCapture]) -> None:
+    capture = faulty("stalls")
+    capture.close()
+    capture.close()
+    assert capture._child.poll() is not None
+    assert not capture._reading.is_alive()
+
+
+@pytest.mark.parametrize("fault", ["stalls", "hangs"])
+@pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
+def test_it_ends_with_a_parent_that_was_killed(
+    faulty: Callable[..., MotionCapture], fault: str
+) -> None:
+    """Also where the library lets no thread of the process have a turn."""
+    code = (
+        "import subprocess, sys, threading, time\n"
+        f"sys.path.append({str(ROOT)!r})\n"
+        "from perchctl.positioning import capture\n"
+        "spawn = capture.spawn\n"
+        "def told(code, output):\n"
+        "    child = spawn(code, output); print(child.pid, flush=True); return child\n"
+        "capture.spawn = told\n"
+        "from perchctl.profile.positioning import PositioningConfig\n"
+        f"one = capture.open_capture(PositioningConfig(by='mocap', host={fault!r}, body='cf'))\n"
+        "print('open', flush=True); time.sleep(60)\n"
+    )
+    if fault == "hangs":
+        code = code.replace("body='cf'", "body='cf', connect_timeout_s=0.9")
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    if fault == "hangs":
+        until(lambda: Path(f"/proc/{pid}").exists())
+        time.sleep(0.3)
+    else:
+        assert parent.stdout.readline() == "open\n"
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    parent.stdout.close()
+    until(lambda: not _runs(pid))
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    stat = Path(f"/proc/{pid}/stat")
+    return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_a_parent_that_says_nothing_is_not_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It speaks once, at the start: the bound of that must not be one of the whole flight."""
+    ended: list[int] = []
+    library = SimpleNamespace(waitForNextFrame=lambda: time.sleep(0.002), rigidBodies={})
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        here = Channel(socket.create_connection(server.getsockname()))
+        there = Channel(server.accept()[0])
+    monkeypatch.setattr(child, "START_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(child, "connect_back", lambda: there)
+    monkeypatch.setattr(child, "_connected", lambda setup: library)
+    monkeypatch.setattr(child.signal, "signal", lambda *what: None)
+    monkeypatch.setattr(child.os, "_exit", ended.append)
+    here.send(CaptureSetup("vicon"))
+    serving = threading.Thread(target=child.serve_parent, daemon=True)
+    serving.start()
+    begun_s = time.monotonic()
+    until(lambda: getattr(here.receive(10.0), "t_s", 0.0) > begun_s + 0.2)
+    assert ended == []
+    here.close()
+    serving.join(10.0)
+    until(lambda: ended)
+    there.close()
+
+
+def test_without_a_host_or_the_library_nothing_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InvalidValue, match=r"positioning: \{by: mocap, host:"):
+        open_capture(PositioningConfig(by="mocap", host=" "))
+    monkeypatch.setattr(capture_module, "find_spec", lambda name: None)
+    with pytest.raises(UsageError) as caught:
+        open_capture(PositioningConfig(by="mocap", host="lab"))
+    assert f"{sys.executable} -m pip install 'perchctl[mocap]'" in str(caught.value)
+    assert isinstance(caught.value, PerchError)
+
+
+def test_a_port_goes_where_the_library_wants_it() -> None:
+    def options(system: str, host: str) -> dict[str, str]:
+        config = PositioningConfig.model_validate({"by": "mocap", "system": system, "host": host})
+        return setup_of(config).options
+
+    assert options("qualisys", "lab:22223") == {"hostname": "lab", "port": "22223"}
+    assert options("optitrack", "10.0.0.2:1511") == {"hostname": "10.0.0.2", "port_command": "1511"}
+    assert options("vrpn", "lab:3884") == {"hostname": "lab:3884"}
+    assert options("vicon", "lab:801") == {"hostname": "lab:801"}
+    assert options("qualisys", "lab") == {"hostname": "lab"}
+
+
+def test_the_real_library_through_its_process() -> None:
+    """Its own stand-in for a system repeats one pose to the last bit: what it delivers is read,
+    and the feed takes it for what it looks like, a capture that stands still."""
+    pytest.importorskip("motioncapture")
+    places: list[ExternalPosition] = []
+    config = PositioningConfig(by="mocap", host="here", body="cf", body_rpy_deg=(0.0, 0.0, 90.0))
+    bodies = {"rigid_bodies": "cf(1,2,3,0.70710678,0,0,0.70710678);wand(0,0,1,1,0,0,0)"}
+    capture = MotionCapture.start(CaptureSetup("mock", bodies), "motion capture mock", "cf")
+    feed = PositionFeed(capture, places.append, config)
+    thread = FeedThread(feed, time.monotonic)
+    try:
+        thread.start()
+        until(lambda: "frozen" in (feed.status(time.monotonic()).problem or ""))
+    finally:
+        thread.close()
+        capture.close()
+    assert len(places) == 1
+    assert places[0].position_m == pytest.approx((1.0, 2.0, 3.0))
+
+
+def test_the_real_library_refuses_what_it_does_not_know() -> None:
+    pytest.importorskip("motioncapture")
+    with pytest.raises(ConnectionFailed, match="no motion capture x: Unknown motion capture type"):
+        MotionCapture.start(CaptureSetup("nokov", {"hostname": "lab"}), "motion capture x", "cf")
