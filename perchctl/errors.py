@@ -40,7 +40,7 @@ def no_motion_capture(needed_by: str = "positioning by motion capture") -> Usage
 
 class ConnectionFailed(PerchError):
     exit_code = 10
-    meaning = "no connection to the vehicle"
+    meaning = "no connection to the vehicle or the motion capture"
 
 
 class NotFound(PerchError):

@@ -7,7 +7,14 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, JsonOption, ProfileOption, perform, reported
+from perchctl.cli.app import (
+    ForceOption,
+    JsonOption,
+    PositioningOption,
+    ProfileOption,
+    perform,
+    reported,
+)
 
 
 def simulate(
@@ -28,6 +35,7 @@ def simulate(
         typer.Option("--only", min=0, help="One flight, of this seed, told in full and logged."),
     ] = None,
     profile: ProfileOption = "sim",
+    positioning: PositioningOption = None,
     faults: Annotated[
         str | None,
         typer.Option(
@@ -51,6 +59,7 @@ def simulate(
 
         request = SimulateRequest(
             profile=profile,
+            positioning=positioning,
             flights=flights,
             seed=seed,
             jobs=jobs,

@@ -19,6 +19,7 @@ from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, UsageError, no_simulator
+from perchctl.positioning.capture import open_named
 from perchctl.profile import Profile, load_profile
 from perchctl.vision.types import CameraModel
 from perchctl.weights.collect import (
@@ -136,10 +137,17 @@ def _truth(request: CollectRequest, profile: Profile, now: Callable[[], float]) 
     if request.truth == "typed":
         return TypedTruth()
     if request.truth == "mocap":
-        if request.mocap is None or ":" not in request.mocap:
+        if request.mocap is None or not request.mocap.partition(":")[2].strip():
             raise UsageError("--truth mocap needs --mocap TYPE:HOST, as in vicon:192.168.1.2")
         body, _, target = request.bodies.partition(",")
-        return MocapTruth(request.mocap, body, target if given is None else given, gear)
+        return MocapTruth(
+            open_named(request.mocap, body, "--truth mocap"),
+            request.mocap,
+            body,
+            target if given is None else given,
+            gear,
+            profile.positioning if profile.positioning.by == "mocap" else None,
+        )
     from perchctl.link.estimate import EstimateLink
 
     link = EstimateLink(profile.link.uri if request.uri is None else request.uri, profile.link, now)

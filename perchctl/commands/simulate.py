@@ -17,7 +17,6 @@ from perchctl.errors import PerchError, no_simulator
 from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
 from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.write import make_log_folder
-from perchctl.profile import load_profile
 
 __all__ = ["SimulateRequest", "run"]
 
@@ -46,7 +45,7 @@ def run(request: SimulateRequest) -> int:
 def _campaign(request: SimulateRequest) -> int:
     from perchctl.flight.campaign import run_campaign
 
-    profile = load_profile(request.profile)
+    profile = request.loaded()
 
     def report(results: list[FlightResult], problem: PerchError | None) -> None:
         if request.as_json:

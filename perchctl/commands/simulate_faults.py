@@ -15,7 +15,7 @@ from perchctl.faults.result import FaultResult
 from perchctl.faults.summary import fault_summary, fault_table
 from perchctl.flight.results import aligned
 from perchctl.log.jsonl import to_plain
-from perchctl.profile import Profile, load_profile
+from perchctl.profile import Profile
 
 
 def run_faults(request: SimulateRequest) -> int:
@@ -24,7 +24,7 @@ def run_faults(request: SimulateRequest) -> int:
         _list(request.as_json)
         return 0
     names = tuple(fault.name for fault in selected(request.faults or "all"))
-    profile = load_profile(request.profile)
+    profile = request.loaded()
     if request.only is not None:
         request = replace(request, log_dir=request.log_folder(profile))
 

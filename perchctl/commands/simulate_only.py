@@ -12,12 +12,12 @@ from perchctl.display.status import timed_text
 from perchctl.errors import PerchError
 from perchctl.flight.campaign import LoggedFlight, fly_all, fly_logged
 from perchctl.log.summary import summary_text
-from perchctl.profile import Profile, load_profile
+from perchctl.profile import Profile
 
 
 def run_only(request: SimulateRequest) -> int:
     """Fly the seed, log it, and print the flight. Errors: NotFound, InvalidValue."""
-    profile = load_profile(request.profile)
+    profile = request.loaded()
     fly = partial(fly_logged, profile, request.log_folder(profile))
 
     def report(flown: list[LoggedFlight], _problem: PerchError | None) -> None:

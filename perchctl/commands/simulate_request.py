@@ -13,10 +13,11 @@ from types import FrameType
 from typing import Any, Protocol, TypeVar
 
 from perchctl.commands.output import say
+from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import Ended, progress_bar
 from perchctl.errors import Interrupted, PerchError, UsageError
 from perchctl.files import check_output
-from perchctl.profile import Profile
+from perchctl.profile import Profile, load_profile
 
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
@@ -49,6 +50,11 @@ class SimulateRequest:
     faults: str | None = None
     heat_map: Path | None = None
     force: bool = False
+    positioning: str | None = None
+
+    def loaded(self) -> Profile:
+        """The profile with the command line on top. Errors: NotFound, InvalidValue."""
+        return positioned(load_profile(self.profile), self.positioning)
 
     @property
     def seeds(self) -> list[int]:

@@ -118,6 +118,21 @@ def external(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.ExternalPositions(how, lasting_s(rng)),)
 
 
+def external_occluded(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    """For 0.3 s, as somebody walks by, or longer."""
+    for_s = 0.3 if rng.uniform() < 0.5 else lasting_s(rng, 0.5)
+    return (e.ExternalPositions("occluded", for_s),)
+
+
+def external_wrong(how: str) -> Draw:
+    return lambda rng, scenario: (e.ExternalPositions(how, lasting_s(rng)),)
+
+
+def external_late(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    late_s = log_between(rng, 0.05, 0.15)
+    return (e.ExternalPositions("late", lasting_s(rng, 1.0), late_s),)
+
+
 def sags(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.BatterySags(log_between(rng, 0.01, 0.1), between(rng, 0.2, 0.7)),)
 

@@ -69,10 +69,12 @@ class EstimateError:
 
 @dataclass(frozen=True)
 class ExternalPositions:
-    """The estimate follows positions from outside; `how` they end: frozen or silent."""
+    """The vehicle has no deck but a motion capture; what goes wrong in it is `how`: frozen,
+    silent, occluded, swapped, millimetres, or late by `late_s`."""
 
     how: str
     for_s: float
+    late_s: float = 0.0
 
 
 @dataclass(frozen=True)

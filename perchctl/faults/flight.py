@@ -13,7 +13,7 @@ from perchctl.calibration.files import camera_of
 from perchctl.errors import PerchError
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
-from perchctl.faults.effects import Effect
+from perchctl.faults.effects import Effect, ExternalPositions
 from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.excuses import LEAST_LIFT, Facts
 from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
@@ -23,6 +23,7 @@ from perchctl.faults.radio import FaultyRadio
 from perchctl.faults.result import End, FaultResult
 from perchctl.faults.truth import WatchedVehicle, sample_of
 from perchctl.flight.lockstep import LockstepSource
+from perchctl.flight.lockstep_positions import by_mocap, feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.geometry import GRAVITY_MPS2
@@ -32,7 +33,7 @@ from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import FlightReport, Watcher
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim.draw import draw_capture, draw_scenario
 from perchctl.sim.powertrain import most_thrust_n
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.thrust_curve import MOTOR_FORCE_N
@@ -57,10 +58,13 @@ class FaultyFlight:
     def __init__(
         self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None
     ) -> None:
+        if any(isinstance(effect, ExternalPositions) for effect in case.effects):
+            profile = by_mocap(profile)
         self._profile, self._case, self._log = profile, case, log
         self._scenario = scenario = _scenario_of(case, scenario)
         camera = camera_of(profile.camera)
-        self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target)
+        capture = draw_capture(profile, scenario.seed)
+        self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
         radio = FaultyRadio()
         radio.serves(vehicle.firmware)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
@@ -82,8 +86,9 @@ class FaultyFlight:
             watchers = (*watchers, log)
         pipeline = make_pipeline(profile, camera)
         self._parts = FlightParts(
-            self._link, source, self._clock, profile, pipeline, watchers, switch.read
-        )
+            self._link, source, self._clock, profile, pipeline, watchers, switch.read,
+            positions=feed_lockstep(self._link, profile),
+        )  # fmt: skip
         safety = profile.safety
         self._oracle = Oracle(Limits(safety.fence_radius_m, safety.max_height_m))
         self._own_landing = False

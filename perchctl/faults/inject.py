@@ -42,10 +42,18 @@ from perchctl.faults.truth import SAMPLE_S, WatchedVehicle
 from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.mission.state import Phase
 from perchctl.mission.watch import Event, Tick
+from perchctl.sim.capture.settings import MILLIMETRES, CaptureFault
 from perchctl.sim.firmware.controller import Estimate
 from perchctl.sim.scenario import Scenario
 
-EXTERNAL_EVERY = 2  # of the 10 ms: positions from outside come at 50 Hz
+CAPTURE_FAULTS = {
+    "frozen": CaptureFault(frozen=True),
+    "silent": CaptureFault(gone=True),
+    "occluded": CaptureFault(occluded=True),
+    "swapped": CaptureFault(swapped=True),
+    "millimetres": CaptureFault(scale=MILLIMETRES),
+    "late": CaptureFault(),
+}
 
 
 def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenario:
@@ -122,19 +130,14 @@ class Injector:
         self._phase = phase
         self._moment_s = moment_s
         self._due_s: float | None = None
-        self._calls = 0
         self._later: list[tuple[float, Callable[[], None]]] = []
         self._estimate: tuple[EstimateError, float] | None = None
         self._sag: tuple[BatterySags, float] | None = None
-        self._outside: tuple[ExternalPositions, float | None] | None = None
-        self._frozen_at_m = (0.0, 0.0, 0.0)
+        self._outside = False
         self._lets_go: float | None = None
         self.begin_s: float | None = None
         self.flown: Phase | None = None  # the phase of the newest turn
         self.on_begin: Callable[[], None] = lambda: None
-        for effect in effects:
-            if isinstance(effect, ExternalPositions):
-                self._outside = (effect, None)
 
     def event(self, event: Event) -> None:
         return None
@@ -151,10 +154,9 @@ class Injector:
 
     @property
     def drifted_m(self) -> float:
-        """How far a slow drift, or positions from outside that come no more, have led the
-        estimate astray by now."""
-        outside = self._outside
-        if outside is not None and outside[0].how == "silent" and outside[1] is not None:
+        """How far a slow drift, or positions from outside that come no more or are late, have led
+        the estimate astray by now."""
+        if self._outside:
             now, world = self._edges.vehicle.firmware.estimator.now, self._edges.vehicle.world
             return math.hypot(now.x_m - world.x_m, now.y_m - world.y_m)
         if self._estimate is None:
@@ -165,7 +167,6 @@ class Injector:
 
     def each(self, t_s: float) -> None:
         """What goes on with simulated time."""
-        self._calls += 1
         if self.begin_s is None and self._due_s is not None and t_s >= self._due_s:
             self._begin(t_s)
         while self._later and self._later[0][0] <= t_s:
@@ -176,8 +177,6 @@ class Injector:
             step_v = min(sag.rate_vps * SAMPLE_S, left_v)
             world.battery_rest_v -= step_v
             self._sag = (sag, left_v - step_v) if left_v > step_v else None
-        if self._outside is not None and self._calls % EXTERNAL_EVERY == 0:
-            self._send_position(t_s)
         if self._lets_go is not None and world.magnet_engaged:
             after_s, self._lets_go = self._lets_go, None
             self._at(t_s + after_s, self._let_go)
@@ -215,9 +214,10 @@ class Injector:
                 vehicle.firmware.estimator.spoil = self._spoil
                 self._at(t_s + effect.for_s, self._heal)
             case ExternalPositions():
-                self._outside = (effect, t_s)
-                world = vehicle.world
-                self._frozen_at_m = (world.x_m, world.y_m, world.z_m)
+                assert vehicle.capture is not None
+                self._outside = True
+                fault = replace(CAPTURE_FAULTS[effect.how], late_s=effect.late_s)
+                vehicle.capture.lay(fault, effect.for_s)
             case LogReads():
                 self._read_wrongly(effect, t_s)
             case BatterySags():
@@ -273,15 +273,3 @@ class Injector:
 
     def _make_room(self) -> None:
         self._edges.disk.problem = None
-
-    def _send_position(self, t_s: float) -> None:
-        """Motion capture, which knows the truth, until the fault."""
-        assert self._outside is not None
-        effect, begin_s = self._outside
-        world = self._edges.vehicle.world
-        here = (world.x_m, world.y_m, world.z_m)
-        if begin_s is not None and t_s < begin_s + effect.for_s:
-            if effect.how == "silent":
-                return
-            here = self._frozen_at_m
-        self._edges.vehicle.firmware.external_position(here)

@@ -84,7 +84,14 @@ PROMISES = (
         "state estimate jumps, drifts, is no number",
         "held for 0.5 s, then landed where it is; what the magnet holds goes on",
         ("estimate-jumps", "height-jumps", "estimate-drifts", "estimate-nan",
-         "external-position", "variance-block-dead"),
+         "variance-block-dead"),
+        unseen=True,
+    ),
+    Promise(
+        "motion capture hides the body, freezes, ends, takes another body for it, is late",
+        "what cannot be true is not sent; held after 0.15 s, landed after 0.7 s without a position",
+        ("external-position", "external-occluded", "external-swapped", "external-scaled",
+         "external-late"),
         unseen=True,
     ),
     Promise(

@@ -9,6 +9,7 @@ from perchctl.faults.oracle import Sample
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.profile import TargetConfig
 from perchctl.sim.body import REST_HEIGHT_M
+from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vehicle import LOCKED
@@ -23,8 +24,14 @@ PRESSING_RATIO = 1.1
 class WatchedVehicle(SimulatedVehicle):
     """Calls `each` once every `SAMPLE_S`, whoever lets its time pass."""
 
-    def __init__(self, scenario: Scenario, camera: CameraModel, target: TargetConfig) -> None:
-        super().__init__(scenario, camera, target)
+    def __init__(
+        self,
+        scenario: Scenario,
+        camera: CameraModel,
+        target: TargetConfig,
+        capture: CaptureSettings | None = None,
+    ) -> None:
+        super().__init__(scenario, camera, target, capture)
         self.each: Callable[[float], None] = lambda t_s: None
         self._next_s = SAMPLE_S
 

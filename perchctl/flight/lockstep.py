@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration.files import camera_of
+from perchctl.flight.lockstep_positions import feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link.mock import MockLink
 from perchctl.log.watch import LogWatcher
@@ -14,7 +15,8 @@ from perchctl.mission.watch import Event, FlightReport, Tick, Watcher
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
 from perchctl.sim.camera import SimCamera
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.sim.draw import draw_capture, draw_scenario
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.told import Teller
 from perchctl.sim.vehicle import SimulatedVehicle
@@ -129,6 +131,7 @@ def fly_lockstep(
     log: LogWatcher | Path | str | None = None,
     *,
     scenario: Scenario | None = None,
+    capture: CaptureSettings | None = None,
     operator_at: dict[Phase, Operator] | None = None,
     watchers: tuple[Watcher, ...] = (),
 ) -> LockstepFlight:
@@ -136,7 +139,7 @@ def fly_lockstep(
 
     Args:
         log: a file to log to, or a watcher that is left open.
-        scenario: flown instead of the seed's own.
+        scenario, capture: flown instead of the seed's own.
         operator_at: the operator's command, given as soon as a phase is reached.
         watchers: others that look on.
 
@@ -146,13 +149,16 @@ def fly_lockstep(
     if isinstance(log, (Path, str)):
         watcher = LogWatcher.lockstep(Path(log), profile, scenario.seed)
         flight = fly_lockstep(
-            profile, log=watcher, scenario=scenario, operator_at=operator_at, watchers=watchers
-        )
+            profile, log=watcher, scenario=scenario, capture=capture, operator_at=operator_at,
+            watchers=watchers,
+        )  # fmt: skip
         watcher.close(flight.report, flight.perched_miss_m, flight.fell)
         return flight
     camera = camera_of(profile.camera)
-    vehicle = SimulatedVehicle(scenario, camera, profile.target)
+    capture = capture or draw_capture(profile, scenario.seed)
+    vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
     link = MockLink(vehicle, profile.link.telemetry_period_s)
+    positions = feed_lockstep(link, profile)
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
     truth = Truth(vehicle)
@@ -166,6 +172,7 @@ def fly_lockstep(
     parts = FlightParts(
         link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
         lambda event: tell(event, event.t_s),  # the clock is the simulation's
+        positions,
     )  # fmt: skip
     link.connect()
     report = fly(parts)

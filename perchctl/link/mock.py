@@ -10,7 +10,7 @@ import heapq
 import itertools
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
@@ -76,6 +76,8 @@ class MockLink:
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
         self._watched_s = -math.inf
+        self._turn: Callable[[float], object] = lambda now_s: None
+        self._turn_due_s = self._turn_period_s = math.inf
 
     @property
     def now_s(self) -> float:
@@ -83,14 +85,21 @@ class MockLink:
 
     def advance_to(self, t_s: float) -> None:
         """Step the vehicle until `t_s`, sending its telemetry on the way."""
-        while (due_s := min(self._due_s.values())) <= t_s:
+        while (due_s := min(self._turn_due_s, *self._due_s.values())) <= t_s:
             self.vehicle.advance_to(due_s)
             for name, block_due_s in self._due_s.items():
                 if block_due_s <= due_s + 1e-9:
                     self._send_down(name)
                     self._due_s[name] = block_due_s + self._periods_s[name]
             self._ask_guard()
+            if self._turn_due_s <= due_s + 1e-9:
+                self._turn_due_s += self._turn_period_s
+                self._turn(self.now_s)
         self.vehicle.advance_to(t_s)
+
+    def each(self, period_s: float, turn: Callable[[float], object]) -> None:
+        """Calls `turn` with the time every `period_s` from now on: a thread's stand-in."""
+        self._turn, self._turn_period_s, self._turn_due_s = turn, period_s, self.now_s
 
     def connect(self) -> None:
         self.advance_to(self.now_s + SETTLE_S)

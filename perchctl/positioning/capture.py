@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from importlib.util import find_spec
+from typing import Any
 
 from perchctl.children import Channel, accept, end, introduce, listen, new_token, spawn
 from perchctl.errors import ConnectionFailed, InvalidValue, no_motion_capture
@@ -63,6 +64,16 @@ def setup_of(config: PositioningConfig) -> CaptureSetup:
         partial=config.system == "vrpn",
         timeout_s=config.connect_timeout_s,
     )
+
+
+def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) -> MotionCapture:
+    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
+    kind, _, host = system.partition(":")
+    if find_spec("motioncapture") is None:
+        raise no_motion_capture(needed_by)
+    # Unchecked, since `check_reachable` has the sentence for a kind that is none.
+    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
+    return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))
 
 
 def open_capture(
@@ -191,15 +202,15 @@ class MotionCapture:
                 case Connected():
                     self._connected = True
                 case Failed(text):
-                    self._ended = self._gone(f": {text}")
+                    self._ended = self._gone("" if self._framed_s is None else " failed", text)
         if self._ended is None and not self._closed:
             end(self._child, _END_TIMEOUT_S)
             self._printing.join(_END_TIMEOUT_S)
-            self._ended = self._gone(f": its reader ended{_code(self._child)}{self._words()}")
+            self._ended = self._gone("", f"its reader ended{_code(self._child)}{self._words()}")
         self._settled.set()
 
-    def _gone(self, why: str) -> str:
-        return f"{'no ' if self._framed_s is None else ''}{self._who}{why}"
+    def _gone(self, how: str, why: str) -> str:
+        return f"{'no ' if self._framed_s is None else ''}{self._who}{how}: {why}"
 
     def _read_output(self) -> None:
         """All of it, so that the child never waits; its last line is kept for a message."""

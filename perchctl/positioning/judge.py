@@ -66,7 +66,7 @@ class Judge:
 
     def __init__(self, config: PositioningConfig) -> None:
         self._config = config
-        self._who = f"the rigid body {config.body!r} of {label(config)}"
+        self._who = f"the rigid body {config.body!r} of the {label(config)}"
         self._arrived_s = -math.inf
         self._newest: BodyPose | None = None
         self._believed: Placed | None = None
@@ -150,7 +150,7 @@ class Judge:
 
 def label(config: PositioningConfig) -> str:
     """For a sentence: which motion capture."""
-    return f"motion capture {config.system}:{config.host}"
+    return f"motion capture at {config.system}:{config.host}"
 
 
 def _is_pose(pose: BodyPose) -> bool:

@@ -23,7 +23,7 @@ class PositioningConfig(Section):
     system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = Field(
         "vicon", description="kind of motion capture"
     )
-    host: str = Field("", description="name or address of its computer")
+    host: str = Field("", description="its computer, or `NAME:PORT`")
     body: str = Field("crazyflie", min_length=1, description="the vehicle's rigid body there")
     body_rpy_deg: Vector3 = Field(
         (0.0, 0.0, 0.0), description="the rigid body's axes in the vehicle's: roll, pitch, yaw"

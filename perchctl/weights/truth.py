@@ -7,20 +7,19 @@ the level frame, (x, y, z, yaw).
 
 from __future__ import annotations
 
-import contextlib
 import math
-import queue
-import sys
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, TimedOut, UsageError
+from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, TimedOut
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
+from perchctl.positioning.judge import place_of
+from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import Attitude
 
@@ -91,103 +90,97 @@ class TypedTruth:
         return None
 
 
+class Frames(Protocol):
+    """The part of `perchctl.positioning.capture.MotionCapture` that is needed here."""
+
+    def frames(self) -> list[CaptureFrame]: ...
+
+    def problem(self, now_s: float) -> str | None: ...
+
+    def close(self) -> None: ...
+
+
 class MocapTruth:
-    """Motion capture through the library `motioncapture` (the extra [mocap]).
+    """Motion capture, by the reader that flights have.
 
     Args:
-        system: ``TYPE:HOST``, as in ``vicon:192.168.1.2``.
-        body: rigid body of the vehicle, in `perchctl.geometry`'s body axes.
+        system: of `capture`, for sentences: ``TYPE:HOST``, as in ``vicon:192.168.1.2``.
+        body: rigid body of the vehicle.
         target: that of the target (its x axis is the heading), or the pose itself, (4,).
+        mounted: how the vehicle's rigid body lies in its body axes; as they are, by default.
     """
 
     repeatable = True
 
-    def __init__(self, system: str, body: str, target: str | Array, gear_body_m: Array) -> None:
-        kind, _, host = system.partition(":")
-        try:
-            import motioncapture
-        except ImportError:
-            raise UsageError(
-                f"--truth mocap needs the library motioncapture; install it with: "
-                f"{sys.executable} -m pip install 'perchctl[mocap]'"
-            ) from None
-        self._system, self._body, self._target, self._gear = system, body, target, gear_body_m
-        try:
-            client = motioncapture.connect(kind, {"hostname": host})
-        except Exception as error:
-            raise ConnectionFailed(f"no motion capture at {system}: {error}") from None
-        self._frames: queue.Queue[dict[str, Any] | Exception] = queue.Queue(maxsize=SAMPLES)
-        self._stop = threading.Event()
-        # Waiting for a frame has no bound of its own.
-        self._thread = threading.Thread(target=self._listen, args=(client,), daemon=True)
-        self._thread.start()
-
-    def _listen(self, client: Any) -> None:
-        while not self._stop.is_set():
-            try:
-                client.waitForNextFrame()
-                frame: dict[str, Any] | Exception = {
-                    name: (np.array(body.position, dtype=np.float64), _rpy(body.rotation))
-                    for name, body in client.rigidBodies.items()
-                }
-            except Exception as error:
-                frame = error
-            if self._frames.full():
-                with contextlib.suppress(queue.Empty):
-                    self._frames.get_nowait()
-            self._frames.put(frame)
-            if isinstance(frame, Exception):
-                return
+    def __init__(
+        self,
+        capture: Frames,
+        system: str,
+        body: str,
+        target: str | Array,
+        gear_body_m: Array,
+        mounted: PositioningConfig | None = None,
+        now: Callable[[], float] = time.monotonic,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._capture, self._system = capture, system
+        self._body, self._target, self._gear = body, target, gear_body_m
+        self._mounted = mounted or _AS_IT_IS
+        self._clock, self._wait = now, wait
 
     def actual(self, ask: Ask) -> Actual:
-        while not self._frames.empty():
-            self._frames.get_nowait()
-        poses: dict[str, list[tuple[Array, tuple[float, float, float]]]] = {}
+        """Errors: ConnectionFailed, NotFound."""
+        self._capture.frames()  # those of before are gone
+        poses: dict[str, list[BodyPose]] = {}
         wanted = [self._body] + ([self._target] if isinstance(self._target, str) else [])
         seen: set[str] = set()
-        until_s = time.monotonic() + WITHIN_S
-        while min((len(poses.get(name, [])) for name in wanted), default=0) < SAMPLES:
-            try:
-                frame = self._frames.get(timeout=max(0.0, until_s - time.monotonic()))
-            except queue.Empty:
-                frame = {}
-            if isinstance(frame, Exception):
-                raise ConnectionFailed(f"motion capture at {self._system} failed: {frame}")
-            seen |= set(frame)
-            for name in wanted:
-                if name in frame:
-                    poses.setdefault(name, []).append(frame[name])
-            if time.monotonic() > until_s:
+        until_s = self._clock() + WITHIN_S
+        while min(len(poses.get(name, [])) for name in wanted) < SAMPLES:
+            frames = self._capture.frames()
+            for frame in frames:
+                seen |= set(frame.bodies)
+                for name in wanted:
+                    if name in frame.bodies:
+                        poses.setdefault(name, []).append(frame.bodies[name])
+            if self._clock() > until_s:
                 missing = next(name for name in wanted if len(poses.get(name, [])) < SAMPLES)
+                raise self._unseen(missing, seen)
+            if not frames:
+                self._wait(0.01)
+        for name in wanted:
+            if len(set(poses[name])) == 1:
                 raise NotFound(
-                    f"motion capture at {self._system} does not see the rigid body {missing!r}; "
-                    f"it sees {', '.join(sorted(seen)) or 'none'}"
+                    f"motion capture at {self._system} has {name!r} frozen: {SAMPLES} times the "
+                    f"same numbers, and a measured pose has noise"
                 )
-        position, rpy = _median(poses[self._body])
+        position, rpy = _median([_measured(pose, self._mounted) for pose in poses[self._body]])
         target = self._target
         if isinstance(target, str):
-            place, turned = _median(poses[target])
+            place, turned = _median([_measured(pose, _AS_IT_IS) for pose in poses[target]])
             target = np.array([*place, turned[2]])
         return relative(position, rpy, target, self._gear)
 
     def close(self) -> None:
-        self._stop.set()
-        while not self._frames.empty():  # it may wait for room
-            self._frames.get_nowait()
-        self._thread.join(1.0)  # a library that is still at work when Python ends aborts it
+        self._capture.close()
 
-
-def _rpy(q: Any) -> tuple[float, float, float]:
-    x, y, z, w = q.x, q.y, q.z, q.w
-    return rpy_from_rotation(
-        np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
+    def _unseen(self, missing: str, seen: set[str]) -> PerchError:
+        problem = self._capture.problem(self._clock())
+        if problem is not None:
+            return ConnectionFailed(problem)
+        return NotFound(
+            f"motion capture at {self._system} does not see the rigid body {missing!r}; "
+            f"it sees {', '.join(sorted(seen)) or 'none'}"
         )
-    )
+
+
+_AS_IT_IS = PositioningConfig()
+
+
+def _measured(
+    pose: BodyPose, mounted: PositioningConfig
+) -> tuple[Array, tuple[float, float, float]]:
+    placed = place_of(pose, mounted)
+    return placed.position_m, rpy_from_rotation(placed.R)
 
 
 def _median(

@@ -13,11 +13,18 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration.files import load_calibration
 from perchctl.faults import effects as e
-from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
+from perchctl.faults.inject import (
+    CAPTURE_FAULTS,
+    Disk,
+    Edges,
+    Injector,
+    changed_scenario,
+)
 from perchctl.faults.truth import WatchedVehicle, sample_of
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.state import Phase, PlannerState
 from perchctl.profile import TargetConfig
+from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.powertrain import most_thrust_n
 from perchctl.sim.scenario import Scenario
 
@@ -34,10 +41,11 @@ class Rig:
     moment_s: float = 0.0
     presses: int = 0
     hang_ups: int = 0
+    capture: CaptureSettings | None = None
     begun: list[Any] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.vehicle = WatchedVehicle(self.scenario, CAMERA, TargetConfig())
+        self.vehicle = WatchedVehicle(self.scenario, CAMERA, TargetConfig(), self.capture)
         self.disk = Disk()
         edge: Any = self
         edges = Edges(self.vehicle, edge, edge, edge, self.press, self.hang_up, self.disk)
@@ -124,25 +132,37 @@ def test_the_estimate_steps_turns_and_slides() -> None:
     assert rig.injector.drifted_m == pytest.approx(0.1, abs=0.01)  # where it has led the vehicle
 
 
-@pytest.mark.parametrize("how", ["frozen", "silent"])
-def test_positions_from_outside_end(how: str) -> None:
-    effect = e.ExternalPositions(how, 1.0)
-    rig = Rig((effect,), changed_scenario(SCENARIO, (effect,)))
-    estimator = rig.vehicle.firmware.estimator
-    rig.wait(1.0)
-    assert estimator.external_count == pytest.approx(50, abs=2)
+@pytest.mark.parametrize("how", sorted(CAPTURE_FAULTS))
+def test_the_motion_capture_goes_wrong_for_its_time(how: str) -> None:
+    effect = e.ExternalPositions(how, 1.0, 0.1 if how == "late" else 0.0)
+    scenario = changed_scenario(SCENARIO, (effect,))
+    assert scenario.extra["external_position"] == 1.0
+    rig = Rig((effect,), scenario, capture=CaptureSettings())
+    capture = rig.vehicle.capture
+    assert capture is not None
+    rig.wait(0.5)
+    capture.take()
     rig.injector.begin_now()
-    rig.vehicle.world.set_pose((0.4, 0.0, 0.5), hold=True)
     rig.wait(0.9)
-    astray_m = abs(estimator.now.x_m - 0.4)
-    if how == "silent":
-        assert estimator.external_count == pytest.approx(50, abs=2)
-        assert rig.injector.drifted_m == pytest.approx(astray_m, abs=0.02)
-    else:
-        assert rig.injector.drifted_m == 0.0  # what stands still can be seen
-        assert abs(estimator.now.x_m) < 0.05  # where it was
-    rig.wait(1.0)
-    assert estimator.now.x_m == pytest.approx(0.4, abs=0.05)
+    frames = [frame for frame in capture.take() if frame.t_s > 0.52]
+    bodies = [frame.bodies["crazyflie"] for frame in frames if "crazyflie" in frame.bodies]
+    far_m = [math.hypot(*pose.position_m) for pose in bodies]
+    match how:
+        case "silent":
+            assert not frames
+        case "occluded":
+            assert frames
+            assert not bodies
+        case "frozen":
+            assert len(set(bodies)) == 1
+        case "late":
+            assert min(frame.t_s for frame in frames) > 0.6
+        case _:
+            assert min(far_m) > 1.0
+    rig.wait(0.5)
+    healed = capture.take()[-1].bodies["crazyflie"]
+    assert math.hypot(*healed.position_m) < 0.05
+    assert rig.injector.drifted_m > 0.02  # nobody sends any position here
 
 
 def test_a_log_variable_reads_wrongly() -> None:

@@ -28,7 +28,7 @@ MOCAP = PROFILE.model_copy(
     update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
 )
 HOLD_S, LAND_S = MOCAP.positioning.hold_s, MOCAP.positioning.land_s
-HIDDEN = "motion capture vicon:lab does not see the rigid body 'cf2'"
+HIDDEN = "motion capture at vicon:lab does not see the rigid body 'cf2'"
 TURN_S, BEGIN_S = 0.02, 10.0
 PRESSED = HOVER_THRUST * 1.12
 HELD_PHASES = (Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)

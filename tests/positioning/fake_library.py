@@ -29,7 +29,7 @@ class Client:
         if self.fault == "silent" or self.fault == "stalls" and self.count > 5:
             time.sleep(60)
         if self.fault == "dies" and self.count > 5:
-            print("the camera bus burnt", file=sys.stderr, flush=True)
+            print("the camera burnt", file=sys.stderr, flush=True)
             os._exit(7)
         if self.fault == "raises" and self.count > 5:
             raise RuntimeError("subject table changed")

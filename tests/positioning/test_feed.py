@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import (
@@ -18,12 +20,14 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
+from perchctl.positioning import thread
 from perchctl.positioning.feed import QUIET_S, FeedStatus, PositionFeed
 from perchctl.positioning.judge import STALE_S, place_of
 from perchctl.positioning.types import BodyPose, CaptureFrame
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 
+FEW = settings(max_examples=20)  # each example is a flight
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf", latency_s=0.01)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 angles = st.floats(-3.0, 3.0)
@@ -140,6 +144,7 @@ def test_position_alone_or_with_the_attitude() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 30.0, 70.0, 100.0])
+@FEW
 @given(st.lists(st.floats(0.001, 0.1), min_size=3, max_size=8))
 def test_never_more_than_the_rate(rate_hz: float, steps_s: list[float]) -> None:
     rig = Rig(CONFIG.model_copy(update={"rate_hz": rate_hz}))
@@ -171,7 +176,7 @@ def test_a_hidden_body_is_not_sent_and_the_others_are_named() -> None:
     assert len(rig.places) == 1
     assert status.age_s == pytest.approx(0.16)
     assert status.problem == (
-        "motion capture vicon:lab does not see the rigid body 'cf'; it sees cf2, wand"
+        "motion capture at vicon:lab does not see the rigid body 'cf'; it sees cf2, wand"
     )
     assert rig.at(1.0).problem is None
 
@@ -249,6 +254,7 @@ def test_what_is_no_pose_is_not_sent(pose: BodyPose) -> None:
     assert "a pose that is none" in (status.problem or "")
 
 
+@FEW
 @given(st.floats(0.2, 5.0), st.floats(-0.4, 0.4), st.floats(0.1, 2.0))
 def test_another_body_is_not_believed_however_long_it_stays(
     aside_m: float, speed_mps: float, lasting_s: float
@@ -282,6 +288,7 @@ def test_a_body_that_turns_over_in_one_frame_is_not_believed() -> None:
     assert len(rig.places) == 2
 
 
+@FEW
 @given(st.floats(-3.0, 3.0), st.floats(-4.0, 4.0))
 def test_a_body_in_flight_is_believed(speed_mps: float, turning_radps: float) -> None:
     rig = Rig()
@@ -320,7 +327,7 @@ def test_silence_and_a_source_that_is_gone_are_named() -> None:
     assert rig.feed.status(rig.now_s).problem is not None
     rig.at(1.0)
     assert "for 0.3 s" in (rig.idle(0.3).problem or "")
-    rig.capture.trouble = "motion capture vicon:lab has ended"
+    rig.capture.trouble = "motion capture at vicon:lab has ended"
     assert rig.idle(0.01).problem == rig.capture.trouble
 
 
@@ -344,3 +351,32 @@ def test_a_noise_free_copy_differs_only_by_its_numbers() -> None:
     rig.frame({"cf": pose})
     rig.frame({"cf": replace(pose, quaternion=(math.cos(1e-4), 0.0, 0.0, math.sin(1e-4)))})
     assert len(rig.places) == 2
+
+
+def test_a_thread_that_hangs_in_the_link_is_named_and_holds_nobody_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(thread, "END_TIMEOUT_S", 0.05)
+    capture, entered, free = Script(), threading.Event(), threading.Event()
+    capture.frame = CaptureFrame(time.monotonic(), {"cf": BodyPose((1.0, 0.0, 0.5), LEVEL)})
+    sent: list[ExternalPosition] = []
+
+    def hang(place: ExternalPosition) -> bool:
+        entered.set()
+        assert free.wait(10.0)
+        sent.append(place)
+        return True
+
+    feed = PositionFeed(capture, hang, CONFIG)
+    turning = thread.FeedThread(feed, time.monotonic)
+    turning.start()
+    assert entered.wait(10.0)
+    status = feed.status(time.monotonic() + 1.0)
+    assert status.sent == 0
+    assert status.problem is not None
+    turning.close()
+    assert sent == []
+    capture.frame = CaptureFrame(time.monotonic(), {"cf": BodyPose((1.1, 0.0, 0.5), LEVEL)})
+    free.set()
+    turning._thread.join(10.0)
+    assert len(sent) == 1  # after `close` no other follows

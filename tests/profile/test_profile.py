@@ -298,7 +298,7 @@ ALIASES = {
     "camera": ("config",), "detector": ("config",), "pose": ("config",), "kalman": ("config",),
     "merge": ("config",), "weights": ("weights",), "large": ("large", "config", "old"),
     "small": ("small", "config", "old"), "mount": ("self",), "simulation": ("ranges", "sim"),
-    "link": ("_config",), "landing": ("landing_config",),
+    "link": ("_config",), "landing": ("landing_config",), "positioning": ("config", "_config"),
 }  # fmt: skip
 """By what other names the code holds a section."""
 

@@ -20,9 +20,12 @@ from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
 from perchctl.commands.fit_weights_collect import _truth
 from perchctl.commands.fit_weights_request import CollectRequest
-from perchctl.errors import InvalidValue
+from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, UsageError
 from perchctl.geometry import rot_z
+from perchctl.positioning import capture
+from perchctl.positioning.types import BodyPose, CaptureFrame
 from perchctl.profile import find_calibration, load_profile
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.weights import truth
 from perchctl.weights.collect import MarkerReader, SessionFile, collecting_pipeline, fault_of
 from perchctl.weights.report import figure
@@ -456,32 +459,71 @@ def test_the_estimate_s_truth_is_learned_by_touching() -> None:
     assert truth.moved(found, source.actual(ask)) is None
 
 
-def test_motion_capture_gives_the_median_or_names_the_bodies(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    level = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
-    turned = SimpleNamespace(x=0.0, y=0.0, z=math.sin(0.2), w=math.cos(0.2))
-    bodies = {
-        "cf": SimpleNamespace(position=[0.1, 0.2, 1.0], rotation=level),
-        "target": SimpleNamespace(position=[0.1, 0.25, 1.2], rotation=turned),
-    }
-    library = SimpleNamespace(
-        connect=lambda kind, options: SimpleNamespace(
-            waitForNextFrame=lambda: None, rigidBodies=bodies
-        )
-    )
-    monkeypatch.setitem(__import__("sys").modules, "motioncapture", library)
-    monkeypatch.setattr(truth, "WITHIN_S", 0.2)
+class Recorded:
+    """A capture of three bodies with some noise, 100 frames a second of a clock of its own."""
+
+    def __init__(self, noise_m: float = 1e-4) -> None:
+        self.now_s, self.noise_m, self.trouble = 0.0, noise_m, ""
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def wait(self, duration_s: float) -> None:
+        self.now_s += duration_s
+
+    def frames(self) -> list[CaptureFrame]:
+        self.now_s += 0.01
+        noise_m = self.noise_m * math.sin(1e4 * self.now_s)
+        turned = (math.cos(0.2), 0.0, 0.0, math.sin(0.2))
+        bodies = {
+            "cf": BodyPose((0.1 + noise_m, 0.2, 1.0), (1.0, 0.0, 0.0, 0.0)),
+            "askew": BodyPose((0.1 + noise_m, 0.2, 1.0), turned),
+            "target": BodyPose((0.1, 0.25 + noise_m, 1.2), turned),
+        }
+        return [CaptureFrame(self.now_s, bodies)]
+
+    def problem(self, now_s: float) -> str | None:
+        return self.trouble or None
+
+    def close(self) -> None:
+        return None
+
+
+def test_motion_capture_gives_the_median_or_names_the_bodies() -> None:
     gear = np.array([0.0, 0.0, 0.03])
-    source = truth.MocapTruth("vicon:host", "cf", "target", gear)
-    assert source.actual(lambda question: "").pose == pytest.approx([0.0, 0.05, 0.17, 0.4])
-    source.close()
-    other = truth.MocapTruth("vicon:host", "drone", "target", gear)
-    with pytest.raises(Exception, match="rigid body 'drone'; it sees cf, target"):
-        other.actual(lambda question: "")
-    other.close()
-    with pytest.raises(Exception, match="--mocap TYPE:HOST"):
-        _truth(CollectRequest(truth="mocap"), load_profile("sim"), lambda: 0.0)
+
+    def truth_of(
+        capture: Recorded, body: str, mounted: PositioningConfig | None = None
+    ) -> truth.MocapTruth:
+        return truth.MocapTruth(
+            capture, "vicon:host", body, "target", gear, mounted, capture.clock, capture.wait
+        )
+
+    found = truth_of(Recorded(), "cf").actual(lambda question: "")
+    assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
+    mounted = PositioningConfig(body_rpy_deg=(0.0, 0.0, math.degrees(0.4)))
+    found = truth_of(Recorded(), "askew", mounted).actual(lambda question: "")
+    assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
+    with pytest.raises(NotFound, match="rigid body 'drone'; it sees askew, cf, target"):
+        truth_of(Recorded(), "drone").actual(lambda question: "")
+    with pytest.raises(NotFound, match="'cf' frozen"):
+        truth_of(Recorded(noise_m=0.0), "cf").actual(lambda question: "")
+    gone = Recorded()
+    gone.trouble = "motion capture at vicon:host has ended"
+    with pytest.raises(ConnectionFailed, match="has ended"):
+        truth_of(gone, "drone").actual(lambda question: "")
+
+
+def test_motion_capture_is_asked_for_with_its_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    for mocap in (None, "vicon", "vicon: "):
+        with pytest.raises(UsageError, match="--mocap TYPE:HOST"):
+            _truth(CollectRequest(truth="mocap", mocap=mocap), load_profile("sim"), lambda: 0.0)
+    monkeypatch.setattr(capture, "find_spec", lambda name: object())
+    with pytest.raises(InvalidValue, match="'nokov' is unknown; allowed are vicon, optitrack"):
+        _truth(CollectRequest(truth="mocap", mocap="nokov:h"), load_profile("sim"), lambda: 0.0)
+    monkeypatch.setattr(capture, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match="--truth mocap needs the library motioncapture"):
+        _truth(CollectRequest(truth="mocap", mocap="vicon:h"), load_profile("sim"), lambda: 0.0)
 
 
 def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:

@@ -1,0 +1,52 @@
+"""Positions from outside in lockstep: the simulated motion capture, the same feed as in real
+time, and the simulated vehicle prepared as a real one is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from perchctl.errors import ConnectionFailed
+from perchctl.geometry import yaw_of
+from perchctl.link.mock import MockLink
+from perchctl.link.outside import RESET, parameters_of
+from perchctl.positioning.feed import FeedStatus, PositionFeed
+from perchctl.positioning.judge import label
+from perchctl.positioning.thread import PERIOD_S
+from perchctl.profile import Profile
+from perchctl.sim.capture.server import SYSTEM
+from perchctl.sim.capture.system import LockstepCapture
+
+FIRST_FRAME_S = 1.0
+
+
+def by_mocap(profile: Profile) -> Profile:
+    """The same with its position from outside instead of by decks."""
+    config = profile.positioning.model_copy(update={"by": "mocap"})
+    return profile.model_copy(update={"positioning": config})
+
+
+def feed_lockstep(link: MockLink, profile: Profile) -> Callable[[float], FeedStatus] | None:
+    """A feed that turns with the link's time, for the flight loop; None with decks.
+
+    Lets the time pass until the vehicle's body is seen, and starts the estimate there. Errors:
+    ConnectionFailed when it is not.
+    """
+    capture, config = link.vehicle.capture, profile.positioning
+    if capture is None or config.by != "mocap":
+        return None
+    config = config.model_copy(update={"system": SYSTEM, "host": "sim"})
+    feed = PositionFeed(LockstepCapture(capture), link.external, config)
+    link.each(PERIOD_S, feed.turn)
+    end_s = link.now_s + FIRST_FRAME_S
+    while (place := feed.place()) is None:
+        if link.now_s >= end_s:
+            why = feed.status(link.now_s).problem or f"nothing comes from {label(config)}"
+            raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")
+        link.advance_to(link.now_s + PERIOD_S)
+    x, y, z = (float(part) for part in place.position_m)
+    start = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(place.R)}
+    initial = {f"kalman.initial{name}": value for name, value in start.items()}
+    for name, value in (parameters_of(config) | initial | {RESET: 1}).items():
+        link.vehicle.firmware.set_parameter(name, value)
+    link.vehicle.firmware.set_parameter(RESET, 0)
+    return feed.status

@@ -1,0 +1,156 @@
+"""The simulated motion capture's server, read by the library that reads a lab's."""
+
+from __future__ import annotations
+
+import math
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from perchctl.errors import ConnectionFailed, InvalidValue
+from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.sim.capture import natnet
+from perchctl.sim.capture.server import SYSTEM, CaptureServer
+from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
+from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.scenario import Scenario
+
+WAIT_S = 10.0
+NAMES = ("crazyflie", "target")
+SEEN = CaptureFrame(
+    1.25,
+    {
+        "crazyflie": BodyPose((0.1, -0.2, 1.5), (0.5, 0.5, -0.5, 0.5)),
+        "target": BodyPose((0.0, 0.0, 2.2), (1.0, 0.0, 0.0, 0.0)),
+    },
+)
+
+
+class Reader:
+    """The library's client, read in a thread, since it waits without a bound. Its connecting
+    lets no other thread run: what answers has to be another process."""
+
+    def __init__(self, host: str) -> None:
+        library = pytest.importorskip("motioncapture", reason="needs the extra [mocap]")
+        name, port = host.split(":")
+        self._client = library.connect(SYSTEM, {"hostname": name, "port_command": port})
+        self._news = threading.Condition()
+        self._bodies: dict[str, Any] = {}
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def until(self, seen: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Name -> (position, quaternion) of the first frame that is as wanted."""
+        with self._news:
+            assert self._news.wait_for(lambda: seen(self._bodies), WAIT_S), self._bodies
+            return self._bodies
+
+    def until_at(
+        self, name: str, position_m: tuple[float, float, float], within_m: float
+    ) -> dict[str, Any]:
+        return self.until(lambda b: name in b and math.dist(b[name][0], position_m) < within_m)
+
+    def _run(self) -> None:
+        while True:
+            self._client.waitForNextFrame()
+            bodies = {
+                name: (
+                    tuple(float(v) for v in body.position),
+                    (body.rotation.w, body.rotation.x, body.rotation.y, body.rotation.z),
+                )
+                for name, body in self._client.rigidBodies.items()
+            }
+            with self._news:
+                self._bodies = bodies
+                self._news.notify_all()
+
+
+@pytest.fixture
+def server() -> Iterator[CaptureServer]:
+    served = CaptureServer(NAMES)
+    yield served
+    served.close()
+
+
+def test_clients_that_have_gone_are_forgotten() -> None:
+    now_s = [0.0]
+    server = CaptureServer(NAMES, clock=lambda: now_s[0])
+    try:
+        port = asked(server.host, natnet.CONNECT)
+        assert len(server._clients) == 1
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
+            listening.bind(("127.0.0.1", port))
+            listening.settimeout(WAIT_S)
+            for _ in range(3):
+                server.publish(SEEN)
+                assert listening.recv(4096)[:2] == b"\x07\x00"
+        for _ in range(6):
+            server.publish(SEEN)
+            now_s[0] += 1.0
+        assert not server._clients
+    finally:
+        server.close()
+
+
+def test_a_hidden_body_is_told_from_one_at_the_origin() -> None:
+    frame = natnet.frame(7, NAMES, CaptureFrame(1.3, {"target": SEEN.bodies["target"]}))
+    kind, length = struct.unpack_from("<HH", frame)
+    assert (kind, length) == (natnet.FRAME, len(frame) - 4)
+    bodies = [struct.unpack_from("<i3f4ffh", frame, 4 + 16 + 38 * i) for i in range(2)]
+    assert [body[-1] for body in bodies] == [0, 1]
+    assert bodies[1][1:8] == pytest.approx((0.0, 0.0, 2.2, 0.0, 0.0, 0.0, 1.0))
+
+
+def asked(host: str, kind: int) -> int:
+    """The port at which frames will come."""
+    name, port = host.split(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        out.settimeout(WAIT_S)
+        out.sendto(b"\x01", (name, int(port)))  # noise is not answered
+        out.sendto(natnet.message(kind, b""), (name, int(port)))
+        answer = out.recv(4096)
+    assert struct.unpack_from("<HH", answer) == (natnet.SERVER_INFO, len(answer) - 4)
+    return int(struct.unpack_from("<H", answer, 4 + 256 + 4 + 4 + 8)[0])
+
+
+def test_a_port_that_is_taken_is_named(server: CaptureServer) -> None:
+    port = int(server.host.split(":")[1])
+    with pytest.raises(ConnectionFailed, match=f"UDP port {port}"):
+        CaptureServer(NAMES, port)
+
+
+def test_the_library_reads_the_room_of_the_vehicle_s_process() -> None:
+    scenario = Scenario(extra={"external_position": 1.0})
+    with SimProcess.start(scenario, "stepped", capture=CaptureSettings()) as sim:
+        assert sim.capture is not None
+        assert sim.capture[0] == SYSTEM
+        first, second = Reader(sim.capture[1]), Reader(sim.capture[1])
+        sim.set_pose((0.2, 0.1, 0.6), (0.0, 0.0, 1.0), hold=True)
+        sim.advance(0.1)
+        for reader in (first, second):  # at the same time, on one computer
+            reader.until_at("crazyflie", (0.2, 0.1, 0.6), 0.006)
+            seen = reader.until_at("wand", (1.2, -0.9, 0.05), 0.006)
+            assert seen["crazyflie"][1] == pytest.approx(
+                (math.cos(0.5), 0.0, 0.0, math.sin(0.5)), abs=0.02
+            )
+        sim.capture_fault(CaptureFault(scale=1000.0), 0.05)
+        sim.advance(0.05)
+        first.until_at("crazyflie", (200.0, 100.0, 600.0), 6.0)
+        sim.advance(0.1)
+        first.until_at("crazyflie", (0.2, 0.1, 0.6), 0.006)
+        sim.capture_fault(CaptureFault(occluded=True))
+        sim.advance(0.1)
+        first.until(lambda bodies: set(bodies) == {"wand"})
+        sim.capture_fault(None)
+        sim.advance(0.1)
+        first.until(lambda bodies: set(bodies) == {"crazyflie", "wand"})
+
+
+def test_without_a_capture_there_is_none_to_spoil() -> None:
+    with SimProcess.start(pace="stepped") as sim:
+        assert sim.capture is None
+        with pytest.raises(InvalidValue, match="without a motion capture"):
+            sim.capture_fault(CaptureFault(gone=True))
