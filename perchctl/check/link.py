@@ -219,7 +219,7 @@ def _self_test(vehicle: Vehicle) -> Row:
 def _at_rest(vehicle: Vehicle, profile: Profile) -> list[Row]:
     """What needs telemetry, and around it what belongs there."""
     t = vehicle.telemetry
-    around = _decks(vehicle), _positioning(vehicle, profile)
+    around = _decks(vehicle, profile), _positioning(vehicle, profile)
     told = _parameters(vehicle, profile)
     if t is None:
         names = ("supervisor", "estimator", "ground", "level", "still", "battery")
@@ -250,8 +250,10 @@ def _supervisor(t: Telemetry) -> Row:
     return _by("supervisor", problem, f"ready (0x{t.supervisor:04X})")
 
 
-def _decks(vehicle: Vehicle) -> Row:
+def _decks(vehicle: Vehicle, profile: Profile) -> Row:
     decks = vehicle.measured_by.decks
+    if not decks and profile.positioning.by == "mocap":
+        return passed("decks", "none, and none is needed")
     if not decks:
         return warned("decks", "none", "mounted ones: take them off and put them on again")
     return passed("decks", ", ".join(decks))

@@ -95,6 +95,10 @@ def y_up(t_s: float, pose: BodyPose) -> dict[str, BodyPose]:
     return {"cf2": BodyPose(place, quaternion_from_rotation(Y_UP))}
 
 
+def high(t_s: float, pose: BodyPose) -> dict[str, BodyPose]:
+    return {"cf2": replace(pose, position_m=(0.0, 0.0, 1.4))}
+
+
 def hidden_at_times(t_s: float, pose: BodyPose) -> dict[str, BodyPose]:
     return {} if t_s % 1.0 < 0.4 else {"cf2": pose}
 
@@ -114,7 +118,7 @@ FAULTS: list[tuple[str, Scripted, str, str]] = [
     ("body noise", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", "mm (one sigma)"),
     ("body place", Scripted(lambda t_s, p: moved(p, 1000.0)), "fail", "look like millimetres"),
     ("body place", Scripted(y_up), "fail", "swapped axes: up is y"),
-    ("body place", Scripted(lambda t_s, p: {"cf2": replace(p, position_m=(0, 0, 1.4))}), "fail", "1.40"),
+    ("body place", Scripted(high), "fail", "1.40"),
 ]  # fmt: skip
 
 
