@@ -62,6 +62,7 @@ def serve_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = connect_back()
     setup = channel.receive(START_TIMEOUT_S)
+    channel.socket.settimeout(None)  # a parent that says nothing more is not gone
     try:
         client = _connected(setup)
         channel.send(Connected())
@@ -115,6 +116,7 @@ def _body(body: Any) -> Body:
 
 def _end_with(channel: Channel) -> None:
     """The parent never speaks again: what is read is its end. The library may be anywhere."""
+    channel.socket.settimeout(None)  # its setup was waited for with a limit; a flight has none
     with contextlib.suppress(OSError):
         channel.socket.recv(1)
     os._exit(0)

@@ -15,7 +15,7 @@ from perchctl.log.watch import LogWatcher, Truth
 from perchctl.mission.state import Operator, Phase
 from perchctl.mission.watch import Event, FlightReport
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim.draw import draw_capture, draw_scenario
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -84,12 +84,19 @@ def fly_short(
     *,
     base: str = SHORT,
     seed: int = SEED,
+    capture: Mapping[str, Any] | None = None,
     **scenario: Any,
 ) -> Flown:
-    """One lockstep flight; `changes` are the profile's, `scenario` its scenario's."""
+    """One lockstep flight; `changes` are the profile's, `scenario` its scenario's, `capture`
+    those of its motion capture's settings."""
     cv2.setNumThreads(1)
     profile = short_profile(changes, base)
     drawn = replace(draw_scenario(profile, seed), **scenario)
     heights = _Heights()
-    flight = fly_lockstep(profile, log=heights, scenario=drawn, operator_at=operator_at)
+    settings = draw_capture(profile, seed)
+    if settings is not None:
+        settings = replace(settings, **(capture or {}))
+    flight = fly_lockstep(
+        profile, log=heights, scenario=drawn, capture=settings, operator_at=operator_at
+    )
     return Flown(flight, heights.z_m, heights.farthest_m)

@@ -21,6 +21,7 @@ def fly(*words: str) -> Result:
 
 
 def test_the_option_wins_over_the_profile(tmp_path: Path) -> None:
+    pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
     profile = tmp_path / "lab.yaml"
     profile.write_text("extends: sim\npositioning: mocap\n", encoding="utf-8")
     for words, by in (
@@ -32,7 +33,6 @@ def test_the_option_wins_over_the_profile(tmp_path: Path) -> None:
         done = fly(*words, "--dry-run", "--json")
         assert done.exit_code == 0, done.output
         assert json.loads(done.stdout)["profile"]["positioning"]["by"] == by
-    pytest.importorskip("motioncapture")
     assert "positioning  motion capture" in fly("--positioning", "mocap", "--dry-run").stdout
     assert "positioning" not in fly("--dry-run").stdout
 

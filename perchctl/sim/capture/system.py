@@ -50,7 +50,7 @@ class SimCapture:
         self._R_capture_world = rot_z(settings.heading_rad)
         self._origin_m = np.asarray(settings.origin_m)
         self._due_s = float(self._rng.random()) / settings.rate_hz
-        self._t_s = -math.inf
+        self._t_s = 0.0
         self._arrival_s = -math.inf
         self._delivered_s = -math.inf
         self._before: dict[str, BodyPose] = {}
