@@ -142,4 +142,6 @@ def _fitting(wanted: str, known: Sequence[Camera]) -> list[Camera]:
 
 def listed(known: Sequence[Camera], paths: bool = False) -> str:
     """For a sentence."""
-    return ", ".join(f"{c} at {c.stable_path}" if paths and c.stable_path else str(c) for c in known)
+    return ", ".join(
+        f"{c} at {c.stable_path}" if paths and c.stable_path else str(c) for c in known
+    )

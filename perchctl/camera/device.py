@@ -122,8 +122,42 @@ def _near(one_hz: float, other_hz: float) -> bool:
     return abs(one_hz - other_hz) <= RATE_TOLERANCE * one_hz
 
 
-class DeviceSource(LiveSource):
-    """Keeps only the newest frame, stamped when the grab returns.
+class CaptureSource(LiveSource):
+    """Keeps only the newest frame of what has read() and release(), as cv2.VideoCapture,
+    stamped when the grab returns."""
+
+    def __init__(
+        self, name: str, latency_s: float, clock: Clock, capture: Any, retry_s: float = RETRY_S
+    ) -> None:
+        super().__init__(name, latency_s, clock)
+        self._capture = capture
+        self._retry_s = retry_s
+
+    def begin(self) -> None:
+        self._start(self._grab)
+
+    def _grab(self) -> None:
+        failures = 0
+        try:
+            while not self._stop.is_set():
+                ok, image = self._capture.read()
+                if ok:
+                    failures = 0
+                    self._put(image)
+                    continue
+                failures += 1
+                if failures >= LOST_AFTER_FAILURES:
+                    self._fail(f"{self._name} stopped delivering frames; is it unplugged?")
+                    return
+                self._stop.wait(self._retry_s)
+        except cv2.error as error:
+            self._fail(f"{self._name} failed while reading: {str(error).strip()}")
+        finally:
+            self._capture.release()
+
+
+class DeviceSource(CaptureSource):
+    """A camera of this computer.
 
     `opened` replaces the real camera, anything with read(), get(), set() and release(), and
     `opener` its driver. Controls are set before the first picture, and once more after it where
@@ -142,17 +176,15 @@ class DeviceSource(LiveSource):
         opener: Opener = open_driver,
         retry_s: float = RETRY_S,
     ) -> None:
-        super().__init__(f"camera:{number}", latency_s, clock)
+        super().__init__(f"camera:{number}", latency_s, clock, opened(number, asked), retry_s)
         self._asked = asked
         self._driver = lambda: opener(number)
-        self._capture = opened(number, asked)
-        self._retry_s = retry_s
         try:
             self._prepare()
         except BaseException:
             self._capture.release()
             raise
-        self._start(self._grab)
+        self.begin()
 
     def _prepare(self) -> None:
         asked, source = self._asked, self._name
@@ -196,25 +228,6 @@ class DeviceSource(LiveSource):
         except InvalidValue as error:
             return [str(error)]
         return []
-
-    def _grab(self) -> None:
-        failures = 0
-        try:
-            while not self._stop.is_set():
-                ok, image = self._capture.read()
-                if ok:
-                    failures = 0
-                    self._put(image)
-                    continue
-                failures += 1
-                if failures >= LOST_AFTER_FAILURES:
-                    self._fail(f"{self._name} stopped delivering frames; is it unplugged?")
-                    return
-                self._stop.wait(self._retry_s)
-        except cv2.error as error:
-            self._fail(f"{self._name} failed while reading: {str(error).strip()}")
-        finally:
-            self._capture.release()
 
 
 def _by_opencv(capture: Any, size_px: tuple[int, int] | None) -> Delivered:

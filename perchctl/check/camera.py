@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from statistics import mean, median
@@ -89,8 +90,11 @@ def unseen(why: str, size: Row | None = None) -> list[Row]:
     return [first, *(skipped(name, why) for name in PICTURE_NAMES)]
 
 
-def opened_row(described: str, devices: list[str]) -> Row:
+def opened_row(described: str, devices: list[str], remarks: Sequence[str] = ()) -> Row:
+    """`remarks`: what it does not do as it was asked."""
     found = f"{described} gives pictures"
+    if remarks:
+        return warned("camera", f"{found}; {'; '.join(remarks)}", "see perchctl check --cameras")
     return passed("camera", f"{found}; there are {', '.join(devices)}" if devices else found)
 
 

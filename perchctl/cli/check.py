@@ -24,6 +24,13 @@ def check(
         bool,
         typer.Option("--scan", help="Only show which vehicles answer, on any channel and rate."),
     ] = False,
+    cameras: Annotated[
+        bool,
+        typer.Option(
+            "--cameras",
+            help="Only list this computer's cameras: number, name, path, modes, controls.",
+        ),
+    ] = False,
     lift: Annotated[
         bool,
         typer.Option("--lift", help="Also watch the position while you lift the vehicle by hand."),
@@ -59,6 +66,7 @@ def check(
             seed=seed,
             log_dir=log_dir,
             scan=scan,
+            cameras=cameras,
             lift=lift,
             prop_test=prop_test,
             yes=yes,

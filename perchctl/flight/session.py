@@ -99,8 +99,9 @@ def fly_session(
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         config = profile.camera
         source = open_source(
-            spec, config.start_latency_s, camera.size_px, clock.now, config.start_timeout_s
-        )
+            spec, config.start_latency_s, camera.size_px, clock.now, config.start_timeout_s,
+            config=config,
+        )  # fmt: skip
         stack.callback(source.close)
         if config.mirrored:
             source = UnmirroredSource(source)

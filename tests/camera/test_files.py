@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.camera.credentials import without_password
 from perchctl.camera.files import (
     BrokenPicture,
     ImagesSource,
@@ -15,7 +16,6 @@ from perchctl.camera.files import (
     VideoSource,
     read_grey,
 )
-from perchctl.camera.mjpeg import without_password
 from perchctl.camera.open import is_live, open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size, to_grey
 from perchctl.errors import InvalidValue, NotFound
