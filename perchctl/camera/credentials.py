@@ -65,8 +65,8 @@ def challenge_of(headers: Sequence[str]) -> Challenge | None:
     found: list[Challenge] = []
     for header in headers:
         starts = list(_SCHEMES.finditer(header))
-        ends = [start.start() for start in starts[1:]] + [len(header)]
-        for start, end in zip(starts, ends, strict=True):
+        for k, start in enumerate(starts, start=1):
+            end = starts[k].start() if k < len(starts) else len(header)
             values = _values(header[start.end() : end])
             if start.group(1).lower() == "basic":
                 found.append(Challenge(False, values.get("realm", "")))

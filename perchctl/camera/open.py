@@ -139,7 +139,7 @@ def _stream(
         host = None
     if not host:
         raise InvalidValue(
-            f"camera source {without_password(spec)!r} lacks a host and port that can be read, as in "
+            f"camera source {without_password(spec)!r} lacks a host that can be read, as in "
             f"{scheme}://192.168.1.20/stream; in a name or password @ is %40, : is %3A, / is %2F"
         )
     return kinds[scheme](spec, latency_s, clock)

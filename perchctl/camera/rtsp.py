@@ -28,6 +28,7 @@ _OPTIONS = {
     "reorder_queue_size": "0",
     "analyzeduration": "200000",
     "probesize": "200000",
+    "fpsprobesize": "0",
     "allowed_media_types": "video",
 }
 

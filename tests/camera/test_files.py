@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,6 +121,7 @@ def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
 def test_a_password_is_not_shown() -> None:
     assert without_password("http://me:secret@host:81/a@b") == "http://host:81/a@b"
     assert without_password("http://host/") == "http://host/"
+    assert without_password("rtsp://me:sec/ret@host/a") == "rtsp://host/a"
     assert without_password("video:mail@home.mp4") == "video:mail@home.mp4"
 
 
@@ -131,13 +133,13 @@ def test_videos_that_are_none(tmp_path: Path) -> None:
         VideoSource(tmp_path / "flight.avi")
 
 
-@pytest.mark.parametrize("spec", ["webcam", "ftp://x", "video:", "images:", "http://", ""])
+@pytest.mark.parametrize("spec", ["webcam", "ftp://x", "video:", "images:", "http://", "gst:", ""])
 def test_unknown_schemes_say_what_is_allowed(spec: str) -> None:
-    with pytest.raises(InvalidValue, match=r"allowed are camera:N, video:FILE, images:DIR"):
+    with pytest.raises(InvalidValue, match=r"allowed are camera:N, .*video:FILE, images:DIR"):
         open_source(spec, 0.0, None, clock)
 
 
-@pytest.mark.parametrize("spec", ["camera:", "camera:x", "camera:-1"])
+@pytest.mark.parametrize("spec", ["camera:", 'camera:""', "camera:-1"])
 def test_a_camera_needs_a_number(spec: str) -> None:
     with pytest.raises(InvalidValue, match="camera:0"):
         open_source(spec, 0.0, None, clock)
@@ -196,3 +198,34 @@ def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None
         path.write_bytes(data)
     with pytest.raises(BrokenPicture, match=r"a\.jpg (cannot be read|is cut off)"):
         read_grey(path)
+
+
+@pytest.mark.parametrize("url", ["rtsp://me:sec/ret@host/a", "http://:80/a", "rtsp:host/a"])
+def test_a_url_without_a_host_is_refused_and_its_password_not_shown(url: str) -> None:
+    with pytest.raises(InvalidValue, match=r"lacks a host .*(rtsp|http)://192") as e:
+        open_source(url, 0.0, None, clock)
+    assert "sec" not in str(e.value)
+
+
+def test_gst_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("perchctl.camera.gst.has_gstreamer", lambda: False)
+    with pytest.raises(InvalidValue, match=r"^gst: needs an OpenCV .* GStreamer.*rtsp://"):
+        open_source("gst:videotestsrc ! appsink", 0.0, None, clock)
+    monkeypatch.setattr("perchctl.camera.gst.has_gstreamer", lambda: True)
+    with pytest.raises(NotFound, match="does not run; try it with gst-launch"):
+        open_source("gst:nonsense", 0.0, None, clock)
+
+
+def test_gst_reads_where_opencv_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Capture:
+        def read(self) -> tuple[bool, Any]:
+            return True, np.random.default_rng().integers(0, 255, (48, 64), np.uint8)
+
+        def release(self) -> None:
+            return None
+
+    monkeypatch.setattr("perchctl.camera.open.open_pipeline", lambda text: Capture())
+    source = open_source("gst:videotestsrc ! appsink", 0.0, None, clock)
+    assert source.size_px == (64, 48)
+    assert source.describe().startswith("gst:videotestsrc")
+    source.close()
