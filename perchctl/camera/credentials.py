@@ -8,7 +8,10 @@ import re
 import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 from urllib.parse import SplitResult, unquote
+
+from perchctl.profile import Profile
 
 _HASHES = {"MD5": hashlib.md5, "SHA-256": hashlib.sha256}
 _PART = re.compile(r'(\w+)\s*=\s*(?:"((?:[^"\\]|\\.)*)"|([^\s,]+))')
@@ -23,6 +26,13 @@ def without_password(url: str) -> str:
     if "@" not in host and "@" in path and port and not port.isdigit():
         return f"{scheme}{slashes}{rest.rpartition('@')[2]}"  # a slash within the password
     return f"{scheme}{slashes}{host.rpartition('@')[2]}{slash}{path}" if slashes else url
+
+
+def profile_record(profile: Profile) -> dict[str, Any]:
+    """Every key of the profile, as for JSON, to be kept and shown: without a password."""
+    record = profile.model_dump(mode="json")
+    record["camera"]["source"] = without_password(profile.camera.source)
+    return record
 
 
 @dataclass(frozen=True)

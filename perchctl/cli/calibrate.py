@@ -56,6 +56,10 @@ def calibrate(
             "goes beside it.",
         ),
     ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option("--size", help="Asked of camera:N, as in 720x576; else its driver's own."),
+    ] = None,
     name: Annotated[str, typer.Option("--name", help="The camera's name.")] = "camera",
     model: Annotated[
         str,
@@ -168,6 +172,7 @@ def calibrate(
             measured_width=measured_width,
             measured_height=measured_height,
             output=output,
+            size=size,
             name=name,
             model=model,
             force=force,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from perchctl.calibration.files import camera_of
+from perchctl.camera.credentials import without_password
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
 from perchctl.camera.source import FrameSource
@@ -61,7 +62,8 @@ def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
     if scheme_of(options.source) not in SCHEMES:
-        raise InvalidValue(f"camera source {options.source!r} is unknown; allowed are {ALLOWED}")
+        shown = without_password(options.source)
+        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
             f"source {options.source} belongs to the simulated vehicle, but the URI is "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import ssl
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -183,6 +184,11 @@ class Server:
         )
         self._thread.start()
 
+    def encrypt(self, pem: Path) -> None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(pem)
+        self._server.socket = context.wrap_socket(self._server.socket, server_side=True)
+
     def close(self) -> None:
         self._server.shutdown()
         self._server.server_close()
@@ -340,6 +346,22 @@ def test_closing_does_not_wait_for_a_stalled_stream(server: Server) -> None:
     source.close()
     assert source._thread is not None
     assert not source._thread.is_alive()
+
+
+def test_a_certificate_that_nobody_vouches_for(
+    server: Server, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pem = Path(__file__).parents[1] / "helpers" / "loopback.pem"  # for 127.0.0.1 and 100 years
+    server.encrypt(pem)
+    url = server.url.replace("http://", "https://me:secret@")
+    with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
+        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    assert "secret" not in str(caught.value)
+    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = MjpegSource(url, 0.0, Clock())
+    opened.append(source)
+    assert level(next_frame(source)) == 60
 
 
 def test_it_follows_a_redirect(server: Server, opened: list[LiveSource]) -> None:

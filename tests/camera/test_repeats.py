@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from perchctl.camera.health import HealthState, assess
 from perchctl.camera.repeats import MOST_AGAIN, RepeatState, repeated
 from perchctl.camera.slot import NewestSlot
 from perchctl.sim.receiver import BLUE_GREY
+from perchctl.vision.types import Frame
 from tests.helpers.interlaced import Pass
 
 Grey = NDArray[np.uint8]
@@ -24,18 +27,19 @@ def judged(pictures: list[Grey]) -> list[bool]:
     return told
 
 
-def noisy(
-    image: Grey | float, sigma: float, seed: int, shape: tuple[int, int] = (480, 640)
-) -> Grey:
-    rng = np.random.default_rng(seed)
-    noise = rng.standard_normal(shape, dtype=np.float32)
+def noisy(image: Grey | float, sigma: float, seed: int) -> Grey:
+    noise = np.random.default_rng(seed).standard_normal((480, 640), dtype=np.float32)
     return np.clip(np.rint(image + sigma * noise), 0, 255).astype(np.uint8)
+
+
+@cache
+def given_out(noise: float) -> list[Frame]:
+    return list(Pass(camera_receiver_hz=60.0, camera_receiver_noise=noise).frames(60))
 
 
 def of_25_in_60(noise: float, quality: int | None = None) -> tuple[list[Grey], list[bool]]:
     """What a receiver gives out, and which of it has been there before."""
-    camera = Pass(camera_receiver_hz=60.0, camera_receiver_noise=noise)
-    frames = list(camera.frames(90))
+    frames = given_out(noise)
     new = [a.index != b.index for a, b in zip(frames[1:], frames, strict=False)]
     pictures = [frame.image for frame in frames]
     if quality is not None:
@@ -45,10 +49,10 @@ def of_25_in_60(noise: float, quality: int | None = None) -> tuple[list[Grey], l
     return pictures, [False] + [not each for each in new]
 
 
-@pytest.mark.parametrize(("noise", "quality"), [(0.0, None), (0.0, 80), (1.0, None), (2.0, 90)])
+@pytest.mark.parametrize(("noise", "quality"), [(0.0, None), (0.0, 80), (1.0, None), (1.0, 90)])
 def test_every_repetition_is_told_and_no_new_picture_is(noise: float, quality: int | None) -> None:
     pictures, truth = of_25_in_60(noise, quality)
-    assert 40 < sum(truth) < 60
+    assert 30 < sum(truth) < 40
     told = judged(pictures)
     learned = 0 if noise == 0.0 else 24  # both kinds must have been seen first
     assert told[learned:] == truth[learned:]
@@ -58,7 +62,7 @@ def test_every_repetition_is_told_and_no_new_picture_is(noise: float, quality: i
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_a_camera_without_a_receiver_repeats_nothing(at_rest: bool) -> None:
     still = {"velocity_mps": (0.0, 0.0, 0.0), "turn_radps": 0.0} if at_rest else {}
-    pictures = [frame.image for frame in Pass(**still).frames(40)]  # type: ignore[arg-type]
+    pictures = [frame.image for frame in Pass(**still).frames(30)]  # type: ignore[arg-type]
     assert not any(judged(pictures))
 
 
@@ -73,7 +77,7 @@ def test_nothing_but_equal_bytes_goes_on_for_long() -> None:
     """A receiver that stands still under a noise of its own is not told from a rough ceiling
     at rest: no flight may be starved of its pictures for that."""
     pictures, _ = of_25_in_60(1.0)
-    stuck = [noisy(pictures[-1], 1.0, k) for k in range(60)]
+    stuck = [noisy(pictures[-1], 1.0, k) for k in range(45)]
     told = judged(pictures + stuck)[len(pictures) :]
     runs = "".join("r" if each else "." for each in told).split(".")
     assert max(map(len, runs)) <= MOST_AGAIN
@@ -121,7 +125,7 @@ def test_repetitions_are_not_frozen_and_a_receiver_that_is_stuck_is() -> None:
 
 
 def test_the_receiver_gives_out_at_its_own_rate_the_newest_that_has_arrived() -> None:
-    frames = list(Pass(camera_receiver_hz=60.0).frames(60))
+    frames = given_out(0.0)
     ticks = np.diff([frame.t_arrival_s for frame in frames])
     assert ticks == pytest.approx(np.full(59, 1 / 60))
     assert set(np.bincount([frame.index for frame in frames])[1:-1]) == {2, 3}
@@ -129,10 +133,10 @@ def test_the_receiver_gives_out_at_its_own_rate_the_newest_that_has_arrived() ->
 
 
 def test_blue_screens_come_by_the_seed_and_change_no_other_picture() -> None:
-    plain = list(Pass().frames(40))
-    blanks = list(Pass(camera_blank_rate=0.3).frames(40))
+    plain = list(Pass().frames(25))
+    blanks = list(Pass(camera_blank_rate=0.3).frames(25))
     blue = [float(f.image.std()) < 1.5 for f in blanks]
-    assert 5 < sum(blue) < 20
+    assert 2 < sum(blue) < 15
     for p, b, is_blue in zip(plain, blanks, blue, strict=True):
         assert p.t_arrival_s == b.t_arrival_s
         if is_blue:
