@@ -5,6 +5,7 @@ PyAV's open and read both end in time, and say why they failed; OpenCV's FFmpeg 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Any
 
@@ -37,16 +38,21 @@ class Waiting:
     """How long a picture was under way beyond the fastest of the last ten seconds; pure.
 
     The camera's own time of a picture tells it. What piles up behind a radio that stalls
-    comes in a heap, and would look as if it had just been taken.
+    comes in a heap, and would look as if it had just been taken. A camera whose clock is set
+    back meanwhile starts anew: nothing else makes its time go backwards.
     """
 
     def __init__(self) -> None:
+        self._camera_s = -math.inf
         self._ways: deque[tuple[float, float]] = deque()  # arrival, and arrival less camera's time
 
     def of(self, camera_s: float | None, arrival_s: float) -> float:
         """s; 0 where the camera gives no time."""
         if camera_s is None:
             return 0.0
+        if camera_s < self._camera_s:
+            self._ways.clear()
+        self._camera_s = camera_s
         way_s = arrival_s - camera_s
         while self._ways and self._ways[-1][1] >= way_s:
             self._ways.pop()  # a window's minimum: none of these will be it any more

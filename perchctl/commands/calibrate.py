@@ -98,6 +98,8 @@ def run(request: CalibrateRequest) -> int:
     if request.convert is not None:
         if request.sources or not (request.check is request.mask is None):
             raise UsageError("--convert takes a file and no source, --check or --mask")
+        if request.size is not None:
+            raise UsageError("--size is asked of a camera, and --convert looks through none")
         _refuse_beside("--convert takes over the file's lens model", request, "--model", "--view")
         return _convert(request, request.convert)
     if request.cam is not None and request.check is None:

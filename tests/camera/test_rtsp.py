@@ -147,3 +147,10 @@ def test_a_clock_of_the_camera_that_runs_slow_makes_nothing_old() -> None:
     for k in range(25 * 600):
         latest = waiting.of(k / 25 * (1 - 1e-4), k / 25)
     assert latest <= 1e-4 * WINDOW_S + 1e-6
+
+
+def test_a_clock_of_the_camera_that_is_set_back_makes_nothing_old() -> None:
+    waiting = Waiting()
+    assert [waiting.of(t, 100.0 + k / 25) for k, t in enumerate((50.0, 50.04, 3.0, 3.04))] == [
+        pytest.approx(0.0, abs=1e-9)
+    ] * 4
