@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,10 @@ from perchctl.camera.files import (
 )
 from perchctl.camera.open import is_live, open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size, to_grey
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.commands.calibrate_source import Source, sized
+from perchctl.errors import InvalidValue, NotFound, UsageError
+from perchctl.log.write import make_header
+from perchctl.profile import Profile
 from perchctl.vision.types import CameraModel, Frame
 
 
@@ -229,3 +233,22 @@ def test_gst_reads_where_opencv_can(monkeypatch: pytest.MonkeyPatch) -> None:
     assert source.size_px == (64, 48)
     assert source.describe().startswith("gst:videotestsrc")
     source.close()
+
+
+def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:
+    assert sized(Source("camera:0"), "720x576").size_px == (720, 576)
+    assert sized(Source("http://host/a"), None).size_px is None
+    for text in ("720", "720x", "0x0", "720 x 576"):
+        with pytest.raises(InvalidValue, match="WIDTHxHEIGHT, as in 720x576"):
+            sized(Source("camera:0"), text)
+    with pytest.raises(UsageError, match="http://host/a has its own: leave it out"):
+        sized(Source("http://me:secret@host/a"), "720x576")
+
+
+def test_a_log_and_a_plan_hold_no_password() -> None:
+    url = "rtsp://me:hushhush@host/a"
+    profile = Profile.model_validate({"camera": {"source": url}})
+    header = make_header(profile, uri="radio://0", source=url)
+    assert "hushhush" not in json.dumps(header)
+    assert header["profile"]["camera"]["source"] == header["source"] == "rtsp://host/a"
+    assert profile.camera.source == url, "it is needed to open it"
