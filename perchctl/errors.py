@@ -88,7 +88,15 @@ class Interrupted(PerchError):
     meaning = "Ctrl-C, landed (in the air) or left (on the ground, at the ceiling)"
 
 
-class ProfileNote(UserWarning):
+class Note(UserWarning):
+    """One sentence for people; the command line prints each once."""
+
+
+class CameraNote(Note):
+    """A camera was opened, and does not do all that it was asked."""
+
+
+class ProfileNote(Note):
     """A profile was read, but one of its keys has another name by now, or is not used."""
 
 

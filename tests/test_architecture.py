@@ -22,7 +22,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "mujoco": ("perchctl.sim",),
     "matplotlib": ("*.plot",),
     "motioncapture": ("perchctl.positioning",),
-    "av": ("perchctl.track.files",),
+    "av": ("perchctl.track.files", "perchctl.camera.rtsp"),
 }
 
 # Time is an argument here.

@@ -98,7 +98,9 @@ def cheap(line: str) -> list[str]:
         case ["perchctl", "calibrate"] if "--mount" in words:  # without a vehicle in a hand
             words = [*words[:3], "-p", "my_vehicle.yaml", "--from", "hand.jsonl"]
         case ["perchctl", "track"]:  # without a camera
-            words = ["video:flight.mp4" if word == "camera:0" else word for word in words]
+            words = ["video:flight.mp4" if w.startswith("camera:") else w for w in words]
+        case ["perchctl", "calibrate"] if words[2].startswith("camera:"):
+            words.append("--help")
         case ["python", "docs/tables.py"]:
             words.append("--check")
         case ["python", "docs/pictures/make.py"]:

@@ -68,6 +68,8 @@ def capture(
             sleep(POLL_S)
             continue
         last_s = clock()
+        if frame.repeated:  # it would look still
+            continue
         name = f"view {len(state.taken) + 1}"
         seen = find_board(frame.image, board, name)
         state = consider(state, seen, board)

@@ -83,8 +83,9 @@ def assess(
     """Judge one frame.
 
     A camera's noise makes each live picture differ from the last, so equal bytes
-    mean that the receiver or the stream repeats an old one. In recordings
-    (`live` false) equal pictures are taken as they are.
+    mean that the receiver or the stream repeats an old one; so does what the source
+    has found to be one (`Frame.repeated`), which is never frozen for that alone. In
+    recordings (`live` false) equal pictures are taken as they are.
     """
     limits = limits or HealthLimits()
     checksum = zlib.crc32(frame.image.tobytes())
@@ -93,6 +94,9 @@ def assess(
         unchanged_s = frame.t_s - state.changed_at_s
         frozen = unchanged_s >= limits.frozen_after_s
         return state, Verdict("frozen" if frozen else "repeated", state.repeats, unchanged_s)
+    if live and frame.repeated:
+        repeats = state.repeats + 1
+        return HealthState(checksum, state.changed_at_s, repeats), Verdict("repeated", repeats)
     return HealthState(checksum, frame.t_s, 0), Verdict(content(frame.image, limits))
 
 

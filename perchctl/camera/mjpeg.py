@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import http.client
 import socket
-from urllib.parse import SplitResult, unquote, urljoin, urlsplit, urlunsplit
+import ssl
+from dataclasses import replace
+from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
 
 import cv2
 import numpy as np
 
+from perchctl.camera.credentials import (
+    Challenge,
+    answer,
+    challenge_of,
+    credentials_of,
+    without_password,
+)
 from perchctl.camera.source import Clock, LiveSource
 
 CONNECT_TIMEOUT_S = 3.0
@@ -21,16 +29,12 @@ MAX_FAILED_CONNECTIONS = 5
 """Connections in a row that bring no picture before the source gives up."""
 RECONNECT_WAIT_S = 0.3
 MAX_REDIRECTS = 3
+MOST_REQUESTS = 3
+"""One that is answered by what to answer to, once more where that was too old."""
 
+_HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*", "Connection": "close"}
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
 _STANDALONE = frozenset(range(0xD0, 0xD8)) | {0x01}  # markers without a length
-
-
-def without_password(url: str) -> str:
-    """The URL without the name and password that it may hold; other text as it is."""
-    scheme, slashes, rest = url.partition("://")
-    host, slash, path = rest.partition("/")
-    return f"{scheme}{slashes}{host.rpartition('@')[2]}{slash}{path}" if slashes else url
 
 
 class Damaged(Exception):
@@ -127,8 +131,10 @@ class MjpegSource(LiveSource):
 
     Reconnects when the stream ends, stalls or breaks; gives up after
     `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
-    answers that there is no such stream before the first picture came. Goes straight
-    to the camera: a proxy for the internet is not for it.
+    answers that there is no such stream, or none for this name and password, before the
+    first picture came. Name and password are sent as the server asks for them, digest or
+    basic, and to no other host. Goes straight to the camera: a proxy for the internet is
+    not for it.
     """
 
     def __init__(
@@ -144,6 +150,7 @@ class MjpegSource(LiveSource):
         self._read_timeout_s = read_timeout_s
         self._reconnect_wait_s = reconnect_wait_s
         self._socket: socket.socket | None = None
+        self._challenge: Challenge | None = None
         self.not_found = False
         self.connections = 0
         self.damaged = 0
@@ -168,6 +175,8 @@ class MjpegSource(LiveSource):
             self.connections += 1
             try:
                 reason = self._connect(self._url, MAX_REDIRECTS)
+            except ssl.SSLCertVerificationError as error:
+                reason, self.not_found = _untrusted(error), self._count == 0
             except (OSError, http.client.HTTPException, ValueError) as error:
                 reason = _reason(error)
             if self.not_found:
@@ -192,22 +201,46 @@ class MjpegSource(LiveSource):
             self._socket = connection.sock
             if self._stop.is_set():
                 return "closed"
-            path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
-            connection.request("GET", path, headers=_headers(parts))
-            response = connection.getresponse()
+            response = self._answered(connection, parts)
             location = response.getheader("Location")
             if response.status in (301, 302, 303, 307, 308) and location and redirects > 0:
-                return self._connect(urljoin(url, location), redirects - 1)
+                return self._connect(_redirected(url, location), redirects - 1)
             if response.status != 200:
                 gone = response.status in (401, 403, 404, 410)
                 self.not_found = gone and self._count == 0
-                return f"the server answers {response.status} {response.reason}"
+                hint = _hint(response, parts)
+                return f"the server answers {response.status} {response.reason}{hint}"
             self._socket.settimeout(self._read_timeout_s)
             self._read(response)
             return "the stream ended"
         finally:
             self._socket = None
             connection.close()
+
+    def _answered(
+        self, connection: http.client.HTTPConnection, parts: SplitResult
+    ) -> http.client.HTTPResponse:
+        """The response; with name and password once the server has asked for them."""
+        path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
+        who = credentials_of(parts)
+        for _ in range(MOST_REQUESTS):
+            headers = dict(_HEADERS)
+            if who is not None and self._challenge is not None:
+                headers["Authorization"] = answer(self._challenge, who, "GET", path)
+                self._challenge = replace(self._challenge, count=self._challenge.count + 1)
+            connection.request("GET", path, headers=headers)
+            response = connection.getresponse()
+            asked = _challenge(response)
+            if response.status != 401 or who is None or asked is None:
+                break
+            # A nonce of an earlier connection may be too old: a new one is answered once more.
+            if self._challenge is not None and asked.asks_the_same(self._challenge):
+                break
+            self._challenge = asked
+            connection.close()
+            connection.connect()
+            self._socket = connection.sock
+        return response
 
     def _read(self, response: http.client.HTTPResponse) -> None:
         splitter = JpegSplitter()
@@ -227,12 +260,36 @@ class MjpegSource(LiveSource):
                 self.damaged += 1
 
 
-def _headers(parts: SplitResult) -> dict[str, str]:
-    headers = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*", "Connection": "close"}
-    if parts.username is not None:
-        secret = f"{unquote(parts.username)}:{unquote(parts.password or '')}".encode()
-        headers["Authorization"] = "Basic " + base64.b64encode(secret).decode("ascii")
-    return headers
+def _redirected(url: str, location: str) -> str:
+    """Where to go: name and password go along to the same host only."""
+    before, after = urlsplit(url), urlsplit(urljoin(url, location))
+    same = (before.hostname, before.port) == (after.hostname, after.port)
+    if same and after.username is None and before.username is not None:
+        after = after._replace(netloc=f"{before.netloc.rpartition('@')[0]}@{after.netloc}")
+    return urlunsplit(after)
+
+
+def _challenge(response: http.client.HTTPResponse) -> Challenge | None:
+    """What the server asks for; one that does not say so gets the simplest."""
+    headers = response.headers.get_all("WWW-Authenticate")
+    return challenge_of(headers) if headers else Challenge(digest=False)
+
+
+def _hint(response: http.client.HTTPResponse, parts: SplitResult) -> str:
+    if response.status != 401:
+        return ""
+    if parts.username is None:
+        return "; it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"
+    if _challenge(response) is None:
+        return ", and asks for no basic or digest authentication; others are not known here"
+    return "; check the name and the password in the URL (@ is %40 there, : is %3A)"
+
+
+def _untrusted(error: ssl.SSLCertVerificationError) -> str:
+    return (
+        f"its certificate is not trusted ({error.verify_message or 'not verified'}); name a file "
+        f"with that certificate in the environment variable SSL_CERT_FILE, or use http://"
+    )
 
 
 def _reason(error: Exception) -> str:

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from urllib.parse import urlsplit
 
-from perchctl.camera.device import DeviceSource
+from perchctl.camera.computer import camera_number
+from perchctl.camera.credentials import without_password
+from perchctl.camera.device import CaptureSource, DeviceSource, asked_of
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
+from perchctl.camera.gst import open_pipeline
 from perchctl.camera.mjpeg import MjpegSource
+from perchctl.camera.rtsp import RtspSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
-from perchctl.errors import InvalidValue, NotFound, TimedOut
+from perchctl.errors import CameraNote, InvalidValue, NotFound, TimedOut
+from perchctl.profile import CameraConfig
 
-REAL = "camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH"
+REAL = (
+    "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
+    "rtsp://HOST/PATH"
+)
 ALLOWED = f"{REAL}, sim:"
 
 FIRST_FRAME_WITHIN_S = 8.0
-SCHEMES = ("camera", "video", "images", "http", "https", "sim")
+SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "gst", "sim")
 RECORDED = ("video", "images")
 
 
@@ -34,7 +45,7 @@ def source_spec(source: str) -> str:
         return source  # `open_source` names what is allowed
     raise NotFound(
         f"{source} does not exist; a source is a video, picture or folder of pictures, or "
-        f"one of camera:N, video:FILE, images:DIR, http://HOST:PORT/PATH"
+        f"one of {REAL}"
     )
 
 
@@ -54,6 +65,11 @@ def of_pictures(spec: str) -> bool:
     return scheme_of(spec) == "images"
 
 
+def note(sentence: str) -> None:
+    """As warning: `perchctl.cli` prints it, and a program that uses the package may catch it."""
+    warnings.warn(sentence, CameraNote, stacklevel=3)
+
+
 def open_source(
     spec: str,
     latency_s: float,
@@ -61,6 +77,8 @@ def open_source(
     clock: Clock,
     timeout_s: float = FIRST_FRAME_WITHIN_S,
     pictures_hz: float = DEFAULT_RATE_HZ,
+    config: CameraConfig | None = None,
+    tell: Callable[[str], None] = note,
 ) -> FrameSource:
     """Open the source and wait for its first frame.
 
@@ -72,10 +90,13 @@ def open_source(
         clock: the loop's clock, s.
         timeout_s: how long the first frame of a live source may take.
         pictures_hz: as if taken at this rate (``images:`` only).
+        config: whose format, rate and controls are asked of ``camera:``.
+        tell: gets a sentence for each thing that the camera does not do as asked.
 
     Raises:
-        NotFound: no such camera, file or stream. InvalidValue: unknown scheme or
-        unreadable content. TimedOut: no first frame in time.
+        NotFound: no such camera, file or stream. InvalidValue: unknown scheme,
+        unreadable content, a control or format that the camera lacks. TimedOut: no
+        first frame in time.
     """
     scheme, _, rest = spec.partition(":")
     if scheme == "video" and rest:
@@ -83,13 +104,15 @@ def open_source(
     if scheme == "images" and rest:
         return ImagesSource(str(Path(rest).expanduser()), latency_s, pictures_hz)
     if scheme == "camera":
-        if not (rest.isascii() and rest.isdigit()):
-            raise InvalidValue(f"camera source {spec!r} lacks a camera number, as in camera:0")
-        return _started(DeviceSource(int(rest), latency_s, size_px, clock), timeout_s)
-    if scheme in ("http", "https") and rest.strip("/"):
-        stream = MjpegSource(spec, latency_s, clock)
+        asked = asked_of(config, size_px)
+        return _started(DeviceSource(camera_number(rest), latency_s, asked, clock), timeout_s, tell)
+    if scheme == "gst" and rest.strip():
+        pipeline = CaptureSource(spec, latency_s, clock, open_pipeline(rest))
+        pipeline.begin()
+        return _started(pipeline, timeout_s, tell)
+    if (stream := _stream(spec, scheme, rest, latency_s, clock)) is not None:
         try:
-            return _started(stream, timeout_s)
+            return _started(stream, timeout_s, tell)
         except TimedOut as error:
             if stream.not_found:
                 raise NotFound(str(error)) from None
@@ -99,11 +122,33 @@ def open_source(
             "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "
             f"other sources are {REAL}"
         )
-    raise InvalidValue(f"camera source {spec!r} is unknown; allowed are {ALLOWED}")
+    shown = without_password(spec)
+    raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
 
 
-def _started(source: LiveSource, timeout_s: float) -> FrameSource:
+def _stream(
+    spec: str, scheme: str, rest: str, latency_s: float, clock: Clock
+) -> MjpegSource | RtspSource | None:
+    kinds = {"http": MjpegSource, "https": MjpegSource, "rtsp": RtspSource}
+    if scheme not in kinds or not rest.strip("/"):
+        return None
+    try:
+        host = urlsplit(spec).hostname if rest.startswith("//") else None
+        _ = urlsplit(spec).port
+    except ValueError:
+        host = None
+    if not host:
+        raise InvalidValue(
+            f"camera source {without_password(spec)!r} lacks a host that can be read, as in "
+            f"{scheme}://192.168.1.20/stream; in a name or password @ is %40, : is %3A, / is %2F"
+        )
+    return kinds[scheme](spec, latency_s, clock)
+
+
+def _started(source: LiveSource, timeout_s: float, tell: Callable[[str], None]) -> FrameSource:
     if source.wait_first(timeout_s):
+        for sentence in source.remarks():
+            tell(sentence)
         return source
     problem = source.problem(float("-inf"))
     described = source.describe()

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.camera.slot import NewestSlot
 from perchctl.errors import InvalidValue
 from perchctl.vision.types import CameraModel, Frame
 
@@ -96,8 +97,7 @@ class LiveSource:
         self._stop = threading.Event()
         self._first = threading.Event()  # set by the first frame, or by failing before it
         self._thread: threading.Thread | None = None
-        self._newest: Frame | None = None
-        self._count = 0
+        self._slot = NewestSlot()
         self._last_arrival_s = clock()
         self._failure: str | None = None
         self._size_px: tuple[int, int] | None = None
@@ -108,8 +108,7 @@ class LiveSource:
 
     def poll(self, now_s: float) -> Frame | None:
         with self._lock:
-            frame, self._newest = self._newest, None
-        return frame
+            return self._slot.take()
 
     def problem(self, now_s: float) -> str | None:
         with self._lock:
@@ -129,6 +128,15 @@ class LiveSource:
         self._first.wait(timeout_s)
         return self._count > 0
 
+    def remarks(self) -> list[str]:
+        """What is worth telling once the first frame has come, a sentence each."""
+        return []
+
+    @property
+    def _count(self) -> int:
+        """Pictures so far, each once."""
+        return self._slot.count
+
     def close(self) -> None:
         self._stop.set()
         if self._thread is not None:
@@ -138,12 +146,12 @@ class LiveSource:
         self._thread = threading.Thread(target=target, name=self._name, daemon=True)
         self._thread.start()
 
-    def _put(self, image: Any) -> None:
+    def _put(self, image: Any, waited_s: float = 0.0) -> None:
+        """`waited_s`: for how long it was under way beyond the usual, where that is known."""
         t_s = self._clock()
         grey = to_grey(image)
         with self._lock:
-            self._newest = Frame(self._count, t_s - self._latency_s, grey, t_s)
-            self._count += 1
+            self._slot.put(grey, t_s - self._latency_s - waited_s, t_s)
             self._last_arrival_s = t_s
             self._size_px = (grey.shape[1], grey.shape[0])
         self._first.set()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from statistics import median
+from statistics import mean, median
 
 from perchctl.camera.health import MEANING
 from perchctl.camera.mirror import MIRRORED
@@ -26,6 +26,8 @@ from perchctl.target.limits import Optics
 from perchctl.vision.fields import BLENDED
 
 RATE_WARN_HZ = 20.0
+SLOWER_WARN = 0.8
+"""Of `camera.rate_hz`."""
 LOST_WARN, LOST_FAIL = 0.2, 0.5
 """Share of pictures: a third lost is flown by; half is not."""
 BAD_WARN, BAD_FAIL = 0.05, 0.5
@@ -88,8 +90,11 @@ def unseen(why: str, size: Row | None = None) -> list[Row]:
     return [first, *(skipped(name, why) for name in PICTURE_NAMES)]
 
 
-def opened_row(described: str, devices: list[str]) -> Row:
+def opened_row(described: str, devices: list[str], remarks: Sequence[str] = ()) -> Row:
+    """`remarks`: what it does not do as it was asked."""
     found = f"{described} gives pictures"
+    if remarks:
+        return warned("camera", f"{found}; {'; '.join(remarks)}", "see perchctl check --cameras")
     return passed("camera", f"{found}; there are {', '.join(devices)}" if devices else found)
 
 
@@ -111,7 +116,7 @@ def rows(rehearsal: Rehearsal, optical: Optical, design: Design, profile: Profil
         why = rehearsal.problem or "no picture came in the rehearsal"
         return [failed("frame rate", why, _AGAIN), *unseen(why)[2:]]
     return [
-        _rate(rehearsal),
+        _rate(rehearsal, profile),
         _lost(rehearsal, profile),
         _age(rehearsal, profile),
         _pictures(rehearsal),
@@ -126,14 +131,19 @@ def rows(rehearsal: Rehearsal, optical: Optical, design: Design, profile: Profil
     ]
 
 
-def _rate(rehearsal: Rehearsal) -> Row:
+def _rate(rehearsal: Rehearsal, profile: Profile) -> Row:
     period_s = frame_period_s(rehearsal)
     if period_s is None:
         why = "too few pictures" if rehearsal.live else "a recording has none of its own"
         return skipped("frame rate", why)
     hz = 1.0 / period_s
     advice = "more light, a smaller picture, or a shorter cable"
-    return by_limits("frame rate", -hz, -RATE_WARN_HZ, -FEWEST_HZ, f"{hz:.0f} Hz", advice)
+    row = by_limits("frame rate", -hz, -RATE_WARN_HZ, -FEWEST_HZ, f"{hz:.0f} Hz", advice)
+    wanted_hz = profile.camera.rate_hz
+    if row.verdict == "pass" and wanted_hz is not None and hz < SLOWER_WARN * wanted_hz:
+        advice = "a shorter exposure (camera.controls), or another camera.format"
+        return warned("frame rate", f"{row.found}, asked for {wanted_hz:g}", advice)
+    return row
 
 
 def _lost(rehearsal: Rehearsal, profile: Profile) -> Row:
@@ -144,8 +154,10 @@ def _lost(rehearsal: Rehearsal, profile: Profile) -> Row:
         return failed("lost frames", f"none for the last {rehearsal.silent_s:.1f} s", _AGAIN)
     if not rehearsal.live or len(gaps) < LEAST_RATED:
         return skipped("lost frames", "too few pictures" if rehearsal.live else "a recording")
-    period_s = median(sorted(gaps)[: 1 + len(gaps) * 3 // 4])
-    lost = sum(max(0, round(gap / period_s) - 1) for gap in gaps)
+    period_s, slack = median(sorted(gaps)[: 1 + len(gaps) * 3 // 4]), 1.5
+    if rehearsal.repeats:  # new ones come at the receiver's own times, near theirs
+        period_s, slack = mean(gap for gap in gaps if gap < 2.2 * period_s), 1.8
+    lost = sum(max(0, math.ceil(gap / period_s - slack)) for gap in gaps)
     share = lost / (lost + len(gaps) + 1)
     found = f"{100.0 * share:.0f} %, longest gap {1e3 * max(gaps):.0f} ms"
     advice = "bring the receiver nearer, turn its antenna, choose another channel"
@@ -174,10 +186,10 @@ def _pictures(rehearsal: Rehearsal) -> Row:
     if not rehearsal.problems:
         if BLENDED in rehearsal.remarks:
             return warned("pictures", BLENDED, "switch the converter's deinterlacing off")
-        return passed("pictures", f"{rehearsal.pictures} good ones")
-    # One that repeats itself for long is frozen.
-    told = Counter({t: n for t, n in rehearsal.problems.items() if t != MEANING["repeated"]})
-    text, count = (told or rehearsal.problems).most_common(1)[0]
+        again = rehearsal.repeats
+        told = f"; {again} repetitions by the receiver are not counted" if again else ""
+        return passed("pictures", f"{rehearsal.pictures} good ones{told}")
+    text, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
     found = f"{count} of {rehearsal.pictures}: {text}"
     advice = _ADVICE.get(text, _SEE)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from perchctl.calibration.files import camera_of
+from perchctl.camera.credentials import without_password
 from perchctl.check.limits import DOUBTFUL
 from perchctl.check.row import Row, Verdict
 from perchctl.errors import PerchError
@@ -63,7 +64,8 @@ def _calibration(profile: Profile, source: str) -> Row:
         return Row(
             name,
             Verdict.WARN,
-            f"{path.name} is the shipped example, and {source} a camera of your own",
+            f"{path.name} is the shipped example, and {without_password(source)} a camera of your "
+            f"own",
             "calibrate it (perchctl calibrate), and name the file in camera.calibration",
         )
     return Row(name, Verdict.PASS, path.name)

@@ -75,6 +75,7 @@ class Rehearsal:
 
     Attributes:
         arrivals: index and time of arrival of each picture that was taken up.
+        repeats: how often one was given out again; these count for nothing else.
         work_s: of the turns that looked at a picture; late_s: of all turns.
         ages_s: from a picture's exposure, by `camera.latency_s`, to its result.
         problems: why pictures were no good, or were remarkable, with their number.
@@ -93,6 +94,7 @@ class Rehearsal:
     remarks: list[str] = field(default_factory=list)
     looked: list[Looked] = field(default_factory=list)
     pictures: int = 0
+    repeats: int = 0
     found: int = 0
     mirrored: int = 0
     silent_s: float = 0.0
@@ -157,6 +159,9 @@ def rehearse(
 def _note(
     done: Rehearsal, frame: Frame, senses: Senses, prints: PrintCheck, work_s: float, now_s: float
 ) -> None:
+    if senses.repeated:
+        done.repeats += 1
+        return
     done.pictures += 1
     done.arrivals.append((frame.index, frame.t_arrival_s))
     if senses.camera_problem is not None:

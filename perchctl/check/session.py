@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 from perchctl.calibration.files import camera_of
+from perchctl.camera.credentials import without_password
 from perchctl.camera.device import device_listing
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
@@ -87,12 +88,14 @@ def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
             heard = probe
             yield passed("address", f"{options.uri} answers")
             yield from _vehicle(probe, options.uri, profile, room, wanted)
-        wanted.tell(f"opening the camera {options.source}")
+        shown, remarks = without_password(options.source), list[str]()
+        wanted.tell(f"opening the camera {shown}")
         try:
-            source = _source(spec, options, stack)
+            source = _source(spec, options, stack, remarks)
         except PerchError as error:
             yield from camera.refused(error, device_listing())
         else:
+            yield camera.opened_row(shown, device_listing(), remarks)
             rehearsal = yield from _camera(heard, source, pipeline, options, wanted)
     yield computer.loop_row(rehearsal, profile)
     yield computer.log_folder_row(options.log_dir)
@@ -208,11 +211,14 @@ def _with_a_hand(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted)
             raise
 
 
-def _source(spec: str, options: FlyOptions, stack: contextlib.ExitStack) -> FrameSource:
+def _source(
+    spec: str, options: FlyOptions, stack: contextlib.ExitStack, remarks: list[str]
+) -> FrameSource:
     config = options.profile.camera
     size_px = camera_of(config).size_px
     source = open_source(
-        spec, config.start_latency_s, size_px, time.monotonic, config.start_timeout_s
+        spec, config.start_latency_s, size_px, time.monotonic, config.start_timeout_s,
+        config=config, tell=remarks.append,
     )  # fmt: skip
     stack.callback(source.close)
     return UnmirroredSource(source) if config.mirrored else source
@@ -222,7 +228,6 @@ def _camera(
     heard: Listened, source: FrameSource, pipeline: Pipeline, options: FlyOptions, wanted: Wanted
 ) -> Generator[Row, None, Rehearsal | None]:
     """Yields the rows; returns the rehearsal, None where there could be none."""
-    yield camera.opened_row(options.source, device_listing())
     size = camera.size_row(source.size_px, pipeline.camera.size_px)
     if size.verdict != "pass":
         yield from camera.unseen("pictures of another size cannot be looked at", size)

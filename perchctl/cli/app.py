@@ -20,8 +20,8 @@ from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
     InvalidValue,
+    Note,
     PerchError,
-    ProfileNote,
     UsageError,
 )
 from perchctl.startup import failure_record, loaded
@@ -77,7 +77,8 @@ SourceOption = Annotated[
     str | None,
     typer.Option(
         "--source",
-        help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:.",
+        help="Camera: camera:N or camera:NAME, rtsp://..., http://..., video:FILE, images:DIR, "
+        "sim:.",
         autocompletion=complete_source,
     ),
 ]
@@ -148,7 +149,7 @@ def reported(as_json: bool = False) -> Iterator[None]:
     """Turns every failure into one sentence on stderr, an object on stdout where one is
     wanted, and its exit code, and each note on the profile into one sentence."""
     try:
-        with _profile_notes():
+        with _notes():
             yield
     except typer.Exit:
         raise
@@ -211,12 +212,12 @@ def _place_refused(error: Exception) -> str | None:
 
 
 @contextlib.contextmanager
-def _profile_notes() -> Iterator[None]:
-    """Prints each different `ProfileNote` once; other warnings go where they went before."""
+def _notes() -> Iterator[None]:
+    """Prints each different `Note` once; other warnings go where they went before."""
     printed: set[str] = set()
 
     with warnings.catch_warnings():
-        warnings.simplefilter("always", ProfileNote)
+        warnings.simplefilter("always", Note)
         show_others = warnings.showwarning
 
         def show(
@@ -227,7 +228,7 @@ def _profile_notes() -> Iterator[None]:
             file: TextIO | None = None,
             line: str | None = None,
         ) -> None:
-            if not issubclass(category, ProfileNote):
+            if not issubclass(category, Note):
                 show_others(message, category, filename, lineno, file, line)
             elif str(message) not in printed:
                 printed.add(str(message))

@@ -24,8 +24,8 @@ def calibrate(
     source: Annotated[
         list[str] | None,
         typer.Argument(
-            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path; or many "
-            "picture files.",
+            help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
+            "http://..., or a path; or many picture files.",
             autocompletion=complete_source,
         ),
     ] = None,
@@ -55,6 +55,10 @@ def calibrate(
             "Default: calib/NAME_WIDTHxHEIGHT.yaml. With --mount the report, .png; the recording "
             "goes beside it.",
         ),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option("--size", help="Asked of camera:N, as in 720x576; else its driver's own."),
     ] = None,
     name: Annotated[str, typer.Option("--name", help="The camera's name.")] = "camera",
     model: Annotated[
@@ -168,6 +172,7 @@ def calibrate(
             measured_width=measured_width,
             measured_height=measured_height,
             output=output,
+            size=size,
             name=name,
             model=model,
             force=force,

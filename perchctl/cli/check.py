@@ -10,6 +10,7 @@ import typer
 from perchctl.cli.app import ProfileOption, SourceOption, UriOption, perform, reported
 
 
+# long: a list of options
 def check(
     profile: ProfileOption = "sim",
     uri: UriOption = None,
@@ -23,6 +24,13 @@ def check(
     scan: Annotated[
         bool,
         typer.Option("--scan", help="Only show which vehicles answer, on any channel and rate."),
+    ] = False,
+    cameras: Annotated[
+        bool,
+        typer.Option(
+            "--cameras",
+            help="Only list this computer's cameras: number, name, path, modes, controls.",
+        ),
     ] = False,
     lift: Annotated[
         bool,
@@ -59,6 +67,7 @@ def check(
             seed=seed,
             log_dir=log_dir,
             scan=scan,
+            cameras=cameras,
             lift=lift,
             prop_test=prop_test,
             yes=yes,

@@ -27,7 +27,7 @@ from perchctl.commands.calibrate_board import board_of
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mask import write_mask
 from perchctl.commands.calibrate_mount_request import MountRequest
-from perchctl.commands.calibrate_source import Source, source_of
+from perchctl.commands.calibrate_source import Source, sized, source_of
 from perchctl.commands.interrupt import drawn
 from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
@@ -51,6 +51,7 @@ class CalibrateRequest:
     measured_width: str | None = None
     measured_height: str | None = None
     output: Path | None = None
+    size: str | None = None
     name: str = "camera"
     model: str = AUTO
     force: bool = False
@@ -97,6 +98,8 @@ def run(request: CalibrateRequest) -> int:
     if request.convert is not None:
         if request.sources or not (request.check is request.mask is None):
             raise UsageError("--convert takes a file and no source, --check or --mask")
+        if request.size is not None:
+            raise UsageError("--size is asked of a camera, and --convert looks through none")
         _refuse_beside("--convert takes over the file's lens model", request, "--model", "--view")
         return _convert(request, request.convert)
     if request.cam is not None and request.check is None:
@@ -105,7 +108,7 @@ def run(request: CalibrateRequest) -> int:
         raise UsageError(
             "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N or http://..."
         )
-    source = source_of(request.sources)
+    source = sized(source_of(request.sources), request.size)
     if not is_live(source.spec):
         _refuse_beside(f"{source} is no live camera", request, "--view")
     if request.check is not None:

@@ -78,7 +78,8 @@ def recorded(setup: LiveSetup) -> tuple[Recording, ...]:
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
         config = setup.profile.camera
-        raw = open_source(setup.source, 0.0, setup.camera.size_px, now, config.start_timeout_s)
+        size_px, timeout_s = setup.camera.size_px, config.start_timeout_s
+        raw = open_source(setup.source, 0.0, size_px, now, timeout_s, config=config)
         stack.callback(raw.close)
         check_size(raw.size_px, setup.camera, raw.describe())
         source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from perchctl.calibration.types import Grey
+from perchctl.camera.credentials import without_password
 from perchctl.camera.files import (
     IMAGE_SUFFIXES,
     BrokenPicture,
@@ -19,7 +21,7 @@ from perchctl.camera.files import (
 )
 from perchctl.camera.open import open_source, source_spec
 from perchctl.camera.source import FrameSource
-from perchctl.errors import NotFound, UsageError
+from perchctl.errors import InvalidValue, NotFound, UsageError
 
 _SAMPLES = 4
 _SAMPLE_EVERY = 30  # frames of a video
@@ -31,10 +33,13 @@ class Source:
 
     spec: str
     files: tuple[Path, ...] = ()
+    size_px: tuple[int, int] | None = None  # asked of a camera of this computer
 
     def __str__(self) -> str:
         """How messages name it."""
-        return f"{self.files[0]} and {len(self.files) - 1} more" if self.files else self.spec
+        if self.files:
+            return f"{self.files[0]} and {len(self.files) - 1} more"
+        return without_password(self.spec)
 
     @property
     def scheme(self) -> str:
@@ -54,7 +59,7 @@ class Source:
         """Its frames, of a live source too. Errors: those of `open_source`."""
         if self.files:
             return ImagesSource(self.files)
-        return open_source(self.spec, 0.0, None, time.monotonic)
+        return open_source(self.spec, 0.0, self.size_px, time.monotonic)
 
     def samples(self) -> list[Grey]:
         """A few pictures from over the whole recording."""
@@ -73,6 +78,18 @@ class Source:
                 frames.append(frame.image)
         source.close()
         return frames
+
+
+def sized(source: Source, text: str | None) -> Source:
+    """With `--size`. Errors: InvalidValue, UsageError."""
+    if text is None:
+        return source
+    found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
+    if found is None:
+        raise InvalidValue(f"--size: found {text!r}; needed is WIDTHxHEIGHT, as in 720x576")
+    if source.scheme != "camera":
+        raise UsageError(f"--size is asked of camera:N, and {source} has its own: leave it out")
+    return replace(source, size_px=(int(found[1]), int(found[2])))
 
 
 def source_of(words: Sequence[str]) -> Source:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from perchctl.check.row import Row, Verdict
 from perchctl.check.session import Wanted, check, found_by_scan
+from perchctl.commands.check_cameras import list_cameras
 from perchctl.commands.fly import FlyRequest, resolve
 from perchctl.commands.interrupt import interruptible, unheeded
 from perchctl.commands.output import say
@@ -40,6 +41,7 @@ class CheckRequest:
     seed: int | None = None
     log_dir: Path | None = None
     scan: bool = False
+    cameras: bool = False
     lift: bool = False
     prop_test: bool = False
     yes: bool = False
@@ -53,6 +55,8 @@ def run(request: CheckRequest, wanted: Wanted | None = None) -> int:
     profile's files.
     """
     _refuse_ignored(request)
+    if request.cameras:
+        return list_cameras(request.as_json)
     if request.prop_test and not request.yes and not sys.stdin.isatty():
         raise UsageError("--prop-test turns the motors, and there is nobody to ask: add --yes")
     rows: list[Row] = []
@@ -85,6 +89,9 @@ def _refuse_ignored(request: CheckRequest) -> None:
     others = (request.source, request.seed, request.log_dir, request.lift, request.prop_test)
     if request.scan and any(other not in (None, False) for other in others):
         raise UsageError("--scan only shows which vehicles answer: give it -u and --json at most")
+    beside = (*others, request.scan, request.uri)
+    if request.cameras and any(other not in (None, False) for other in beside):
+        raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
 
 
 def _rows(request: CheckRequest, wanted: Wanted) -> Iterator[Row]:

@@ -7,12 +7,13 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from perchctl.camera.computer import camera_numbers
 from perchctl.camera.files import IMAGE_SUFFIXES
 from perchctl.commands.positioning import POSITIONINGS
 from perchctl.profile.places import listing
 
 _DEVICES = Path("/dev")
-_SCHEMES = ("video:", "images:", "http://", "sim:")
+_SCHEMES = ("video:", "images:", "http://", "rtsp://", "sim:")
 _YAML = (".yaml", ".yml")
 _PICTURES = (*IMAGE_SUFFIXES, ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 
@@ -31,12 +32,7 @@ def sources(begun: str) -> list[str]:
     kind, colon, place = begun.partition(":")
     if colon and f"{kind}:" in _SCHEMES:
         return [f"{kind}:{path}" for path in _files(place, _PICTURES)]
-    numbers = sorted(
-        int(path.name.removeprefix("video"))
-        for path in _DEVICES.glob("video*")
-        if path.name.removeprefix("video").isdigit()
-    )
-    offered = (*(f"camera:{number}" for number in numbers), *_SCHEMES)
+    offered = (*(f"camera:{number}" for number in camera_numbers(_DEVICES)), *_SCHEMES)
     return [*_that_begin(begun, offered), *_files(begun, _PICTURES)]
 
 

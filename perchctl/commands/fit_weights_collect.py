@@ -112,8 +112,9 @@ def _collect_with_person(
         truth = _truth(request, profile, now)
         stack.callback(truth.close)
         source: FrameSource = open_source(
-            spec, config.start_latency_s, camera.size_px, now, config.start_timeout_s
-        )
+            spec, config.start_latency_s, camera.size_px, now, config.start_timeout_s,
+            config=config,
+        )  # fmt: skip
         stack.callback(source.close)
         if config.mirrored:
             source = UnmirroredSource(source)

@@ -6,6 +6,7 @@ import dataclasses
 import textwrap
 from typing import Any
 
+from perchctl.camera.credentials import profile_record, without_password
 from perchctl.check.profile import rows
 from perchctl.check.row import Verdict
 from perchctl.flight.session import FlyOptions
@@ -23,13 +24,13 @@ def plan(options: FlyOptions) -> dict[str, Any]:
     mask = options.profile.camera.mask
     return {
         "uri": options.uri,
-        "source": options.source,
+        "source": without_password(options.source),
         "seed": options.seed if options.simulated else None,
         "profile_file": str(options.profile_path),
         "calibration_file": str(calibration),
         "mask_file": None if mask is None else str(find_mask(mask)),
         "log_directory": str(options.log_dir),
-        "profile": options.profile.model_dump(mode="json"),
+        "profile": profile_record(options.profile),
         "check": [
             dataclasses.asdict(row)
             for row in rows(options.profile, uri=options.uri, source=options.source)

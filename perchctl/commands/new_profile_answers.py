@@ -48,12 +48,12 @@ def _simulated(answers: Texts) -> bool:
 
 
 def _source(text: str, answers: Texts) -> str:
-    if scheme_of(text) not in SCHEMES or re.fullmatch(r"camera:(?!\d+$).*", text):
+    if scheme_of(text) not in SCHEMES or re.fullmatch(r"camera:\W*(-\d*)?", text):
         raise InvalidValue(f"{text!r} is no camera; allowed are {ALLOWED}")
     if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
         raise InvalidValue(
             f"{text} is no camera that flies with {answers['uri']}; allowed are camera:N, "
-            f"http://HOST:PORT/PATH"
+            f"camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH"
         )
     return text
 

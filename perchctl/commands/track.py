@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TextIO
 
 from perchctl.calibration.files import assumed_size, load_calibration, load_sized
+from perchctl.camera.credentials import without_password
 from perchctl.camera.files import DEFAULT_RATE_HZ, ImagesSource, Recording
 from perchctl.camera.mirror import UnmirroredSource
-from perchctl.camera.mjpeg import without_password
 from perchctl.camera.open import of_pictures, open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.commands.interrupt import Stopper
@@ -205,7 +205,9 @@ def _open(
     config = options.profile.camera
     pictures_hz = STILLS_HZ if options.stills else DEFAULT_RATE_HZ
     latency_s = config.start_latency_s
-    raw = open_source(options.source, latency_s, size_px, now, pictures_hz=pictures_hz)
+    raw = open_source(
+        options.source, latency_s, size_px, now, pictures_hz=pictures_hz, config=config
+    )
     source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
     paths = raw.paths if isinstance(raw, ImagesSource) else None
     if isinstance(raw, Recording):

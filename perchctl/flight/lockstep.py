@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from perchctl.calibration.files import camera_of
+from perchctl.camera.slot import NewestSlot
 from perchctl.flight.lockstep_positions import feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link.mock import MockLink
@@ -51,16 +52,17 @@ class LockstepSource:
     def __init__(self, camera: SimCamera, latency_s: float) -> None:
         self._camera = camera
         self._latency_s = latency_s
+        self._slot = NewestSlot()
         self._count = 0
 
     def poll(self, now_s: float) -> Frame | None:
-        delivered = self._camera.take()
-        if not delivered:
+        for each in self._camera.take():
+            self._slot.put(each.image, each.t_arrival_s - self._latency_s, each.t_arrival_s)
+        frame = self._slot.take()
+        if frame is None:
             return None
-        last = delivered[-1]
-        self._count += 1
-        arrival_s = last.t_arrival_s
-        return Frame(self._count - 1, arrival_s - self._latency_s, last.image, arrival_s)
+        self._count += not frame.repeated
+        return replace(frame, index=self._count - 1)
 
     def problem(self, now_s: float) -> str | None:
         return None

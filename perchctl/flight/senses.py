@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from perchctl.camera.health import HealthState, assess
+from perchctl.camera.health import MEANING, HealthState, assess
 from perchctl.camera.mirror import MIRRORED
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import History, attitude_at, attitude_of, extended
@@ -26,7 +26,8 @@ REMARK_PICTURES = 3
 class Senses:
     """The loop's working memory of what it sees.
 
-    `output` is what this turn's frame gave, None where there was none to look at.
+    `output` is what this turn's frame gave, None where there was none to look at; `repeated`: it
+    was the one before once more.
     """
 
     link: Link
@@ -37,6 +38,7 @@ class Senses:
     state: PipelineState = field(default_factory=PipelineState)
     output: PipelineOutput | None = None
     blind: bool = False
+    repeated: bool = False
     last_good_frame_s: float = -math.inf
     camera_problem: str | None = None
     frames: int = 0
@@ -53,7 +55,7 @@ class Senses:
         """Telemetry and at most one frame. Without `look` the frame only counts as a sign
         of the camera's life."""
         self.history = extended(self.history, self.link.telemetry(), self.profile.safety)
-        self.output, self.blind = None, not look
+        self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
         used_s = self.noticed.used_s
         if frame is not None and used_s:
@@ -68,8 +70,10 @@ class Senses:
         if self.frames == 0:
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         rejection = problem or self._rejection(frame, now_s)
+        self.repeated = rejection == MEANING["repeated"]
         if rejection is not None:
-            self.camera_problem = rejection
+            if not self.repeated:  # which says nothing new, of the camera's troubles neither
+                self.camera_problem = rejection
             return
         self.last_good_frame_s = now_s
         self.frames += 1

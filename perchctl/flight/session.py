@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from perchctl.calibration.files import camera_of
+from perchctl.camera.credentials import without_password
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
 from perchctl.camera.source import FrameSource
@@ -68,7 +69,8 @@ def check_options(options: FlyOptions) -> None:
     check_uri(options.uri)
     check_positioning(options.profile, simulated=options.simulated)
     if scheme_of(options.source) not in SCHEMES:
-        raise InvalidValue(f"camera source {options.source!r} is unknown; allowed are {ALLOWED}")
+        shown = without_password(options.source)
+        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
             f"source {options.source} belongs to the simulated vehicle, but the URI is "
@@ -106,8 +108,9 @@ def fly_session(
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         config = profile.camera
         source = open_source(
-            spec, config.start_latency_s, camera.size_px, clock.now, config.start_timeout_s
-        )
+            spec, config.start_latency_s, camera.size_px, clock.now, config.start_timeout_s,
+            config=config,
+        )  # fmt: skip
         stack.callback(source.close)
         if config.mirrored:
             source = UnmirroredSource(source)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import perchctl
+from perchctl.camera.credentials import profile_record, without_password
 from perchctl.errors import InvalidValue
 from perchctl.log.behind import Behind
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
@@ -53,11 +54,11 @@ def make_header(
         "version": SCHEMA_VERSION,
         "perchctl": perchctl.__version__,
         "uri": uri,
-        "source": source,
+        "source": without_password(source),
         "seed": seed,
         "lockstep": lockstep,
         "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
-        "profile": profile.model_dump(mode="json"),
+        "profile": profile_record(profile),
         "fields": FIELDS,
         "event_fields": EVENT_FIELDS,
     }

@@ -75,6 +75,19 @@ class SimulationConfig(Section):
     camera_analogue: float = Field(
         0.0, ge=0, le=1, description="trembling, torn and lost lines; 1 is about to be lost"
     )
+    camera_receiver_hz: float | None = Field(
+        None,
+        gt=0,
+        le=200,
+        description="the receiver's own rate, at which it gives out its newest picture again; "
+        "none: each once, as it comes",
+    )
+    camera_receiver_noise: float = Field(
+        0.0, ge=0, le=50, description="that the receiver adds each time; of 255, one sigma"
+    )
+    camera_blank_rate: float = Field(
+        0.0, ge=0, lt=1, description="share of pictures in whose place the screen is blue"
+    )
     mount_error_deg: float = Field(
         1.0, ge=0, le=20, description="what the profile's mount is wrong by, at most"
     )

@@ -67,7 +67,9 @@ picture is so late that the target is not to be steered by."""
 
 class CameraConfig(Section):
     source: str = Field(
-        "sim:", description="`camera:N`, `http://...`, `video:FILE`, `images:DIR`, `sim:`"
+        "sim:",
+        description="`camera:N` or its name, `rtsp://...`, `http://...`, `video:FILE`, "
+        "`images:DIR`, `sim:`",
     )
     calibration: str = Field(
         "example_640x480.yaml", description="file beside the profile, in `calib/`, or a whole path"
@@ -91,6 +93,19 @@ class CameraConfig(Section):
         ge=0,
         le=0.05,
         description="rolling shutter: from the first row to the last; none: not known",
+    )
+
+    format: str | None = Field(
+        None,
+        pattern=r"^[A-Z0-9]{3,4}$",
+        description="asked of `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
+    )
+    rate_hz: float | None = Field(
+        None, gt=0, le=500, description="asked of `camera:` sources; none: the driver's own"
+    )
+    controls: dict[str, int | str] = Field(
+        default_factory=dict,
+        description="of `camera:` sources, as V4L2 names them, set before the first picture",
     )
 
     @field_validator("latency_s", mode="before")

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from perchctl.geometry import Array, make_T
+from perchctl.sim.receiver import DeliveredFrame, Receiver, blanked
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.shutter import Shutter
 from perchctl.sim.surfaces import Picture
+
+__all__ = ["DeliveredFrame", "SimCamera"]
 
 SCHEDULE_STREAM = 411
 
@@ -29,17 +31,6 @@ class BodyState(Protocol):
     def R_world_body(self) -> Array: ...
 
 
-@dataclass(frozen=True, eq=False)
-class DeliveredFrame:
-    """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
-    two fields of an interlaced one."""
-
-    t_arrival_s: float
-    t_exposure_s: float
-    image: Picture
-    index: int  # of the exposure: gaps are lost frames
-
-
 class SimCamera:
     """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes.
 
@@ -52,6 +43,8 @@ class SimCamera:
     - late: `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`, cut at
       2.5 sigma), never before the exposure's end, never overtaking;
     - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
+    - blank: with `camera_blank_rate` a blue screen in the place of the picture;
+    - given out again: at the receiver's own rate, where it has one (`perchctl.sim.receiver`);
     - gone: nothing arrives at or after `camera_gone_at_s`.
     """
 
@@ -69,6 +62,7 @@ class SimCamera:
         self._last_image: Picture | None = None
         self._t_s = -np.inf
         self._under_way: deque[DeliveredFrame] = deque()
+        self._receiver = Receiver(scenario)
 
     @property
     def exposed_s(self) -> float:
@@ -94,7 +88,7 @@ class SimCamera:
         out = []
         while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
             out.append(self._under_way.popleft())
-        return out
+        return self._receiver.given_out(out, self._t_s)
 
     def _expose(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> None:
         s = self.scenario
@@ -111,7 +105,8 @@ class SimCamera:
         frozen = s.camera_freeze_at_s is not None and middle_s >= s.camera_freeze_at_s
         if self._last_image is None or not frozen:
             self._last_image = self._picture(middle_s, pose_at)
-        self._under_way.append(DeliveredFrame(arrival_s, middle_s, self._last_image, self._index))
+        image = blanked(s, self._index, self._last_image)
+        self._under_way.append(DeliveredFrame(arrival_s, middle_s, image, self._index))
 
     def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Picture:
         def T_world_cam_at(t_s: float) -> Array:

@@ -112,6 +112,9 @@ def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
         "camera_readout_s": sim.camera_readout_s,
         "camera_flicker": sim.camera_flicker,
         "camera_pumping": sim.camera_pumping,
+        "camera_receiver_hz": sim.camera_receiver_hz,
+        "camera_receiver_noise": sim.camera_receiver_noise,
+        "camera_blank_rate": sim.camera_blank_rate,
     }
 
 

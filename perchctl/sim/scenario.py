@@ -30,6 +30,9 @@ class Scenario:
         camera_readout_s: from a picture's (or field's) first row to its last.
         camera_flicker, camera_pumping: share by which lamps (100 Hz) and an exposure control
             that hunts change the brightness.
+        camera_receiver_hz: of the receiver's output, where it gives out its newest picture
+            again and again, with `camera_receiver_noise` on it each time; None: it does not.
+        camera_blank_rate: share of pictures that are a blue screen.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its gusts (`perchctl.sim.wind`).
         magnet_force_n: pull the magnet can hold.
@@ -73,6 +76,9 @@ class Scenario:
     camera_readout_s: float = 0.0
     camera_flicker: float = 0.0
     camera_pumping: float = 0.0
+    camera_receiver_hz: float | None = None
+    camera_receiver_noise: float = 0.0
+    camera_blank_rate: float = 0.0
     estimate_noise_m: float = 0.002
     estimate_tilt_bias_rad: tuple[float, float] = (0.0, 0.0)
     drift_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)

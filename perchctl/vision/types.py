@@ -50,7 +50,8 @@ class Frame:
 
     `image` is grey, uint8, shape (height, width). `fields` says whether it is a picture of one
     moment: ``whole``; ``woven`` of two fields; the ``top`` or ``bottom`` field of such a one
-    at full height; None while nobody has looked (`perchctl.vision.fields`).
+    at full height; None while nobody has looked (`perchctl.vision.fields`). `repeated`: the
+    source has given out the picture before once more, which is no measurement.
     """
 
     index: int
@@ -58,6 +59,7 @@ class Frame:
     image: NDArray[np.uint8]
     t_arrival_s: float = 0.0
     fields: PictureKind | None = None
+    repeated: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,7 +122,7 @@ class Experiment:
         while got < count:
             now_s = self._now()
             frame = self._source.poll(now_s)
-            if frame is not None:
+            if frame is not None and not frame.repeated:
                 if got == 0:
                     check_size(
                         (frame.image.shape[1], frame.image.shape[0]),

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from perchctl.camera.credentials import without_password
 from perchctl.camera.files import (
     BrokenPicture,
     ImagesSource,
@@ -15,10 +18,12 @@ from perchctl.camera.files import (
     VideoSource,
     read_grey,
 )
-from perchctl.camera.mjpeg import without_password
 from perchctl.camera.open import is_live, open_source, source_spec
 from perchctl.camera.source import FrameSource, check_size, to_grey
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.commands.calibrate_source import Source, sized
+from perchctl.errors import InvalidValue, NotFound, UsageError
+from perchctl.log.write import make_header
+from perchctl.profile import Profile
 from perchctl.vision.types import CameraModel, Frame
 
 
@@ -120,6 +125,7 @@ def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
 def test_a_password_is_not_shown() -> None:
     assert without_password("http://me:secret@host:81/a@b") == "http://host:81/a@b"
     assert without_password("http://host/") == "http://host/"
+    assert without_password("rtsp://me:sec/ret@host/a") == "rtsp://host/a"
     assert without_password("video:mail@home.mp4") == "video:mail@home.mp4"
 
 
@@ -131,13 +137,13 @@ def test_videos_that_are_none(tmp_path: Path) -> None:
         VideoSource(tmp_path / "flight.avi")
 
 
-@pytest.mark.parametrize("spec", ["webcam", "ftp://x", "video:", "images:", "http://", ""])
+@pytest.mark.parametrize("spec", ["webcam", "ftp://x", "video:", "images:", "http://", "gst:", ""])
 def test_unknown_schemes_say_what_is_allowed(spec: str) -> None:
-    with pytest.raises(InvalidValue, match=r"allowed are camera:N, video:FILE, images:DIR"):
+    with pytest.raises(InvalidValue, match=r"allowed are camera:N, .*video:FILE, images:DIR"):
         open_source(spec, 0.0, None, clock)
 
 
-@pytest.mark.parametrize("spec", ["camera:", "camera:x", "camera:-1"])
+@pytest.mark.parametrize("spec", ["camera:", 'camera:""', "camera:-1"])
 def test_a_camera_needs_a_number(spec: str) -> None:
     with pytest.raises(InvalidValue, match="camera:0"):
         open_source(spec, 0.0, None, clock)
@@ -196,3 +202,53 @@ def test_what_is_no_picture_is_named(tmp_path: Path, data: bytes | None) -> None
         path.write_bytes(data)
     with pytest.raises(BrokenPicture, match=r"a\.jpg (cannot be read|is cut off)"):
         read_grey(path)
+
+
+@pytest.mark.parametrize("url", ["rtsp://me:sec/ret@host/a", "http://:80/a", "rtsp:host/a"])
+def test_a_url_without_a_host_is_refused_and_its_password_not_shown(url: str) -> None:
+    with pytest.raises(InvalidValue, match=r"lacks a host .*(rtsp|http)://192") as e:
+        open_source(url, 0.0, None, clock)
+    assert "sec" not in str(e.value)
+
+
+def test_gst_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("perchctl.camera.gst.has_gstreamer", lambda: False)
+    with pytest.raises(InvalidValue, match=r"^gst: needs an OpenCV .* GStreamer.*rtsp://"):
+        open_source("gst:videotestsrc ! appsink", 0.0, None, clock)
+    monkeypatch.setattr("perchctl.camera.gst.has_gstreamer", lambda: True)
+    with pytest.raises(NotFound, match="does not run; try it with gst-launch"):
+        open_source("gst:nonsense", 0.0, None, clock)
+
+
+def test_gst_reads_where_opencv_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Capture:
+        def read(self) -> tuple[bool, Any]:
+            return True, np.random.default_rng().integers(0, 255, (48, 64), np.uint8)
+
+        def release(self) -> None:
+            return None
+
+    monkeypatch.setattr("perchctl.camera.open.open_pipeline", lambda text: Capture())
+    source = open_source("gst:videotestsrc ! appsink", 0.0, None, clock)
+    assert source.size_px == (64, 48)
+    assert source.describe().startswith("gst:videotestsrc")
+    source.close()
+
+
+def test_the_size_of_a_calibration_is_asked_of_a_camera_of_this_computer_only() -> None:
+    assert sized(Source("camera:0"), "720x576").size_px == (720, 576)
+    assert sized(Source("http://host/a"), None).size_px is None
+    for text in ("720", "720x", "0x0", "720 x 576"):
+        with pytest.raises(InvalidValue, match="WIDTHxHEIGHT, as in 720x576"):
+            sized(Source("camera:0"), text)
+    with pytest.raises(UsageError, match="http://host/a has its own: leave it out"):
+        sized(Source("http://me:secret@host/a"), "720x576")
+
+
+def test_a_log_and_a_plan_hold_no_password() -> None:
+    url = "rtsp://me:hushhush@host/a"
+    profile = Profile.model_validate({"camera": {"source": url}})
+    header = make_header(profile, uri="radio://0", source=url)
+    assert "hushhush" not in json.dumps(header)
+    assert header["profile"]["camera"]["source"] == header["source"] == "rtsp://host/a"
+    assert profile.camera.source == url, "it is needed to open it"

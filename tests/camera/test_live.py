@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import ssl
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -15,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.camera.device import LOST_AFTER_FAILURES, DeviceSource, open_capture
+from perchctl.camera.device import LOST_AFTER_FAILURES, Asked, DeviceSource, open_capture
 from perchctl.camera.mjpeg import (
     MAX_FAILED_CONNECTIONS,
     MAX_PICTURE_BYTES,
@@ -130,6 +131,8 @@ class Server:
         self.redirect_first = ""
         self.paths: list[str] = []
         self.authorization: list[str | None] = []
+        self.challenges: list[str] = []
+        self.nonce = "n1"
         outer = self
 
         class Handler(BaseHTTPRequestHandler):
@@ -139,7 +142,16 @@ class Server:
 
             def do_GET(self) -> None:
                 outer.paths.append(self.path)
-                outer.authorization.append(self.headers["Authorization"])
+                given = self.headers["Authorization"]
+                outer.authorization.append(given)
+                if outer.challenges and not (
+                    given and (given.startswith("Basic") or f'nonce="{outer.nonce}"' in given)
+                ):
+                    self.send_response(401)
+                    for challenge in outer.challenges:
+                        self.send_header("WWW-Authenticate", challenge)
+                    self.end_headers()
+                    return
                 try:
                     script = outer.scripts.get_nowait()
                 except queue.Empty:
@@ -171,6 +183,11 @@ class Server:
             target=self._server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True
         )
         self._thread.start()
+
+    def encrypt(self, pem: Path) -> None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(pem)
+        self._server.socket = context.wrap_socket(self._server.socket, server_side=True)
 
     def close(self) -> None:
         self._server.shutdown()
@@ -331,6 +348,22 @@ def test_closing_does_not_wait_for_a_stalled_stream(server: Server) -> None:
     assert not source._thread.is_alive()
 
 
+def test_a_certificate_that_nobody_vouches_for(
+    server: Server, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pem = Path(__file__).parents[1] / "helpers" / "loopback.pem"  # for 127.0.0.1 and 100 years
+    server.encrypt(pem)
+    url = server.url.replace("http://", "https://me:secret@")
+    with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
+        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    assert "secret" not in str(caught.value)
+    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = MjpegSource(url, 0.0, Clock())
+    opened.append(source)
+    assert level(next_frame(source)) == 60
+
+
 def test_it_follows_a_redirect(server: Server, opened: list[LiveSource]) -> None:
     server.redirect_first = "/elsewhere.mjpg?x=1"
     server.scripts.put([])
@@ -342,11 +375,80 @@ def test_it_follows_a_redirect(server: Server, opened: list[LiveSource]) -> None
 def test_user_and_password_of_the_url_are_sent(server: Server, opened: list[LiveSource]) -> None:
     server.scripts.put([part(jpeg(60)), threading.Event()])
     url = server.url.replace("http://", "http://me:p%40ss@")
+    server.challenges = ['Basic realm="camera"']
     source = MjpegSource(url, 0.0, Clock())
     opened.append(source)
     next_frame(source)
-    assert server.authorization == ["Basic bWU6cEBzcw=="]
+    assert server.authorization == [None, "Basic bWU6cEBzcw=="], "once it is asked for"
     assert "p%40ss" not in source.describe()
+
+
+DIGEST = ['Basic realm="camera"', 'Digest realm="camera", nonce="n1", qop="auth,auth-int"']
+
+
+def test_digest_is_preferred_and_kept_for_the_next_connection(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    server.challenges = DIGEST
+    server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(100)), threading.Event()])
+    url = server.url.replace("http://", "http://me:secret@")
+    source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
+    opened.append(source)
+    wait_for(lambda: len(server.authorization) == 3)
+    assert server.authorization[0] is None
+    kept = [str(each) for each in server.authorization[1:]]
+    assert all(each.startswith('Digest username="me", realm="camera"') for each in kept)
+    assert [each[-len("nc=00000001") :] for each in kept] == ["nc=00000001", "nc=00000002"]
+    assert all("secret" not in each for each in kept)
+
+
+def test_a_nonce_that_is_too_old_is_changed(server: Server, opened: list[LiveSource]) -> None:
+    server.challenges = DIGEST
+    server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(100)), threading.Event()])
+    source = MjpegSource(
+        server.url.replace("http://", "http://me:secret@"), 0.0, Clock(), reconnect_wait_s=0.05
+    )
+    opened.append(source)
+    wait_for(lambda: len(server.authorization) == 2)
+    server.challenges = ['Digest realm="camera", nonce="n2", stale=true, qop="auth"']
+    server.nonce = "n2"
+    wait_for(lambda: source._count == 2)
+    assert 'nonce="n2"' in str(server.authorization[-1])
+
+
+@pytest.mark.parametrize(("challenges", "who", "sentence"), [
+    (DIGEST, "", "it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"),
+    (DIGEST, "me:wrong@", "check the name and the password in the URL"),
+    (["Negotiate"], "me:secret@", "asks for no basic or digest authentication"),
+])  # fmt: skip
+def test_who_may_not_see_it_is_told_at_once(
+    server: Server, challenges: list[str], who: str, sentence: str
+) -> None:
+    server.challenges, server.nonce = challenges, "none of mine"
+    url = server.url.replace("http://", f"http://{who}")
+    with pytest.raises(NotFound, match=f"401.*{sentence}") as caught:
+        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    assert "wrong" not in str(caught.value)
+    assert len(server.authorization) <= 3
+
+
+def test_name_and_password_do_not_go_to_another_host(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    other = Server()
+    try:
+        other.challenges = ['Basic realm="camera"']
+        server.redirect_first = other.url
+        url = server.url.replace("http://", "http://me:secret@")
+        source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
+        opened.append(source)
+        wait_for(lambda: source.problem(100.0) is not None)
+        assert other.authorization == [None]
+        assert "401" in str(source.problem(100.0))
+    finally:
+        other.close()
 
 
 def test_no_first_frame_in_time(server: Server) -> None:
@@ -396,7 +498,7 @@ def test_a_device_delivers_grey_frames_and_is_released(opened: list[LiveSource])
     capture = Capture()
     for value in (60, 160):
         capture.pictures.put(np.full((48, 64, 3), value, np.uint8))
-    source = DeviceSource(2, 0.05, (64, 48), Clock(), lambda n, size: capture)
+    source = DeviceSource(2, 0.05, Asked((64, 48)), Clock(), lambda n, asked: capture)
     opened.append(source)
     assert source.wait_first(WAIT_S)
     seen = [next_frame(source)]
@@ -413,7 +515,7 @@ def test_a_device_delivers_grey_frames_and_is_released(opened: list[LiveSource])
 def test_an_unplugged_device_is_a_problem(opened: list[LiveSource]) -> None:
     capture = Capture()
     capture.pictures.put(np.full((48, 64), 50, np.uint8))
-    source = DeviceSource(0, 0.0, None, Clock(), lambda n, size: capture, retry_s=0.0)
+    source = DeviceSource(0, 0.0, Asked(), Clock(), lambda n, asked: capture, retry_s=0.0)
     opened.append(source)
     assert source.wait_first(WAIT_S)
     capture.unplugged = True
@@ -425,4 +527,4 @@ def test_an_unplugged_device_is_a_problem(opened: list[LiveSource]) -> None:
 def test_a_missing_device_says_what_there_is() -> None:
     assert not Path("/dev/video97").exists()
     with pytest.raises(NotFound, match=r"camera:97 was not found; (there are|no /dev/video)"):
-        open_capture(97, None)
+        open_capture(97, Asked())

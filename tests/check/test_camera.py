@@ -193,7 +193,11 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
     ("picture age", "warn", {"ages_s": [0.3] * 20}),
     ("picture age", "fail", {"ages_s": [0.5] * 20}),
     ("picture age", "skipped", {"live": False}),
-    ("pictures", "warn", {"problems": Counter({MEANING["repeated"]: 2})}),
+    ("pictures", "warn", {"problems": Counter({MEANING["snow"]: 2})}),
+    ("pictures", "pass", {"repeats": 100}),
+    ("lost frames", "pass", {"arrivals": gaps(*[0.033, 0.05, 0.033, 0.05, 0.033] * 4),
+                             "repeats": 30}),
+    ("lost frames", "warn", {"arrivals": gaps(*[0.033, 0.05, 0.033, 0.14] * 5), "repeats": 30}),
     ("target", "warn", {"found": 3, "target": None}),
     ("target", "fail", {"target": target_at(1.0, (0.0, 0.0, 0.23), (0.0, 0.0, 0.0))}),
     ("loop", "warn", {"work_s": [0.028] * 20}),
@@ -206,6 +210,32 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
 def test_figures_make_their_row(name: str, verdict: str, changes: dict[str, Any]) -> None:
     done = altered(**changes)
     assert rows_of(done, Optical())[name].verdict == verdict
+
+
+def test_what_a_receiver_gives_out_again_is_counted_once() -> None:
+    done = rehearsed(duration_s=0.8, camera_rate_hz=25.0, camera_receiver_hz=60.0)
+    assert done.repeats >= 10
+    rows = rows_of(done)
+    assert rows["pictures"].verdict is Verdict.PASS
+    assert "repetitions by the receiver" in rows["pictures"].found
+    assert 23.0 < float(rows["frame rate"].found.split()[0]) < 27.5
+    assert rows["lost frames"].verdict in (Verdict.PASS, Verdict.SKIPPED)
+    assert done.found == done.pictures, "nor does it make the target seem unseen"
+
+
+def test_a_rate_below_the_wanted_one_warns() -> None:
+    slow = PROFILE.model_copy(
+        update={"camera": PROFILE.camera.model_copy(update={"rate_hz": 60.0})}
+    )
+    rows = {row.name: row for row in camera.rows(good()[0], Optical(), DESIGN, slow)}
+    assert rows["frame rate"].verdict is Verdict.WARN
+    assert "asked for 60" in rows["frame rate"].found
+
+
+def test_what_the_camera_does_not_do_as_asked_is_told() -> None:
+    row = camera.opened_row("camera:0", ["camera:0 (USB Video)"], ["it gives YUYV"])
+    assert (row.verdict, "YUYV" in row.found) == (Verdict.WARN, True)
+    assert camera.opened_row("camera:0", []).verdict is Verdict.PASS
 
 
 @pytest.mark.parametrize(("name", "verdict", "optical"), [

@@ -64,6 +64,8 @@ def test_json_is_a_list_of_rows(quick: None) -> None:
     (("--yes",), 2, "--yes answers --prop-test"),
     (("--scan", "--lift"), 2, "--scan only shows"),
     (("--scan", "--prop-test", "--yes"), 2, "--scan only shows"),
+    (("--cameras", "--scan"), 2, "--cameras only lists"),
+    (("--cameras", "--source", "camera:0"), 2, "--cameras only lists"),
 ])  # fmt: skip
 def test_bad_input_is_one_sentence(words: tuple[str, ...], code: int, complaint: str) -> None:
     said = invoke(*words)

@@ -1,0 +1,85 @@
+"""Pictures that a receiver gives out again because no new one has come; pure.
+
+A receiver of 25 pictures a second in a stream of 60 gives each out two or three times. A second
+time is no second measurement, and its time is the first one's.
+
+Most repeat byte for byte. One that was converted to analogue and back in between has the
+converter's own noise on it, and is told by that: the sensor's noise, which differs from picture
+to picture, is the same in both. What two pictures differ by, where they differ least, is then
+far below the noise that each has along its columns. A picture at rest on a rough ceiling can
+look so, too, and so can one of which a codec has left nothing but the outlines: it only counts
+in a stream that shows both kinds by turns, and no more than four times in a row. So nothing but
+equal bytes can starve a flight of its pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import groupby
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Grey = NDArray[np.uint8]
+
+MOST_AGAIN = 4
+"""15 pictures a second in a stream of 60 come three times again."""
+_WINDOW = 24
+_ALIKE, _UNLIKE = 0.6, 0.8
+_LEAST_OF_EACH = 4
+_CALM = 0.7  # of the pixels: what moved, and edges, are no noise
+_LEAST_NOISE = 1.0
+_STEP = 8
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatState:
+    """`last`: the newest picture that was new. `ratios`: how unlike the newest few were to the
+    one before, in units of their own noise; None where there was no noise to tell by."""
+
+    last: Grey | None = None
+    ratios: tuple[float | None, ...] = ()
+    again: int = 0
+
+
+def repeated(state: RepeatState, image: Grey) -> tuple[RepeatState, bool]:
+    """Whether the picture is the one before once more. Grey, (h, w)."""
+    last = state.last
+    if last is None or last.shape != image.shape:
+        return RepeatState(image), False
+    if np.array_equal(last[::_STEP], image[::_STEP]) and np.array_equal(last, image):
+        return state, True
+    ratios = (*state.ratios[1 - _WINDOW :], _unlike(last, image))
+    again = state.again + 1
+    if _alike(ratios[-1]) and again <= MOST_AGAIN and _by_turns(ratios):
+        return RepeatState(last, ratios, again), True
+    return RepeatState(image, ratios), False
+
+
+def _alike(ratio: float | None) -> bool:
+    return ratio is not None and ratio < _ALIKE
+
+
+def _by_turns(ratios: tuple[float | None, ...]) -> bool:
+    alike = [_alike(ratio) for ratio in ratios]
+    new = sum(ratio is not None and ratio > _UNLIKE for ratio in ratios)
+    longest = max((len(list(run)) for kind, run in groupby(alike) if kind), default=0)
+    return sum(alike) >= _LEAST_OF_EACH <= new and longest <= MOST_AGAIN
+
+
+def _unlike(last: Grey, image: Grey) -> float | None:
+    """The noise between the pictures over that between rows two apart (of one field)."""
+    rows = image[: len(image) - 2 : _STEP]
+    below = image[2::_STEP][: len(rows)]
+    own = _calm(rows, below)
+    return _calm(rows, last[: len(image) - 2 : _STEP]) / own if own >= _LEAST_NOISE else None
+
+
+def _calm(one: Grey, other: Grey) -> float:
+    """Mean difference where it is small, grey levels."""
+    counts = np.bincount(cv2.absdiff(one, other).ravel(), minlength=256)
+    most = max(1, int(_CALM * one.size))
+    kept = np.minimum(np.cumsum(counts), most)
+    kept = np.diff(kept, prepend=0)
+    return float((kept * np.arange(256)).sum() / most)

@@ -1,0 +1,167 @@
+"""Network cameras: ``rtsp://host/path``, decoded by a thread, newest frame wins.
+
+PyAV's open and read both end in time, and say why they failed; OpenCV's FFmpeg says neither.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+from perchctl.camera.credentials import without_password
+from perchctl.camera.source import Clock, LiveSource
+
+CONNECT_TIMEOUT_S = 5.0
+READ_TIMEOUT_S = 2.0
+RECONNECT_WAIT_S = 0.3
+MAX_FAILED_CONNECTIONS = 5
+"""Connections in a row that bring no picture before the source gives up."""
+MAX_DAMAGED = 100
+"""Packets in a row that cannot be decoded before it connects anew."""
+WINDOW_S = 10.0
+
+_OPTIONS = {
+    "rtsp_flags": "prefer_tcp",  # a lost packet costs every picture up to the next whole one
+    "fflags": "nobuffer",
+    "flags": "low_delay",
+    "max_delay": "0",
+    "reorder_queue_size": "0",
+    "analyzeduration": "200000",
+    "probesize": "200000",
+    "fpsprobesize": "0",
+    "allowed_media_types": "video",
+}
+
+
+class Waiting:
+    """How long a picture was under way beyond the fastest of the last ten seconds; pure.
+
+    The camera's own time of a picture tells it. What piles up behind a radio that stalls
+    comes in a heap, and would look as if it had just been taken. A camera whose clock is set
+    back meanwhile starts anew: nothing else makes its time go backwards.
+    """
+
+    def __init__(self) -> None:
+        self._camera_s = -math.inf
+        self._ways: deque[tuple[float, float]] = deque()  # arrival, and arrival less camera's time
+
+    def of(self, camera_s: float | None, arrival_s: float) -> float:
+        """s; 0 where the camera gives no time."""
+        if camera_s is None:
+            return 0.0
+        if camera_s < self._camera_s:
+            self._ways.clear()
+        self._camera_s = camera_s
+        way_s = arrival_s - camera_s
+        while self._ways and self._ways[-1][1] >= way_s:
+            self._ways.pop()  # a window's minimum: none of these will be it any more
+        self._ways.append((arrival_s, way_s))
+        while self._ways[0][0] < arrival_s - WINDOW_S:
+            self._ways.popleft()
+        return way_s - self._ways[0][1]
+
+
+class RtspSource(LiveSource):
+    """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
+
+    Reconnects when the stream ends, stalls or breaks; gives up after
+    `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when before the first
+    picture the camera answers that there is no such stream, or none for this name and
+    password.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        latency_s: float,
+        clock: Clock,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
+        read_timeout_s: float = READ_TIMEOUT_S,
+        reconnect_wait_s: float = RECONNECT_WAIT_S,
+    ) -> None:
+        super().__init__(without_password(url), latency_s, clock)
+        self._url = url
+        self._timeouts_s = (connect_timeout_s, read_timeout_s)
+        self._reconnect_wait_s = reconnect_wait_s
+        self.not_found = False
+        self.connections = 0
+        self._start(self._run)
+
+    def _run(self) -> None:
+        import av  # late: most flights have another camera
+        import av.error
+
+        failed = 0
+        while not self._stop.is_set():
+            before = self._count
+            self.connections += 1
+            try:
+                with av.open(self._url, options=_OPTIONS, timeout=self._timeouts_s) as stream:
+                    reason = self._read(stream)
+            except (av.error.FFmpegError, OSError, ValueError) as error:
+                reason = _reason(error)
+                self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
+            if self.not_found:
+                self._fail(f"{self._name}: {reason}")
+                return
+            failed = 0 if self._count > before else failed + 1
+            if failed >= MAX_FAILED_CONNECTIONS:
+                self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
+                return
+            self._stop.wait(self._reconnect_wait_s)
+
+    def _read(self, stream: Any) -> str:
+        """One connection until it ends; why it ended. Errors: those of PyAV."""
+        import av.error
+
+        if not stream.streams.video:
+            return "the stream has no picture in it"
+        video = stream.streams.video[0]
+        # A thread for each frame would hold back as many frames as there are threads.
+        video.thread_type = "NONE"
+        waiting, damaged = Waiting(), 0
+        for packet in stream.demux(video):
+            if self._stop.is_set():
+                return "closed"
+            try:
+                frames = packet.decode()
+                damaged = 0
+            except av.error.InvalidDataError:
+                damaged += 1
+                if damaged >= MAX_DAMAGED:
+                    return "its pictures cannot be decoded"
+                continue
+            for frame in frames[-1:]:
+                self._put(frame.to_ndarray(format="gray"), waiting.of(frame.time, self._clock()))
+        return "the stream ended"
+
+
+def _gone(errors: Any) -> tuple[type[Exception], ...]:
+    """What trying again would not mend."""
+    return (
+        errors.HTTPUnauthorizedError,
+        errors.HTTPForbiddenError,
+        errors.HTTPNotFoundError,
+        errors.HTTPBadRequestError,
+        errors.ProtocolNotFoundError,
+        errors.DecoderNotFoundError,
+    )
+
+
+def _reason(error: Exception) -> str:
+    """Without the URL that FFmpeg's own texts have in them, the password too."""
+    name = type(error).__name__
+    return _REASONS.get(name) or str(getattr(error, "strerror", None) or name)
+
+
+_REASONS = {
+    "HTTPUnauthorizedError": "it wants another name or password (401), as in "
+    "rtsp://NAME:PASSWORD@HOST/PATH (@ is %40 there, : is %3A)",
+    "HTTPForbiddenError": "this name may not see the stream (403)",
+    "HTTPNotFoundError": "there is no such stream (404); look for the path in its manual",
+    "ConnectionRefusedError": "connection refused",
+    "ExitError": "no answer in time",
+    "InvalidDataError": "no answer in time, or none of RTSP",
+    "TimeoutError": "no answer in time",
+}

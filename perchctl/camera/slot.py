@@ -1,0 +1,34 @@
+"""The newest picture of a live source; pure."""
+
+from __future__ import annotations
+
+from perchctl.camera.repeats import Grey, RepeatState, repeated
+from perchctl.vision.types import Frame
+
+
+class NewestSlot:
+    """Keeps the newest picture, at the time at which it came first.
+
+    One that a receiver gives out again takes no new one's place: it would make it look younger
+    than it is. Where the new one has been taken already it comes with the same index, and
+    `Frame.repeated`: a sign of life, and no measurement.
+    """
+
+    def __init__(self) -> None:
+        self._frame: Frame | None = None
+        self._repeats = RepeatState()
+        self.count = 0
+
+    def put(self, image: Grey, t_s: float, t_arrival_s: float) -> None:
+        """Times of exposure and of arrival."""
+        self._repeats, again = repeated(self._repeats, image)
+        if not again:
+            self._frame = Frame(self.count, t_s, image, t_arrival_s)
+            self.count += 1
+        elif self._frame is None or self._frame.repeated:
+            self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, repeated=True)
+
+    def take(self) -> Frame | None:
+        """Once."""
+        frame, self._frame = self._frame, None
+        return frame

@@ -1,0 +1,300 @@
+"""Cameras of this computer behind a stand-in for their driver: names, modes, controls."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+
+from perchctl.camera.computer import camera_number, cameras
+from perchctl.camera.controls import set_controls
+from perchctl.camera.device import Asked, DeviceSource, asked_of, differences, set_up
+from perchctl.camera.v4l2 import (
+    Call,
+    Delivered,
+    controls_of,
+    delivered_of,
+    modes_of,
+    open_driver,
+    value_of,
+)
+from perchctl.commands.check_cameras import camera_lines, list_cameras
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.profile import CameraConfig
+from tests.helpers.v4l2 import READ_ONLY, FakeControl, FakeDevice
+
+WAIT_S = 10.0
+FIXED = {
+    "exposure_time_absolute": 80,  # named first, and can only be set after the next
+    "auto_exposure": "manual mode",
+    "white_balance_automatic": 0,
+}
+
+
+class Opener:
+    """A computer with these cameras."""
+
+    def __init__(self, devices: dict[int, FakeDevice | OSError]) -> None:
+        self.devices = devices
+
+    @contextlib.contextmanager
+    def __call__(self, number: int) -> Iterator[Call]:
+        device = self.devices[number]
+        if isinstance(device, OSError):
+            raise device
+        yield device.call
+
+
+@pytest.fixture
+def dev(tmp_path: Path) -> Callable[..., Path]:
+    """A /dev with such nodes and such lasting names."""
+
+    def make(*numbers: int, **by_id: int) -> Path:
+        (tmp_path / "v4l" / "by-id").mkdir(parents=True)
+        for number in numbers:
+            (tmp_path / f"video{number}").touch()
+        for name, number in by_id.items():
+            (tmp_path / "v4l" / "by-id" / name).symlink_to(tmp_path / f"video{number}")
+        return tmp_path
+
+    return make
+
+
+# --- which there are ------------------------------------------------------------------
+
+
+def test_a_camera_is_named_by_number_name_part_of_it_or_path(dev: Callable[..., Path]) -> None:
+    devices = dev(0, 1, 2, 10, usb_cam=0, usb_grabber=2)
+    opener = Opener({
+        0: FakeDevice("HD Webcam C525"), 1: FakeDevice("HD Webcam C525", pictures_node=False),
+        2: FakeDevice("USB Video"), 10: FakeDevice("USB Video: deluxe"),
+    })  # fmt: skip
+
+    def number(text: str) -> int:
+        return camera_number(text, opener, devices, devices)
+
+    assert number("7") == 7, "a number is not looked up"
+    assert number("HD Webcam C525") == number('"webcam"') == number(" c525 ") == 0
+    assert number("USB Video") == 2, "the whole name, though another holds it"
+    assert number("'deluxe'") == 10
+    assert number("usb_grabber") == number(f"{devices}/v4l/by-id/usb_grabber") == 2
+    assert number(f"{devices}/video10") == 10
+    with pytest.raises(InvalidValue, match=r"camera:usb fits 3 cameras: .*C525.* at .*usb_cam"):
+        number("usb")
+    with pytest.raises(NotFound, match=r"camera:nix was not found; there are camera:0 \(HD W"):
+        number("nix")
+    for text in ("", '""', " ", "-1"):
+        with pytest.raises(InvalidValue, match="as in camera:0 or camera:USB Video"):
+            number(text)
+
+
+def test_two_of_one_name_are_told_apart_by_their_path(dev: Callable[..., Path]) -> None:
+    devices = dev(0, 2, port_1=0, port_2=2)
+    opener = Opener({0: FakeDevice(), 2: FakeDevice()})
+    with pytest.raises(InvalidValue, match=r"fits 2 cameras: .*port_1, .*port_2; give"):
+        camera_number("USB Video", opener, devices, devices)
+    assert camera_number("port_2", opener, devices, devices) == 2
+
+
+def test_one_that_may_not_be_opened_has_its_name_from_the_system(dev: Callable[..., Path]) -> None:
+    devices = dev(3)
+    names = devices / "names"
+    (names / "video3").mkdir(parents=True)
+    (names / "video3" / "name").write_text("Locked\n")
+    opener = Opener({3: OSError(errno.EACCES, "Permission denied")})
+    (camera,) = cameras(opener, devices, names, asked=True)
+    assert (camera.number, camera.name, camera.modes) == (3, "Locked", ())
+    assert "Permission denied" in camera.problem
+    assert camera_number("lock", opener, devices, names) == 3
+    assert "Permission denied" in "\n".join(camera_lines(camera))
+
+
+def test_no_camera_at_all(dev: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(NotFound, match="this computer has no camera"):
+        camera_number("USB", Opener({}), dev(), dev)  # type: ignore[arg-type]
+    assert list_cameras(True, ()) == NotFound.exit_code
+    said = capsys.readouterr()
+    assert json.loads(said.out) == []
+    assert "has no camera" in said.err
+
+
+def test_a_driver_that_is_not_there_is_an_os_error() -> None:
+    with pytest.raises(OSError, match=r"video97|V4L2"), open_driver(97):
+        pass
+
+
+def test_the_list_for_people_and_for_programs(
+    dev: Callable[..., Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    devices = dev(0, usb_grabber=0)
+    known = cameras(Opener({0: FakeDevice()}), devices, devices, asked=True)
+    assert list_cameras(False, known) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("camera:0  USB Video\n")
+    for part in ("usb_grabber", "MJPG 640x480 at 30, 25 Hz", "MJPG 720x576 at 25 Hz",
+                 "auto_exposure = 3  (1: Manual Mode, 3: Aperture Priority Mode)",
+                 "exposure_time_absolute = 157  (1 to 5000, held by an automatic one)",
+                 "gain = 10  (0 to 100 in steps of 5)"):  # fmt: skip
+        assert part in told
+    assert list_cameras(True, known) == 0
+    (record,) = json.loads(capsys.readouterr().out)
+    assert record["source"] == "camera:0"
+    assert record["modes"][0] == {"format": "MJPG", "size_px": [640, 480], "rates_hz": [30, 25]}
+    controls = {each["name"]: each for each in record["controls"]}
+    assert controls["auto_exposure"]["menu"]["1"] == "Manual Mode"
+    assert controls["exposure_time_absolute"]["inactive"] is True
+
+
+# --- controls -------------------------------------------------------------------------
+
+
+def values(device: FakeDevice) -> dict[str, int]:
+    return {n: value_of(device.call, k) for n, k in controls_of(device.call).items()}
+
+
+def test_controls_are_set_the_automatic_ones_first_and_read_back() -> None:
+    device = FakeDevice()
+    set_controls(device.call, FIXED, "camera:0")
+    got = values(device)
+    assert {name: got[name] for name in FIXED} == {
+        "exposure_time_absolute": 80, "auto_exposure": 1, "white_balance_automatic": 0,
+    }  # fmt: skip
+    assert device.log[-1] == "Exposure Time, Absolute = 80"
+
+
+@pytest.mark.parametrize(("wanted", "sentence"), [
+    ({"shutter": 1}, r"no control 'shutter' \(camera.controls\); it has brightness, white_bal"),
+    ({"gain": 101}, r"camera.controls.gain: found 101; allowed are 0 to 100 in steps of 5"),
+    ({"gain": 12}, r"found 12; allowed are 0 to 100 in steps of 5"),
+    ({"gain": "high"}, r"found 'high'; needed is 0 to 100"),
+    ({"white_balance_automatic": 2}, r"allowed are 0 \(off\) or 1 \(on\)"),
+    ({"auto_exposure": 2}, r"allowed are 1 \(Manual Mode\), 3 \(Aperture Priority Mode\)"),
+    ({"exposure_time_absolute": 80}, r"could not be set to 80 .* while an automatic control"),
+    ({"sensor": 1}, r"camera.controls.sensor can only be read"),
+    ({"brightness": 5}, r"camera.controls.brightness was set to 5 and reads 0"),
+])  # fmt: skip
+def test_what_the_driver_does_not_take_is_one_sentence(
+    wanted: dict[str, Any], sentence: str
+) -> None:
+    device = FakeDevice(stubborn=("Brightness",))
+    device.controls.append(FakeControl(0x9E0901, "Sensor", 1, 0, 9, 1, flags=READ_ONLY))
+    with pytest.raises(InvalidValue, match=f"^camera:0.*{sentence}"):
+        set_controls(device.call, wanted, "camera:0")
+
+
+def test_a_driver_without_controls_says_so() -> None:
+    with pytest.raises(InvalidValue, match="its driver has none at all"):
+        set_controls(FakeDevice(controls=[]).call, {"gain": 1}, "camera:0")
+
+
+def test_a_driver_that_lists_for_ever_is_left() -> None:
+    def stuck(request: int, data: bytearray) -> None:
+        data[0:4] = (7).to_bytes(4, "little")
+
+    assert len(controls_of(stuck)) <= 1
+    assert len(modes_of(FakeDevice(formats={"MJPG": {}}).call)) == 1
+
+
+# --- the source -----------------------------------------------------------------------
+
+
+def opened(device: FakeDevice, asked: Asked) -> DeviceSource:
+    return DeviceSource(
+        0, 0.05, asked, lambda: 100.0, lambda n, asked: device, device.opener, retry_s=0.0
+    )
+
+
+def test_controls_are_set_before_the_first_picture_and_again_where_streaming_resets_them() -> None:
+    device = FakeDevice(resets={"Exposure Time, Absolute": 157})
+    source = opened(device, Asked(controls=FIXED))
+    try:
+        assert source.wait_first(WAIT_S)
+        first = device.log.index("read")
+        assert "Exposure Time, Absolute = 80" in device.log[:first]
+        assert values(device)["exposure_time_absolute"] == 157, "the driver has forgotten it"
+        assert source.remarks() == []
+        assert values(device)["exposure_time_absolute"] == 80
+    finally:
+        source.close()
+
+
+def test_what_cannot_be_set_ends_it_with_the_device_released() -> None:
+    device = FakeDevice()
+    with pytest.raises(InvalidValue, match="no control 'shutter'"):
+        opened(device, Asked(controls={"shutter": 1}))
+    assert device.released
+    device = FakeDevice()
+    with pytest.raises(InvalidValue, match=r"no format 'H264'.*it has MJPG, YUYV"):
+        opened(device, Asked(format="H264"))
+    assert device.released
+
+
+def test_what_is_delivered_otherwise_is_told() -> None:
+    device = FakeDevice(format="YUYV", rate=(1, 15))
+    source = opened(device, Asked((720, 576), "MJPG", 25.0))
+    try:
+        assert source.wait_first(WAIT_S)
+        assert source.remarks() == [
+            "camera:0 was asked for MJPG (camera.format) and gives YUYV; it has MJPG, YUYV",
+            "camera:0 was asked for 720x576 px, the calibration's, and gives 640x480 px; in YUYV "
+            "it has 640x480",
+            "camera:0 was asked for 25 Hz (camera.rate_hz) and gives 15 Hz; at this size and "
+            "format it has 15 Hz",
+        ]
+    finally:
+        source.close()
+
+
+def test_what_is_delivered_as_asked_is_no_news() -> None:
+    device = FakeDevice(format="MJPG", rate=(1001, 30000))
+    got = delivered_of(device.call)
+    assert got == Delivered("MJPG", (640, 480), pytest.approx(29.97, abs=0.01))
+    assert differences(Asked((640, 480), "MJPG", 30.0), got, (), "camera:0") == []
+    assert differences(Asked(), got, (), "camera:0") == []
+
+
+def test_without_v4l2_the_pictures_come_and_only_controls_are_refused() -> None:
+    @contextlib.contextmanager
+    def nothing(number: int) -> Iterator[Call]:
+        raise OSError(errno.ENOSYS, "this system has no V4L2")
+        yield
+
+    class Windows(FakeDevice):
+        def get(self, prop: int) -> float:
+            return {cv2.CAP_PROP_FOURCC: 0.0, cv2.CAP_PROP_FPS: 15.0}[prop]
+
+    device = Windows()
+    source = DeviceSource(
+        0, 0.0, Asked(None, "MJPG", 30.0), lambda: 1.0, lambda n, a: device, nothing
+    )
+    assert source.wait_first(WAIT_S)
+    assert source.remarks() == ["camera:0 was asked for 30 Hz (camera.rate_hz) and gives 15 Hz"]
+    source.close()
+    with pytest.raises(InvalidValue, match="no V4L2"):
+        DeviceSource(0, 0.0, Asked(controls=FIXED), lambda: 1.0, lambda n, a: device, nothing)
+
+
+def test_opencv_is_asked_for_format_then_size_then_rate() -> None:
+    class Capture:
+        def __init__(self) -> None:
+            self.said: list[tuple[int, float]] = []
+
+        def set(self, prop: int, value: float) -> None:
+            self.said.append((prop, value))
+
+    capture = Capture()
+    config = CameraConfig(format="MJPG", rate_hz=25, controls={"gain": 5})
+    asked = asked_of(config, (720, 576))
+    assert asked == Asked((720, 576), "MJPG", 25.0, {"gain": 5})
+    set_up(capture, asked)
+    assert [prop for prop, _ in capture.said] == [
+        cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT,
+        cv2.CAP_PROP_FPS, cv2.CAP_PROP_BUFFERSIZE,
+    ]  # fmt: skip
+    assert int(capture.said[0][1]) == int.from_bytes(b"MJPG", "little")

@@ -1,0 +1,156 @@
+"""RTSP from a server on loopback: arrival, faults, reconnecting, passwords."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from perchctl.camera.open import open_source
+from perchctl.camera.rtsp import MAX_FAILED_CONNECTIONS, WINDOW_S, RtspSource, Waiting
+from perchctl.camera.source import LiveSource
+from perchctl.errors import NotFound, TimedOut
+from tests.camera.test_live import WAIT_S, Clock, level, next_frame, wait_for
+from tests.helpers.rtsp import RtspServer, Step
+
+
+@pytest.fixture
+def server() -> Iterator[RtspServer]:
+    server = RtspServer()
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def opened() -> Iterator[list[LiveSource]]:
+    sources: list[LiveSource] = []
+    yield sources
+    for source in sources:
+        source.close()
+
+
+def started(server: RtspServer, opened: list[LiveSource], who: str = "") -> RtspSource:
+    source = RtspSource(
+        server.url(who), 0.07, Clock(), connect_timeout_s=2.0, read_timeout_s=0.3,
+        reconnect_wait_s=0.0,
+    )  # fmt: skip
+    opened.append(source)
+    return source
+
+
+def seconds(count: int, *levels: int) -> list[Step]:
+    """Pictures of 25 a second whose levels take turns."""
+    return [(k / 25, levels[k % len(levels)]) for k in range(count)]
+
+
+def test_pictures_come_and_the_newest_wins(server: RtspServer, opened: list[LiveSource]) -> None:
+    never = threading.Event()
+    server.scripts.put([*seconds(20, 60, 100), (0.8, 160), never])
+    source = started(server, opened)
+    seen = []
+
+    def last_came() -> bool:
+        frame = source.poll(0.0)
+        if frame is not None:
+            seen.append(frame)
+        return bool(seen) and level(seen[-1]) == 160
+
+    wait_for(last_came)
+    assert seen[-1].image.shape == (48, 64)
+    assert seen[-1].t_arrival_s == 100.0
+    assert seen[-1].t_s == pytest.approx(99.93, abs=1e-6) or seen[-1].t_s < 99.93
+    assert source.describe() == f"{server.url()} (64x48 px)"
+    never.set()
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_it_connects_anew_where_the_stream_is_cut_or_stalls(
+    server: RtspServer, opened: list[LiveSource], cut: bool
+) -> None:
+    never = threading.Event()
+    server.scripts.put([*seconds(20, 60, 80), *([] if cut else [never])])
+    server.scripts.put([*seconds(20, 160, 180), never])
+    source = started(server, opened)
+    wait_for(lambda: server.plays == 2)
+    frame = next_frame(source)
+    while level(frame) < 150:
+        frame = next_frame(source)
+    never.set()
+
+
+def test_connections_are_bounded(server: RtspServer, opened: list[LiveSource]) -> None:
+    server.status = "500 Internal Server Error"
+    source = started(server, opened)
+    wait_for(lambda: "gave no picture in 5 attempts" in (source.problem(100.0) or ""))
+    assert source.connections == MAX_FAILED_CONNECTIONS
+
+
+def test_name_and_password_are_answered_by_digest_and_not_shown(
+    server: RtspServer, opened: list[LiveSource]
+) -> None:
+    never = threading.Event()
+    server.who = ("me", "se:cret")
+    server.scripts.put([*seconds(20, 60, 80), never])
+    source = started(server, opened, "me:se%3Acret@")
+    next_frame(source)
+    assert "DESCRIBE Digest" in server.asked
+    assert "cret" not in source.describe()
+    never.set()
+
+
+@pytest.mark.parametrize(("who", "path", "sentence"), [
+    ("me:hushhush@", "/live", "it wants another name or password (401), as in rtsp://NAME"),
+    ("me:secret@", "/nowhere", "there is no such stream (404)"),
+])  # fmt: skip
+def test_what_trying_again_would_not_mend_is_told_at_once(
+    server: RtspServer, who: str, path: str, sentence: str
+) -> None:
+    server.who = ("me", "secret")
+    url = server.url(who).replace("/live", path)
+    with pytest.raises(NotFound) as caught:
+        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    assert sentence in str(caught.value)
+    assert "hush" not in str(caught.value)
+    assert "secret" not in str(caught.value)
+
+
+def test_nobody_listens(server: RtspServer) -> None:
+    server.close()
+    with pytest.raises(TimedOut, match=r"gave no picture in 5 attempts: connection refused"):
+        open_source(server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S)
+
+
+def test_closing_does_not_wait_for_a_stalled_stream(server: RtspServer) -> None:
+    never = threading.Event()
+    server.scripts.put([*seconds(20, 60, 80), never])
+    source = RtspSource(server.url(), 0.0, Clock(), read_timeout_s=1.0)
+    assert source.wait_first(WAIT_S)
+    source.close()
+    assert source._thread is not None
+    assert not source._thread.is_alive()
+    never.set()
+
+
+def test_what_piled_up_is_known_to_be_old() -> None:
+    waiting = Waiting()
+    for k in range(50):
+        assert waiting.of(k / 25, 100.0 + k / 25) == pytest.approx(0.0, abs=1e-9)
+    heap = [waiting.of(k / 25, 102.4) for k in range(50, 60)]
+    assert heap == pytest.approx([2.4 - k / 25 for k in range(50, 60)])
+    assert waiting.of(60 / 25, 102.41) == pytest.approx(0.01)
+    assert waiting.of(None, 103.0) == 0.0
+
+
+def test_a_clock_of_the_camera_that_runs_slow_makes_nothing_old() -> None:
+    waiting, latest = Waiting(), 0.0
+    for k in range(25 * 600):
+        latest = waiting.of(k / 25 * (1 - 1e-4), k / 25)
+    assert latest <= 1e-4 * WINDOW_S + 1e-6
+
+
+def test_a_clock_of_the_camera_that_is_set_back_makes_nothing_old() -> None:
+    waiting = Waiting()
+    assert [waiting.of(t, 100.0 + k / 25) for k, t in enumerate((50.0, 50.04, 3.0, 3.04))] == [
+        pytest.approx(0.0, abs=1e-9)
+    ] * 4
