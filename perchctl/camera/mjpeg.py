@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import http.client
-import socket
 from urllib.parse import SplitResult, unquote, urljoin, urlsplit, urlunsplit
 
 import cv2
 import numpy as np
 
-from perchctl.camera.source import Clock, LiveSource
+from perchctl.camera.source import Clock
+from perchctl.camera.stream import (
+    CONNECT_TIMEOUT_S,
+    READ_TIMEOUT_S,
+    RECONNECT_WAIT_S,
+    StreamSource,
+)
 
-CONNECT_TIMEOUT_S = 3.0
-READ_TIMEOUT_S = 2.0
 READ_BYTES = 65536
 MAX_PICTURE_BYTES = 8_000_000
-MAX_FAILED_CONNECTIONS = 5
-"""Connections in a row that bring no picture before the source gives up."""
-RECONNECT_WAIT_S = 0.3
 MAX_REDIRECTS = 3
 
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
@@ -122,13 +121,10 @@ def jpeg_end(data: bytes | bytearray) -> int | None:
                 break
 
 
-class MjpegSource(LiveSource):
+class MjpegSource(StreamSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    Reconnects when the stream ends, stalls or breaks; gives up after
-    `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
-    answers that there is no such stream before the first picture came. Goes straight
-    to the camera: a proxy for the internet is not for it.
+    Goes straight to the camera: a proxy for the internet is not for it.
     """
 
     def __init__(
@@ -139,45 +135,12 @@ class MjpegSource(LiveSource):
         read_timeout_s: float = READ_TIMEOUT_S,
         reconnect_wait_s: float = RECONNECT_WAIT_S,
     ) -> None:
-        super().__init__(without_password(url), latency_s, clock)
+        super().__init__(without_password(url), latency_s, clock, read_timeout_s, reconnect_wait_s)
         self._url = url
-        self._read_timeout_s = read_timeout_s
-        self._reconnect_wait_s = reconnect_wait_s
-        self._socket: socket.socket | None = None
-        self.not_found = False
-        self.connections = 0
-        self.damaged = 0
         self._start(self._run)
 
-    def close(self) -> None:
-        self._stop.set()
-        self._wake()
-        super().close()
-
-    def _wake(self) -> None:
-        """End a read that waits for bytes."""
-        current = self._socket
-        if current is not None:
-            with contextlib.suppress(OSError):
-                current.shutdown(socket.SHUT_RDWR)
-
-    def _run(self) -> None:
-        failed = 0
-        while not self._stop.is_set():
-            before = self._count
-            self.connections += 1
-            try:
-                reason = self._connect(self._url, MAX_REDIRECTS)
-            except (OSError, http.client.HTTPException, ValueError) as error:
-                reason = _reason(error)
-            if self.not_found:
-                self._fail(f"{self._name}: {reason}")
-                return
-            failed = 0 if self._count > before else failed + 1
-            if failed >= MAX_FAILED_CONNECTIONS:
-                self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
-                return
-            self._stop.wait(self._reconnect_wait_s)
+    def _connection(self) -> str:
+        return self._connect(self._url, MAX_REDIRECTS)
 
     def _connect(self, url: str, redirects: int) -> str:
         """One connection until it ends; why it ended."""
@@ -234,10 +197,3 @@ def _headers(parts: SplitResult) -> dict[str, str]:
         headers["Authorization"] = "Basic " + base64.b64encode(secret).decode("ascii")
     return headers
 
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, TimeoutError):
-        return "no answer in time"
-    if isinstance(error, ConnectionRefusedError):
-        return "connection refused"
-    return str(error) or type(error).__name__
