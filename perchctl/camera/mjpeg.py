@@ -196,4 +196,3 @@ def _headers(parts: SplitResult) -> dict[str, str]:
         secret = f"{unquote(parts.username)}:{unquote(parts.password or '')}".encode()
         headers["Authorization"] = "Basic " + base64.b64encode(secret).decode("ascii")
     return headers
-

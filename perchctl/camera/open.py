@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
 from perchctl.camera.device import DeviceSource
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
 from perchctl.errors import InvalidValue, NotFound, TimedOut
 
-REAL = "camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH"
+REAL = f"camera:N, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, {FORM}"
 ALLOWED = f"{REAL}, sim:"
 
 FIRST_FRAME_WITHIN_S = 8.0
-SCHEMES = ("camera", "video", "images", "http", "https", "sim")
+SCHEMES = ("camera", "video", "images", "http", "https", "aideck", "sim")
 RECORDED = ("video", "images")
 
 
@@ -34,7 +35,7 @@ def source_spec(source: str) -> str:
         return source  # `open_source` names what is allowed
     raise NotFound(
         f"{source} does not exist; a source is a video, picture or folder of pictures, or "
-        f"one of camera:N, video:FILE, images:DIR, http://HOST:PORT/PATH"
+        f"one of camera:N, video:FILE, images:DIR, http://HOST:PORT/PATH, {FORM}"
     )
 
 
@@ -94,6 +95,8 @@ def open_source(
             if stream.not_found:
                 raise NotFound(str(error)) from None
             raise
+    if scheme == "aideck":
+        return _started(AiDeckSource(aideck_address(spec), latency_s, clock), timeout_s)
     if spec == "sim:":
         raise InvalidValue(
             "camera source sim: is the simulated vehicle's camera and needs a link of sim://; "

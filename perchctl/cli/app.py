@@ -77,7 +77,7 @@ SourceOption = Annotated[
     str | None,
     typer.Option(
         "--source",
-        help="Camera: camera:N, video:FILE, images:DIR, http://..., sim:.",
+        help="Camera: camera:N, video:FILE, images:DIR, http://..., aideck://HOST, sim:.",
         autocompletion=complete_source,
     ),
 ]

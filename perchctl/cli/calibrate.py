@@ -24,8 +24,8 @@ def calibrate(
     source: Annotated[
         list[str] | None,
         typer.Argument(
-            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., or a path; or many "
-            "picture files.",
+            help="images:DIR (or a pattern), video:FILE, camera:N, http://..., aideck://HOST, "
+            "or a path; or many picture files.",
             autocompletion=complete_source,
         ),
     ] = None,

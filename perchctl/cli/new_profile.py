@@ -23,7 +23,9 @@ def new_profile(
     source: Annotated[
         str | None,
         typer.Option(
-            "--source", help="Camera: camera:N, http://..., sim:.", autocompletion=complete_source
+            "--source",
+            help="Camera: camera:N, http://..., aideck://HOST, sim:.",
+            autocompletion=complete_source,
         ),
     ] = None,
     calibration: Annotated[

@@ -24,7 +24,8 @@ def track(
     source: Annotated[
         str,
         typer.Argument(
-            help="camera:N, video:FILE, images:DIR (or a pattern), http://..., or a path.",
+            help="camera:N, video:FILE, images:DIR (or a pattern), http://..., aideck://HOST, "
+            "or a path.",
             autocompletion=complete_source,
         ),
     ],

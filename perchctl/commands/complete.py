@@ -11,7 +11,7 @@ from perchctl.camera.files import IMAGE_SUFFIXES
 from perchctl.profile.places import listing
 
 _DEVICES = Path("/dev")
-_SCHEMES = ("video:", "images:", "http://", "sim:")
+_SCHEMES = ("video:", "images:", "http://", "aideck://", "sim:")
 _YAML = (".yaml", ".yml")
 _PICTURES = (*IMAGE_SUFFIXES, ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 

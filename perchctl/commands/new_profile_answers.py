@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from perchctl.calibration.files import load_calibration
+from perchctl.camera.aideck import aideck_address
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, scheme_of
 from perchctl.check.limits import OVERDUE
 from perchctl.errors import InvalidValue
@@ -50,10 +51,12 @@ def _simulated(answers: Texts) -> bool:
 def _source(text: str, answers: Texts) -> str:
     if scheme_of(text) not in SCHEMES or re.fullmatch(r"camera:(?!\d+$).*", text):
         raise InvalidValue(f"{text!r} is no camera; allowed are {ALLOWED}")
+    if scheme_of(text) == "aideck":
+        aideck_address(text)
     if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
         raise InvalidValue(
             f"{text} is no camera that flies with {answers['uri']}; allowed are camera:N, "
-            f"http://HOST:PORT/PATH"
+            f"http://HOST:PORT/PATH, aideck://HOST"
         )
     return text
 
@@ -134,7 +137,7 @@ QUESTIONS: tuple[Question, ...] = (
         lambda text, _: check_uri(text),
     ),
     Question(
-        "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://...",
+        "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://..., aideck://HOST",
         lambda answers: "sim:" if _simulated(answers) else "camera:0", _source,
     ),
     Question(

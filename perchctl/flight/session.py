@@ -65,7 +65,7 @@ def check_options(options: FlyOptions) -> None:
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
             f"source {options.source} belongs to the simulated vehicle, but the URI is "
-            f"{options.uri}; name the camera with --source (camera:N, http://...)"
+            f"{options.uri}; name the camera with --source (camera:N, http://..., aideck://HOST)"
         )
     if not is_live(options.source) and not options.simulated:
         raise UsageError(
