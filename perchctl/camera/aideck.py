@@ -49,13 +49,13 @@ class AiDeckAddress:
 
 def aideck_address(spec: str) -> AiDeckAddress:
     """Of ``aideck://HOST[:PORT][?colour=auto|yes|no]``. Errors: InvalidValue."""
-    parts = urlsplit(spec)
     wrong = InvalidValue(
         f"camera source {spec!r} is no AI-deck's address; write {FORM}, as in "
         f"aideck://192.168.4.1, and behind it ?colour=yes or ?colour=no where the picture "
         f"does not tell"
     )
     try:
+        parts = urlsplit(spec)
         port = PORT if parts.port is None else parts.port
         given = parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
     except ValueError:
@@ -97,6 +97,7 @@ class AiDeckSource(StreamSource):
         super().__init__(name, latency_s, clock, read_timeout_s, reconnect_wait_s)
         self._address = address
         self._no_picture_s = no_picture_s
+        self.bytes_seen = 0
         self._grey = MosaicFilter(address.colour)
         self._start(self._run)
 
@@ -121,6 +122,7 @@ class AiDeckSource(StreamSource):
         while not self._stop.is_set():
             data = connection.recv(_READ_BYTES)
             now_s = self._clock()
+            self.bytes_seen += len(data)
             if not data:
                 return "the stream ended" if splitter.pictures else _nothing(splitter)
             for picture in reversed(splitter.feed(data, now_s)):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import queue
+import select
 import socket
 import struct
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -20,7 +22,15 @@ GAP8_TO_HOST = 0x40 | (4 << 3) | 3
 ESP32_TO_HOST = 0x40 | (2 << 3) | 3
 LEAST_S = 10.0  # bound of every wait; reached only when a test fails
 
-Script = list[bytes | threading.Event]
+
+@dataclass(frozen=True)
+class Pause:
+    """Between two pictures, as a camera takes them."""
+
+    length_s: float
+
+
+Script = list[bytes | threading.Event | Pause]
 
 
 def packet(data: bytes, function: int = APP, routing: int = GAP8_TO_HOST) -> bytes:
@@ -126,7 +136,11 @@ class AiDeck:
                     self.closed.wait(0.01)
         for step in script:
             if isinstance(step, threading.Event):
-                step.wait(LEAST_S)
+                while not (step.wait(0.01) or self.closed.is_set()):
+                    if select.select([client], [], [], 0.0)[0]:
+                        return  # the computer has hung up
+            elif isinstance(step, Pause):
+                self.closed.wait(step.length_s)
             else:
                 client.sendall(step)
 
