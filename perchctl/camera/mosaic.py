@@ -1,8 +1,8 @@
 """A colour camera's mosaic in what is delivered as a grey picture.
 
 The sensor's pixels look through colour filters, two by two, and a raw picture, or a JPEG that was
-made of one as if it were grey, has their pattern all over it. Corners measured on it are off by 2
-to 7 times as much (`benchmarks/aideck.py --mosaic`).
+made of one as if it were grey, has their pattern all over it. Corners measured on it are off by up
+to 6 times as much, and a fifth of the far markers is not found (`benchmarks/aideck.py --mosaic`).
 """
 
 from __future__ import annotations
