@@ -57,6 +57,12 @@ planner: {perching_time_s: 0.3}
 """A flight that lands again before it has left the floor; whole ones are flown in tests/flight."""
 TOOLS = ("pytest", "ruff ", "mypy")
 """`.ci/run` runs these; a test does not run the tests."""
+AIDECK = "aideck://192.168.4.1"
+WITHOUT_A_CAMERA = {
+    "camera:0": "video:flight.mp4",
+    AIDECK: "video:flight.mp4",
+    "calib/aideck_324x244.yaml": "camera.yaml",
+}
 SET_UP = ("python3 -m venv ", ". .venv/", "pip install ", "git clone ", "cd ")
 
 
@@ -98,9 +104,12 @@ def cheap(line: str) -> list[str]:
         case ["perchctl", "calibrate"] if "--mount" in words:  # without a vehicle in a hand
             words = [*words[:3], "-p", "my_vehicle.yaml", "--from", "hand.jsonl"]
         case ["perchctl", "track"]:  # without a camera
+            words = [WITHOUT_A_CAMERA.get(word, word) for word in words]
             words = ["video:flight.mp4" if w.startswith("camera:") else w for w in words]
         case ["perchctl", "calibrate"] if words[2].startswith("camera:"):
             words.append("--help")
+        case ["perchctl", "calibrate"]:
+            words = ["images:board" if word == AIDECK else word for word in words]
         case ["python", "docs/tables.py"]:
             words.append("--check")
         case ["python", "docs/pictures/make.py"]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import http.client
-import socket
 import ssl
 from dataclasses import replace
 from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
@@ -19,15 +17,16 @@ from perchctl.camera.credentials import (
     credentials_of,
     without_password,
 )
-from perchctl.camera.source import Clock, LiveSource
+from perchctl.camera.source import Clock
+from perchctl.camera.stream import (
+    CONNECT_TIMEOUT_S,
+    READ_TIMEOUT_S,
+    RECONNECT_WAIT_S,
+    StreamSource,
+)
 
-CONNECT_TIMEOUT_S = 3.0
-READ_TIMEOUT_S = 2.0
 READ_BYTES = 65536
 MAX_PICTURE_BYTES = 8_000_000
-MAX_FAILED_CONNECTIONS = 5
-"""Connections in a row that bring no picture before the source gives up."""
-RECONNECT_WAIT_S = 0.3
 MAX_REDIRECTS = 3
 MOST_REQUESTS = 3
 """One that is answered by what to answer to, once more where that was too old."""
@@ -126,15 +125,12 @@ def jpeg_end(data: bytes | bytearray) -> int | None:
                 break
 
 
-class MjpegSource(LiveSource):
+class MjpegSource(StreamSource):
     """A Motion-JPEG stream (multipart/x-mixed-replace, or bare JPEGs one after another).
 
-    Reconnects when the stream ends, stalls or breaks; gives up after
-    `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when the server
-    answers that there is no such stream, or none for this name and password, before the
-    first picture came. Name and password are sent as the server asks for them, digest or
-    basic, and to no other host. Goes straight to the camera: a proxy for the internet is
-    not for it.
+    Given up at once, too, where the server wants another name and password. They are sent
+    as it asks for them, digest or basic, and to no other host. Goes straight to the camera:
+    a proxy for the internet is not for it.
     """
 
     def __init__(
@@ -145,48 +141,17 @@ class MjpegSource(LiveSource):
         read_timeout_s: float = READ_TIMEOUT_S,
         reconnect_wait_s: float = RECONNECT_WAIT_S,
     ) -> None:
-        super().__init__(without_password(url), latency_s, clock)
+        super().__init__(without_password(url), latency_s, clock, read_timeout_s, reconnect_wait_s)
         self._url = url
-        self._read_timeout_s = read_timeout_s
-        self._reconnect_wait_s = reconnect_wait_s
-        self._socket: socket.socket | None = None
         self._challenge: Challenge | None = None
-        self.not_found = False
-        self.connections = 0
-        self.damaged = 0
         self._start(self._run)
 
-    def close(self) -> None:
-        self._stop.set()
-        self._wake()
-        super().close()
-
-    def _wake(self) -> None:
-        """End a read that waits for bytes."""
-        current = self._socket
-        if current is not None:
-            with contextlib.suppress(OSError):
-                current.shutdown(socket.SHUT_RDWR)
-
-    def _run(self) -> None:
-        failed = 0
-        while not self._stop.is_set():
-            before = self._count
-            self.connections += 1
-            try:
-                reason = self._connect(self._url, MAX_REDIRECTS)
-            except ssl.SSLCertVerificationError as error:
-                reason, self.not_found = _untrusted(error), self._count == 0
-            except (OSError, http.client.HTTPException, ValueError) as error:
-                reason = _reason(error)
-            if self.not_found:
-                self._fail(f"{self._name}: {reason}")
-                return
-            failed = 0 if self._count > before else failed + 1
-            if failed >= MAX_FAILED_CONNECTIONS:
-                self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
-                return
-            self._stop.wait(self._reconnect_wait_s)
+    def _connection(self) -> str:
+        try:
+            return self._connect(self._url, MAX_REDIRECTS)
+        except ssl.SSLCertVerificationError as error:
+            self.not_found = self._count == 0
+            return _untrusted(error)
 
     def _connect(self, url: str, redirects: int) -> str:
         """One connection until it ends; why it ended."""
@@ -290,11 +255,3 @@ def _untrusted(error: ssl.SSLCertVerificationError) -> str:
         f"its certificate is not trusted ({error.verify_message or 'not verified'}); name a file "
         f"with that certificate in the environment variable SSL_CERT_FILE, or use http://"
     )
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, TimeoutError):
-        return "no answer in time"
-    if isinstance(error, ConnectionRefusedError):
-        return "connection refused"
-    return str(error) or type(error).__name__

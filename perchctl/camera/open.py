@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
 from perchctl.camera.computer import camera_number
 from perchctl.camera.credentials import without_password
 from perchctl.camera.device import CaptureSource, DeviceSource, asked_of
@@ -15,17 +16,18 @@ from perchctl.camera.gst import open_pipeline
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.rtsp import RtspSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
+from perchctl.camera.stream import StreamSource
 from perchctl.errors import CameraNote, InvalidValue, NotFound, TimedOut
 from perchctl.profile import CameraConfig
 
 REAL = (
     "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
-    "rtsp://HOST/PATH"
+    f"rtsp://HOST/PATH, {FORM}"
 )
 ALLOWED = f"{REAL}, sim:"
 
 FIRST_FRAME_WITHIN_S = 8.0
-SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "gst", "sim")
+SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "aideck", "gst", "sim")
 RECORDED = ("video", "images")
 
 
@@ -128,7 +130,9 @@ def open_source(
 
 def _stream(
     spec: str, scheme: str, rest: str, latency_s: float, clock: Clock
-) -> MjpegSource | RtspSource | None:
+) -> StreamSource | None:
+    if scheme == "aideck":
+        return AiDeckSource(aideck_address(spec), latency_s, clock)
     kinds = {"http": MjpegSource, "https": MjpegSource, "rtsp": RtspSource}
     if scheme not in kinds or not rest.strip("/"):
         return None

@@ -10,13 +10,10 @@ from collections import deque
 from typing import Any
 
 from perchctl.camera.credentials import without_password
-from perchctl.camera.source import Clock, LiveSource
+from perchctl.camera.source import Clock
+from perchctl.camera.stream import READ_TIMEOUT_S, RECONNECT_WAIT_S, StreamSource
 
 CONNECT_TIMEOUT_S = 5.0
-READ_TIMEOUT_S = 2.0
-RECONNECT_WAIT_S = 0.3
-MAX_FAILED_CONNECTIONS = 5
-"""Connections in a row that bring no picture before the source gives up."""
 MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
 WINDOW_S = 10.0
@@ -62,13 +59,10 @@ class Waiting:
         return way_s - self._ways[0][1]
 
 
-class RtspSource(LiveSource):
+class RtspSource(StreamSource):
     """An RTSP stream of any codec that FFmpeg decodes, over TCP where the camera can.
 
-    Reconnects when the stream ends, stalls or breaks; gives up after
-    `MAX_FAILED_CONNECTIONS` in a row without a picture, or at once when before the first
-    picture the camera answers that there is no such stream, or none for this name and
-    password.
+    Given up at once, too, where the camera wants another name and password.
     """
 
     def __init__(
@@ -80,36 +74,21 @@ class RtspSource(LiveSource):
         read_timeout_s: float = READ_TIMEOUT_S,
         reconnect_wait_s: float = RECONNECT_WAIT_S,
     ) -> None:
-        super().__init__(without_password(url), latency_s, clock)
+        super().__init__(without_password(url), latency_s, clock, read_timeout_s, reconnect_wait_s)
         self._url = url
         self._timeouts_s = (connect_timeout_s, read_timeout_s)
-        self._reconnect_wait_s = reconnect_wait_s
-        self.not_found = False
-        self.connections = 0
         self._start(self._run)
 
-    def _run(self) -> None:
+    def _connection(self) -> str:
         import av  # late: most flights have another camera
         import av.error
 
-        failed = 0
-        while not self._stop.is_set():
-            before = self._count
-            self.connections += 1
-            try:
-                with av.open(self._url, options=_OPTIONS, timeout=self._timeouts_s) as stream:
-                    reason = self._read(stream)
-            except (av.error.FFmpegError, OSError, ValueError) as error:
-                reason = _reason(error)
-                self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
-            if self.not_found:
-                self._fail(f"{self._name}: {reason}")
-                return
-            failed = 0 if self._count > before else failed + 1
-            if failed >= MAX_FAILED_CONNECTIONS:
-                self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
-                return
-            self._stop.wait(self._reconnect_wait_s)
+        try:
+            with av.open(self._url, options=_OPTIONS, timeout=self._timeouts_s) as stream:
+                return self._read(stream)
+        except (av.error.FFmpegError, OSError, ValueError) as error:
+            self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
+            return _reason(error)
 
     def _read(self, stream: Any) -> str:
         """One connection until it ends; why it ended. Errors: those of PyAV."""
@@ -133,7 +112,10 @@ class RtspSource(LiveSource):
                     return "its pictures cannot be decoded"
                 continue
             for frame in frames[-1:]:
-                self._put(frame.to_ndarray(format="gray"), waiting.of(frame.time, self._clock()))
+                self._put(
+                    frame.to_ndarray(format="gray"),
+                    waited_s=waiting.of(frame.time, self._clock()),
+                )
         return "the stream ended"
 
 

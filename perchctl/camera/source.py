@@ -146,13 +146,16 @@ class LiveSource:
         self._thread = threading.Thread(target=target, name=self._name, daemon=True)
         self._thread.start()
 
-    def _put(self, image: Any, waited_s: float = 0.0) -> None:
-        """`waited_s`: for how long it was under way beyond the usual, where that is known."""
-        t_s = self._clock()
+    def _put(self, image: Any, *, waited_s: float = 0.0, began_s: float | None = None) -> None:
+        """`waited_s`: for how long it was under way beyond the usual, where that is known.
+        `began_s`: when the picture began to arrive, where that is known and tells more of its
+        exposure than its end does: the latency is counted from there."""
+        arrival_s = self._clock()
+        t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
         grey = to_grey(image)
         with self._lock:
-            self._slot.put(grey, t_s - self._latency_s - waited_s, t_s)
-            self._last_arrival_s = t_s
+            self._slot.put(grey, t_s, arrival_s)
+            self._last_arrival_s = arrival_s
             self._size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 

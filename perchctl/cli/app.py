@@ -77,8 +77,8 @@ SourceOption = Annotated[
     str | None,
     typer.Option(
         "--source",
-        help="Camera: camera:N or camera:NAME, rtsp://..., http://..., video:FILE, images:DIR, "
-        "sim:.",
+        help="Camera: camera:N or camera:NAME, rtsp://..., http://..., aideck://HOST, video:FILE, "
+        "images:DIR, sim:.",
         autocompletion=complete_source,
     ),
 ]

@@ -25,7 +25,7 @@ def calibrate(
         list[str] | None,
         typer.Argument(
             help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
-            "http://..., or a path; or many picture files.",
+            "http://..., aideck://HOST, or a path; or many picture files.",
             autocompletion=complete_source,
         ),
     ] = None,

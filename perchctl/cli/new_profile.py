@@ -24,7 +24,7 @@ def new_profile(
         str | None,
         typer.Option(
             "--source",
-            help="Camera: camera:N, rtsp://..., http://..., sim:.",
+            help="Camera: camera:N, rtsp://..., http://..., aideck://HOST, sim:.",
             autocompletion=complete_source,
         ),
     ] = None,

@@ -24,8 +24,8 @@ def track(
     source: Annotated[
         str,
         typer.Argument(
-            help="camera:N or its name, rtsp://..., http://..., video:FILE, images:DIR (or a "
-            "pattern), or a path.",
+            help="camera:N or its name, rtsp://..., http://..., aideck://HOST, video:FILE, "
+            "images:DIR (or a pattern), or a path.",
             autocompletion=complete_source,
         ),
     ],

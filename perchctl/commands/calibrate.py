@@ -106,7 +106,7 @@ def run(request: CalibrateRequest) -> int:
         raise UsageError("--cam names a camera of the file of --check or --convert: give one")
     if not request.sources:
         raise UsageError(
-            "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N or http://..."
+            "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N, http://... or aideck://HOST"
         )
     source = sized(source_of(request.sources), request.size)
     if not is_live(source.spec):

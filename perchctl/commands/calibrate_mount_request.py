@@ -149,7 +149,9 @@ def _live(
     """The camera, and the vehicle where the carry needs it (or it was named)."""
     given = profile.camera.source if request.source is None else request.source
     if given.startswith("sim:"):
-        raise UsageError(f"camera {given} {_SIMULATED} with --source (camera:N, http://...)")
+        raise UsageError(
+            f"camera {given} {_SIMULATED} with --source (camera:N, http://..., aideck://HOST)"
+        )
     source = source_spec(given)
     named = request.uri if request.uri is not None else os.environ.get("CFLIB_URI")
     if "carry" not in parts and request.uri is None:

@@ -13,7 +13,7 @@ from perchctl.commands.positioning import POSITIONINGS
 from perchctl.profile.places import listing
 
 _DEVICES = Path("/dev")
-_SCHEMES = ("video:", "images:", "http://", "rtsp://", "sim:")
+_SCHEMES = ("video:", "images:", "http://", "rtsp://", "aideck://", "sim:")
 _YAML = (".yaml", ".yml")
 _PICTURES = (*IMAGE_SUFFIXES, ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 

@@ -105,7 +105,7 @@ def _collect_with_person(
     if spec.startswith("sim:"):
         raise UsageError(
             "the simulator has the truth itself: add --truth sim, or name a real camera "
-            "with --source (camera:N, http://...)"
+            "with --source (camera:N, http://..., aideck://HOST)"
         )
     config = profile.camera
     with ExitStack() as stack:

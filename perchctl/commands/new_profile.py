@@ -12,14 +12,14 @@ from pathlib import Path
 from perchctl.check.profile import rows
 from perchctl.check.row import Verdict
 from perchctl.commands.new_profile_answers import (
-    EXAMPLE,
     NONE_YET,
     QUESTIONS,
-    WRITTEN,
     Question,
     checked,
     completed,
+    example_of,
     made,
+    written_for,
 )
 from perchctl.commands.output import print_record, say, tell
 from perchctl.errors import Interrupted, PerchError, UsageError
@@ -69,7 +69,9 @@ def run(request: NewProfileRequest, ask: Ask | None = None) -> int:
         answers = _dialogue(answers, output, ask or _ask_terminal)
     answers = completed(answers)
     profile = made(answers, output)
-    text = HEAD.format(name=shlex.quote(str(output))) + profile_text(profile, WRITTEN)
+    text = HEAD.format(name=shlex.quote(str(output))) + profile_text(
+        profile, written_for(answers["source"])
+    )
     write_files({output: text.encode()})
     _report(request, load_profile(str(output.absolute())), answers)
     return 0
@@ -172,7 +174,8 @@ def _report(request: NewProfileRequest, profile: Profile, answers: Mapping[str, 
         doubts = [row for row in doubts if row.name != "calibration file"]
         own = not profile.camera.source.startswith("sim:")
         say(
-            f"calibration: none yet: wrote {EXAMPLE}, the shipped example; "
+            f"calibration: none yet: wrote {example_of(profile.camera.source)}, the shipped "
+            f"example; "
             + (
                 "calibrate yours (perchctl calibrate), and name its file in camera.calibration"
                 if own

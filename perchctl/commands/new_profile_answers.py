@@ -14,16 +14,18 @@ from typing import Any
 from pydantic import ValidationError
 
 from perchctl.calibration.files import load_calibration
+from perchctl.camera.aideck import aideck_address
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, scheme_of
 from perchctl.check.limits import OVERDUE
 from perchctl.errors import InvalidValue
 from perchctl.link.uri import check_uri
-from perchctl.profile import Profile, find_calibration
+from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.profile.base import FARTHEST_ON_BODY_M
 from perchctl.profile.load import first_fault
 from perchctl.profile.picture import EDGES, edges_beside, mount_from_edges
 
 EXAMPLE = "example_640x480.yaml"
+AIDECKS_EXAMPLE = "example_aideck_324x244.yaml"
 NONE_YET = "none"
 SIMULATED, RADIO = "sim://", "radio://0/80/2M/E7E7E7E7E7"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
@@ -50,10 +52,12 @@ def _simulated(answers: Texts) -> bool:
 def _source(text: str, answers: Texts) -> str:
     if scheme_of(text) not in SCHEMES or re.fullmatch(r"camera:\W*(-\d*)?", text):
         raise InvalidValue(f"{text!r} is no camera; allowed are {ALLOWED}")
+    if scheme_of(text) == "aideck":
+        aideck_address(text)
     if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
         raise InvalidValue(
             f"{text} is no camera that flies with {answers['uri']}; allowed are camera:N, "
-            f"camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH"
+            f"camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, aideck://HOST"
         )
     return text
 
@@ -134,7 +138,7 @@ QUESTIONS: tuple[Question, ...] = (
         lambda text, _: check_uri(text),
     ),
     Question(
-        "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://...",
+        "source", "--source", "The camera: camera:N (a receiver at /dev/videoN), http://..., aideck://HOST",
         lambda answers: "sim:" if _simulated(answers) else "camera:0", _source,
     ),
     Question(
@@ -197,6 +201,11 @@ WRITTEN = frozenset({
     "link.uri", "link.parameters",
 })  # fmt: skip
 """The keys of the new file."""
+OF_AN_AIDECK = frozenset({
+    "kalman.drift_mps2", "kalman.n_max", "planner.ascend.settle_xy_m", "planner.ascend.fresh_s",
+    "safety.max_frame_age_s",
+})  # fmt: skip
+"""What its few and late pictures need besides: as the shipped profile has it."""
 OVER_THE_CEILING_M = 0.4
 """So far above it the height limit is: an estimate that drifts must not end a flight there."""
 FAR_SIGHT_M, NEAR_SIGHT_M, LOW_SEARCH_M = 1.1, 0.5, 1.3
@@ -232,7 +241,7 @@ def made(texts: Texts, output: Path) -> Profile:
         "description": f"a vehicle at {uri}, with its camera at {texts['source']}",
         "camera": {
             "source": answer["source"],
-            "calibration": _named(answer["calibration"], output),
+            "calibration": _named(answer["calibration"], output, texts["source"]),
             "latency_s": _thousandth(_number(answer["latency"])),
             "mount": {"position_m": answer["camera"], "rpy_deg": (0.0, 0.0, mounted[0])},
             "mirrored": mounted[1],
@@ -244,6 +253,11 @@ def made(texts: Texts, output: Path) -> Profile:
         "safety": heights["safety"] | {"fence_radius_m": answer["fence"]},
         "link": {"uri": uri, "parameters": {"stabilizer.estimator": 2}},
     }
+    if scheme_of(texts["source"]) == "aideck":
+        shipped = load_profile("aideck")
+        values["kalman"] = shipped.kalman
+        values["planner"]["ascend"] = shipped.planner.ascend
+        values["safety"]["max_frame_age_s"] = shipped.safety.max_frame_age_s
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
@@ -281,10 +295,20 @@ def _heights(ceiling_m: float) -> dict[str, dict[str, Any]]:
     }
 
 
-def _named(calibration: object, output: Path) -> str:
+def written_for(source: str) -> frozenset[str]:
+    """The keys of the new file of a vehicle with that camera."""
+    return WRITTEN | OF_AN_AIDECK if scheme_of(source) == "aideck" else WRITTEN
+
+
+def example_of(source: str) -> str:
+    """The shipped calibration that stands in for one's own: of the size that the source has."""
+    return AIDECKS_EXAMPLE if scheme_of(source) == "aideck" else EXAMPLE
+
+
+def _named(calibration: object, output: Path, source: str) -> str:
     """The calibration as the profile at `output` names it: beside it, or by the whole path."""
     if not isinstance(calibration, Path):
-        return EXAMPLE
+        return example_of(source)
     if calibration == find_calibration(EXAMPLE).resolve():
         return EXAMPLE
     folder = output.absolute().parent.resolve()

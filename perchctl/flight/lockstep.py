@@ -180,16 +180,20 @@ def fly_lockstep(
     report = fly(parts)
     link.close()
     link.advance_to(link.now_s + 1.0)
+    return _flown(report, vehicle, truth)
+
+
+def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:
     hanging = bool(vehicle.world.state().magnet_engaged)
     fell = truth.fell or (report.phase is Phase.PERCHED and not hanging)
     return LockstepFlight(
         report=report,
-        seed=scenario.seed,
+        seed=vehicle.scenario.seed,
         miss_m=vehicle.world.gear_miss_m(),
         hanging=hanging,
         fell=fell,
         locked=bool(vehicle.firmware.supervisor_info & LOCKED),
-        simulated_s=link.now_s,
+        simulated_s=vehicle.firmware.t_s,
         touchdown_mps=truth.touchdown_mps,
     )
 

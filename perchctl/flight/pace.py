@@ -16,7 +16,7 @@ from perchctl.mission.state import SEVEN, Outcome, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 
 WINDOW_S = 2.0
-FEWEST_HZ = 10.0
+FEWEST_HZ, FEWEST_SHARE = 10.0, 0.4
 LATEST_S = 0.25
 FARTHEST_BEHIND_S = 0.3
 
@@ -58,11 +58,15 @@ class PaceWatcher:
             self.frames_hz = min(self.frames_hz, len(self._frames_s) / WINDOW_S)
 
 
-def judged(report: FlightReport, pace: PaceWatcher, behind_s: float) -> FlightReport:
+def judged(
+    report: FlightReport, pace: PaceWatcher, behind_s: float, camera_hz: float
+) -> FlightReport:
     """The report of a simulated flight. Ended for safety on a computer that did not keep up,
-    it names that for its reason. `behind_s`: by how much the simulator lost against the wall."""
+    it names that for its reason. `behind_s`: by how much the simulator lost against the wall;
+    `camera_hz`: the pictures that the simulated camera takes, of which some are lost."""
+    fewest_hz = min(FEWEST_HZ, FEWEST_SHARE * camera_hz)
     kept_up = (
-        pace.frames_hz >= FEWEST_HZ and pace.late_s <= LATEST_S and behind_s <= FARTHEST_BEHIND_S
+        pace.frames_hz >= fewest_hz and pace.late_s <= LATEST_S and behind_s <= FARTHEST_BEHIND_S
     )
     if report.outcome is not Outcome.SAFETY or kept_up:
         return report

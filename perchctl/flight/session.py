@@ -74,7 +74,7 @@ def check_options(options: FlyOptions) -> None:
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
             f"source {options.source} belongs to the simulated vehicle, but the URI is "
-            f"{options.uri}; name the camera with --source (camera:N, http://...)"
+            f"{options.uri}; name the camera with --source (camera:N, http://..., aideck://HOST)"
         )
     if not is_live(options.source) and not options.simulated:
         raise UsageError(
@@ -130,7 +130,8 @@ def fly_session(
             )  # fmt: skip
             report = fly(parts)
             if simulated is not None:
-                report = judged(report, pace, _lag_s(simulated, clock) - lag_s)
+                behind_s = _lag_s(simulated, clock) - lag_s
+                report = judged(report, pace, behind_s, profile.simulation.camera_rate_hz)
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()

@@ -68,8 +68,8 @@ picture is so late that the target is not to be steered by."""
 class CameraConfig(Section):
     source: str = Field(
         "sim:",
-        description="`camera:N` or its name, `rtsp://...`, `http://...`, `video:FILE`, "
-        "`images:DIR`, `sim:`",
+        description="`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
+        "`video:FILE`, `images:DIR`, `sim:`",
     )
     calibration: str = Field(
         "example_640x480.yaml", description="file beside the profile, in `calib/`, or a whole path"

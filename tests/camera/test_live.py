@@ -17,14 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.camera.device import LOST_AFTER_FAILURES, Asked, DeviceSource, open_capture
-from perchctl.camera.mjpeg import (
-    MAX_FAILED_CONNECTIONS,
-    MAX_PICTURE_BYTES,
-    JpegSplitter,
-    MjpegSource,
-)
+from perchctl.camera.mjpeg import MAX_PICTURE_BYTES, JpegSplitter, MjpegSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
+from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
 from perchctl.errors import NotFound, TimedOut
 from perchctl.vision.types import Frame
 

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 import pytest
 
 from perchctl.camera.open import open_source
-from perchctl.camera.rtsp import MAX_FAILED_CONNECTIONS, WINDOW_S, RtspSource, Waiting
+from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting
 from perchctl.camera.source import LiveSource
+from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
 from perchctl.errors import NotFound, TimedOut
 from tests.camera.test_live import WAIT_S, Clock, level, next_frame, wait_for
 from tests.helpers.rtsp import RtspServer, Step

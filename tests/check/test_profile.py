@@ -95,6 +95,7 @@ def test_the_example_calibration_fits_no_camera_of_one_s_own(tmp_path: Path) -> 
     assert row_of(load_profile("sim"), "calibration file", source="camera:1").verdict is (
         Verdict.WARN
     )
+    assert row_of(load_profile("aideck"), "calibration file").verdict is Verdict.WARN
     example = (data_folder("calib") / "example_640x480.yaml").read_text(encoding="utf-8")
     for text, verdict in ((example, Verdict.WARN), (f"{example}\n", Verdict.PASS)):
         (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")

@@ -40,7 +40,7 @@ def watched(frames_hz: float, late_s: float = 0.0, phase: Phase = Phase.SEARCH) 
 def test_an_abort_on_a_slow_computer_names_the_computer(
     pace: PaceWatcher, behind_s: float, words: str
 ) -> None:
-    report = judged(REPORT, pace, behind_s)
+    report = judged(REPORT, pace, behind_s, 30.0)
     assert words in report.reason
     assert report.reason.startswith("this computer is too slow")
     assert report.reason.endswith("no picture for 3.0 s")
@@ -48,15 +48,20 @@ def test_an_abort_on_a_slow_computer_names_the_computer(
 
 
 def test_a_computer_that_keeps_up_is_not_blamed() -> None:
-    assert judged(REPORT, watched(30.0, late_s=0.1), 0.05) is REPORT
+    assert judged(REPORT, watched(30.0, late_s=0.1), 0.05, 30.0) is REPORT
     assert watched(30.0).frames_hz > FEWEST_HZ
 
 
 def test_a_flight_that_ended_well_is_left_as_it_is() -> None:
     perched = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging still", 1, 9.0, False)
-    assert judged(perched, watched(3.0, 2.0), 5.0) is perched
+    assert judged(perched, watched(3.0, 2.0), 5.0, 30.0) is perched
 
 
 def test_where_no_picture_is_looked_at_none_is_missed() -> None:
     assert watched(0.0, phase=Phase.COMPLETE).frames_hz == float("inf")
     assert watched(0.0, phase=Phase.LANDING).frames_hz == float("inf")
+
+
+def test_a_slow_camera_is_not_a_slow_computer() -> None:
+    assert judged(REPORT, watched(7.0), 0.0, 10.0) is REPORT
+    assert judged(REPORT, watched(3.0), 0.0, 10.0) is not REPORT

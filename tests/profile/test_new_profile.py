@@ -274,3 +274,21 @@ def test_profile_prints_a_schema_for_editors() -> None:
     refused = CliRunner().invoke(app, ["profile", "--schema", "-p", "sim"])
     assert refused.exit_code == 2
     assert "leave it out" in refused.stderr
+
+
+def test_an_aideck_gets_its_size_and_what_late_pictures_need(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = {"uri": "usb://0", "source": "aideck://192.168.4.1", "calibration": "none"}
+    run(NewProfileRequest(tmp_path / "m.yaml", said, defaults=True))
+    assert "none yet: wrote example_aideck_324x244.yaml" in capsys.readouterr().err
+    mine, shipped = load_profile(str(tmp_path / "m.yaml")), load_profile("aideck")
+    assert mine.camera.calibration == shipped.camera.calibration
+    assert (mine.kalman, mine.planner.ascend) == (shipped.kalman, shipped.planner.ascend)
+    assert mine.safety.max_frame_age_s == shipped.safety.max_frame_age_s
+
+
+def test_an_aideck_without_a_host_is_refused(tmp_path: Path) -> None:
+    said = {"uri": "usb://0", "source": "aideck://"}
+    with pytest.raises(PerchError, match="aideck://192"):
+        run(NewProfileRequest(tmp_path / "m.yaml", said, defaults=True))

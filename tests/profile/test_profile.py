@@ -17,13 +17,13 @@ from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.profile.places import listing
 
 
-@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv"])
+@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck"])
 def test_shipped_profiles_load(name: str) -> None:
     assert load_profile(name).name == name
 
 
 def test_the_shipped_profiles_are_all_listed() -> None:
-    assert {"sim", "paper", "crazyflie", "fpv"} <= set(listing("profiles"))
+    assert {"sim", "paper", "crazyflie", "fpv", "aideck"} <= set(listing("profiles"))
 
 
 def test_paper_constants() -> None:

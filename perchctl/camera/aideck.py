@@ -1,0 +1,164 @@
+"""The AI-deck's camera over Wi-Fi: ``aideck://HOST[:PORT]``, read by a thread, newest frame wins.
+
+HOST is 192.168.4.1 where the deck is its own access point. Bitcraze's example `wifi-img-streamer`
+has to be in the deck's GAP8; it sends raw or JPEG pictures of 324x244.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+from dataclasses import dataclass
+from urllib.parse import parse_qsl, urlsplit
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.camera.cpx import CpxPicture, CpxSplitter
+from perchctl.camera.mosaic import MosaicFilter
+from perchctl.camera.source import Clock
+from perchctl.camera.stream import (
+    CONNECT_TIMEOUT_S,
+    READ_TIMEOUT_S,
+    RECONNECT_WAIT_S,
+    StreamSource,
+)
+from perchctl.errors import InvalidValue
+
+PORT = 5000
+FORM = "aideck://HOST[:5000]"
+NO_PICTURE_S = 5.0
+"""Bytes that come for so long without a whole picture end the connection."""
+
+# What waits unread would be taken for new: the kernel holds back the deck instead.
+_RECEIVE_BYTES = 131072
+_READ_BYTES = 4 * _RECEIVE_BYTES
+_COLOURS: dict[str, bool | None] = {"auto": None, "yes": True, "no": False}
+_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|[0-9A-Fa-f:]+")
+
+
+@dataclass(frozen=True)
+class AiDeckAddress:
+    """`colour`: whether the camera has a colour mosaic; None is found out by its pictures."""
+
+    host: str
+    port: int = PORT
+    colour: bool | None = None
+
+
+def aideck_address(spec: str) -> AiDeckAddress:
+    """Of ``aideck://HOST[:PORT][?colour=auto|yes|no]``. Errors: InvalidValue."""
+    wrong = InvalidValue(
+        f"camera source {spec!r} is no AI-deck's address; write {FORM}, as in "
+        f"aideck://192.168.4.1, and behind it ?colour=yes or ?colour=no where the picture "
+        f"does not tell"
+    )
+    try:
+        parts = urlsplit(spec)
+        port = PORT if parts.port is None else parts.port
+        given = parse_qsl(parts.query, keep_blank_values=True, strict_parsing=bool(parts.query))
+    except ValueError:
+        raise wrong from None
+    options = dict(given)
+    colour = options.pop("colour", "auto")
+    if (
+        parts.scheme != "aideck"
+        or not _HOST.fullmatch(parts.hostname or "")
+        or port == 0
+        or parts.username is not None
+        or parts.path not in ("", "/")
+        or parts.fragment
+        or options
+        or colour not in _COLOURS
+    ):
+        raise wrong
+    return AiDeckAddress(str(parts.hostname), port, _COLOURS[colour])
+
+
+class AiDeckSource(StreamSource):
+    """Bitcraze's image streamer: CPX packets over TCP, raw or JPEG pictures.
+
+    A picture's time is that of its first byte less `latency_s`: the deck sends the header as soon
+    as the picture is taken, and only the transfer behind it, of 60 ms and more for a raw one,
+    hangs on the air. Its age of arrival is the last byte's.
+    """
+
+    def __init__(
+        self,
+        address: AiDeckAddress,
+        latency_s: float,
+        clock: Clock,
+        read_timeout_s: float = READ_TIMEOUT_S,
+        reconnect_wait_s: float = RECONNECT_WAIT_S,
+        no_picture_s: float = NO_PICTURE_S,
+    ) -> None:
+        name = f"aideck://{address.host}:{address.port}"
+        super().__init__(name, latency_s, clock, read_timeout_s, reconnect_wait_s)
+        self._address = address
+        self._no_picture_s = no_picture_s
+        self.bytes_seen = 0
+        self._grey = MosaicFilter(address.colour)
+        self._start(self._run)
+
+    def _connection(self) -> str:
+        with socket.socket(_family(self._address.host), socket.SOCK_STREAM) as connection:
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+            connection.settimeout(CONNECT_TIMEOUT_S)
+            connection.connect((self._address.host, self._address.port))
+            self._socket = connection
+            try:
+                if self._stop.is_set():
+                    return "closed"
+                connection.settimeout(self._read_timeout_s)
+                return self._read(connection)
+            finally:
+                self._socket = None
+
+    def _read(self, connection: socket.socket) -> str:
+        """Until the stream ends; why it did."""
+        splitter = CpxSplitter()
+        earlier, last_s = self.damaged, self._clock()
+        while not self._stop.is_set():
+            data = connection.recv(_READ_BYTES)
+            now_s = self._clock()
+            self.bytes_seen += len(data)
+            if not data:
+                return "the stream ended" if splitter.pictures else _nothing(splitter)
+            for picture in reversed(splitter.feed(data, now_s)):
+                image = _decoded(picture)
+                if image is not None:
+                    last_s = now_s
+                    self._put(self._grey(image), began_s=picture.began_s)
+                    break
+                splitter.damaged += 1
+            self.damaged = earlier + splitter.damaged
+            if now_s - last_s > self._no_picture_s:
+                return _nothing(splitter)
+        return "closed"
+
+
+def _nothing(splitter: CpxSplitter) -> str:
+    if splitter.bytes_seen == 0:
+        return "the deck took the connection and sent nothing; switch the Crazyflie off and on"
+    return (
+        f"{splitter.bytes_seen} bytes came, and no whole picture as Bitcraze's wifi-img-streamer "
+        f"sends them; is that the program in the deck?"
+    )
+
+
+def _decoded(picture: CpxPicture) -> NDArray[np.uint8] | None:
+    shape = (picture.height, picture.width)
+    pixels = np.frombuffer(picture.data, np.uint8)
+    if not picture.is_jpeg:
+        return pixels.reshape(shape)
+    try:
+        image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        return None
+    # Of the size that its header says: one picture's header never comes with another's bytes.
+    return image if image is not None and image.shape == shape else None  # type: ignore[return-value]
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -1,0 +1,310 @@
+"""The AI-deck's source on a deck that the test scripts, and the commands through it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perchctl.calibration.files import load_calibration
+from perchctl.camera.aideck import NO_PICTURE_S, AiDeckAddress, AiDeckSource, aideck_address
+from perchctl.camera.open import open_source
+from perchctl.camera.source import check_size
+from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
+from perchctl.errors import InvalidValue, TimedOut
+from perchctl.profile import TargetConfig
+from perchctl.sim.renderer import Renderer
+from perchctl.sim.scenario import Scenario
+from perchctl.vision.types import Frame
+from tests.helpers.aideck import (
+    AiDeck,
+    Pause,
+    Picture,
+    aideck,
+    bayer,
+    console,
+    header,
+    jpeg,
+    packet,
+    picture,
+    raw,
+    raw_packets,
+)
+from tests.helpers.boards import CHARUCO, BoardRenderer, draw_poses
+from tests.helpers.commands import run
+
+WAIT_S = 10.0  # bound of every wait; reached only when a test fails
+CAMERA = load_calibration("example_aideck_324x244.yaml")
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.t_s = 100.0
+
+    def __call__(self) -> float:
+        return self.t_s
+
+
+@pytest.fixture
+def deck() -> Iterator[AiDeck]:
+    with aideck() as deck:
+        yield deck
+
+
+@pytest.fixture
+def opened() -> Iterator[Callable[..., AiDeckSource]]:
+    sources: list[AiDeckSource] = []
+
+    def make(deck: AiDeck, clock: Clock | None = None, **options: float) -> AiDeckSource:
+        source = AiDeckSource(
+            aideck_address(deck.url), 0.06, clock or Clock(), reconnect_wait_s=0.0, **options
+        )
+        sources.append(source)
+        return source
+
+    yield make
+    for source in sources:
+        source.close()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    tick = threading.Event()
+    for _ in range(int(WAIT_S / 0.002)):
+        if condition():
+            return
+        tick.wait(0.002)
+    raise AssertionError("waited in vain")
+
+
+def next_frame(source: AiDeckSource) -> Frame:
+    found: list[Frame] = []
+
+    def ready() -> bool:
+        frame = source.poll(0.0)
+        if frame is not None:
+            found.append(frame)
+        return bool(found)
+
+    wait_for(ready)
+    return found[0]
+
+
+def level(frame: Frame) -> int:
+    return 20 * round(float(frame.image.mean()) / 20.0)
+
+
+Opened = Callable[..., AiDeckSource]
+
+
+def test_a_frame_is_of_its_first_byte_and_arrives_with_its_last(
+    deck: AiDeck, opened: Opened
+) -> None:
+    clock, begun, go = Clock(), threading.Event(), threading.Event()
+    whole = raw(picture(160))
+    deck.scripts.put([jpeg(picture(60)), begun, whole[:3000], go, whole[3000:], threading.Event()])
+    source = opened(deck, clock)
+    first = next_frame(source)
+    assert (first.index, level(first), first.t_arrival_s) == (0, 60, 100.0)
+    assert source.size_px == (324, 244)
+    before, clock.t_s = source.bytes_seen, 100.1
+    begun.set()
+    wait_for(lambda: source.bytes_seen > before)
+    clock.t_s = 100.3
+    go.set()
+    second = next_frame(source)
+    assert (second.index, level(second), second.t_arrival_s) == (1, 160, 100.3)
+    assert second.t_s == pytest.approx(100.1 - 0.06)
+
+
+FAULTS: dict[str, bytes] = {
+    "cut packet": raw(picture(80))[:50_000],
+    "half a header": raw(picture(80))[:9],
+    "lost chunk": b"".join(p for i, p in enumerate(raw_packets(picture(80))) if i != 40),
+    "wrong length": raw(picture(80))[:15] + b"\xf0\x01" + raw(picture(80))[17:],
+    "size of nonsense": header(324, 244, 4_000_000_000, 0) + raw(picture(80))[15:],
+    "garbage": bytes(range(256)) * 100,
+    "console amid": b"".join([*raw_packets(picture(80))[:9], *[console()] * 5]),
+    "JPEG that is none": header(324, 244, 500, 1) + packet(b"\xff\xd8" + bytes(498)),
+    "JPEG of another size": header(324, 244, len(jpeg(picture(80, (162, 122)))) - 99, 1)
+    + jpeg(picture(80, (162, 122)))[15:],
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_frames_go_on_after_a_fault(fault: str, deck: AiDeck, opened: Opened) -> None:
+    """On the same connection, with no wrong picture between."""
+    go, end = threading.Event(), threading.Event()
+    deck.scripts.put([raw(picture(60)), go, FAULTS[fault] + console() + raw(picture(160)), end])
+    source = opened(deck)
+    assert level(next_frame(source)) == 60
+    go.set()
+    after = next_frame(source)
+    assert (level(after), after.index) == (160, 1)
+    assert source.connections == 1
+    end.set()
+
+
+def test_it_reconnects_when_the_deck_restarts_or_stalls(deck: AiDeck, opened: Opened) -> None:
+    never = threading.Event()
+    whole = raw(picture(80))
+    deck.scripts.put([raw(picture(60)), whole[:40_000]])  # broken off
+    deck.scripts.put([whole[40_000:], never])  # the rest of it, and then nothing
+    deck.scripts.put([raw(picture(160)), never])
+    source = opened(deck, read_timeout_s=0.2)
+    assert level(next_frame(source)) == 60
+    after = next_frame(source)
+    assert (level(after), after.index) == (160, 1)
+    assert source.connections == 3
+
+
+def test_reconnects_are_bounded_and_the_reason_is_said(deck: AiDeck, opened: Opened) -> None:
+    for _ in range(MAX_FAILED_CONNECTIONS):
+        deck.scripts.put([b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+    source = opened(deck)
+    wait_for(lambda: "gave no picture" in (source.problem(100.0) or ""))
+    assert "in 5 attempts: 28 bytes came, and no whole picture" in str(source.problem(100.0))
+    assert deck.connections == MAX_FAILED_CONNECTIONS
+
+
+def test_a_deck_that_takes_the_connection_and_sends_nothing(deck: AiDeck, opened: Opened) -> None:
+    source = opened(deck)
+    wait_for(lambda: "gave no picture" in (source.problem(100.0) or ""))
+    assert "sent nothing; switch the Crazyflie off and on" in str(source.problem(100.0))
+
+
+def test_bytes_without_pictures_end_the_connection(deck: AiDeck, opened: Opened) -> None:
+    """A camera that hangs, while its console goes on talking."""
+    clock, said, never = Clock(), threading.Event(), threading.Event()
+    deck.scripts.put([raw(picture(60)), said, console(), never])
+    deck.scripts.put([raw(picture(160)), never])
+    source = opened(deck, clock)
+    next_frame(source)
+    clock.t_s += NO_PICTURE_S + 0.1
+    said.set()
+    assert level(next_frame(source)) == 160
+    assert source.connections == 2
+
+
+def test_a_colour_camera_gives_a_smooth_picture(deck: AiDeck, opened: Opened) -> None:
+    flat = np.clip(picture(150).astype(int) // 8 * 8, 0, 255).astype(np.uint8)
+    deck.forever = [raw(bayer(np.full_like(flat, 150)))]
+    frame = next_frame(opened(deck))
+    assert int(frame.image.max()) - int(frame.image.min()) <= 1
+
+
+def test_another_size_than_the_calibrations_is_refused(deck: AiDeck) -> None:
+    deck.forever = [raw(picture(90, (162, 122)))]
+    source = open_source(deck.url, 0.0, CAMERA.size_px, Clock(), timeout_s=WAIT_S)
+    try:
+        with pytest.raises(InvalidValue, match="162x122 px, but the calibration was made at 324x"):
+            check_size(source.size_px, CAMERA, source.describe())
+    finally:
+        source.close()
+
+
+def test_nobody_listens(deck: AiDeck) -> None:
+    deck.close()
+    with pytest.raises(TimedOut, match="5 attempts: connection refused"):
+        open_source(deck.url, 0.0, None, Clock(), timeout_s=WAIT_S)
+
+
+def test_closing_does_not_wait_for_a_stalled_deck(deck: AiDeck) -> None:
+    end = threading.Event()
+    deck.scripts.put([raw(picture(60)), end])
+    source = AiDeckSource(aideck_address(deck.url), 0.0, Clock(), read_timeout_s=1000.0)
+    next_frame(source)
+    source.close()
+    assert source._thread is not None
+    assert not source._thread.is_alive()
+    end.set()
+
+
+@pytest.mark.parametrize(
+    ("spec", "address"),
+    [
+        ("aideck://192.168.4.1", AiDeckAddress("192.168.4.1", 5000, None)),
+        ("aideck://192.168.4.1:5000/", AiDeckAddress("192.168.4.1", 5000, None)),
+        ("aideck://aideck-4E4BDC.local:81", AiDeckAddress("aideck-4e4bdc.local", 81, None)),
+        ("aideck://10.0.0.7?colour=yes", AiDeckAddress("10.0.0.7", 5000, True)),
+        ("aideck://10.0.0.7?colour=no", AiDeckAddress("10.0.0.7", 5000, False)),
+        ("aideck://[::1]:5001", AiDeckAddress("::1", 5001, None)),
+    ],
+)
+def test_an_address(spec: str, address: AiDeckAddress) -> None:
+    assert aideck_address(spec) == address
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        "aideck:", "aideck://", "aideck:192.168.4.1", "aideck://:5000", "aideck://a:b", "aideck://a:0",
+        "aideck://a:70000", "aideck://a/stream", "aideck://u:p@a", "aideck://a?colour=maybe",
+        "aideck://a?color=yes", "aideck://a?", "aideck://a b", "aideck://a#x", "aideck://[::1",
+    ],
+)  # fmt: skip
+def test_a_wrong_address_is_one_sentence(spec: str) -> None:
+    if spec == "aideck://a?":
+        assert aideck_address(spec).host == "a"
+        return
+    with pytest.raises(InvalidValue, match=r"write aideck://HOST\[:5000\], as in aideck://192"):
+        open_source(spec, 0.0, None, Clock())
+
+
+# -- the commands ------------------------------------------------------------
+
+
+RANGES_M = np.linspace(0.8, 0.1, 8)
+
+
+def approach(form: Callable[[Picture], bytes]) -> list[bytes]:
+    """The target nearer and nearer."""
+    scene = Renderer(Scenario(ceiling_z_m=2.2, camera_noise_sigma=4.0), CAMERA, TargetConfig())
+    frames = []
+    for i, z_m in enumerate(RANGES_M):
+        T_world_cam = np.eye(4)
+        T_world_cam[:3, 3] = (0.02, -0.03, 2.2 - z_m)
+        frames.append(form(scene.render([T_world_cam], 0.9, i)))
+    return frames
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "raw",
+        pytest.param("jpeg", marks=pytest.mark.long),
+        pytest.param("colour", marks=pytest.mark.long),
+    ],
+)
+def test_track_through_it(form: str, deck: AiDeck) -> None:
+    forms = {"raw": raw, "jpeg": jpeg, "colour": lambda image: jpeg(bayer(image))}
+    frames = approach(forms[form])
+    deck.scripts.put([step for f in frames for step in (console(), f, Pause(0.12))])
+    said = run("track", deck.url, "--json", "--calibration", "example_aideck_324x244.yaml")
+    lines = [json.loads(line) for line in said.stdout.splitlines()]
+    assert len(lines) >= 4, "slow computers skip some"
+    seen = [line["target"]["tvec_m"] for line in lines if line["stage"] != "none"]
+    assert len(seen) >= len(lines) - 1
+    for x_m, y_m, z_m in seen:
+        assert (x_m, y_m) == pytest.approx((-0.02, 0.03), abs=0.001)
+        assert min(abs(z_m / at_m - 1.0) for at_m in RANGES_M) < 0.01
+
+
+@pytest.mark.long
+def test_calibrate_through_it(deck: AiDeck, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    renderer = BoardRenderer(CAMERA, CHARUCO)
+    script: list[bytes | threading.Event | Pause] = []
+    for pose in draw_poses(rng, CAMERA, CHARUCO, 16):
+        image = raw(renderer.render(pose, rng))
+        script += [image, Pause(0.2), image, Pause(0.2), image, Pause(0.2)]
+    deck.scripts.put(script)  # and then it is gone, which ends the capture
+    output = tmp_path / "mine.yaml"
+    said = run("calibrate", deck.url, "--board", CHARUCO.notation(), "-o", str(output))
+    assert said.code == 0, said.stderr
+    found = load_calibration(output)
+    assert found.size_px == (324, 244)
+    assert np.allclose(found.K, CAMERA.K, atol=2.0)

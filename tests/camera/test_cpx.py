@@ -1,0 +1,198 @@
+"""An AI-deck's pictures out of its bytes: whole ones only, whatever breaks between them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.camera.cpx import STALLED_S, CpxPicture, CpxSplitter
+from perchctl.camera.mosaic import MosaicFilter, has_mosaic, without_mosaic
+from tests.helpers.aideck import (
+    APP,
+    CHUNK_BYTES,
+    Picture,
+    bayer,
+    console,
+    header,
+    jpeg,
+    jpeg_packets,
+    packet,
+    picture,
+    raw,
+    raw_packets,
+)
+
+SMALL = (60, 44)  # three chunks
+A, B, C, D = (picture(level, SMALL) for level in (40, 90, 140, 190))
+
+
+def split(stream: bytes, at: list[int] | None = None) -> list[CpxPicture]:
+    splitter, out, last = CpxSplitter(), [], 0
+    for place in [*(at or []), len(stream)]:
+        out += splitter.feed(stream[last:place], 0.0)
+        last = place
+    return out
+
+
+def grey(got: CpxPicture) -> Picture:
+    pixels = np.frombuffer(got.data, np.uint8)
+    if not got.is_jpeg:
+        return pixels.reshape(got.height, got.width)
+    return np.asarray(cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE), np.uint8)
+
+
+@pytest.mark.parametrize("size_px", [(324, 244), (162, 122), (324, 324), (160, 102)])
+def test_raw_and_jpeg_pictures_of_each_size(size_px: tuple[int, int]) -> None:
+    """The last one fills its chunks to the byte: the streamer then sends an empty packet."""
+    image = picture(120, size_px)
+    first, second = split(raw(image) + console() + jpeg(image))
+    assert (first.width, first.height, first.is_jpeg) == (*size_px, False)
+    assert (grey(first) == image).all()
+    assert second.is_jpeg
+    assert np.abs(grey(second).astype(float) - image).mean() < 4.0
+
+
+STREAM = b"".join([console(), raw(A), console(), jpeg(B), raw(C), console("x" * 300), jpeg(D)])
+WHOLE = split(STREAM)
+
+
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(st.lists(st.integers(0, len(STREAM)), max_size=40))
+def test_any_split_of_the_stream_gives_the_same_pictures(places: list[int]) -> None:
+    assert split(STREAM, sorted(places)) == WHOLE
+    assert len(WHOLE) == 4
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(
+    st.sampled_from(["cut", "insert", "change"]),
+    st.floats(0.0, 1.0),
+    st.integers(1, 3000),
+    st.binary(min_size=1, max_size=64),
+    st.booleans(),
+)
+def test_after_any_damage_the_next_picture_but_one_is_right(
+    how: str, where: float, length: int, filling: bytes, as_jpeg: bool
+) -> None:
+    form = jpeg if as_jpeg else raw
+    spoilt = console() + form(A) + console()
+    at = int(where * len(spoilt))
+    middle = {"cut": b"", "insert": filling + spoilt[at:], "change": filling}[how]
+    rest = {"cut": spoilt[at + length :], "insert": b"", "change": spoilt[at + len(filling) :]}[how]
+    out = split(spoilt[:at] + middle + rest + form(B) + form(C) + form(D))
+    right = split(form(B) + form(C) + form(D))
+    assert out[-2:] == right[1:], "the last two, right behind one another"
+    assert len(out) <= 4
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.binary(max_size=4000))
+def test_noise_neither_raises_nor_piles_up(noise: bytes) -> None:
+    splitter = CpxSplitter()
+    assert splitter.feed(noise * 8, 0.0) == []
+    assert len(splitter._buffer) < 100
+
+
+def without(packets: list[bytes], index: int) -> bytes:
+    return b"".join(p for i, p in enumerate(packets) if i != index)
+
+
+def wrong_length(by: int) -> bytes:
+    first, second, *rest = raw_packets(B)
+    length = int.from_bytes(second[:2], "little") + by
+    return first + length.to_bytes(2, "little") + second[2:] + b"".join(rest)
+
+
+FAULTS: dict[str, bytes] = {
+    "cut in the middle": raw(B)[: len(raw(B)) // 2],
+    "cut in a packet's head": raw(B)[: 15 + 2],
+    "half a header": raw(B)[:9],
+    "a chunk lost": without(raw_packets(B), 1),
+    "the last chunk lost": without(raw_packets(B), 3),
+    "the header lost": without(raw_packets(B), 0),
+    "a JPEG's chunk lost": without(jpeg_packets(B), 2),
+    "a JPEG's first part lost": without(jpeg_packets(B), 1),
+    "a JPEG's end lost": without(jpeg_packets(B), len(jpeg_packets(B)) - 1),
+    "a length too small": wrong_length(-7),
+    "a length too large": wrong_length(+5),
+    "a length beyond any packet": wrong_length(+40000),
+    "a size of nonsense": header(*SMALL, 0xFFFFFFFF, 0) + b"".join(raw_packets(B)[1:]),
+    "a JPEG's size of nonsense": header(*SMALL, 0xFFFFFFFF, 1) + b"".join(jpeg_packets(B)[1:]),
+    "a size of zero": header(*SMALL, 0, 1) + b"".join(jpeg_packets(B)[1:]),
+    "no width": header(0, 44, B.size, 0) + b"".join(raw_packets(B)[1:]),
+    "an unknown format": header(*SMALL, B.size, 7) + b"".join(raw_packets(B)[1:]),
+    "two bytes a pixel": header(*SMALL, B.size, 0, depth=2) + b"".join(raw_packets(B)[1:]),
+    "garbage": bytes(range(256)) * 9,
+    "a header twice": raw_packets(B)[0] + raw_packets(B)[0][:7],
+    "more than its size": header(*SMALL, B.size, 0) + packet(bytes(B.size + 8)[:CHUNK_BYTES]) * 3,
+    "a console that never ends": raw_packets(B)[0] + console("x" * 1000) * 100,
+    "a version that is none": raw_packets(B)[0] + packet(b"abc", APP | 0x40),
+    "a sender that is none": raw_packets(B)[0] + packet(b"abc", APP, 0x40 | 3),
+}
+
+
+@pytest.mark.parametrize("form", [raw, jpeg])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_costs_its_own_picture_only(fault: str, form: Callable[[Picture], bytes]) -> None:
+    splitter = CpxSplitter()
+    out = splitter.feed(form(A) + FAULTS[fault] + form(C) + form(D), 0.0)
+    assert out == split(form(A) + form(C) + form(D))
+    assert len(splitter._buffer) < 100
+
+
+def test_a_picture_of_two_is_none() -> None:
+    """A lost chunk, and the next header lost with it: the bytes would fit."""
+    stream = without(raw_packets(B), 1) + b"".join(raw_packets(C)[1:]) + raw(D)
+    assert split(stream) == split(raw(D))
+
+
+def test_a_picture_has_the_time_of_its_first_byte() -> None:
+    """Also where the one before was broken off, and the search went back to it later."""
+    splitter = CpxSplitter()
+    torn, whole = raw(A)[:2000], raw(B)
+    splitter.feed(torn, 10.0)
+    splitter.feed(whole[:500], 10.4)
+    assert splitter.feed(whole[500:-1], 10.6) == []
+    (got,) = splitter.feed(whole[-1:], 10.9)
+    assert got.began_s == 10.4
+
+
+def test_a_picture_that_stalls_is_dropped() -> None:
+    """Its end would be taken for its time of arrival by the flight's guards."""
+    splitter = CpxSplitter()
+    whole = raw(A)
+    splitter.feed(whole[:1500], 10.0)
+    assert splitter.feed(whole[1500:], 10.01 + STALLED_S) == []
+    assert splitter.damaged == 1
+    assert len(splitter.feed(raw(B), 10.1 + STALLED_S)) == 1
+
+
+def test_a_mosaic_is_told_from_grey() -> None:
+    scene = cv2.GaussianBlur(picture(130), (0, 0), 3.0)
+    for image in (scene, bayer(scene, (1.0, 1.0, 1.0))):
+        assert not has_mosaic(np.asarray(image, np.uint8))
+    for gains in ((0.55, 1.0, 0.7), (0.9, 1.0, 0.95)):
+        assert has_mosaic(bayer(np.asarray(scene, np.uint8), gains))
+
+
+def test_the_mosaic_goes_whatever_its_order() -> None:
+    flat = np.full((40, 60), 150, np.uint8)
+    for flip in (flat, flat[::-1], flat[:, ::-1]):
+        smooth = without_mosaic(np.ascontiguousarray(bayer(flip)))
+        assert int(smooth.max()) - int(smooth.min()) <= 1
+
+
+def test_a_colour_camera_is_found_once_and_stays_one() -> None:
+    mosaic, plain = bayer(picture(150)), picture(150)
+    found, told_no, told_yes = MosaicFilter(), MosaicFilter(False), MosaicFilter(True)
+    for _ in range(3):
+        assert (found(mosaic) == without_mosaic(mosaic)).all()
+    assert (found(plain) == without_mosaic(plain)).all(), "a scene that hides it changes nothing"
+    assert (told_no(mosaic) == mosaic).all()
+    assert (told_yes(plain) == without_mosaic(plain)).all()
+    assert (MosaicFilter()(plain) == plain).all()
