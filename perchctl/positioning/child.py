@@ -62,7 +62,6 @@ def serve_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = connect_back()
     setup = channel.receive(START_TIMEOUT_S)
-    channel.socket.settimeout(None)  # a parent that says nothing more is not gone
     try:
         client = _connected(setup)
         channel.send(Connected())

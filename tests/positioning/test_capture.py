@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 import perchctl
-from perchctl.children import Channel
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.positioning import capture as capture_module
-from perchctl.positioning import child
 from perchctl.positioning.capture import MotionCapture, open_capture, setup_of
 from perchctl.positioning.child import CaptureSetup
 from perchctl.positioning.feed import PositionFeed
@@ -169,6 +164,7 @@ def test_closing_ends_the_process_wherever_it_is(faulty: Callable[..., MotionCap
     assert not capture._reading.is_alive()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["stalls", "hangs"])
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
 def test_it_ends_with_a_parent_that_was_killed(
@@ -210,30 +206,6 @@ def _runs(pid: int) -> bool:
         return False
     stat = Path(f"/proc/{pid}/stat")
     return not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] != "Z"
-
-
-def test_a_parent_that_says_nothing_is_not_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It speaks once, at the start: the bound of that must not be one of the whole flight."""
-    ended: list[int] = []
-    library = SimpleNamespace(waitForNextFrame=lambda: time.sleep(0.002), rigidBodies={})
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        here = Channel(socket.create_connection(server.getsockname()))
-        there = Channel(server.accept()[0])
-    monkeypatch.setattr(child, "START_TIMEOUT_S", 0.05)
-    monkeypatch.setattr(child, "connect_back", lambda: there)
-    monkeypatch.setattr(child, "_connected", lambda setup: library)
-    monkeypatch.setattr(child.signal, "signal", lambda *what: None)
-    monkeypatch.setattr(child.os, "_exit", ended.append)
-    here.send(CaptureSetup("vicon"))
-    serving = threading.Thread(target=child.serve_parent, daemon=True)
-    serving.start()
-    begun_s = time.monotonic()
-    until(lambda: getattr(here.receive(10.0), "t_s", 0.0) > begun_s + 0.2)
-    assert ended == []
-    here.close()
-    serving.join(10.0)
-    until(lambda: ended)
-    there.close()
 
 
 def test_without_a_host_or_the_library_nothing_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:

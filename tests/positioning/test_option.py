@@ -25,16 +25,14 @@ def test_the_option_wins_over_the_profile(tmp_path: Path) -> None:
     profile = tmp_path / "lab.yaml"
     profile.write_text("extends: sim\npositioning: mocap\n", encoding="utf-8")
     for words, by in (
-        ((), "deck"),
         (("--positioning", "mocap"), "mocap"),
-        (("-p", str(profile)), "mocap"),
         (("-p", str(profile), "--positioning", "deck"), "deck"),
     ):
         done = fly(*words, "--dry-run", "--json")
         assert done.exit_code == 0, done.output
         assert json.loads(done.stdout)["profile"]["positioning"]["by"] == by
-    assert "positioning  motion capture" in fly("--positioning", "mocap", "--dry-run").stdout
-    assert "positioning" not in fly("--dry-run").stdout
+    text = fly("-p", str(profile), "--dry-run").stdout
+    assert "positioning  motion capture the simulated room's, body 'crazyflie'" in text
 
 
 def test_other_words_are_refused() -> None:
