@@ -174,6 +174,8 @@ def test_every_command_line_runs(
     request: pytest.FixtureRequest,
 ) -> None:
     words = cheap(line)
+    if "mocap" in words:
+        pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
     shutil.copytree(place, tmp_path, dirs_exist_ok=True)
     if "--collect" in words:
         (tmp_path / "session.csv").unlink()

@@ -31,8 +31,6 @@ AGREE_WITHIN_S, AGREE_FOR_S = 3.0, 0.5
 """Of one reset; the whole is bounded by `RESETS` of them."""
 AGREE_M, AGREE_RAD = 0.05, math.radians(5.0)
 """Ten times what a capture is trusted for, and what half a metre of climb can bear."""
-FARTHEST_M = 50.0
-"""No room is larger; a place in millimetres is beyond."""
 STILL_M = 0.05
 """From the reset until they agree: who carries the vehicle about has not put it down."""
 _POLL_S = 0.02
@@ -120,12 +118,6 @@ class Settling:
             )
         placed = feed.place()
         assert placed is not None  # `_await_positions` has seen one
-        if float(abs(placed.position_m).max()) > FARTHEST_M:
-            x, y, z = placed.position_m
-            raise InvalidValue(
-                f"{label(self._config)} has the vehicle at {x:.0f} {y:.0f} {z:.0f} m: a place in "
-                f"millimetres? Set the unit of its stream to metres"
-            )
         return placed
 
     def _reset(self, start: Placed) -> None:

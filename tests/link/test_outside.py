@@ -197,11 +197,6 @@ def test_a_hidden_body_is_named_before_anything_is_set() -> None:
     assert bench.orders == []
 
 
-def test_millimetres_are_named() -> None:
-    bench = Bench(place_m=(1200.0, -700.0, 30.0))
-    assert "a place in millimetres?" in refused(bench, InvalidValue)
-
-
 def test_a_vehicle_that_is_carried_is_waited_for() -> None:
     assert "it is being moved" in refused(Bench(carried_mps=0.3), TimedOut)
 

@@ -164,6 +164,7 @@ def test_closing_ends_the_process_wherever_it_is(faulty: Callable[..., MotionCap
     assert not capture._reading.is_alive()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fault", ["stalls", "hangs"])
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
 def test_it_ends_with_a_parent_that_was_killed(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +20,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
+from perchctl.positioning import thread
 from perchctl.positioning.feed import QUIET_S, FeedStatus, PositionFeed
 from perchctl.positioning.judge import STALE_S, place_of
 from perchctl.positioning.types import BodyPose, CaptureFrame
@@ -348,3 +351,32 @@ def test_a_noise_free_copy_differs_only_by_its_numbers() -> None:
     rig.frame({"cf": pose})
     rig.frame({"cf": replace(pose, quaternion=(math.cos(1e-4), 0.0, 0.0, math.sin(1e-4)))})
     assert len(rig.places) == 2
+
+
+def test_a_thread_that_hangs_in_the_link_is_named_and_holds_nobody_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(thread, "END_TIMEOUT_S", 0.05)
+    capture, entered, free = Script(), threading.Event(), threading.Event()
+    capture.frame = CaptureFrame(time.monotonic(), {"cf": BodyPose((1.0, 0.0, 0.5), LEVEL)})
+    sent: list[ExternalPosition] = []
+
+    def hang(place: ExternalPosition) -> bool:
+        entered.set()
+        assert free.wait(10.0)
+        sent.append(place)
+        return True
+
+    feed = PositionFeed(capture, hang, CONFIG)
+    turning = thread.FeedThread(feed, time.monotonic)
+    turning.start()
+    assert entered.wait(10.0)
+    status = feed.status(time.monotonic() + 1.0)
+    assert status.sent == 0
+    assert status.problem is not None
+    turning.close()
+    assert sent == []
+    capture.frame = CaptureFrame(time.monotonic(), {"cf": BodyPose((1.1, 0.0, 0.5), LEVEL)})
+    free.set()
+    turning._thread.join(10.0)
+    assert len(sent) == 1  # after `close` no other follows

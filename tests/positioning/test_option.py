@@ -1,0 +1,59 @@
+"""`--positioning`, its words, and what the plan says of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from perchctl.cli import app
+from perchctl.commands.complete import positionings
+
+REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
+
+
+def fly(*words: str) -> Result:
+    result = CliRunner().invoke(app, ["fly", *words])
+    assert "Traceback" not in result.output
+    return result
+
+
+def test_the_option_wins_over_the_profile(tmp_path: Path) -> None:
+    pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
+    profile = tmp_path / "lab.yaml"
+    profile.write_text("extends: sim\npositioning: mocap\n", encoding="utf-8")
+    for words, by in (
+        (("--positioning", "mocap"), "mocap"),
+        (("-p", str(profile), "--positioning", "deck"), "deck"),
+    ):
+        done = fly(*words, "--dry-run", "--json")
+        assert done.exit_code == 0, done.output
+        assert json.loads(done.stdout)["profile"]["positioning"]["by"] == by
+    text = fly("-p", str(profile), "--dry-run").stdout
+    assert "positioning  motion capture the simulated room's, body 'crazyflie'" in text
+
+
+def test_other_words_are_refused() -> None:
+    done = fly("--positioning", "gps", "--dry-run")
+    assert done.exit_code == 30
+    assert "'gps' is unknown; allowed are deck, mocap" in done.stderr
+    assert positionings("m") == ["mocap"]
+    assert positionings("") == ["deck", "mocap"]
+
+
+def test_a_real_vehicle_needs_the_computer_of_its_capture() -> None:
+    done = fly("--positioning", "mocap", *REAL)
+    assert done.exit_code == 30
+    assert "the computer of the motion capture (vicon) is not named" in done.stderr
+
+
+def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    from perchctl.flight import positions
+
+    monkeypatch.setattr(positions, "find_spec", lambda name: None)
+    done = fly("--positioning", "mocap")
+    assert done.exit_code == 2
+    assert "-m pip install 'perchctl[mocap]'" in done.stderr
+    assert done.stderr.strip().count("\n") == 0
