@@ -91,6 +91,14 @@ def paired(telemetry: Sequence[Telemetry], places: Sequence[Placed]) -> Moved | 
     return Moved(np.array(own), np.array(seen), np.array(place_m), moved_g)
 
 
+def is_enough(moved: Moved) -> bool:
+    """Lifted, turned and tilted, and put back: more would tell no more."""
+    turns, ways_m = turns_of(moved), np.linalg.norm(moved.place_m - moved.place_m[0], axis=1)
+    back = ways_m[-1] < STILL_M and _angle_rad(moved.own[0].T @ moved.own[-1]) < MOVED_RAD
+    whole = turns is not None and turns.up is not None and turns.R_body is not None
+    return whole and bool(back) and float(ways_m.max()) > 2.0 * LIFTED_M
+
+
 def row(moved: Moved | None, config: PositioningConfig) -> Row:
     """The comparison as one row: the gravest that was found."""
     if moved is None:

@@ -219,7 +219,7 @@ def _self_test(vehicle: Vehicle) -> Row:
 def _at_rest(vehicle: Vehicle, profile: Profile) -> list[Row]:
     """What needs telemetry, and around it what belongs there."""
     t = vehicle.telemetry
-    around = _decks(vehicle), _positioning(vehicle, profile)
+    around = _decks(vehicle, profile), _positioning(vehicle, profile)
     told = _parameters(vehicle, profile)
     if t is None:
         names = ("supervisor", "estimator", "ground", "level", "still", "battery")
@@ -250,8 +250,10 @@ def _supervisor(t: Telemetry) -> Row:
     return _by("supervisor", problem, f"ready (0x{t.supervisor:04X})")
 
 
-def _decks(vehicle: Vehicle) -> Row:
+def _decks(vehicle: Vehicle, profile: Profile) -> Row:
     decks = vehicle.measured_by.decks
+    if not decks and profile.positioning.by == "mocap":
+        return passed("decks", "none, and none is needed")
     if not decks:
         return warned("decks", "none", "mounted ones: take them off and put them on again")
     return passed("decks", ", ".join(decks))
@@ -270,7 +272,12 @@ def _positioning(vehicle: Vehicle, profile: Profile) -> Row:
     return passed("positioning", f"by {', '.join(decks)}" if decks else "by positions from outside")
 
 
+BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
+
+
 def _estimator(vehicle: Vehicle, t: Telemetry, profile: Profile) -> Row:
+    if profile.positioning.by == "mocap" and not vehicle.measured_by.position_decks:
+        return skipped("estimator", BY_FLY)
     problem = criteria.unsettled(t, profile)
     if problem is not None:
         return failed("estimator", problem.found, "is there a positioning system? wait a little")
@@ -288,6 +295,8 @@ def _estimator(vehicle: Vehicle, t: Telemetry, profile: Profile) -> Row:
 
 
 def _ground(t: Telemetry, profile: Profile) -> Row:
+    if profile.positioning.by == "mocap":
+        return skipped("ground", BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
         return failed("ground", "the position is no number", "restart the vehicle")
     return _by("ground", criteria.off_the_ground(t, profile), f"at {t.position_m[2]:.2f} m")

@@ -12,19 +12,25 @@ from perchctl.camera.device import device_listing
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
-from perchctl.check import camera, computer, gone, health, lift, link, quick, scan
+from perchctl.check import camera, capture, computer, gone, hand, health, lift, link, quick, scan
 from perchctl.check.lift import WITHIN_S as LIFT_S
 from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
 from perchctl.check.row import Row, failed, passed, skipped
 from perchctl.errors import ConnectionFailed, PerchError
 from perchctl.flight.clock import WallClock
+from perchctl.flight.positions import at_hand
 from perchctl.flight.session import FlyOptions, check_options, simulated_vehicle
 from perchctl.link.probe import ProbeLink
 from perchctl.link.scan import Answering, address_of
 from perchctl.link.scan import scan as scan_for
 from perchctl.link.uri import check_uri
 from perchctl.pipeline import Pipeline, make_pipeline
+from perchctl.positioning.capture import open_capture
+from perchctl.positioning.judge import label
+from perchctl.positioning.types import CaptureSource
 from perchctl.profile import Profile
+from perchctl.profile.positioning import PositioningConfig
+from perchctl.vehicle import Telemetry
 
 NO_VEHICLE = "the vehicle does not answer"
 AFTERWARDS = "the motor test ends by itself within 15 s: keep clear of the propellers"
@@ -35,7 +41,8 @@ class Wanted:
     """What is looked at beyond what can be seen at rest, and for how long, s.
 
     `may_turn_motors` asks for leave when the moment has come; None: no motor is turned. `tell`
-    says what goes on. `other_vehicles` looks for those that answer.
+    says what goes on. `other_vehicles` looks for those that answer, `open_capture` opens a motion
+    capture.
     """
 
     may_turn_motors: Callable[[], bool] | None = None
@@ -45,6 +52,8 @@ class Wanted:
     lift_s: float = LIFT_S
     health_s: float | None = None
     tell: Callable[[str], None] = lambda text: None
+    open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
+    capture_s: float = capture.LISTEN_S
     other_vehicles: Callable[[str], Answering] = lambda uri: scan_for([address_of(uri)])
 
 
@@ -63,6 +72,8 @@ def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
             simulated = stack.enter_context(simulated_vehicle(options, calibrated))
             uri = simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
+            profile = _with_capture_at(profile, simulated.capture)
+        room = _opened_capture(profile.positioning, wanted, stack)
         probe = ProbeLink(uri, profile.link, time.monotonic)
         stack.callback(probe.close)
         heard: Listened = Silent()
@@ -71,10 +82,11 @@ def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
             probe.connect()
         except ConnectionFailed as error:
             yield from _no_vehicle(options, error, wanted)
+            yield from _room(room, lambda: [], profile, wanted)
         else:
             heard = probe
             yield passed("address", f"{options.uri} answers")
-            yield from _vehicle(probe, options, wanted)
+            yield from _vehicle(probe, options.uri, profile, room, wanted)
         wanted.tell(f"opening the camera {options.source}")
         try:
             source = _source(spec, options, stack)
@@ -105,25 +117,79 @@ def _no_vehicle(options: FlyOptions, error: ConnectionFailed, wanted: Wanted) ->
         yield skipped(name, NO_VEHICLE)
 
 
-def _vehicle(probe: ProbeLink, options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
-    profile = options.profile
+Room = CaptureSource | str | None
+"""An open motion capture, or why it could not be opened; None where decks do it."""
+
+
+def _with_capture_at(profile: Profile, simulated: tuple[str, str] | None) -> Profile:
+    positioning = at_hand(profile.positioning, simulated)
+    return profile.model_copy(update={"positioning": positioning})
+
+
+def _opened_capture(config: PositioningConfig, wanted: Wanted, stack: contextlib.ExitStack) -> Room:
+    if config.by != "mocap":
+        return None
+    wanted.tell(f"connecting to {label(config)}")
+    try:
+        opened = wanted.open_capture(config)
+    except PerchError as error:
+        return str(error)
+    stack.callback(opened.close)
+    return opened
+
+
+def _room(
+    room: Room, heard: Callable[[], list[Telemetry]], profile: Profile, wanted: Wanted
+) -> Iterator[Row]:
+    """The rows of the motion capture; none with decks."""
+    if room is None:
+        return
+    if isinstance(room, str):
+        yield from capture.refused(room, profile.positioning)
+        return
+    wanted.tell(f"listening to {label(profile.positioning)} for {wanted.capture_s:g} s")
+    seen = capture.listen(heard, room, time.monotonic, time.sleep, wanted.capture_s)
+    yield from capture.rows(seen, profile)
+
+
+def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> Row:
+    """By its own position, or by a motion capture against its attitude."""
+    if room is None:
+        wanted.tell(f"now, within {wanted.lift_s:g} s: {lift.HOW}")
+        return lift.row(lift.lift_of(lift.watch(probe, time.sleep, wanted.lift_s)))
+    if isinstance(room, str):
+        return skipped(lift.NAME, f"no {label(profile.positioning)}")
+    config = profile.positioning
+    wanted.tell(f"now, within {wanted.lift_s:g} s: {hand.HOW}")
+
+    def enough(so_far: capture.Listened) -> bool:
+        moved = hand.paired(so_far.telemetry, so_far.places(config))
+        return moved is not None and hand.is_enough(moved)
+
+    seen = capture.listen(probe.telemetry, room, time.monotonic, time.sleep, wanted.lift_s, enough)
+    return hand.row(hand.paired(seen.telemetry, seen.places(config)), config)
+
+
+def _vehicle(
+    probe: ProbeLink, uri: str, profile: Profile, room: Room, wanted: Wanted
+) -> Iterator[Row]:
     wanted.tell(f"listening to the vehicle for {wanted.listen_s:g} s")
-    seen = link.look(probe, options.uri, wanted.listen_s)
+    seen = link.look(probe, uri, wanted.listen_s)
     if lost := probe.lost():
         yield failed("packets", f"the link was lost: {lost}", "see address; restart the vehicle")
         for name in (*link.NAMES[1:], lift.NAME, *health.NAMES):
             yield skipped(name, NO_VEHICLE)
         return
     yield from link.rows(seen, profile)
-    yield from _with_a_hand(probe, profile, wanted)
+    yield from _room(room, probe.telemetry, profile, wanted)
+    yield from _with_a_hand(probe, room, profile, wanted)
     yield from gone.rows(probe)
 
 
-def _with_a_hand(probe: ProbeLink, profile: Profile, wanted: Wanted) -> Iterator[Row]:
+def _with_a_hand(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> Iterator[Row]:
     """What somebody has to lift it for, or to keep clear of; it may end with a dead vehicle."""
     if wanted.lift:
-        wanted.tell(f"now, within {wanted.lift_s:g} s: {lift.HOW}")
-        yield lift.row(lift.lift_of(lift.watch(probe, time.sleep, wanted.lift_s)))
+        yield _lifted(probe, room, profile, wanted)
     else:
         yield lift.unasked()
     if wanted.may_turn_motors is None:

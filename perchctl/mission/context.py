@@ -63,7 +63,7 @@ class Context:
     def placed(self) -> bool:
         """Whether the estimated position and speed can prove anything: not where they come from
         outside and do not, or have only just come again. With decks always."""
-        if self.obs.position_age_s > self.profile.positioning.hold_s:
+        if self.state.astray or self.obs.position_age_s > self.profile.positioning.hold_s:
             return False
         stale_s = self.state.stale_s
         return stale_s is None or self.obs.t_s - stale_s > PUT_RIGHT_S

@@ -168,8 +168,8 @@ def why_astray(c: Context) -> str:
     setpoint = c.state.setpoint
     away_m = 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
     return (
-        f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: the motion "
-        f"capture's axes or the body's heading are not the vehicle's, see perchctl check --lift"
+        f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: swapped axes "
+        f"in the motion capture, or a body that is turned in it; perchctl check --lift tells"
     )
 
 

@@ -19,6 +19,7 @@ DAMPING_S_PER_M = 0.15
 INTEGRAL_PER_M = 0.1
 RAMP_PER_S = 0.25
 STILL_MPS = 0.05
+ASTRAY_PART, ASTRAY_S = 0.88, 1.5
 
 
 def can_level(c: Context) -> bool:
@@ -40,7 +41,10 @@ def level_down(c: Context) -> Acted:
     if vz > -STILL_MPS:
         before = state.level_thrust or hover
         thrust = min(thrust, before - RAMP_PER_S * hover * dt_s)
-    thrust = max(0.4 * hover, min(60000.0, thrust))
+    # The speed of a vehicle that is astray is not its own: it sinks by a little less than hovering
+    # takes, from the little height that it has, before it is let down.
+    blind = state.astray and c.in_phase_s < ASTRAY_S
+    thrust = max((ASTRAY_PART if blind else 0.4) * hover, min(60000.0, thrust))
     state = replace(
         state, hover_thrust=hover, level_thrust=thrust, setpoint=None, orders=0, caught=True
     )

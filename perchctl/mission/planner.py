@@ -229,7 +229,7 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
             # In a climb the accelerometer tells by how much the thrust is above the weight.
             g = min(1.5, max(0.75, obs.telemetry.acc_z_g))
             hover = old.hover_thrust or obs.telemetry.thrust / g
-            return replace(new, heading_lost=True, hover_thrust=hover)
+            return replace(new, heading_lost=True, astray=True, hover_thrust=hover)
         case Phase.LANDING if new.row == "mounting":
             # The setpoint is ahead, and every centimetre there is one in a wrong direction.
             return replace(new, setpoint=None)

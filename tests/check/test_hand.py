@@ -94,16 +94,16 @@ def test_a_true_capture_passes() -> None:
     assert "rose by 0.30 m" in row.found
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.sampled_from(TURNS), st.integers(0, 99), st.floats(-3.1, 3.1))
-def test_each_of_the_axes_is_found_and_named(turn: Array, seed: int, yaw: float) -> None:
+@pytest.mark.parametrize("number", range(len(TURNS)))
+def test_each_of_the_axes_is_found_and_named(number: int) -> None:
     """A world in other axes, in whatever heading, its body defined along them."""
-    row = recorded(seed, turn @ rot_z(yaw), rot_z(-yaw) @ turn.T)
+    turn, yaw = TURNS[number], 0.7 * number
+    row = recorded(number, turn @ rot_z(yaw), rot_z(-yaw) @ turn.T)
     if named_up(turn) != "z":
         assert row.verdict is Verdict.FAIL
         assert f"swapped axes: up is {named_up(turn)} in" in row.found
-    elif np.allclose(turn @ rot_z(yaw), rot_z(yaw)) and np.allclose(turn, I3):
-        assert abs(yaw) < math.radians(5.5) or row.verdict is not Verdict.PASS
+    elif number:  # the first names them as they are
+        assert "the rigid body's axes are turned by" in row.found
 
 
 @pytest.mark.parametrize("turn", UPRIGHT)

@@ -333,7 +333,28 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone() -> None:
     assert "perchctl check --lift" in state.reason
     assert raw[0] < 60000 / 1.1
     assert raw == sorted(raw, reverse=True)
-    assert raw[-1] < 0.85 * 60000 / 1.1
+    assert raw[-1] > 0.85 * 60000 / 1.1  # not let fall: its speed is not its own
+
+
+def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
+    """On the floor, by a height that says 0.6 m: the motors are stopped all the same, in time."""
+    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
+    thrust = 60000.0
+    for t_s in times(14.0):
+        down = t_s > BEGIN_S + 2.0
+        body_m = (0.0, 0.2, 0.6 if down else 0.0)
+        tel = telemetry(
+            t_s, position_m=body_m, thrust=thrust, supervisor=READY if thrust == 0 else AIRBORNE
+        )
+        obs = observation(t_s, telemetry=tel, target=None)
+        state, command = planner.step(state, obs, MOCAP)
+        if isinstance(command, RawThrust):
+            thrust = float(command.thrust)
+        elif isinstance(command, StopMotors):
+            thrust = 0.0
+        if planner.is_over(state):
+            break
+    assert state.phase is Phase.LANDED
 
 
 @pytest.mark.parametrize("profile", [PROFILE, MOCAP])
