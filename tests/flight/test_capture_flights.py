@@ -1,0 +1,98 @@
+"""Whole flights of a vehicle without a deck, by a simulated motion capture, in lockstep."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.errors import ConnectionFailed, SafetyAbort
+from perchctl.mission.state import Outcome, Phase
+from perchctl.sim.capture.settings import MILLIMETRES, SWAPPED_XY, Y_UP, CaptureFault
+from tests.helpers.flights import Flown, fly_short
+
+MOCAP = {"positioning.by": "mocap"}
+ASIDE = {"origin_m": (0.7, -0.5, 0.0)}
+"""Nobody starts at the very origin of a room's capture."""
+FOR_EVER_S = 1e3
+IN_ALIGN_S = 4.0
+
+
+def flown(**capture: Any) -> Flown:
+    return fly_short(MOCAP, capture=ASIDE | capture)
+
+
+def wrong(since_s: float, for_s: float = FOR_EVER_S, **what: Any) -> dict[str, Any]:
+    return {"faults": ((since_s, since_s + for_s, CaptureFault(**what)),)}
+
+
+def test_it_perches_in_another_world_though_the_body_is_hidden_for_a_moment() -> None:
+    """Turned and shifted against the vehicle's own start, 0.3 s without a position."""
+    it = flown(heading_rad=2.0, **wrong(IN_ALIGN_S, 0.3, occluded=True))
+    assert it.report.phase is Phase.PERCHED
+    assert it.flight.perched_miss_m is not None
+    assert it.flight.perched_miss_m < 0.01
+    assert Phase.LANDING.value not in it.way
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ({"occluded": True}, "does not see the rigid body 'crazyflie'; it sees wand"),
+        ({"frozen": True}, "is frozen"),
+        ({"gone": True}, "no frame has come"),
+        ({"swapped": True}, "another body is taken for it"),
+        ({"scale": MILLIMETRES}, "jumped by"),
+    ],
+)
+def test_what_lasts_is_landed_and_named(what: dict[str, Any], words: str) -> None:
+    it = flown(**wrong(IN_ALIGN_S, **what))
+    assert it.report.phase is Phase.LANDED, it.report.reason
+    assert it.report.outcome is Outcome.SAFETY
+    assert words in it.report.reason
+    assert not it.flight.fell
+    assert it.farthest_m < 0.5
+
+
+@pytest.mark.long
+def test_a_capture_that_is_50_ms_late_is_flown_by() -> None:
+    it = flown(**wrong(IN_ALIGN_S, late_s=0.05))
+    assert it.report.phase is Phase.PERCHED
+    assert it.flight.perched_miss_m is not None
+    assert it.flight.perched_miss_m < 0.03
+
+
+@pytest.mark.parametrize(
+    ("capture", "words"),
+    [
+        ({"axes": Y_UP}, "swapped axes"),
+        (wrong(0.0, scale=MILLIMETRES), "millimetres"),
+    ],
+)
+def test_swapped_axes_and_millimetres_do_not_take_off(capture: dict[str, Any], words: str) -> None:
+    with pytest.raises(SafetyAbort, match=words):
+        flown(**capture)
+
+
+def test_a_body_that_is_not_there_is_no_flight() -> None:
+    with pytest.raises(ConnectionFailed, match="does not see the rigid body"):
+        flown(**wrong(0.0, occluded=True))
+
+
+@pytest.mark.long
+def test_axes_turned_about_the_vertical_are_named_in_the_first_rise() -> None:
+    """What no vehicle that stands can know: its positions turn the wrong way as it moves."""
+    it = flown(axes=SWAPPED_XY)
+    assert it.report.phase is not Phase.PERCHED
+    assert "axes" in it.report.reason
+
+
+@pytest.mark.long
+def test_the_body_s_own_axes_are_the_profile_s() -> None:
+    own = {"positioning.body_rpy_deg": [0, 0, 90], "positioning.body_position_m": [0.02, 0, 0.03]}
+    it = fly_short(MOCAP | own, capture={"heading_rad": -math.pi / 3})
+    assert it.report.phase is Phase.PERCHED
