@@ -19,7 +19,6 @@ from perchctl.errors import InvalidValue, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import Frame
 from tests.helpers.aideck import (
     AiDeck,
     Pause,
@@ -36,17 +35,9 @@ from tests.helpers.aideck import (
 )
 from tests.helpers.boards import CHARUCO, BoardRenderer, draw_poses
 from tests.helpers.commands import run
+from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
 
-WAIT_S = 10.0  # bound of every wait; reached only when a test fails
 CAMERA = load_calibration("example_aideck_324x244.yaml")
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.t_s = 100.0
-
-    def __call__(self) -> float:
-        return self.t_s
 
 
 @pytest.fixture
@@ -69,32 +60,6 @@ def opened() -> Iterator[Callable[..., AiDeckSource]]:
     yield make
     for source in sources:
         source.close()
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    tick = threading.Event()
-    for _ in range(int(WAIT_S / 0.002)):
-        if condition():
-            return
-        tick.wait(0.002)
-    raise AssertionError("waited in vain")
-
-
-def next_frame(source: AiDeckSource) -> Frame:
-    found: list[Frame] = []
-
-    def ready() -> bool:
-        frame = source.poll(0.0)
-        if frame is not None:
-            found.append(frame)
-        return bool(found)
-
-    wait_for(ready)
-    return found[0]
-
-
-def level(frame: Frame) -> int:
-    return 20 * round(float(frame.image.mean()) / 20.0)
 
 
 Opened = Callable[..., AiDeckSource]

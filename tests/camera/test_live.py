@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import ssl
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, ClassVar
@@ -22,17 +22,7 @@ from perchctl.camera.open import open_source
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
 from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
 from perchctl.errors import NotFound, TimedOut
-from perchctl.vision.types import Frame
-
-WAIT_S = 10.0  # bound of every wait; reached only when a test fails
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.t_s = 100.0
-
-    def __call__(self) -> float:
-        return self.t_s
+from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
 
 
 def jpeg(level: int, size: tuple[int, int] = (48, 64), **options: int) -> bytes:
@@ -40,16 +30,6 @@ def jpeg(level: int, size: tuple[int, int] = (48, 64), **options: int) -> bytes:
     image = np.clip(rng.normal(level, 4.0, size), 0, 255).astype(np.uint8)
     flags = [x for pair in options.items() for x in (getattr(cv2, pair[0]), pair[1])]
     return bytes(cv2.imencode(".jpg", image, flags)[1].tobytes())
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Poll on an event with a bound; no fixed pauses."""
-    tick = threading.Event()
-    for _ in range(int(WAIT_S / 0.002)):
-        if condition():
-            return
-        tick.wait(0.002)
-    raise AssertionError("waited in vain")
 
 
 # -- the splitter ------------------------------------------------------------
@@ -210,23 +190,6 @@ def stream(server: Server, clock: Clock, opened: list[LiveSource], **options: fl
     source = MjpegSource(server.url, 0.07, clock, reconnect_wait_s=0.0, **options)
     opened.append(source)
     return source
-
-
-def next_frame(source: LiveSource) -> Frame:
-    found: list[Frame] = []
-
-    def ready() -> bool:
-        frame = source.poll(0.0)
-        if frame is not None:
-            found.append(frame)
-        return bool(found)
-
-    wait_for(ready)
-    return found[0]
-
-
-def level(frame: Frame) -> int:
-    return 20 * round(float(frame.image.mean()) / 20.0)
 
 
 def test_frames_are_stamped_at_arrival_less_the_latency(

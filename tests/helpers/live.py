@@ -1,0 +1,47 @@
+"""What tests of live sources share: a clock that stands, and waits with a bound."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from perchctl.camera.source import LiveSource
+from perchctl.vision.types import Frame
+
+WAIT_S = 10.0  # bound of every wait; reached only when a test fails
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.t_s = 100.0
+
+    def __call__(self) -> float:
+        return self.t_s
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    """Poll on an event with a bound; no fixed pauses."""
+    tick = threading.Event()
+    for _ in range(int(WAIT_S / 0.002)):
+        if condition():
+            return
+        tick.wait(0.002)
+    raise AssertionError("waited in vain")
+
+
+def next_frame(source: LiveSource) -> Frame:
+    found: list[Frame] = []
+
+    def ready() -> bool:
+        frame = source.poll(0.0)
+        if frame is not None:
+            found.append(frame)
+        return bool(found)
+
+    wait_for(ready)
+    return found[0]
+
+
+def level(frame: Frame) -> int:
+    """Of a picture of one grey, to the nearest 20."""
+    return 20 * round(float(frame.image.mean()) / 20.0)
