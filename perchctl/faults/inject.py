@@ -43,7 +43,7 @@ from perchctl.geometry import GRAVITY_MPS2, rot_z
 from perchctl.mission.state import Phase
 from perchctl.mission.watch import Event, Tick
 from perchctl.sim.firmware.controller import Estimate
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 
 EXTERNAL_EVERY = 2  # of the 10 ms: positions from outside come at 50 Hz
 
@@ -75,7 +75,7 @@ def _other_room(scenario: Scenario, room: Room) -> Scenario:
         ceiling_z_m=room.ceiling_z_m or scenario.ceiling_z_m,
         no_target=room.no_target or scenario.no_target,
         target_above_ceiling_m=room.target_above_ceiling_m,
-        second_target_m=room.second_target_m,
+        neighbours=() if room.second_target_m is None else (Neighbour(room.second_target_m),),
         T_body_cam_true=tuple(tuple(row) for row in rows),
     )
 

@@ -92,6 +92,14 @@ class SimulationConfig(Section):
         0.1, ge=0, le=1, description="share of flights in which the first contact does not hold"
     )
     no_target: bool = Field(False, description="a bare ceiling")
+    neighbours: tuple[tuple[float, float, float], ...] = Field(
+        (),
+        max_length=8,
+        description="other targets beside the own one: x and y (m) in its axes, heading (deg)",
+    )
+    neighbour_ids: tuple[int, int] | None = Field(
+        None, description="of their large and small markers; none: the own target's"
+    )
 
 
 class LogConfig(Section):
