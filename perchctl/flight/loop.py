@@ -234,6 +234,7 @@ def _observe(parts: FlightParts, senses: Senses, now_s: float, late_s: float) ->
         operator=parts.operator(),
         log_problem=next((w.problem for w in parts.watchers if w.problem), None),
         delay_s=senses.noticed.used_s,
+        target_refused=senses.refused,
     )
 
 

@@ -75,6 +75,7 @@ class Verdict:
     same: bool = False
     stranger: Stranger | None = None
     text: str = ""
+    refused: bool = False  # another vehicle's, by its place
 
 
 def judged(
