@@ -34,7 +34,8 @@ class HostSetup:
 
     `camera` None: no camera and no stream. Ports 0: chosen by the operating system.
     `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
-    parent has ended. `linger_s`: how long the vehicle then runs on, in wall-clock time.
+    parent has ended. `heard_file`: JSON lines of every packet that arrived, and who had sent it.
+    `linger_s`: how long the vehicle then runs on, in wall-clock time.
     """
 
     scenario: Scenario = field(default_factory=Scenario)
@@ -45,6 +46,7 @@ class HostSetup:
     port: int = 0
     http_port: int = 0
     truth_file: str | None = None
+    heard_file: str | None = None
     linger_s: float = LINGER_S
 
 
