@@ -22,6 +22,7 @@ for _name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP"):
         _usual = signal.default_int_handler if _name == "SIGINT" else signal.SIG_DFL
         signal.signal(_number, _usual)
 
+
 @pytest.fixture(scope="session", autouse=True)
 def _runtime_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """One of its own for each worker: two that name the same address must not meet there."""
