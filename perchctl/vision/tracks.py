@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perchctl.profile import KalmanConfig
-from perchctl.vision.filter import FilterSetup, Measurement, make_filter, step_track
+from perchctl.vision.filter import POSITION, FilterSetup, Measurement, make_filter, step_track
 from perchctl.vision.gate import Sight, Verdict, judged, locked, remembered
 from perchctl.vision.own import NOWHERE, OwnPlace, refusal
 from perchctl.vision.places import measurement
 from perchctl.vision.pose import PoseSetup
+from perchctl.vision.predict import is_in_view
 from perchctl.vision.types import (
     Attitude,
     Lock,
@@ -86,6 +87,10 @@ def followed_on(
     sight, verdict = None, Verdict(taken=True, stranger=state.stranger)
     if fed:
         sight = _sight(measured, fed, t_s, in_world)
+        if state.stranger is not None and state.lock is not None and attitude is not None:
+            place_m = state.lock.track.x[POSITION]
+            looks = not in_world or is_in_view(place_m, attitude, setup.pose)
+            sight = replace(sight, looks_there=looks)
         another = refusal(sight.pose, attitude, setup.own, setup.pose)
         verdict = _verdict(state, sight, another, constants, setup.gate)
     if not setup.gate:

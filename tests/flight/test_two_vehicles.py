@@ -25,8 +25,10 @@ from perchctl.calibration.files import camera_of
 from perchctl.flight.pace import FEWEST_HZ, LATEST_S, WINDOW_S
 from perchctl.log.read import FlightLog, read_log
 from perchctl.profile import Profile, load_profile
+from perchctl.sim.draw import draw_scenario
 from perchctl.sim.process.handle import SimProcess
-from tests.helpers.flights import ROOT, SHORT, short_profile
+from perchctl.sim.scenario import Neighbour
+from tests.helpers.flights import ROOT, SEED, SHORT, fly_short, short_profile
 from tests.helpers.room import Heard, Pair, Perch, farthest_m, fly_one, heard, knowing, pair
 
 APART_M = 0.8
@@ -69,6 +71,18 @@ def test_a_pair_perches_side_by_side(tmp_path: Path) -> None:
         seen = xy[np.isfinite(xy[:, 0])]
         assert np.linalg.norm(seen - scenario.target_xy_m, axis=1).max() < APART_M / 4
         assert not any("taken up anew" in (r["lock_note"] or "") for r in log.records)
+
+
+@pytest.mark.long
+def test_where_only_the_other_s_is_in_view_it_lands_and_says_why() -> None:
+    """Before it has gone anywhere."""
+    here = draw_scenario(short_profile(), SEED).target_xy_m
+    flown = fly_short(
+        {"target.expected_xy_m": here}, no_target=True, neighbours=(Neighbour((0.4, 0.0)),)
+    )
+    assert flown.way == ["APPROACH", "SEARCH", "LANDING", "LANDED"]
+    assert "0.40 m from target.expected_xy_m is not followed" in flown.report.reason
+    assert flown.farthest_m < 0.15
 
 
 @pytest.mark.campaign

@@ -34,12 +34,18 @@ Output = PipelineOutput
 @lru_cache(maxsize=4)
 def renderer(neighbour: Neighbour) -> Renderer:
     scene = Scenario(
-        target_xy_m=OWN_M, target_yaw_rad=0.3, ceiling_z_m=CEILING_M, neighbours=(neighbour,)
+        target_xy_m=OWN_M,
+        target_yaw_rad=0.3,
+        ceiling_z_m=CEILING_M,
+        neighbours=(neighbour,),
+        no_target=neighbour is ALONE,
     )
     return Renderer(scene, CAMERA, Profile().target)
 
 
 ALIKE = Neighbour((APART_M, 0.0), 0.7)
+ALONE = Neighbour((APART_M, 0.0), 0.7, large_id=997)
+"""... with the own one taken down (`renderer`)."""
 
 
 def profile(**target: object) -> Profile:
@@ -59,11 +65,12 @@ class Flight:
     pipeline: Pipeline
     neighbour: Neighbour = ALIKE
     k: int = 0
+    hz: float = HZ
     state: PipelineState = field(default_factory=PipelineState)
 
     def at(self, xy_m: tuple[float, float], below_m: float, yaw_rad: float = 0.0) -> Output:
         position_m = (xy_m[0], xy_m[1], CEILING_M - below_m)
-        t_s = self.k / HZ
+        t_s = self.k / self.hz
         T = make_T(rot_z(yaw_rad), position_m)
         image = renderer(self.neighbour).render([T], frame_index=self.k)
         attitude = Attitude(t_s, 0.0, 0.0, yaw_rad, position_m)
@@ -149,6 +156,23 @@ def test_a_lock_goes_on_where_the_estimate_has_drifted_out_of_the_circle() -> No
     assert place(flown.at(OWN_M, BOTH_READ_M)) == pytest.approx(OWN_M, abs=0.02)
     flown = Flight(pipeline, k=1)
     assert place(flown.at(OWN_M, BOTH_READ_M)) is None
+
+
+@pytest.mark.parametrize(("beyond", "taken"), [(1.75, False), (1.0, True)])
+def test_a_lock_goes_over_only_where_its_own_place_is_looked_at_and_empty(
+    beyond: float, taken: bool
+) -> None:
+    """Out of the picture it may hang there still; in the picture it has been moved."""
+    flown = flight()
+    flown.hz = 10.0
+    assert all(place(flown.at(OWN_M, BOTH_READ_M)) for _ in range(8))
+    away_m = between_both(beyond)
+    for _ in flown.along(OWN_M, away_m, BOTH_READ_M, 12):
+        pass
+    flown.neighbour = ALONE if taken else ALIKE
+    notes = [flown.at(away_m, BOTH_READ_M).lock_note for _ in range(42)]
+    assert any("taken up anew" in note for note in notes) is taken
+    assert any(note.startswith("not the tracked target") for note in notes)
 
 
 def test_a_target_with_other_ids_is_none() -> None:
