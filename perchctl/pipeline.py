@@ -23,6 +23,7 @@ from perchctl.vision.markers.cut import prepare
 from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
 from perchctl.vision.markers.mask import GearMask, make_mask
 from perchctl.vision.merge import stage_of
+from perchctl.vision.own import Chooser, OwnPlace
 from perchctl.vision.places import seen_from, to_level, to_world
 from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners
@@ -95,7 +96,7 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
         detector=detector,
         pose=pose,
         strategy=strategy,
-        tracks=make_track_setup(profile.kalman, strategy.tracks, pose),
+        tracks=make_track_setup(profile.kalman, strategy.tracks, pose, _own_place(profile)),
         kalman=profile.kalman,
         camera=camera,
         fields=profile.camera.fields,
@@ -109,6 +110,14 @@ def _mask(profile: Profile, camera: CameraModel) -> GearMask | None:
         return None
     covered = read_mask(profile.camera.mask, camera.size_px)
     return make_mask(covered[:, ::-1] if profile.camera.mirrored else covered)
+
+
+def _own_place(profile: Profile) -> OwnPlace:
+    """The target's, or else where the vehicle is sent to look for it."""
+    target = profile.target
+    if target.expected_xy_m is not None:
+        return OwnPlace(target.expected_xy_m, target.expected_within_m)
+    return OwnPlace(profile.planner.approach_xy_m)
 
 
 def camera_profile(profile: Profile) -> Profile:
@@ -146,7 +155,8 @@ def step(
     # A first picture is searched by all means.
     first = state.last is None and state.stranger is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
-    detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, empty)
+    own = Chooser(pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
+    detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own)
     return _followed(state, detections, near, attitude, pipeline, frame.fields or "whole")
 
 
@@ -206,6 +216,7 @@ def _followed(
         disagreeing_frames=disagreeing,
         lock_note=followed.note or (SEVERAL if detections.targets > 1 else ""),
         fields=fields,
+        refused=followed.refused,
     )
     return new, output
 

@@ -133,7 +133,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
     (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")
-    shutil.copyfile(ROOT / "profiles" / "crazyflie.yaml", folder / "my_vehicle.yaml")
+    for name in ("my_vehicle", "left", "right"):
+        shutil.copyfile(ROOT / "profiles" / "crazyflie.yaml", folder / f"{name}.yaml")
     return folder
 
 

@@ -58,6 +58,7 @@ def plan_text(options: FlyOptions) -> str:
         f"target       {target.large.side_m * 1e3:g} mm {target.large.dictionary}/"
         f"{target.large.id} around {target.small.side_m * 1e3:g} mm "
         f"{target.small.dictionary}/{target.small.id}",
+        *_place_lines(options.profile),
         *_vehicle_lines(options.profile),
         f"merge        {how}",
         f"1 APPROACH   take off to {planner.takeoff_height_m:g} m",
@@ -89,6 +90,16 @@ def _positioning_line(options: FlyOptions) -> list[str]:
         f"positioning  motion capture {where}, body {config.body!r}, {config.send} at most "
         f"{config.rate_hz:g} Hz"
     ]
+
+
+def _place_lines(profile: Profile) -> list[str]:
+    """Where the target has to be, if that is said."""
+    target = profile.target
+    if target.expected_xy_m is None:
+        return []
+    x_m, y_m = target.expected_xy_m
+    within_m = target.expected_within_m
+    return [f"{'':{_COLUMN}}within {within_m:g} m of x {x_m:g} m, y {y_m:g} m, or it is another's"]
 
 
 def _vehicle_lines(profile: Profile) -> list[str]:

@@ -44,7 +44,7 @@ from perchctl.mission.state import Phase
 from perchctl.mission.watch import Event, Tick
 from perchctl.sim.capture.settings import MILLIMETRES, CaptureFault
 from perchctl.sim.firmware.controller import Estimate
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 
 CAPTURE_FAULTS = {
     "frozen": CaptureFault(frozen=True),
@@ -83,7 +83,7 @@ def _other_room(scenario: Scenario, room: Room) -> Scenario:
         ceiling_z_m=room.ceiling_z_m or scenario.ceiling_z_m,
         no_target=room.no_target or scenario.no_target,
         target_above_ceiling_m=room.target_above_ceiling_m,
-        second_target_m=room.second_target_m,
+        neighbours=() if room.second_target_m is None else (Neighbour(room.second_target_m),),
         T_body_cam_true=tuple(tuple(row) for row in rows),
     )
 

@@ -258,6 +258,7 @@ def _observe(
         delay_s=senses.noticed.used_s,
         position_age_s=0.0 if outside is None else outside.age_s,
         position_problem=None if outside is None else outside.problem,
+        target_refused=senses.refused,
     )
 
 

@@ -15,6 +15,7 @@ from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile
 from perchctl.vision.consistency import Consistency, solved
 from perchctl.vision.fields import BLENDED, INTERLACED
+from perchctl.vision.own import ANOTHERS
 from perchctl.vision.tracks import surest_of
 from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineState, TargetEstimate
 
@@ -44,6 +45,7 @@ class Senses:
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     noticed: Noticed = field(default_factory=Noticed)
+    refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
     _mirrored: int = 0
@@ -118,9 +120,12 @@ class Senses:
 
     def _remark(self, output: PipelineOutput) -> None:
         """Each is made once a flight, when three pictures in a row have shown it."""
+        if output.refused:
+            self.refused = output.lock_note
         for text, shown in (
             (INTERLACED, output.fields != "whole"),
             (BLENDED, output.detections.ghost_px > 0.0),
+            (ANOTHERS, output.refused),
         ):
             before = self._shown.get(text, 0)
             if before < REMARK_PICTURES:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from perchctl.errors import ConnectionFailed
+from perchctl.link.claim import Claim, claim
 from perchctl.link.uri import UDEV_HELP
 from perchctl.profile.places import user_cache_folder
 from perchctl.sim.crtp.codec import Packet
@@ -38,6 +39,7 @@ class Connection:
         cache.mkdir(parents=True, exist_ok=True)
         self.cf: Any = Crazyflie(rw_cache=str(cache))
         self.lost: str | None = None
+        self.claimed: Claim | None = None
         self._left = False
         self._settled = threading.Event()  # connected, or failed
         self.cf.fully_connected.add_callback(lambda _uri: self._settled.set())
@@ -90,6 +92,7 @@ class Connection:
         """Close with cflib's farewell, a zero setpoint: only when nothing flies."""
         self._left = True
         _run_bounded([self.cf.close_link])
+        self._release()
 
     def abandon(self) -> None:
         """Release the driver and clean up, sending nothing more."""
@@ -97,6 +100,11 @@ class Connection:
         # Without its driver, close_link has nowhere to send the zero setpoint.
         driver, self.cf.link = self.cf.link, None
         _run_bounded([self.cf.close_link] if driver is None else [driver.close, self.cf.close_link])
+        self._release()
+
+    def _release(self) -> None:
+        if self.claimed is not None:
+            self.claimed.release()
 
     def _on_reopened_lost(self, message: str) -> None:
         driver, self.cf.link = self.cf.link, None
@@ -113,8 +121,21 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
     """A vehicle's connection with all tables and parameters read.
 
     `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
-    connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`.
+    connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also where another
+    program has the vehicle.
     """
+    claimed = claim(uri)
+    try:
+        connection = _opened(uri, timeout_s)
+    except BaseException:
+        if claimed is not None:
+            claimed.release()
+        raise
+    connection.claimed = claimed
+    return connection
+
+
+def _opened(uri: str, timeout_s: float) -> Connection:
     ready_cflib()
     _keep_radio_patient()
     share_s = timeout_s / CONNECT_TRIES
@@ -189,6 +210,12 @@ def plain_cause(message: str) -> str:
     """cflib's message without its traceback, and with the remedy where there is one."""
     line = message.strip().splitlines()[0] if message.strip() else "unknown cause"
     line = line.removeprefix("Couldn't load link driver: ")
+    if "Resource busy" in message or "[Errno 16]" in message:
+        return (
+            f"another program has it open ({line}): a Crazyradio, or a USB cable, serves one "
+            f"program at a time; end that one, or plug in another Crazyradio and name it as "
+            f"radio://1/..."
+        )
     if "Crazyradio" in message or "Access denied" in message or "insufficient" in message.lower():
         missing = "Cannot find" in message
         what = "no Crazyradio is plugged in, or " if missing else ""

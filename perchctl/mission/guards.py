@@ -194,6 +194,8 @@ def why_not_found(c: Context) -> str:
     text = "target not found in the allowed attempts"
     if c.obs.camera_problem:
         return f"{text} ({c.obs.camera_problem})"
+    if c.obs.target_refused:
+        return f"{text}: {c.obs.target_refused}"
     if c.target_m is not None and c.state.mount.open:
         return f"{text}, though it was seen before: does camera.mount fit the camera?"
     return text

@@ -119,6 +119,7 @@ class Observation:
         disagreeing_frames: frames in a row in which the markers contradicted.
         log_problem: the flight log cannot be written.
         delay_s: taken off the frames' times beyond the profile's latency (`measured`).
+        target_refused: why the last target that was seen is another vehicle's; None: none was.
         position_age_s: of the newest position from outside that was sent to the vehicle; 0 where
             its decks measure it.
         position_problem: why none is sent, None while they are.
@@ -139,6 +140,7 @@ class Observation:
     operator: Operator = Operator.NONE
     log_problem: str | None = None
     delay_s: float = 0.0
+    target_refused: str | None = None
     position_age_s: float = 0.0
     position_problem: str | None = None
 

@@ -105,6 +105,8 @@ def _allowed_of(kind: Any, metadata: Iterable[Any]) -> str:
         return ", ".join(f"`{choice}`" for choice in get_args(kind))
     if bounds := _bounds(metadata):
         return _span(bounds)
+    if get_origin(kind) is tuple and Ellipsis in get_args(kind):
+        return f"any number, each of {_allowed_of(get_args(kind)[0], ())}"
     if get_origin(kind) is tuple:
         ordered = any(type(m).__name__ == "AfterValidator" for m in metadata)
         text = "lowest, highest" if ordered else f"{len(get_args(kind))} numbers"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import platformdirs
@@ -32,6 +33,13 @@ def listing(kind: str) -> list[str]:
 
 def user_config_folder() -> Path:
     return Path(platformdirs.user_config_dir("perchctl", appauthor=False))
+
+
+def user_runtime_folder() -> Path:
+    """For what lives no longer than a session. Nothing is made, and nothing may be there."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # where the system names none, another is taken
+        return Path(platformdirs.user_runtime_dir("perchctl", appauthor=False))
 
 
 def user_cache_folder() -> Path:

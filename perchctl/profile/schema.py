@@ -7,11 +7,12 @@ A profile is checked here and only here; `perchctl.profile.load` reads it from i
 from __future__ import annotations
 
 import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from perchctl.profile.base import Range, Section
+from perchctl.profile.dictionaries import check_marker_id
 from perchctl.profile.limits import IMPOSSIBLE
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.old_keys import with_present_keys
@@ -35,6 +36,9 @@ class LinkConfig(Section):
     )
     telemetry_period_s: float = Field(0.01, ge=0.01, le=0.1, description="of position and attitude")
     loop_hz: float = Field(50.0, ge=5, le=200, description="turns of the flight loop")
+
+
+MarkerId = Annotated[int, Field(ge=0)]
 
 
 class SimulationConfig(Section):
@@ -111,6 +115,14 @@ class SimulationConfig(Section):
     capture_noise_m: float = Field(
         0.001, gt=0, le=0.1, description="motion capture: of a position, one sigma"
     )
+    neighbours: tuple[tuple[float, float, float], ...] = Field(
+        (),
+        max_length=8,
+        description="other targets beside the own one: x and y (m) in its axes, heading (deg)",
+    )
+    neighbour_ids: tuple[MarkerId, MarkerId] | None = Field(
+        None, description="of their large and small markers; none: the own target's"
+    )
 
 
 class LogConfig(Section):
@@ -145,6 +157,18 @@ class Profile(Section):
     def _present_keys(cls, values: Any) -> Any:
         """Logs of earlier versions hold profiles with old keys."""
         return with_present_keys(values)[0] if isinstance(values, dict) else values
+
+    @model_validator(mode="after")
+    def _neighbours_can_be_printed(self) -> Profile:
+        ids = self.simulation.neighbour_ids
+        for name, marker, number in zip(
+            ("large", "small"), (self.target.large, self.target.small), ids or (), strict=False
+        ):
+            try:
+                check_marker_id(marker.dictionary, number)
+            except ValueError as error:
+                raise ValueError(f"simulation.neighbour_ids, {name}: {error}") from None
+        return self
 
     @model_validator(mode="after")
     def _limits_fit(self) -> Profile:

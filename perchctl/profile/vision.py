@@ -170,6 +170,14 @@ class TargetConfig(Section):
         description="so much times r^2 a place r from the sheet's centre may be off its plane",
     )
 
+    expected_xy_m: tuple[float, float] | None = Field(
+        None,
+        description="where it hangs, in the estimate's world: of several alike the nearest counts",
+    )
+    expected_within_m: float = Field(
+        0.3, gt=0, le=20, description="one farther from `expected_xy_m` is another vehicle's"
+    )
+
     @model_validator(mode="after")
     def _markers_differ(self) -> TargetConfig:
         large, small = self.large, self.small

@@ -11,7 +11,7 @@ from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile
 from perchctl.profile.schema import SimulationConfig
 from perchctl.sim.capture.settings import CaptureSettings
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 
 _STREAM = 1  # the scenario's own random stream
 
@@ -71,6 +71,15 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
         no_target=sim.no_target,
         extra=_extra(profile),
+        neighbours=_neighbours(sim),
+    )
+
+
+def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
+    large_id, small_id = sim.neighbour_ids or (None, None)
+    return tuple(
+        Neighbour((x_m, y_m), math.radians(yaw_deg), large_id, small_id)
+        for x_m, y_m, yaw_deg in sim.neighbours
     )
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -33,7 +34,7 @@ from perchctl.sim.rays import (
     ray_grid,
     trace,
 )
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 from perchctl.sim.shutter import Shot, blended, woven
 from perchctl.sim.surfaces import (
     CEILING_TEXTURE_PX,
@@ -80,9 +81,9 @@ class Renderer:
             large=target.large.model_copy(update={"side_m": scenario.large_side_m}),
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
-        self.sheet = None if scenario.no_target else _printed_sheet(printed.model_dump_json())
+        own = () if scenario.no_target else (_Placed(_printed_sheet(printed.model_dump_json())),)
+        self._sheets = (*own, *(_beside(n, printed) for n in scenario.neighbours))
         self.move_target(scenario.target_xy_m)
-        self._second_m = scenario.second_target_m
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         self._fine = ray_grid(camera, FINE_PX)
         self._coarse = ray_grid(camera, COARSE_PX)
@@ -164,38 +165,19 @@ class Renderer:
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
-        inside = None if self.sheet is None else self._nodes_on_sheet(nodes)
-        if self.sheet is not None and self._second_m is not None:
-            return self._with_two(nodes, misses, maps, motion_px)
-        hidden = inside is not None and self._covers_all(nodes)
+        views = [(each, each.seen_from(nodes)) for each in self._sheets]
+        hidden = [(each, moved) for each, moved in views if each.covers_all(moved)]
         height, width = ((n - 2) * COARSE_PX for n in nodes.shape[:2])
         if hidden:
             picture = np.zeros((height, width), np.uint8)
         else:
             picture = self._background(nodes, misses, motion_px)
-        if inside is not None and inside.any():
-            length_px = path_length_px(motion_px)
-            self._add_sheet(picture, nodes, inside, maps, length_px, opaque=hidden)
-        return picture
-
-    def _with_two(
-        self,
-        nodes: NDArray[np.float32],
-        misses: NDArray[np.bool_],
-        maps: list[Array],
-        motion_px: Array,
-    ) -> Picture:
-        """The same sheet twice, `second_target_m` apart in target axes."""
-        picture = self._background(nodes, misses, motion_px)
         length_px = path_length_px(motion_px)
-        assert self._second_m is not None
-        for x, y in ((0.0, 0.0), self._second_m):
-            shift = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
-            moved = nodes - np.array((x, y), np.float32)
-            inside = self._nodes_on_sheet(moved)
+        for each, moved in hidden or views:
+            inside = each.nodes_on(moved)
             if inside.any():
-                shifted = [shift @ each for each in maps]
-                self._add_sheet(picture, moved, inside, shifted, length_px, opaque=False)
+                own = maps if each.plane is None else [each.plane @ m for m in maps]
+                self._add_sheet(picture, each.sheet, moved, inside, own, length_px, bool(hidden))
         return picture
 
     def _background(
@@ -222,29 +204,16 @@ class Renderer:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
 
-    def _nodes_on_sheet(self, nodes: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Coarse nodes on the sheet or within 1.5 nodes of it."""
-        assert self.sheet is not None
-        step = np.abs(np.diff(nodes, axis=1)).max(axis=2)  # m a node
-        step = np.minimum(np.pad(step, ((0, 0), (0, 1)), mode="edge"), 1.0)
-        reach = self.sheet.drawing.sheet_side_m / 2.0 + 1.5 * step
-        return np.asarray(np.abs(nodes).max(axis=2) < reach)
-
-    def _covers_all(self, nodes: NDArray[np.float32]) -> bool:
-        """Whether nothing but paper is in view (with room for motion and blur)."""
-        assert self.sheet is not None
-        return float(np.abs(nodes).max()) < 0.45 * self.sheet.drawing.sheet_side_m
-
     def _add_sheet(
         self,
         picture: Picture,
+        sheet: Sheet,
         nodes: NDArray[np.float32],
         inside: NDArray[np.bool_],
         maps: list[Array],
         length_px: float,
         opaque: bool,
     ) -> None:
-        assert self.sheet is not None
         rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
         # One more block all around: motion moves the sheet within the exposure.
         grow = 1 + math.ceil(length_px / COARSE_PX)
@@ -254,7 +223,7 @@ class Renderer:
         if bottom <= top or right <= left:
             return
         j, i = int(rows.mean()), int(cols.mean())
-        texture = self.sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
+        texture = sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
         k = COARSE_PX // FINE_PX
         grid = self._fine.crop(slice(top * k, bottom * k + 2), slice(left * k, right * k + 2))
         value, alpha = Mean(len(maps)), Mean(len(maps))
@@ -306,6 +275,43 @@ class Renderer:
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = rng.standard_normal(size, np.float32) * np.float32(sigma)
         return np.asarray(np.rint(bank), np.int16)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
+
+    sheet: Sheet
+    plane: Array | None = None
+
+    def seen_from(self, nodes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The coarse nodes (rows, columns, 2) in this sheet's axes, m."""
+        if self.plane is None:
+            return nodes
+        turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
+        return np.asarray(nodes @ turn.astype(np.float32) + shift.astype(np.float32))
+
+    def nodes_on(self, nodes: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Nodes, in its axes, on the sheet or within 1.5 nodes of it."""
+        step = np.abs(np.diff(nodes, axis=1)).max(axis=2)  # m a node
+        step = np.minimum(np.pad(step, ((0, 0), (0, 1)), mode="edge"), 1.0)
+        reach = self.sheet.drawing.sheet_side_m / 2.0 + 1.5 * step
+        return np.asarray(np.abs(nodes).max(axis=2) < reach)
+
+    def covers_all(self, nodes: NDArray[np.float32]) -> bool:
+        """Whether nothing but its paper is in view (with room for motion and blur)."""
+        return float(np.abs(nodes).max()) < 0.45 * self.sheet.drawing.sheet_side_m
+
+
+def _beside(neighbour: Neighbour, own: TargetConfig) -> _Placed:
+    large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
+    small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
+    target = TargetConfig(
+        large=own.large.model_copy(update=large), small=own.small.model_copy(update=small)
+    )
+    to_own = make_T(rot_z(neighbour.yaw_rad), (*neighbour.xy_m, 0.0))
+    plane = np.delete(np.delete(invert_T(to_own), 2, axis=0), 2, axis=1)
+    return _Placed(_printed_sheet(target.model_dump_json()), plane)
 
 
 @lru_cache(maxsize=4)

@@ -9,6 +9,22 @@ CONTROL_PERIOD_S = 0.002
 
 
 @dataclass(frozen=True)
+class Neighbour:
+    """Another vehicle's target on the same ceiling.
+
+    Attributes:
+        xy_m: its centre in the own target's axes.
+        yaw_rad: its heading less the own target's.
+        large_id, small_id: its markers', in the own ones' dictionaries; None: the same.
+    """
+
+    xy_m: tuple[float, float]
+    yaw_rad: float = 0.0
+    large_id: int | None = None
+    small_id: int | None = None
+
+
+@dataclass(frozen=True)
 class Scenario:
     """Everything that differs between two simulated flights; SI, world frame.
 
@@ -45,7 +61,7 @@ class Scenario:
         rssi_dbm: of the radio, at the vehicle.
         parameters: the firmware's, where they differ from its release at boot.
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
-        second_target_m: where a second sheet like the first hangs, in the target's axes.
+        neighbours: other vehicles' targets. What these vehicles do to the air is in the draught.
     """
 
     seed: int = 0
@@ -94,5 +110,5 @@ class Scenario:
     camera_freeze_at_s: float | None = None
     camera_gone_at_s: float | None = None
     target_above_ceiling_m: float = 0.0
-    second_target_m: tuple[float, float] | None = None
+    neighbours: tuple[Neighbour, ...] = ()
     extra: dict[str, float] = field(default_factory=dict)

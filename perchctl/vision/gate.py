@@ -8,8 +8,8 @@ is watched: as long as it goes on it stays one, however vague the lock becomes m
 
 The lock goes over to a stranger explicitly: to one that rests on both markers, at once if the
 lock never did, or, if it is as far away as the target was, after `REACQUIRE_S` in which the
-target was not seen; and to any that was seen more often than a lock that is hardly begun. A
-lock that nothing has confirmed for `FORGET_S` is forgotten.
+target was not seen, though its place is in the picture; and to any that was seen more often than
+a lock that is hardly begun. A lock that nothing has confirmed for `FORGET_S` is forgotten.
 
 Where the state estimate jumps, the target seems to jump in the world, but not in the picture:
 a pose that goes on from the last one relative to the vehicle, though not in the world, is the
@@ -55,13 +55,15 @@ _EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfit
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A frame's pose, as a measurement of the tracks; `whole` if it rests on both markers."""
+    """A frame's pose, as a measurement of the tracks; `whole` if it rests on both markers;
+    `looks_there` if the lock's place is in the picture."""
 
     t_s: float
     pose: MarkerPose
     measured: Measurement
     in_world: bool
     whole: bool
+    looks_there: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +77,7 @@ class Verdict:
     same: bool = False
     stranger: Stranger | None = None
     text: str = ""
+    refused: bool = False  # another vehicle's, by its place
 
 
 def judged(
@@ -261,8 +264,10 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
     if not lock.whole:
         return True
     unseen_s = sight.t_s - max(stranger.since_s, lock.track.t_s)
+    # What is not looked at is not empty.
     return (
-        not stranger.another_range
+        sight.looks_there
+        and not stranger.another_range
         and stranger.whole >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S
     )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from perchctl.geometry import Array, finite
 from perchctl.vision.camera_model import project
 from perchctl.vision.filter import MAX_GAP_S
+from perchctl.vision.markers.overview import lattice_of
 from perchctl.vision.pose import PoseSetup, rotation_matrix, rotation_vector
 from perchctl.vision.solve import Candidate
 from perchctl.vision.types import Attitude, MarkerName, Sighting
@@ -36,6 +39,17 @@ def expected_corners(
     if not finite(corners):
         return None, moved
     return {"large": corners[:4], "small": corners[4:]}, moved
+
+
+def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
+    """Whether a place (3,) in the world of the state estimate lies in the picture."""
+    R, t_m = _world_cam(attitude, setup)
+    way_m = R.T @ (place_m - t_m)
+    # Farther off the axis a lens model may fold back into the picture.
+    if way_m[2] <= 0.0 or np.hypot(*way_m[:2]) > lattice_of(setup.camera).reach * way_m[2]:
+        return False
+    (at_px,) = project(np.zeros((1, 3)), np.zeros(3), way_m, setup.camera)
+    return bool((at_px > 0.0).all() and (at_px < np.subtract(setup.camera.size_px, 1)).all())
 
 
 def _world_cam(attitude: Attitude, setup: PoseSetup) -> tuple[Array, Array]:

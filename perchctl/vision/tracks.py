@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from perchctl.profile import KalmanConfig
-from perchctl.vision.filter import FilterSetup, Measurement, make_filter, step_track
+from perchctl.vision.filter import POSITION, FilterSetup, Measurement, make_filter, step_track
 from perchctl.vision.gate import Sight, Verdict, judged, locked, remembered
+from perchctl.vision.own import NOWHERE, OwnPlace, refusal
 from perchctl.vision.places import measurement
 from perchctl.vision.pose import PoseSetup
+from perchctl.vision.predict import is_in_view
 from perchctl.vision.types import (
     Attitude,
     Lock,
@@ -25,14 +27,15 @@ from perchctl.vision.types import (
 
 @dataclass(frozen=True, eq=False)
 class TrackSetup:
-    """The filters' constants in the level frame and in the world, the tracks' names, and
-    whether a pose has to pass the gate."""
+    """The filters' constants in the level frame and in the world, the tracks' names,
+    whether a pose has to pass the gate, and where the own target is."""
 
     level: FilterSetup
     world: FilterSetup
     names: tuple[str, ...]
     pose: PoseSetup
     gate: bool
+    own: OwnPlace = NOWHERE
 
     def constants(self, in_world: bool) -> FilterSetup:
         return self.world if in_world else self.level
@@ -41,7 +44,8 @@ class TrackSetup:
 @dataclass(frozen=True, eq=False)
 class Followed:
     """The tracks one frame on. `measured` feeds nothing where its pose was not `taken`; `note`
-    is a sentence for people on a pose that was not, or that begins the tracks anew."""
+    is a sentence for people on a pose that was not, or that begins the tracks anew; `refused`, it
+    was another vehicle's target."""
 
     measured: Measured
     tracks: dict[str, MarkerTrack]
@@ -49,15 +53,19 @@ class Followed:
     stranger: Stranger | None = None
     taken: bool = True
     note: str = ""
+    refused: bool = False
 
 
-def make_track_setup(config: KalmanConfig, names: tuple[str, ...], pose: PoseSetup) -> TrackSetup:
+def make_track_setup(
+    config: KalmanConfig, names: tuple[str, ...], pose: PoseSetup, own: OwnPlace = NOWHERE
+) -> TrackSetup:
     return TrackSetup(
         level=make_filter(config, in_world=False),
         world=make_filter(config, in_world=True),
         names=names,
         pose=pose,
         gate=config.gate,
+        own=own,
     )
 
 
@@ -76,12 +84,22 @@ def followed_on(
         for name, pose in measured.fed.items()
     }
     old = state.tracks if state.in_world == in_world else {}
-    if not setup.gate:
-        return Followed(measured, _stepped(old, fed, t_s, setup.names, constants))
     sight, verdict = None, Verdict(taken=True, stranger=state.stranger)
     if fed:
         sight = _sight(measured, fed, t_s, in_world)
-        verdict = judged(state.lock, state.stranger, sight, constants)
+        if state.stranger is not None and state.lock is not None and attitude is not None:
+            place_m = state.lock.track.x[POSITION]
+            looks = not in_world or is_in_view(place_m, attitude, setup.pose)
+            sight = replace(sight, looks_there=looks)
+        another = refusal(sight.pose, attitude, setup.own, setup.pose)
+        verdict = _verdict(state, sight, another, constants, setup.gate)
+    if not setup.gate:
+        fed = fed if verdict.taken else {}
+        measured = measured if verdict.taken else replace(measured, fed={})
+        tracks = _stepped(old, fed, t_s, setup.names, constants)
+        return Followed(
+            measured, tracks, taken=verdict.taken, note=verdict.text, refused=verdict.refused
+        )
     if not verdict.taken:
         measured, fed = replace(measured, fed={}), {}
     tracks = _stepped({} if verdict.afresh else old, fed, t_s, setup.names, constants)
@@ -91,7 +109,22 @@ def followed_on(
         if len(tracks) > 1:
             surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
         lock = locked(lock, surest, sight, verdict)
-    return Followed(measured, tracks, lock, stranger, verdict.taken, verdict.text)
+    return Followed(measured, tracks, lock, stranger, verdict.taken, verdict.text, verdict.refused)
+
+
+def _verdict(
+    state: PipelineState, sight: Sight, another: str | None, constants: FilterSetup, gate: bool
+) -> Verdict:
+    """The gate's; and a target that is `another` vehicle's is never locked on. One that was
+    locked on goes on, however far the estimate's world has drifted meanwhile."""
+    verdict = Verdict(taken=True, stranger=state.stranger)
+    if gate:
+        verdict = judged(state.lock, state.stranger, sight, constants)
+    lock, _ = remembered(state.lock, None, sight.t_s)
+    goes_on = lock is not None and (verdict.same or not verdict.afresh)
+    if another is not None and verdict.taken and not goes_on:
+        return Verdict(taken=False, stranger=state.stranger, text=another, refused=True)
+    return verdict
 
 
 def _sight(measured: Measured, fed: Mapping[str, Measurement], t_s: float, in_world: bool) -> Sight:

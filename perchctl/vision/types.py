@@ -324,3 +324,4 @@ class PipelineOutput:
     disagreeing_frames: int = 0  # frames in a row in which the two markers contradict
     fields: PictureKind = "whole"  # what the picture was
     lock_note: str = ""  # why this frame's pose was not taken, or taken at another place
+    refused: bool = False  # this frame showed another vehicle's target, by its place

@@ -26,7 +26,7 @@ from perchctl.mission.state import Phase, PlannerState
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.powertrain import most_thrust_n
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, target_xy_m=(0.1, 0.2))
@@ -252,7 +252,7 @@ def test_what_is_so_from_the_start() -> None:
     room = e.Room(1.2, True, 0.1, (0.4, 0.0), 90.0)
     other = changed_scenario(SCENARIO, (room,))
     assert (other.ceiling_z_m, other.no_target) == (1.2, True)
-    assert (other.target_above_ceiling_m, other.second_target_m) == (0.1, (0.4, 0.0))
+    assert (other.target_above_ceiling_m, other.neighbours) == (0.1, (Neighbour((0.4, 0.0)),))
     turned = np.array(other.T_body_cam_true)[:3, :3] @ (1.0, 0.0, 0.0)
     assert turned == pytest.approx((0.0, 1.0, 0.0), abs=1e-12)
     assert changed_scenario(SCENARIO, (e.Killed(),)) == SCENARIO

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 import perchctl
 from perchctl.calibration.files import load_calibration
@@ -199,6 +199,12 @@ camera: {T_body_cam: {position_m: [0.01, 0.02, 0.03]}}
 planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}}
 merge: {z1_m: 1.2}
 """
+
+
+@pytest.mark.parametrize("ids", [[1000, 5], [997, -1]])
+def test_a_neighbour_s_ids_are_of_the_own_dictionaries(ids: list[int]) -> None:
+    with pytest.raises(ValidationError, match="neighbour_ids"):
+        Profile.model_validate({"simulation": {"neighbour_ids": ids}})
 
 
 def test_old_keys_are_read_and_said(tmp_path: Path) -> None:

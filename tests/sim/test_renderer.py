@@ -20,7 +20,7 @@ from perchctl.geometry import (
 )
 from perchctl.profile import TargetConfig
 from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 from perchctl.target.drawing import marker_corners_m
 from perchctl.vision.types import CameraModel
 
@@ -312,6 +312,24 @@ def test_any_image_size(size: tuple[int, int]) -> None:
     assert image.shape == (height, width)
     errors = corner_errors_px(image, camera, scenario(), pose, 0.150, 2.5)
     assert np.abs(errors).max() < 0.025
+
+
+def test_a_neighbour_s_target_hangs_where_it_is_said(renderer: Renderer) -> None:
+    """In the own target's axes, with its own heading and ids; here beside a bare place, too."""
+    beside = Neighbour((0.4, -0.1), 0.9, large_id=145, small_id=254)
+    x, y = np.array(XY) + rot_z(0.5)[:2, :2] @ beside.xy_m
+    there = scenario(target_xy_m=(x, y), target_yaw_rad=0.5 + beside.yaw_rad)
+    pose = make_T(np.eye(3), (x + 0.05, y - 0.1, CEILING - 0.7))
+    alone = Renderer(scenario(neighbours=(beside,), no_target=True), PLUMB_BOB, TARGET)
+    both = Renderer(scenario(neighbours=(beside,)), PLUMB_BOB, TARGET)
+    for each in (alone, both):
+        errors = corner_errors_px(each.render([pose]), PLUMB_BOB, there, pose, 0.150, 3.0)
+        assert np.abs(errors).max() < 0.1
+    low = camera_pose(0.16)  # nothing but the own paper is in view
+    assert np.array_equal(both.render([low]), renderer.render([low]))
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    _, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(both.render([pose]))
+    assert 145 in ids
 
 
 def test_analogue_faults_spoil_but_repeat() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -23,7 +23,8 @@ class UdpEndpoint:
     """The socket of a simulated vehicle, bound to loopback.
 
     Answers go to the requesting address. What the vehicle sends by itself goes to the
-    peer: the last address that sent anything but a scan's probe.
+    peer: the last address that sent anything but a scan's probe. `heard` is told of each
+    datagram that is a packet, before anything is made of it: time, sender, bytes.
     """
 
     def __init__(self, port: int, options: LinkOptions) -> None:
@@ -31,6 +32,7 @@ class UdpEndpoint:
         self._options = options
         self._random = np.random.default_rng([options.loss_seed, _STREAM])
         self._peer: Address | None = None
+        self.heard: Callable[[float, Address, bytes], None] | None = None
         self._silent: tuple[float, float] | None = None
         if options.silent_from_s is not None:
             self._silent = (options.silent_from_s, options.silent_from_s + options.silent_for_s)
@@ -67,6 +69,8 @@ class UdpEndpoint:
             packet = Packet.decode(datagram)
             if packet is None:
                 continue
+            if self.heard is not None:
+                self.heard(t_s, address, datagram)
             if datagram[0] != _NULL_HEADER:
                 self._peer = address
             self._send(server.handle(packet), address, t_s)

@@ -23,7 +23,8 @@ class HostSetup:
     `camera` None: no camera and no stream; `capture` None: no motion capture. Ports 0: chosen
     by the operating system.
     `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
-    parent has ended. `linger_s`: how long the vehicle then runs on, in wall-clock time.
+    parent has ended. `heard_file`: JSON lines of every packet that arrived, and who had sent it.
+    `linger_s`: how long the vehicle then runs on, in wall-clock time.
     """
 
     scenario: Scenario = field(default_factory=Scenario)
@@ -36,4 +37,5 @@ class HostSetup:
     http_port: int = 0
     capture_port: int = 0
     truth_file: str | None = None
+    heard_file: str | None = None
     linger_s: float = LINGER_S

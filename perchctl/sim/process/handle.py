@@ -74,13 +74,15 @@ class SimProcess:
         http_port: int = 0,
         capture_port: int = 0,
         truth_file: Path | None = None,
+        heard_file: Path | None = None,
         linger_s: float = LINGER_S,
         timeout_s: float = START_TIMEOUT_S,
     ) -> SimProcess:
         """Start the vehicle and wait, for at most `timeout_s`, until it answers.
 
         Ports 0 are chosen by the operating system. `truth_file` receives JSON lines of
-        `truth()`, 50 a simulated second. `linger_s` is how long the vehicle runs on after
+        `truth()`, 50 a simulated second, `heard_file` of the packets that arrive: time, sender
+        and bytes in hex. `linger_s` is how long the vehicle runs on after
         this process has gone. Raises `ConnectionFailed` when the child ends or does not
         come up, `InvalidValue` for an unknown pace.
         """
@@ -97,6 +99,7 @@ class SimProcess:
             http_port=http_port,
             capture_port=capture_port,
             truth_file=str(truth_file) if truth_file is not None else None,
+            heard_file=str(heard_file) if heard_file is not None else None,
             linger_s=linger_s,
         )
         token = new_token()

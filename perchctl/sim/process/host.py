@@ -12,7 +12,7 @@ from typing import Any, TextIO
 from perchctl.geometry import rpy_from_rotation
 from perchctl.sim.capture.server import SYSTEM, CaptureServer
 from perchctl.sim.crtp.server import CrtpServer
-from perchctl.sim.crtp.udp import UdpEndpoint
+from perchctl.sim.crtp.udp import Address, UdpEndpoint
 from perchctl.sim.process.control import HostSetup
 from perchctl.sim.process.mjpeg import MjpegServer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -41,6 +41,7 @@ class VehicleHost:
         self.stream: MjpegServer | None = None
         self.positions: CaptureServer | None = None
         self._truth: TextIO | None = None
+        self._heard: TextIO | None = None
         self._feed: _PictureFeed | None = None
         try:
             if setup.camera is not None:
@@ -49,6 +50,9 @@ class VehicleHost:
                 self.positions = CaptureServer(setup.capture.names, setup.capture_port)
             if setup.truth_file is not None:
                 self._truth = Path(setup.truth_file).open("w", encoding="utf-8")  # noqa: SIM115
+            if setup.heard_file is not None:
+                self._heard = Path(setup.heard_file).open("w", encoding="utf-8")  # noqa: SIM115
+                self.endpoint.heard = self._write_heard
         except BaseException:
             self.close()
             raise
@@ -125,8 +129,15 @@ class VehicleHost:
             self.stream.close()
         if self.positions is not None:
             self.positions.close()
-        if self._truth is not None:
-            self._truth.close()
+        for file in (self._truth, self._heard):
+            if file is not None:
+                file.close()
+
+    def _write_heard(self, t_s: float, address: Address, datagram: bytes) -> None:
+        assert self._heard is not None
+        heard = {"t_s": t_s, "from": f"{address[0]}:{address[1]}", "packet": datagram.hex()}
+        self._heard.write(json.dumps(heard) + "\n")
+        self._heard.flush()
 
     def _publish_arrived(self) -> None:
         if self.vehicle.camera is None or self.stream is None:

@@ -37,6 +37,7 @@ from perchctl.vision.markers.search import Found, Look, search
 from perchctl.vision.markers.seen_edges import ROOM_PX
 from perchctl.vision.markers.shift import known_from
 from perchctl.vision.markers.square import completed, nested, side_lengths_px, within
+from perchctl.vision.own import Chooser
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -61,6 +62,7 @@ def detect(
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
+    own: Chooser | None = None,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
@@ -69,8 +71,8 @@ def detect(
     predictions of the corners (4, 2) px, from the target's pose and the vehicle's motion.
     `empty_frames` is how many frames in a row have shown nothing: in a stream the searches take
     turns by it, since all of them in one frame take longer than a frame may. None searches by
-    all. In a frame of two fields each is looked at, and the result is the mean: where the
-    markers were at the frame's own time.
+    all. `own` chooses among several targets where none is expected. In a frame of two fields each
+    is looked at, and the result is the mean: where the markers were at the frame's own time.
     """
     expected = dict(expected) if expected else predicted_corners(previous, frame.t_s)
     look = _look(empty_frames, bool(expected), setup)
@@ -84,7 +86,7 @@ def detect(
         hidden = hidden_in(picture, setup.mask)
         if hidden is not None:
             picture = replace(picture, image=filled(picture.image, hidden))
-        return _looked(picture, hidden, expected, setup, camera, shift, look, lately, turn)
+        return _looked(picture, hidden, expected, setup, camera, shift, look, lately, turn, own)
 
     if frame.fields == "woven":
         return with_motion(between(*(looked(field) for field in halves(frame))), previous)
@@ -123,6 +125,7 @@ def _looked(
     look: Look,
     lately: bool,
     turn: int | None,
+    own: Chooser | None,
 ) -> Detections:
     """What is in a picture of one moment; `hidden` (h, w) is where that is not seen, `lately`
     whether the target was measured a moment ago, `turn` of the fits to a blurred one."""
@@ -136,7 +139,7 @@ def _looked(
     if look not in ("blurred", "fits") and (
         not seen or _missing(seen, expected, image.shape, hidden)
     ):
-        found = search(image, expected, setup, look)
+        found = search(image, expected, setup, look, own)
         if len(found.corners_px) >= len(seen):
             seen = _refined(image, hidden, found, setup, camera)
     if not seen and look not in ("sharp", "window") and setup.blurred and setup.by_lines:

@@ -4,6 +4,7 @@ whole picture; and the choice among what it finds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -21,6 +22,7 @@ from perchctl.vision.markers.detector import (
     strict_detector,
 )
 from perchctl.vision.markers.square import mean_side_px, nested
+from perchctl.vision.own import Chooser
 from perchctl.vision.types import MARKERS, MarkerName
 
 Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
@@ -69,22 +71,24 @@ def search(
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     look: Look = "all",
+    own: Chooser | None = None,
 ) -> Found:
     """By the window, if there is one, and by the whole picture where that gave too little; only
-    one of them with a `look` that is "near", "window" or "sharp"."""
+    one of them with a `look` that is "near", "window" or "sharp". `own` chooses among several
+    where none is expected."""
     whole = Box(0, 0, image.shape[1], image.shape[0])
     if setup.window and expected and look != "sharp":
         box = search_window(expected, setup.ratio, image.shape) or whole
         found = Found({}, mirrored=False, full_frame=False)
         if len(expected) == 2:
-            found = _pass(image, box, expected, setup, QUICK_THRESHOLDS)
+            found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own)
         if len(found.corners_px) < 2 and box != whole:
-            found = _pass(image, box, expected, setup, OPENCV_THRESHOLDS)
+            found = _pass(image, box, expected, setup, OPENCV_THRESHOLDS, own)
         if len(found.corners_px) >= (2 if box == whole else 1) or (
             look in ("near", "window") and box != whole
         ):
             return found
-    return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS)
+    return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS, own)
 
 
 def search_window(
@@ -119,6 +123,7 @@ def _pass(
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     thresholds: Thresholds,
+    own: Chooser | None,
 ) -> Found:
     """What one pass of OpenCV's detector over the box gives."""
     part = image[box.top : box.bottom, box.left : box.right]
@@ -137,40 +142,86 @@ def _pass(
         name = MARKERS[int(dictionary)]
         candidates[name].append(np.asarray(quad, dtype=np.float64).reshape(4, 2) + first)
     targets = len(_wholes(candidates, setup.ratio))
-    return Found(choose(candidates, expected, setup.ratio), mirrored, full_frame, targets)
+    chosen = choose(candidates, expected, setup.ratio, own)
+    return Found(chosen, mirrored, full_frame, targets)
 
 
 def choose(
-    candidates: Mapping[MarkerName, list[Array]], expected: Mapping[MarkerName, Array], ratio: float
+    candidates: Mapping[MarkerName, list[Array]],
+    expected: Mapping[MarkerName, Array],
+    ratio: float,
+    own: Chooser | None = None,
 ) -> dict[MarkerName, Array]:
     """At most one of each marker: look-alikes and what does not fit together are dropped.
 
     A small marker in the centre of a large one, of the right size and turn, verifies
-    both; of several such pairs the one counts that is nearest to the last detections. Without
-    a pair the last detections decide; without these, a lone marker is taken, and of several
-    the evidence is too thin to take any.
+    both; of several such pairs the one counts that is nearest to the last detections, and what
+    goes on from these counts more than a pair elsewhere. Without a pair the last detections
+    decide; without these, a lone marker is taken. Of several the one counts that `own` has
+    nearest; without it the evidence is too thin to take any of several lone ones.
     """
+    if own is not None and not expected:
+        candidates = _possible(candidates, own)
     large, small = candidates["large"], candidates["small"]
     wholes = _wholes(candidates, ratio)
-    if wholes:
-        _, i, j = wholes[0]
-        if expected and len(wholes) > 1:
-            centre = next(iter(expected.values())).mean(axis=0)
-            away = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
-            _, i, j = wholes[int(np.argmin(away))]
-        return {"large": large[i], "small": small[j]}
     near_large = _nearest("large", large, expected, ratio)
     near_small = _nearest("small", small, expected, ratio)
+    if wholes:
+        _, i, j = _chosen(wholes, large, expected, own)
+        elsewhere = _nearest("large", [large[i]], expected, ratio) is None
+        if not (elsewhere and (near_large is not None or near_small is not None)):
+            return {"large": large[i], "small": small[j]}
     if near_large is not None:
         return {"large": near_large}
     if near_small is not None:
         return {"small": near_small}
+    if own is not None and not expected:
+        large, small = (_least_aside(name, candidates[name], own) for name in MARKERS)
     # A small marker beside a whole large one is not the target's.
     if len(large) == 1:
         return {"large": large[0]}
     if len(small) == 1 and not large:
         return {"small": small[0]}
     return {}
+
+
+def _chosen(
+    wholes: list[tuple[float, int, int]],
+    large: list[Array],
+    expected: Mapping[MarkerName, Array],
+    own: Chooser | None,
+) -> tuple[float, int, int]:
+    """Of several whole targets."""
+    if len(wholes) == 1 or not (expected or own):
+        return wholes[0]
+    if expected:
+        centre = next(iter(expected.values())).mean(axis=0)
+        away = [float(np.linalg.norm(large[i].mean(axis=0) - centre)) for _, i, _ in wholes]
+    else:
+        assert own is not None
+        away = [own.aside_m("large", large[i]) for _, i, _ in wholes]
+    return wholes[int(np.argmin(away))]
+
+
+def _possible(
+    candidates: Mapping[MarkerName, list[Array]], own: Chooser
+) -> Mapping[MarkerName, list[Array]]:
+    """Without the markers that are too far aside. A lone one is left to the pipeline, which says
+    why it is not taken."""
+    if not own.refuses or sum(map(len, candidates.values())) < 2:
+        return candidates
+    kept: dict[MarkerName, list[Array]] = {
+        name: [quad for quad in quads if math.isfinite(own.aside_m(name, quad))]
+        for name, quads in candidates.items()
+    }
+    return kept if any(kept.values()) else candidates
+
+
+def _least_aside(name: MarkerName, quads: list[Array], own: Chooser) -> list[Array]:
+    if len(quads) < 2:
+        return quads
+    away = [own.aside_m(name, quad) for quad in quads]
+    return [quads[int(np.argmin(away))]]
 
 
 def _wholes(
