@@ -126,7 +126,7 @@ class AiDeckSource(StreamSource):
             if not data:
                 return "the stream ended" if splitter.pictures else _nothing(splitter)
             for picture in reversed(splitter.feed(data, now_s)):
-                image = _decoded(picture)
+                image = decoded(picture)
                 if image is not None:
                     last_s = now_s
                     self._put(self._grey(image), began_s=picture.began_s)
@@ -147,7 +147,8 @@ def _nothing(splitter: CpxSplitter) -> str:
     )
 
 
-def _decoded(picture: CpxPicture) -> NDArray[np.uint8] | None:
+def decoded(picture: CpxPicture) -> NDArray[np.uint8] | None:
+    """Grey (height, width); None where a JPEG is none, or of another size than its header says."""
     shape = (picture.height, picture.width)
     pixels = np.frombuffer(picture.data, np.uint8)
     if not picture.is_jpeg:

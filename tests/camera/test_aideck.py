@@ -11,7 +11,14 @@ import numpy as np
 import pytest
 
 from perchctl.calibration.files import load_calibration
-from perchctl.camera.aideck import NO_PICTURE_S, AiDeckAddress, AiDeckSource, aideck_address
+from perchctl.camera.aideck import (
+    NO_PICTURE_S,
+    AiDeckAddress,
+    AiDeckSource,
+    aideck_address,
+    decoded,
+)
+from perchctl.camera.cpx import CpxPicture
 from perchctl.camera.open import open_source
 from perchctl.camera.source import check_size
 from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
@@ -28,6 +35,7 @@ from tests.helpers.aideck import (
     console,
     header,
     jpeg,
+    jpeg_packets,
     packet,
     picture,
     raw,
@@ -85,6 +93,8 @@ def test_a_frame_is_of_its_first_byte_and_arrives_with_its_last(
     assert second.t_s == pytest.approx(100.1 - 0.06)
 
 
+SMALLER = jpeg_packets(picture(80, (162, 122)))
+SIZE = int.from_bytes(SMALLER[0][-4:], "little")
 FAULTS: dict[str, bytes] = {
     "cut packet": raw(picture(80))[:50_000],
     "half a header": raw(picture(80))[:9],
@@ -94,8 +104,7 @@ FAULTS: dict[str, bytes] = {
     "garbage": bytes(range(256)) * 100,
     "console amid": b"".join([*raw_packets(picture(80))[:9], *[console()] * 5]),
     "JPEG that is none": header(324, 244, 500, 1) + packet(b"\xff\xd8" + bytes(498)),
-    "JPEG of another size": header(324, 244, len(jpeg(picture(80, (162, 122)))) - 99, 1)
-    + jpeg(picture(80, (162, 122)))[15:],
+    "JPEG of another size": header(324, 244, SIZE, 1) + b"".join(SMALLER[1:]),
 }
 
 
@@ -111,6 +120,12 @@ def test_frames_go_on_after_a_fault(fault: str, deck: AiDeck, opened: Opened) ->
     assert (level(after), after.index) == (160, 1)
     assert source.connections == 1
     end.set()
+
+
+def test_a_jpeg_of_another_size_than_its_header_s_is_none() -> None:
+    data = b"".join(p[4:] for p in SMALLER[1:])
+    assert decoded(CpxPicture(0.0, 324, 244, True, data)) is None
+    assert decoded(CpxPicture(0.0, 162, 122, True, data)) is not None
 
 
 def test_it_reconnects_when_the_deck_restarts_or_stalls(deck: AiDeck, opened: Opened) -> None:
@@ -146,7 +161,7 @@ def test_bytes_without_pictures_end_the_connection(deck: AiDeck, opened: Opened)
     clock, said, never = Clock(), threading.Event(), threading.Event()
     deck.scripts.put([raw(picture(60)), said, console(), never])
     deck.scripts.put([raw(picture(160)), never])
-    source = opened(deck, clock)
+    source = opened(deck, clock, read_timeout_s=1000.0)
     next_frame(source)
     clock.t_s += NO_PICTURE_S + 0.1
     said.set()

@@ -118,6 +118,7 @@ FAULTS: dict[str, bytes] = {
     "a JPEG's chunk lost": without(jpeg_packets(B), 2),
     "a JPEG's first part lost": without(jpeg_packets(B), 1),
     "a JPEG's end lost": without(jpeg_packets(B), len(jpeg_packets(B)) - 1),
+    "a JPEG whose end is not one": jpeg(B)[:-2] + b"\0\0",
     "a length too small": wrong_length(-7),
     "a length too large": wrong_length(+5),
     "a length beyond any packet": wrong_length(+40000),
@@ -143,6 +144,19 @@ def test_a_fault_costs_its_own_picture_only(fault: str, form: Callable[[Picture]
     out = splitter.feed(form(A) + FAULTS[fault] + form(C) + form(D), 0.0)
     assert out == split(form(A) + form(C) + form(D))
     assert len(splitter._buffer) < 100
+
+
+def test_a_smaller_picture_behind_a_torn_one_comes_at_once() -> None:
+    torn = b"".join(jpeg_packets(picture(100))[:4])
+    assert split(torn + jpeg(C)) == split(jpeg(C))
+
+
+def test_what_is_held_is_bounded() -> None:
+    splitter = CpxSplitter()
+    splitter.feed(raw_packets(B)[0], 0.0)
+    for _ in range(200):
+        splitter.feed(console("x" * 1000), 0.0)
+        assert len(splitter._buffer) < 70_000
 
 
 def test_a_picture_of_two_is_none() -> None:
