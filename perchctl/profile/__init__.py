@@ -1,6 +1,7 @@
 """Profiles: one YAML file says everything a flight depends on.
 
-schema: the models, each key with its bounds (vision and mission hold the larger sections).
+schema: the models, each key with its bounds (vision, merge, mission and positioning hold the
+larger sections).
 load: reading, `extends`, the files a profile names. plain_yaml: what of YAML is read.
 old_keys: what earlier versions called them. places: where shipped and the user's files are.
 limits: keys that must fit each other. keys: each with its unit, bounds and meaning.
@@ -15,6 +16,7 @@ from perchctl.profile.load import (
     load_profile,
     read_weights,
 )
+from perchctl.profile.merge import FittedWeights, MergeConfig, WeightsConfig
 from perchctl.profile.mission import (
     AlignConfig,
     AscendConfig,
@@ -36,15 +38,12 @@ from perchctl.profile.schema import (
 from perchctl.profile.vision import (
     CameraConfig,
     DetectorConfig,
-    FittedWeights,
     KalmanConfig,
     MarkerConfig,
-    MergeConfig,
     Mounting,
     PoseConfig,
     TargetConfig,
     VehicleConfig,
-    WeightsConfig,
 )
 
 __all__ = [

@@ -13,11 +13,11 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from perchctl.errors import InvalidValue, NotFound, ProfileNote
+from perchctl.profile.merge import FittedWeights
 from perchctl.profile.old_keys import with_present_keys
 from perchctl.profile.places import data_file, data_folder, listing
 from perchctl.profile.plain_yaml import clipped, parse_yaml
 from perchctl.profile.schema import Profile
-from perchctl.profile.vision import FittedWeights
 
 _NAMED_FILES = (
     ("merge", "weights_file", "weights"),

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 from perchctl.profile.base import Range, Section
 from perchctl.profile.dictionaries import check_marker_id
 from perchctl.profile.limits import IMPOSSIBLE
+from perchctl.profile.merge import MergeConfig
 from perchctl.profile.mission import PlannerConfig, SafetyConfig
 from perchctl.profile.old_keys import with_present_keys
 from perchctl.profile.positioning import PositioningConfig
@@ -21,7 +22,6 @@ from perchctl.profile.vision import (
     CameraConfig,
     DetectorConfig,
     KalmanConfig,
-    MergeConfig,
     PoseConfig,
     TargetConfig,
     VehicleConfig,

@@ -6,7 +6,7 @@ import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile.base import BodyVector3, Section, Vector3
@@ -288,67 +288,3 @@ class KalmanConfig(Section):
         description="an unmeasured target moves in the estimate's world at most so fast",
     )
     gate: bool = Field(True, description="a pose that contradicts the target's track is not taken")
-
-
-class WeightsConfig(Section):
-    x: float = Field(
-        0.275, ge=0, le=1, description="the large marker's share; the small one has the rest"
-    )
-    y: float = Field(0.306, ge=0, le=1, description="as x")
-    z: float = Field(0.728, ge=0, le=1, description="as x")
-    yaw: float = Field(0.469, ge=0, le=1, description="as x")
-
-
-class MergeConfig(Section):
-    method: Literal["weights", "joint"] = Field(
-        "joint", description="the paper's weights, or both markers solved as one"
-    )
-    weights: WeightsConfig = WeightsConfig()
-    weights_file: str | None = Field(
-        None, description="of `perchctl fit-weights`; replaces `weights`"
-    )
-    stages: Literal["seen", "range"] = Field(
-        "seen", description="merge what is seen, or by distance as equations 4, 6, 11"
-    )
-    z2_m: float = Field(0.25, gt=0, description="farthest range of the small marker")
-    z3_m: float = Field(0.12, gt=0, description="nearest range of the whole large marker")
-    disagreement_m: float = Field(
-        0.03, gt=0, description="farther apart than this the markers contradict"
-    )
-    disagreement_frames: int = Field(15, ge=1, description="so many in a row, and it lands")
-
-    @model_validator(mode="after")
-    def _ranges_in_order(self) -> MergeConfig:
-        if not self.z3_m < self.z2_m:
-            raise ValueError("z3_m < z2_m must hold (metres)")
-        return self
-
-
-class FittedData(BaseModel):
-    """The data that weights were fitted to."""
-
-    file: str = ""
-    sha256: str = ""
-    rows: int = 0
-    positions: int = 0
-
-
-class FittedWeights(BaseModel):
-    """A weights file, as far as a flight needs it (`perchctl.weights.files` writes more)."""
-
-    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-
-    date: str = ""
-    method: str = ""
-    weights: WeightsConfig
-    data: FittedData = FittedData()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _all_axes(cls, values: dict[str, Any]) -> dict[str, Any]:
-        given = values.get("weights")
-        if isinstance(given, dict):
-            missing = [axis for axis in WeightsConfig.model_fields if axis not in given]
-            if missing:
-                raise ValueError(f"weights.{missing[0]} is missing; needed are x, y, z and yaw")
-        return values

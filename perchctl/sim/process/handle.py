@@ -102,6 +102,10 @@ class SimProcess:
             heard_file=str(heard_file) if heard_file is not None else None,
             linger_s=linger_s,
         )
+        return cls._with(setup, timeout_s)
+
+    @classmethod
+    def _with(cls, setup: HostSetup, timeout_s: float) -> SimProcess:
         token = new_token()
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
         with listen() as listener:
