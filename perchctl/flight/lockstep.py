@@ -178,11 +178,16 @@ def fly_lockstep(
     report = fly(parts)
     link.close()
     link.advance_to(link.now_s + 1.0)
+    return _judged(link, scenario.seed, report, truth)
+
+
+def _judged(link: MockLink, seed: int, report: FlightReport, truth: Truth) -> LockstepFlight:
+    vehicle = link.vehicle
     hanging = bool(vehicle.world.state().magnet_engaged)
     fell = truth.fell or (report.phase is Phase.PERCHED and not hanging)
     return LockstepFlight(
         report=report,
-        seed=scenario.seed,
+        seed=seed,
         miss_m=vehicle.world.gear_miss_m(),
         hanging=hanging,
         fell=fell,
