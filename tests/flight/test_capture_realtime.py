@@ -144,7 +144,7 @@ def test_hidden_for_good_it_lands_and_says_why(tmp_path: Path) -> None:
     assert "does not see the rigid body 'crazyflie'" in it.stderr
     assert truth["floor_contact"]
     assert truth["motors"] == (0, 0, 0, 0)
-    assert math.hypot(*truth["position_m"][:2]) < 0.5
+    assert math.hypot(*truth["position_m"][:2]) < 1.5  # blind on the way down
 
 
 @pytest.mark.parametrize(
