@@ -59,9 +59,9 @@ def test_parameters_are_kept_and_the_estimate_begins_where_they_say(pilot: Pilot
         for name, value in PARAMETERS.items():
             pilot.cf.param.set_value(name, f"{value:g}")
             assert read(pilot, name) == pytest.approx(value)
-        pilot.cf.param.set_value("kalman.resetEstimation", "1")
-        pilot.cf.param.set_value("kalman.resetEstimation", "0")
-        assert read(pilot, "kalman.resetEstimation") == 0.0
+        for value in (1, 0):
+            pilot.cf.param.set_value("kalman.resetEstimation", str(value))
+            assert read(pilot, "kalman.resetEstimation") == value
         pilot.advance(0.05)
         start = [pilot.now(f"stateEstimate.{axis}") for axis in "xyz"]
         assert start == pytest.approx((0.4, -0.3, 0.1), abs=0.01)
