@@ -158,7 +158,10 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog) -> FlightRe
         state, redone = new, False
         if not isinstance(command, Idle):
             parts.link.send(command)
-        watchdog.turn(now_s, max(due_s, now_s) + period_s, state, command, obs.telemetry)
+        watchdog.turn(
+            now_s, max(due_s, now_s) + period_s, state, command, obs.telemetry,
+            placed=Context(state, obs, parts.profile).placed,
+        )  # fmt: skip
         events = _events(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True

@@ -45,7 +45,9 @@ def refuse_strange(
 ) -> None:
     """Raises SafetyAbort for positions in another unit, or of another world. Held askew or moved
     it is not judged: capture and attitude are not of one moment."""
-    if status is None or status.measured is None or telemetry is None:
+    if status is None or status.problem is not None or status.measured is None:
+        return  # what was sent last may have been elsewhere
+    if telemetry is None:
         return
     if tilted(telemetry, profile) is None and moving(telemetry) is None:
         _refuse(strange(status.measured, telemetry, profile))

@@ -73,6 +73,7 @@ class Turn:
     Attributes:
         due_s: when the next turn is due; the loop measures its lateness from there.
         held_m: height of the body where the ceiling holds it, None away from the ceiling.
+        placed: whether the estimate's height and speed prove anything (`Context.placed`).
     """
 
     t_s: float
@@ -84,6 +85,7 @@ class Turn:
     held_m: float | None
     stopped: bool
     by_itself: bool
+    placed: bool = True
 
 
 class Watchdog:
@@ -98,6 +100,7 @@ class Watchdog:
         self._land_s = profile.safety.loop_late_land_s
         self._top_m = profile.safety.max_height_m
         self._proof_age_s = profile.safety.proof_age_s
+        self._carried_g = 1.0 - profile.planner.perch.contact_acc_g
         self._complete = profile.planner.complete
         self._operator = operator
         self._turn: Turn | None = None
@@ -112,7 +115,14 @@ class Watchdog:
     # --- the loop's side ---------------------------------------------------------------
 
     def turn(
-        self, now_s: float, due_s: float, state: PlannerState, command: Command, newest: Telemetry
+        self,
+        now_s: float,
+        due_s: float,
+        state: PlannerState,
+        command: Command,
+        newest: Telemetry,
+        *,
+        placed: bool = True,
     ) -> None:
         """A turn of the loop is done, its command on its way."""
         if isinstance(command, (PositionSetpoint, RawThrust)):
@@ -132,6 +142,7 @@ class Watchdog:
             held_m,
             state.stopped_s is not None,
             state.phase is Phase.LANDING and state.orders > 0,
+            placed,
         )
 
     def rescuing(self) -> None:
@@ -220,7 +231,7 @@ class Watchdog:
         if not free and known is not None and turn.held_m is not None:
             if isinstance(turn.command, RawThrust) and turn.command.thrust <= THRUST_MIN:
                 return turn.command
-            if known.position_m[2] > turn.held_m - PEELED_M:
+            if not turn.placed or known.position_m[2] > turn.held_m - PEELED_M:
                 if self._peel is None:
                     x, y, z = known.position_m
                     self._peel = PositionSetpoint(x, y, z - PEEL_BELOW_M, known.yaw_rad)
@@ -265,6 +276,9 @@ class Watchdog:
         x, y, z = known.position_m
         sink_mps = known.velocity_mps[2]
         if self._slipped_s is None:
+            # An estimate that slides sinks at 1 g; what falls does not.
+            if not turn.placed and known.acc_z_g >= self._carried_g:
+                return None
             if turn.held_m - z <= SLIP_M or sink_mps >= -self._complete.slip_mps:
                 return None
             self._slipped_s = now_s

@@ -11,6 +11,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
@@ -23,7 +24,7 @@ from perchctl.link.encode import (
     encode_external,
 )
 from perchctl.link.protocol import Guard
-from perchctl.link.variables import EXTERNAL, decks_of
+from perchctl.link.variables import EXTERNAL, LISTEN_S, decks_of
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
@@ -110,7 +111,12 @@ class MockLink:
     def measured_by(self) -> MeasuredBy:
         firmware = self.vehicle.firmware
         told = {n: firmware.get_parameter(n) for n in firmware.PARAMETERS if n.startswith("deck.")}
-        return MeasuredBy(decks_of(told), external=firmware.log_value(EXTERNAL) > 0)
+        by = MeasuredBy(decks_of(told))
+        if by.position_decks:
+            return by
+        before = firmware.log_value(EXTERNAL)
+        self.advance_to(self.now_s + LISTEN_S)
+        return replace(by, external=firmware.log_value(EXTERNAL) != before)
 
     def telemetry(self) -> list[Telemetry]:
         self._collect()

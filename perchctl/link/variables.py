@@ -11,10 +11,10 @@ from typing import Any
 from perchctl.vehicle import MeasuredBy
 
 ANSWER_S = 1.5
-LISTEN_S = 0.3
-"""Positions from outside come ten times a second, or they are none to fly by."""
-EXTERNAL = "locSrv.tick"
-"""Steps with each position from outside."""
+LISTEN_S = 1.0
+"""Positions from outside that come less than once a second are none to fly by."""
+EXTERNAL = "locSrvZ.tick"
+"""When the newest position from outside came, ms (source): steps with each of them."""
 _BLOCK_BYTES = 26
 
 

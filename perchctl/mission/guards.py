@@ -95,7 +95,9 @@ def hangs_stopped(c: Context) -> bool:
     stopped_s, hangs_s = c.state.stopped_s, c.state.since.get(Condition.WEIGHT_HANGS)
     if stopped_s is None:
         return False
-    return still_at_contact(c) or (hangs_s is not None and hangs_s <= stopped_s)
+    # A landing without positions puts the weight on whatever carries it: the floor, perhaps.
+    hung = c.state.phase is Phase.COMPLETE and hangs_s is not None and hangs_s <= stopped_s
+    return hung or still_at_contact(c)
 
 
 def still_at_contact(c: Context) -> bool:
@@ -115,7 +117,7 @@ def hangs_in_landing(c: Context) -> bool:
     began_m = c.state.entry_m[2]
     high = began_m - (ground[2] if ground else 0.0) > HIGH_M
     stayed = c.proves and c.placed and high and not c.far_below_target and began_m - z_m < STAYED_M
-    return stayed or still_at_contact(c)
+    return stayed or (still_at_contact(c) and c.height_m > LOW_M)
 
 
 def settling_too_long(c: Context) -> bool:

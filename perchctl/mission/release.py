@@ -81,7 +81,7 @@ def ready(c: Context) -> Acted:
     it, what falls unseen is caught. Still motors would be a stop without a proof."""
     state, tel = c.state, c.obs.telemetry
     x, y, z_m = tel.position_m
-    if state.contact_z_m is not None:
+    if state.contact_z_m is not None and c.placed:  # else the estimate has slid away from it
         z_m = state.contact_z_m
     setpoint = PositionSetpoint(x, y, z_m + CATCH_TURNING_ABOVE_M, tel.yaw_rad)
     return replace(state, setpoint=setpoint, released_s=None), limited(c, setpoint)

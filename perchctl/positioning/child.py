@@ -22,6 +22,7 @@ START_TIMEOUT_S = 30.0
 MOST_HZ = 500.0
 """No system is faster; what comes faster is not a measurement, and would keep the parent busy."""
 AFTER_PARENT_S = 1.0
+PAUSE_S, AT_ONCE_S = 0.1, 2e-4
 
 Body = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 """Position and quaternion (w, x, y, z): plain numbers, so that nothing of the library travels."""
@@ -95,11 +96,15 @@ def _by_address(setup: CaptureSetup) -> dict[str, str]:
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:
-    sent_s = -1.0
+    """After a pause the library may hand out what has waited in its queue: the first frame, and
+    each that then comes without any waiting, is of an unknown age, and not passed on."""
+    sent_s, behind = -1.0, False
     while True:
+        asked_s = time.monotonic()
         client.waitForNextFrame()
         now_s = time.monotonic()
-        if now_s - sent_s < 1.0 / MOST_HZ:
+        behind = now_s - asked_s > PAUSE_S or (behind and now_s - asked_s < AT_ONCE_S)
+        if behind or now_s - sent_s < 1.0 / MOST_HZ:
             continue
         bodies = {str(name): _body(body) for name, body in client.rigidBodies.items()}
         if bodies or not partial:

@@ -8,6 +8,8 @@ from pydantic import Field, model_validator
 
 from perchctl.profile.base import BodyVector3, Section, Vector3
 
+SPARE_S = 0.02
+"""Frames do not come to the millisecond."""
 CAPTURE_SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")
 
 
@@ -58,6 +60,12 @@ class PositioningConfig(Section):
 
     @model_validator(mode="after")
     def _fits(self) -> PositioningConfig:
+        if self.hold_s <= self.latency_s + 1.0 / self.rate_hz + SPARE_S:
+            raise ValueError(
+                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) and a "
+                f"period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to spare: else a "
+                f"position is stale before the next one comes"
+            )
         if self.land_s <= self.hold_s:
             raise ValueError(
                 f"land_s ({self.land_s:g}) must be longer than hold_s ({self.hold_s:g})"

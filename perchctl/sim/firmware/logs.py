@@ -35,6 +35,7 @@ class Logged(Protocol):
     scenario: Scenario
     driver: MotorDriver
     flown_setpoint: Setpoint
+    external_tick_ms: int
 
     @property
     def motors(self) -> Sequence[float]: ...
@@ -85,7 +86,7 @@ def _system(firmware: Logged) -> dict[str, Getter]:
         "range.zrange": lambda: (  # a deck's
             1000.0 * max(0.0, firmware.world.z_m) if estimator.outside is None else 0.0
         ),
-        "locSrv.tick": _field(estimator, "external_count"),
+        "locSrvZ.tick": lambda: float(firmware.external_tick_ms),
     }
 
 

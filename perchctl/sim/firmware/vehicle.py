@@ -61,6 +61,7 @@ class Firmware:
         self._low_level = False
         self._decoder = Decoder()
         self.estimator = Estimator(self.scenario)
+        self.external_tick_ms = 0
         self.planner = Planner()
         self.supervisor = Supervisor()
         self.controller = Controller()
@@ -184,6 +185,7 @@ class Firmware:
 
     def external_position(self, position_m: tuple[float, float, float]) -> None:
         """A position from outside, m; see `Estimator`."""
+        self.external_tick_ms = int(1e3 * self.t_s) % 65536
         self.estimator.external_position(position_m)
 
     def external_pose(
@@ -192,6 +194,7 @@ class Firmware:
         quaternion_xyzw: tuple[float, float, float, float],
     ) -> None:
         """A pose from outside: m, and body to world."""
+        self.external_tick_ms = int(1e3 * self.t_s) % 65536
         x, y, z, w = quaternion_xyzw
         self.estimator.external_pose(position_m, (w, x, y, z))
 
