@@ -315,25 +315,50 @@ def test_the_ground_stays_where_it_was_when_the_drift_ends() -> None:
 # --- Another world -----------------------------------------------------------------------
 
 
-def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone() -> None:
-    """A world with another axis up: the vehicle lifts, its position slides, its height stands,
-    and each setpoint would be answered with more thrust."""
-    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
-    raw = []
-    for t_s in times(1.5):
-        aside_m = 0.3 * (t_s - BEGIN_S)
-        tel = telemetry(t_s, position_m=(0.0, aside_m, 0.0), thrust=60000.0, acc_z_g=1.1)
+@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.015, -0.015])
+@pytest.mark.parametrize("hover", [42000.0, 55000.0])
+def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
+    hover: float, felt_too_much_g: float
+) -> None:
+    """A world with its y up: the vehicle rises, its position slides, its height and its vertical
+    speed stand. It is let down by what its accelerometer feels, one with an offset too."""
+    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
+    z_m, up_mps, thrust, highest_m = 0.0, 0.0, 1.15 * hover, 0.0
+    for t_s in times(5.0):
+        acc_g = thrust / hover
+        up_mps += 9.81 * (acc_g - 1.0) * TURN_S
+        z_m += up_mps * TURN_S
+        highest_m = max(highest_m, z_m)
+        tel = telemetry(
+            t_s, position_m=(0.0, z_m, 0.0), velocity_mps=(0.0, up_mps, 0.0), thrust=thrust,
+            acc_z_g=acc_g + felt_too_much_g,
+        )  # fmt: skip
         obs = observation(t_s, telemetry=tel, target=target_at(t_s, body_m=tel.position_m))
         state, command = planner.step(state, obs, MOCAP)
-        if aside_m < 0.1:
-            assert isinstance(command, PositionSetpoint)
         if isinstance(command, RawThrust):
-            raw.append(command.thrust)
+            thrust = float(command.thrust)
+        if z_m <= 0.0:
+            break
     assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
     assert "perchctl check --lift" in state.reason
-    assert raw[0] < 60000 / 1.1
-    assert raw == sorted(raw, reverse=True)
-    assert raw[-1] > 0.85 * 60000 / 1.1  # not let fall: its speed is not its own
+    assert z_m <= 0.0
+    assert -0.9 < up_mps < 0.0
+    assert highest_m < 0.3
+
+
+def test_what_is_astray_and_unfelt_for_a_moment_keeps_the_speed_that_it_had() -> None:
+    """A gap in telemetry tells nothing: neither that it stands still nor the estimate's speed."""
+    state = replace(
+        state_in(Phase.LANDING), astray=True, heading_lost=True, row="position-astray",
+        felt_mps=-0.4, last=telemetry(10.0),
+    )  # fmt: skip
+    tel = telemetry(10.3, velocity_mps=(0.0, 0.0, 0.8))
+    after, _ = planner.step(state, observation(10.3, telemetry=tel), MOCAP)
+    assert after.felt_mps == -0.4
+    again, _ = planner.step(
+        after, observation(10.32, telemetry=telemetry(10.32, acc_z_g=1.1)), MOCAP
+    )
+    assert -0.4 < again.felt_mps < -0.38
 
 
 def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
