@@ -9,6 +9,7 @@ comparison.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from dataclasses import asdict, dataclass
@@ -169,20 +170,15 @@ def newest(config: PositioningConfig) -> Compared | Unreadable | None:
 
 def keep(config: PositioningConfig, record: Compared) -> str | None:
     """Write it down; what was there of this set-up is gone. None, or why it could not be written:
-    then, too, an older one that passed is taken away if it can be."""
+    one that passed must not stand, then, where the newest did not, and is taken away if it can
+    be."""
     set_up = set_up_of(config)
     path = path_of(set_up)
     try:
         write_files({path: encoded(set_up, record)})
     except (InvalidValue, OSError) as error:
-        return _without_the_old(path, str(error))
+        if not record.passed:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+        return str(error)
     return None
-
-
-def _without_the_old(path: Path, why: str) -> str:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return f"{why}; what stands there is an older comparison's"
-    return why
-
