@@ -394,6 +394,9 @@ def test_only_positions_from_outside_go_astray(profile: Any) -> None:
 @pytest.mark.parametrize(("phase", "z_m", "aside_m", "lands"), [
     (Phase.APPROACH, 0.02, 0.08, False), (Phase.APPROACH, 0.2, 0.2, False),
     (Phase.APPROACH, 0.2, 0.3, True), (Phase.ALIGN, 1.0, 0.6, False), (Phase.ALIGN, 1.0, 0.9, True),
+    (Phase.SEARCH, 0.5, 0.15, False), (Phase.SEARCH, 0.5, 0.3, True),
+    (Phase.ESTIMATE, 0.5, 0.3, True),
+    (Phase.LANDING, 1.0, 0.3, False), (Phase.LANDING, 1.0, 0.5, True),
 ])  # fmt: skip
 def test_a_draught_is_not_another_world(
     phase: Phase, z_m: float, aside_m: float, lands: bool
@@ -402,3 +405,20 @@ def test_a_draught_is_not_another_world(
     obs = observation(10.02, telemetry=tel)
     state, _ = planner.step(state_in(phase, z_m=z_m), obs, MOCAP)
     assert (state.row == "position-astray") is lands
+
+
+def test_what_has_touched_the_ceiling_is_left_to_its_landing() -> None:
+    """The magnet may hold it aside of its setpoint: that is no other world."""
+    begin = replace(state_in(Phase.LANDING, z_m=1.0), contact_z_m=1.0)
+    obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 1.0)))
+    state, _ = planner.step(begin, obs, MOCAP)
+    assert state.row != "position-astray"
+
+
+def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
+    begin = replace(state_in(Phase.LANDING, z_m=0.5), reason="camera.mount", row="mounting")
+    obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 0.5)))
+    state, command = planner.step(begin, obs, MOCAP)
+    assert isinstance(command, RawThrust)
+    assert state.astray
+    assert "swapped axes" in state.reason
