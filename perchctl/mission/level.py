@@ -30,7 +30,11 @@ FELT_S = 1.0
 offset: without it 0.2 m/s^2 would be 0.4 m/s in two seconds."""
 UNFELT_S = 0.1
 ASTRAY_S = 2.5
-"""For so long the felt speed is believed; then the thrust only falls."""
+"""For so long the felt speed is believed, and longer from higher up; then the thrust only falls."""
+ASTRAY_ABOVE_M, ASTRAY_MEAN_MPS, ASTRAY_LONGEST_S = 0.5, 0.5, 10.0
+VERTICAL_ABOVE_M, VERTICAL_MPS = 0.3, 0.2
+"""Risen so far by the estimate, with a speed so near to the felt one, its vertical is the true one:
+the axes are swapped in the plane alone."""
 ASTRAY_SINK_MPS2, ASTRAY_MOST_MPS = 0.15, 0.6
 """It is to sink the faster the longer it takes, so that a felt speed that has drifted does not
 keep it up, and never as fast as what counts as a fall (1 m/s)."""
@@ -58,9 +62,21 @@ def felt_climb_mps(c: Context) -> float:
         return state.felt_mps if state.astray or dt_s <= 0.0 else estimated_mps
     up_g = 0.5 * (tel.acc_z_g + last.acc_z_g) * math.cos(c.tilt_rad) - 1.0
     felt_mps = state.felt_mps + GRAVITY_MPS2 * up_g * dt_s
-    if state.astray:
+    if state.astray and state.felt_alone:
         return felt_mps
     return felt_mps + (estimated_mps - felt_mps) * dt_s / FELT_S
+
+
+def is_felt_alone(c: Context) -> bool:
+    """Whether nothing but the accelerometer tells how fast it sinks, as it is found astray."""
+    apart_mps = abs(c.state.felt_mps - c.obs.telemetry.velocity_mps[2])
+    return not (c.height_m > VERTICAL_ABOVE_M and apart_mps < VERTICAL_MPS)
+
+
+def _believed_s(c: Context) -> float:
+    ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
+    above_m = max(0.0, c.state.entry_m[2] - ground_m - ASTRAY_ABOVE_M)
+    return min(ASTRAY_S + above_m / ASTRAY_MEAN_MPS, ASTRAY_LONGEST_S)
 
 
 def astray_down(c: Context) -> Acted:
@@ -70,7 +86,7 @@ def astray_down(c: Context) -> Acted:
     sink_mps = min(SINK_MPS + ASTRAY_SINK_MPS2 * c.in_phase_s, ASTRAY_MOST_MPS)
     part = 1.0 - ASTRAY_GAIN_S_PER_M * (state.felt_mps + sink_mps)
     thrust = hover * max(ASTRAY_LEAST, min(ASTRAY_MOST, part))
-    if c.in_phase_s >= ASTRAY_S:
+    if c.in_phase_s >= _believed_s(c):
         before = min(state.level_thrust or hover, hover)
         thrust = max(0.4 * hover, before - RAMP_PER_S * hover * (c.obs.t_s - state.t_s))
     thrust = min(60000.0, thrust)

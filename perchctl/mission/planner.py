@@ -16,7 +16,7 @@ from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, ho
 from perchctl.mission.context import PUT_RIGHT_S, Context
 from perchctl.mission.guidance import presses
 from perchctl.mission.hold import hold_reason
-from perchctl.mission.level import felt_climb_mps
+from perchctl.mission.level import felt_climb_mps, is_felt_alone
 from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
 from perchctl.mission.state import (
@@ -202,6 +202,8 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         ordered_s=None,
         orders=0,
     )
+    if row.name == "position-astray":
+        new = replace(new, felt_alone=is_felt_alone(context))
     return _started_phase(new, state, obs)
 
 

@@ -422,3 +422,29 @@ def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
     assert isinstance(command, RawThrust)
     assert state.astray
     assert "swapped axes" in state.reason
+
+
+@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.02, -0.02])
+@pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
+def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: float) -> None:
+    """Axes swapped in the plane alone: the estimate's vertical speed is its own, and corrects
+    what an accelerometer's offset would sum up to on the longer way."""
+    state = state_in(Phase.ALIGN, z_m=height_m)
+    z_m, up_mps, thrust = height_m, 0.0, state.hover_thrust
+    for t_s in times(9.0):
+        acc_g = thrust / HOVER_THRUST
+        up_mps += 9.81 * (acc_g - 1.0) * TURN_S
+        z_m += up_mps * TURN_S
+        aside_m = 2.0 * (t_s - BEGIN_S)
+        tel = telemetry(
+            t_s, position_m=(aside_m, 0.0, z_m), velocity_mps=(2.0, 0.0, up_mps), thrust=thrust,
+            acc_z_g=acc_g + felt_too_much_g,
+        )  # fmt: skip
+        state, command = planner.step(state, observation(t_s, telemetry=tel, target=None), MOCAP)
+        if isinstance(command, RawThrust):
+            thrust = float(command.thrust)
+        if z_m <= 0.0:
+            break
+    assert state.row == "position-astray"
+    assert z_m <= 0.0
+    assert -1.0 < up_mps < 0.0
