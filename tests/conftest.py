@@ -24,10 +24,12 @@ for _name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP"):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _runtime_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """One of its own for each worker: two that name the same address must not meet there."""
+def _own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Of its own for each worker: two that name the same address must not meet there, and what
+    tests compare is no word on the user's motion capture."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("runtime")))
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
 
 

@@ -13,12 +13,24 @@ from perchctl.camera.device import device_listing
 from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
-from perchctl.check import camera, capture, computer, gone, hand, health, lift, link, quick, scan
+from perchctl.check import (
+    camera,
+    capture,
+    compared,
+    computer,
+    gone,
+    hand,
+    health,
+    lift,
+    link,
+    quick,
+    scan,
+)
 from perchctl.check.lift import WITHIN_S as LIFT_S
 from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
 from perchctl.check.row import Row, failed, passed, skipped
 from perchctl.errors import ConnectionFailed, PerchError
-from perchctl.flight.clock import WallClock
+from perchctl.flight.clock import WallClock, wall_date
 from perchctl.flight.positions import at_hand
 from perchctl.flight.session import FlyOptions, check_options, simulated_vehicle
 from perchctl.link.probe import ProbeLink
@@ -84,6 +96,7 @@ def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
         except ConnectionFailed as error:
             yield from _no_vehicle(options, error, wanted)
             yield from _room(room, lambda: [], profile, wanted)
+            yield from _compared(options.uri, profile)
         else:
             heard = probe
             yield passed("address", f"{options.uri} answers")
@@ -173,6 +186,10 @@ def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> R
     return hand.row(hand.paired(seen.telemetry, seen.places(config)), config)
 
 
+def _compared(uri: str, profile: Profile) -> list[Row]:
+    return compared.rows(profile.positioning, wall_date(), simulated=uri.startswith("sim://"))
+
+
 def _vehicle(
     probe: ProbeLink, uri: str, profile: Profile, room: Room, wanted: Wanted
 ) -> Iterator[Row]:
@@ -182,19 +199,26 @@ def _vehicle(
         yield failed("packets", f"the link was lost: {lost}", "see address; restart the vehicle")
         for name in (*link.NAMES[1:], lift.NAME, *health.NAMES):
             yield skipped(name, NO_VEHICLE)
+        yield from _compared(uri, profile)
         return
     yield from link.rows(seen, profile)
     yield from _room(room, probe.telemetry, profile, wanted)
-    yield from _with_a_hand(probe, room, profile, wanted)
+    yield from _with_a_hand(probe, uri, room, profile, wanted)
     yield from gone.rows(probe)
 
 
-def _with_a_hand(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> Iterator[Row]:
+def _with_a_hand(
+    probe: ProbeLink, uri: str, room: Room, profile: Profile, wanted: Wanted
+) -> Iterator[Row]:
     """What somebody has to lift it for, or to keep clear of; it may end with a dead vehicle."""
     if wanted.lift:
-        yield _lifted(probe, room, profile, wanted)
+        lifted = _lifted(probe, room, profile, wanted)
+        yield lifted
+        rows = _compared(uri, profile)
+        yield from [compared.kept(lifted, profile.positioning, wall_date())] if rows else []
     else:
         yield lift.unasked()
+        yield from _compared(uri, profile)
     if wanted.may_turn_motors is None:
         yield from health.unasked()
         return

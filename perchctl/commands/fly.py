@@ -31,6 +31,7 @@ from perchctl.errors import (
     UsageError,
 )
 from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight.positions import check_compared
 from perchctl.flight.session import (
     PLAIN_SEED,
     FlyOptions,
@@ -85,6 +86,7 @@ def run(request: FlyRequest) -> int:
         return 0
     for warning in quick.warnings(options):
         say(f"check: {warning}")
+    check_compared(options.profile.positioning, simulated=options.simulated)
     if not (request.yes or options.simulated):
         ask_before_arming(options.uri)
     return fly(options, request.as_json, page_port(request.view, request.view_port))

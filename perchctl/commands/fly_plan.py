@@ -7,8 +7,10 @@ import textwrap
 from typing import Any
 
 from perchctl.camera.credentials import profile_record, without_password
+from perchctl.check import compared
 from perchctl.check.profile import rows
-from perchctl.check.row import Verdict
+from perchctl.check.row import Row, Verdict
+from perchctl.flight.clock import wall_date
 from perchctl.flight.session import FlyOptions
 from perchctl.profile import Profile, find_calibration, find_weights, read_weights
 from perchctl.profile.mask import find_mask
@@ -33,7 +35,10 @@ def plan(options: FlyOptions) -> dict[str, Any]:
         "profile": profile_record(options.profile),
         "check": [
             dataclasses.asdict(row)
-            for row in rows(options.profile, uri=options.uri, source=options.source)
+            for row in (
+                *rows(options.profile, uri=options.uri, source=options.source),
+                *_compared(options),
+            )
         ],
     }
 
@@ -88,8 +93,17 @@ def _positioning_line(options: FlyOptions) -> list[str]:
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
     return [
         f"positioning  motion capture {where}, body {config.body!r}, {config.send} at most "
-        f"{config.rate_hz:g} Hz"
+        f"{config.rate_hz:g} Hz",
+        *(
+            f"{'':{_COLUMN}}{row.found}"
+            for row in _compared(options)
+            if row.verdict == Verdict.PASS
+        ),
     ]
+
+
+def _compared(options: FlyOptions) -> list[Row]:
+    return compared.rows(options.profile.positioning, wall_date(), simulated=options.simulated)
 
 
 def _place_lines(profile: Profile) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import datetime
 from typing import Protocol
 
 
@@ -24,3 +25,8 @@ class WallClock:
         left_s = t_s - time.monotonic()
         if left_s > 0:
             time.sleep(left_s)
+
+
+def wall_date() -> datetime:
+    """Now, in this computer's time zone; for what is kept from one day to the next."""
+    return datetime.now().astimezone()

@@ -6,12 +6,13 @@ import contextlib
 from collections.abc import Callable
 from importlib.util import find_spec
 
-from perchctl.errors import no_motion_capture
-from perchctl.flight.clock import Clock
+from perchctl.errors import SafetyAbort, no_motion_capture
+from perchctl.flight.clock import Clock, wall_date
 from perchctl.flight.preflight import refuse_strange
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.outside import check_parameters
 from perchctl.positioning.capture import check_reachable, open_capture
+from perchctl.positioning.compared import newest, objection
 from perchctl.positioning.feed import FeedStatus, PositionFeed
 from perchctl.positioning.thread import FeedThread
 from perchctl.positioning.types import CaptureSource
@@ -32,6 +33,16 @@ def check_positioning(profile: Profile, *, simulated: bool) -> None:
         check_reachable(config)
     elif find_spec("motioncapture") is None:  # its room has a capture of its own
         raise no_motion_capture()
+
+
+def check_compared(config: PositioningConfig, *, simulated: bool) -> None:
+    """Raises SafetyAbort for a capture that no hand has compared of late: that its axes are
+    swapped does not show at rest. The simulator's own room is right as it is built."""
+    if config.by != "mocap" or simulated:
+        return
+    objected = objection(newest(config), wall_date())
+    if objected is not None:
+        raise SafetyAbort(": ".join(objected))
 
 
 def opened_capture(

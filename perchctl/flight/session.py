@@ -21,6 +21,7 @@ from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.pace import PaceWatcher, judged
 from perchctl.flight.positions import (
     at_hand,
+    check_compared,
     check_positioning,
     opened_capture,
     started_feed,
@@ -97,6 +98,7 @@ def fly_session(
     to look at its frames on their way.
     """
     check_options(options)
+    check_compared(options.profile.positioning, simulated=options.simulated)
     profile, clock, switch = options.profile, WallClock(), switch or OperatorSwitch()
     camera = camera_of(profile.camera)
     pipeline = make_pipeline(profile, camera)

@@ -15,9 +15,12 @@ CATCHABLE_M = 1.0
 slip": up to 0.8 m at 42 g)."""
 FALLING_MPS = -0.05
 LIFTED_M, SIDEWAYS_M = 0.05, 0.12
-LOW_M, ASTRAY_LOW_M, ASTRAY_M = 0.3, 0.25, 0.8
-"""At take-off a vehicle stays within a few centimetres of its place; later a setpoint is walked
-ahead of it, and a blow may carry it half a metre."""
+LOW_M, ASTRAY_LOW_M, ASTRAY_LANDING_M, ASTRAY_M = 0.3, 0.22, 0.4, 0.8
+"""As long as nothing but a climb was ordered, a vehicle stays within a few centimetres of its
+place (7 cm in simulated flights); later a setpoint is walked ahead of it, and a blow may carry it
+half a metre. A landing goes straight down."""
+ABOVE_START_M = 0.1
+ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
 HUNG_WITHIN_M = 0.3
 HIGH_M, STAYED_M = 0.45, 0.15
 BELOW_S = 0.3
@@ -59,18 +62,32 @@ def too_weak(c: Context) -> bool:
 
 def is_astray(c: Context) -> bool:
     """Position control leads away from its setpoint: at take-off sideways, where only a climb was
-    ordered, and later farther off than any draught carries it.
+    ordered, and later farther off than any draught carries it. On a way down that began for another
+    reason it is looked for too: there it would speed up until it tilts over.
 
     Positions from outside in other axes than the vehicle's do that: those that a vehicle at rest
     does not tell from true ones (fault 11)."""
     setpoint = c.state.setpoint
     if c.profile.positioning.by != "mocap" or setpoint is None or not c.placed:
         return False
+    touched = c.state.contact_z_m is not None or c.state.stopped_s is not None
+    if c.state.phase is Phase.LANDING and touched:
+        return False
     x_m, y_m, _ = c.obs.telemetry.position_m
     away_m = math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
     if c.state.phase is Phase.APPROACH and c.height_m < LIFTED_M:
         return away_m > SIDEWAYS_M
-    return away_m > (ASTRAY_LOW_M if c.height_m < LOW_M else ASTRAY_M)
+    if c.state.phase is Phase.LANDING:
+        return away_m > ASTRAY_LANDING_M
+    return away_m > (ASTRAY_LOW_M if c.height_m < LOW_M or _only_climbs(c) else ASTRAY_M)
+
+
+def _only_climbs(c: Context) -> bool:
+    """Its setpoint is still above the place of its take-off, and is not walked."""
+    setpoint, ground = c.state.setpoint, c.state.ground_m
+    if setpoint is None or ground is None or c.state.phase not in ONLY_UP:
+        return False
+    return math.hypot(setpoint.x_m - ground[0], setpoint.y_m - ground[1]) < ABOVE_START_M
 
 
 def stopped_for_s(c: Context) -> float:

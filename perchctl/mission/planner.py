@@ -16,6 +16,7 @@ from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, ho
 from perchctl.mission.context import PUT_RIGHT_S, Context
 from perchctl.mission.guidance import presses
 from perchctl.mission.hold import hold_reason
+from perchctl.mission.level import felt_climb_mps, is_felt_alone
 from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
 from perchctl.mission.state import (
@@ -85,7 +86,8 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
     if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    state = replace(state, last=obs.telemetry)
+    felt_mps = felt_climb_mps(Context(state, obs, profile))
+    state = replace(state, last=obs.telemetry, felt_mps=felt_mps)
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
 
@@ -200,6 +202,8 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         ordered_s=None,
         orders=0,
     )
+    if row.name == "position-astray":
+        new = replace(new, felt_alone=is_felt_alone(context))
     return _started_phase(new, state, obs)
 
 

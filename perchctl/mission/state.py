@@ -186,6 +186,8 @@ class PlannerState:
     astray: bool = False  # positions from outside lead elsewhere: they prove nothing any more
     stale_s: float | None = None  # when there was no position from outside last
     last: Telemetry | None = None  # of the turn before
+    felt_mps: float = 0.0  # how fast it climbs, by its accelerometer
+    felt_alone: bool = False  # astray, and its vertical speed with it
     heading_lost: bool = False  # position control would lead away from its setpoint
     level_thrust: float = 0.0  # raw thrust of a level way down
     hold: str = ""  # why the vehicle is held in place, empty when it is not

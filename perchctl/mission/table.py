@@ -107,7 +107,8 @@ TABLE: tuple[Row, ...] = (
         "the estimated heading jumped: down level, by thrust alone", S.LAND, O.SAFETY,
     ),
     Row(
-        "position-astray", IN_THE_OPEN, is_astray, P.LANDING, why_astray, S.LAND, O.SAFETY,
+        "position-astray", IN_THE_OPEN | {P.LANDING}, is_astray, P.LANDING, why_astray, S.LAND,
+        O.SAFETY,
     ),
     Row(
         "position-lost", IN_THE_OPEN | {P.PERCH},

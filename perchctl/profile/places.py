@@ -44,3 +44,8 @@ def user_runtime_folder() -> Path:
 
 def user_cache_folder() -> Path:
     return Path(platformdirs.user_cache_dir("perchctl", appauthor=False))
+
+
+def user_state_folder() -> Path:
+    """For what was found out, and is not made anew by itself."""
+    return Path(platformdirs.user_state_dir("perchctl", appauthor=False))

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import camera, gone, session
+from perchctl.check import camera, compared, gone, session
 from perchctl.check.row import Row, Verdict, failed, passed, skipped, warned
 from perchctl.check.session import Wanted
 from perchctl.cli import app
@@ -182,5 +182,5 @@ def test_a_flight_says_what_its_profile_makes_doubtful(tmp_path: Path) -> None:
 
 def test_every_row_is_on_its_page() -> None:
     page = (ROOT / "docs" / "check.md").read_text(encoding="utf-8")
-    for name in (*VEHICLE, gone.NAME, *camera.NAMES, "loop", "disk", "log folder"):
+    for name in (*VEHICLE, compared.NAME, gone.NAME, *camera.NAMES, "loop", "disk", "log folder"):
         assert f"`{name}`" in page, name

@@ -1,12 +1,16 @@
-"""The 24 ways to name the axes of a right-handed world, and what a capture says in each."""
+"""The 24 ways to name the axes of a right-handed world, what a capture says in each, and the
+record of a comparison by hand."""
 
 from __future__ import annotations
 
 import itertools
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
 from perchctl.geometry import Array
+from perchctl.positioning.compared import Compared, keep
+from perchctl.profile.positioning import PositioningConfig
 
 
 def _turns() -> list[Array]:
@@ -30,3 +34,11 @@ def named_up(turn: Array) -> str:
     """The capture's axis that is up."""
     i = int(np.argmax(np.abs(turn[:, 2])))
     return f"{'-' if turn[i, 2] < 0 else ''}{'xyz'[i]}"
+
+
+def compared(
+    config: PositioningConfig, *, ago_s: float = 0.0, passed: bool = True, found: str = "it turns"
+) -> None:
+    """As if `perchctl check --lift` had found that, so long ago."""
+    at = datetime.now(UTC) - timedelta(seconds=ago_s)
+    assert keep(config, Compared(at, passed, found)) is None

@@ -1,0 +1,44 @@
+"""Whether `fly` finds a comparison by hand of this motion capture, and the writing of one."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from perchctl.check.row import Row, Verdict, failed, passed, warned
+from perchctl.positioning.compared import Compared, Unreadable, keep, newest, objection, told
+from perchctl.profile.positioning import PositioningConfig
+
+NAME = "compared"
+
+
+def kept(lifted: Row, config: PositioningConfig, now: datetime) -> Row:
+    """Write down what the hand found, and the row of it. A lift that told nothing is none."""
+    if lifted.verdict is Verdict.SKIPPED:
+        return row(newest(config), now)
+    record = Compared(now, lifted.verdict is Verdict.PASS, lifted.found)
+    why = keep(config, record)
+    if why is None:
+        return row(record, now)
+    standing = newest(config)
+    if not record.passed and objection(standing, now) is None:
+        return failed(
+            NAME, f"what was found could not be written, and fly goes by an older pass: {why}",
+            "free some space, or give back the right to write there; do not fly before",
+        )  # fmt: skip
+    return warned(NAME, f"not written, so fly does not know of it: {why}", "then once more")
+
+
+def row(record: Compared | Unreadable | None, now: datetime) -> Row:
+    objected = objection(record, now)
+    if objected is None:
+        assert isinstance(record, Compared)
+        return passed(NAME, told(record, now))
+    found, advice = objected
+    return warned(NAME, f"{found}; fly refuses", advice)
+
+
+def rows(config: PositioningConfig, now: datetime, *, simulated: bool) -> list[Row]:
+    """None with decks, nor for the simulator's own vehicle, whose room is right as it is built."""
+    if config.by != "mocap" or simulated:
+        return []
+    return [row(newest(config), now)]

@@ -1,0 +1,184 @@
+"""What a comparison by hand found of a motion capture (`perchctl check --lift`), kept for `fly`.
+
+Axes that are swapped do not show on a vehicle at rest that stands as it stood when its body was
+defined: all numbers look right. Only a hand that lifts and turns it tells. So each comparison is
+written down, for exactly the set-up that it is true of, and a flight asks for one that passed, at
+most `VALID_S` old. What cannot be read, or is of another time than the past, is unknown, and no
+comparison.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from perchctl.errors import InvalidValue
+from perchctl.files import write_files
+from perchctl.profile.places import user_state_folder
+from perchctl.profile.positioning import PositioningConfig
+
+VALID_S = 24 * 3600.0
+AHEAD_S = 60.0
+"""A computer's clock is set by so much, now and then."""
+MOST_BYTES, MOST_FOUND = 65536, 300
+AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
+
+
+@dataclass(frozen=True)
+class SetUp:
+    """What a comparison is true of: another capture, body or turn of its axes is another one."""
+
+    system: str
+    host: str
+    body: str
+    body_rpy_deg: tuple[float, ...]
+    body_position_m: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A comparison's date (with its time zone), whether it passed, and what it found."""
+
+    at: datetime
+    passed: bool
+    found: str
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    """There is a record, and nobody knows what it says."""
+
+    path: Path
+    why: str
+
+
+def set_up_of(config: PositioningConfig) -> SetUp:
+    rpy, place = (tuple(map(float, v)) for v in (config.body_rpy_deg, config.body_position_m))
+    return SetUp(config.system, config.host, config.body, rpy, place)
+
+
+# --- Judging: pure -----------------------------------------------------------------------
+
+
+def objection(record: Compared | Unreadable | None, now: datetime) -> tuple[str, str] | None:
+    """Why no flight may rely on it: what was found, and what to do. None where it passed, and not
+    long ago. `now` has a time zone, in which dates are told."""
+    if record is None:
+        return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
+    if isinstance(record, Unreadable):
+        found = f"whether the motion capture was compared is not known: {record.path} {record.why}"
+        return found, f"remove that file, then {AGAIN}"
+    when = _told(record.at, now)
+    if not record.passed:
+        return f"{record.found} (found by check --lift on {when})", f"mend that, then {AGAIN}"
+    age_s = (now - record.at).total_seconds()
+    if age_s < -AHEAD_S:
+        found = f"the motion capture was compared on {when}, which is yet to come"
+        return found, f"set this computer's clock, then {AGAIN}"
+    if age_s > VALID_S:
+        hours = age_s / 3600.0
+        old = f"{hours:.0f} h" if hours < 72.0 else f"{hours / 24.0:.0f} days"
+        found = f"the motion capture was last compared {old} ago, on {when} (24 h at most)"
+        return found, AGAIN
+    return None
+
+
+def told(record: Compared, now: datetime) -> str:
+    """Of a comparison that passed."""
+    return f"compared by hand on {_told(record.at, now)}"
+
+
+def _told(at: datetime, now: datetime) -> str:
+    """Of another year with the year, in the time zone of `now`."""
+    there = at.astimezone(now.tzinfo)
+    year = f" {there.year}" if there.year != now.year else ""
+    return f"{there.day} {_MONTHS[there.month - 1]}{year} {there:%H:%M}"
+
+
+_MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
+
+
+def encoded(set_up: SetUp, record: Compared) -> bytes:
+    values = {
+        "set_up": asdict(set_up),
+        "at": record.at.astimezone(UTC).isoformat(),
+        "passed": record.passed,
+        "found": _one_line(record.found),
+    }
+    return (json.dumps(values, indent=1) + "\n").encode()
+
+
+def decoded(data: bytes, set_up: SetUp) -> Compared:
+    """Errors: ValueError, with what is wrong of it, for what is none or is of another set-up."""
+    try:
+        values = json.loads(data)
+        at = datetime.fromisoformat(values["at"])
+        passed, found, of = values["passed"], values["found"], values["set_up"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise ValueError("is damaged") from None
+    if not (isinstance(passed, bool) and isinstance(found, str)) or at.tzinfo is None:
+        raise ValueError("is damaged")
+    if not timedelta(0) < at - _LONG_AGO < _LONG:  # else no time zone could tell it
+        raise ValueError("is damaged")
+    if of != json.loads(json.dumps(asdict(set_up))):
+        raise ValueError("is of another set-up")
+    return Compared(at, passed, _one_line(found))
+
+
+_LONG_AGO, _LONG = datetime(2000, 1, 1, tzinfo=UTC), timedelta(days=365_000)
+
+
+def _one_line(text: str) -> str:
+    """What a terminal shows as one."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:MOST_FOUND]
+
+
+# --- The files ---------------------------------------------------------------------------
+
+
+def path_of(set_up: SetUp) -> Path:
+    name = hashlib.sha256(json.dumps(asdict(set_up)).encode()).hexdigest()[:16]
+    return user_state_folder() / "compared" / f"{name}.json"
+
+
+def newest(config: PositioningConfig) -> Compared | Unreadable | None:
+    """What is known of this set-up; None where it was never compared."""
+    set_up = set_up_of(config)
+    path = path_of(set_up)
+    try:
+        if not path.exists():
+            return None
+        if not path.is_file():  # one that is a pipe would be waited for
+            return Unreadable(path, "is no file")
+        with path.open("rb") as stream:
+            data = stream.read(MOST_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        return Unreadable(path, f"cannot be read ({error.strerror or error})")
+    if len(data) > MOST_BYTES:
+        return Unreadable(path, "is damaged")
+    try:
+        return decoded(data, set_up)
+    except ValueError as error:
+        return Unreadable(path, str(error))
+
+
+def keep(config: PositioningConfig, record: Compared) -> str | None:
+    """Write it down; what was there of this set-up is gone. None, or why it could not be written:
+    one that passed must not stand, then, where the newest did not, and is taken away if it can
+    be."""
+    set_up = set_up_of(config)
+    path = path_of(set_up)
+    try:
+        write_files({path: encoded(set_up, record)})
+    except (InvalidValue, OSError) as error:
+        if not record.passed:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+        return str(error)
+    return None

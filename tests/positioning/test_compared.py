@@ -1,0 +1,247 @@
+"""What a hand found of a motion capture is kept, and a flight goes by nothing else."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner, Result
+
+from perchctl.check import compared as check_compared
+from perchctl.check.row import Verdict, failed, passed, skipped, warned
+from perchctl.cli import app
+from perchctl.errors import SafetyAbort
+from perchctl.flight import positions
+from perchctl.positioning import compared
+from perchctl.positioning.compared import Compared, Unreadable, decoded, encoded, objection
+from perchctl.profile.positioning import PositioningConfig
+from tests.helpers.capture import compared as was_compared
+
+CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
+NOW = datetime(2026, 11, 22, 15, 0, tzinfo=timezone(timedelta(hours=2)))
+SWAPPED = "swapped axes: up is y in the motion capture"
+DAY_S = 24 * 3600.0
+OTHERS: list[dict[str, Any]] = [
+    {"system": "vrpn"}, {"host": "lab2"}, {"body": "cf3"}, {"body_rpy_deg": (0.0, 0.0, 90.0)},
+    {"body_position_m": (0.0, 0.0, 0.02)},
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(compared, "user_state_folder", lambda: tmp_path / "state")
+    return tmp_path / "state"
+
+
+def ago(seconds: float, passes: bool = True, found: str = "fine") -> Compared:
+    return Compared(NOW - timedelta(seconds=seconds), passes, found)
+
+
+# --- The judgement -----------------------------------------------------------------------
+
+
+@given(st.floats(-1e8, 1e8), st.booleans())
+def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -> None:
+    allowed = passes and -compared.AHEAD_S <= seconds <= DAY_S
+    age_s = (NOW - ago(seconds).at).total_seconds()  # of whole microseconds
+    if min(abs(age_s - DAY_S), abs(age_s + compared.AHEAD_S)) > 1e-3:
+        assert (objection(ago(seconds, passes), NOW) is None) is allowed
+
+
+@pytest.mark.parametrize(("record", "words"), [
+    (None, "was never compared with this vehicle: run perchctl check --lift"),
+    (ago(30 * 3600.0), "last compared 30 h ago, on 21 Nov 09:00 (24 h at most)"),
+    (ago(400 * DAY_S), "last compared 400 days ago, on 18 Oct 2025 15:00"),
+    (ago(-7200.0), "compared on 22 Nov 17:00, which is yet to come: set this computer's clock"),
+    (ago(3000.0, False, SWAPPED), f"{SWAPPED} (found by check --lift on 22 Nov 14:10): mend"),
+    (Unreadable(Path("x.json"), "is damaged"), "is not known: x.json is damaged: remove"),
+])  # fmt: skip
+def test_each_objection_says_what_is_and_what_to_do(
+    record: Compared | Unreadable | None, words: str
+) -> None:
+    said = objection(record, NOW)
+    assert said is not None
+    assert words in ": ".join(said)
+    assert "check --lift" in said[1]
+
+
+# --- The record --------------------------------------------------------------------------
+
+
+@given(st.text(), st.booleans(), st.datetimes(datetime(2001, 1, 1), datetime(2900, 1, 1)))
+def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None:
+    set_up = compared.set_up_of(CONFIG)
+    record = Compared(at.replace(tzinfo=UTC), passes, found)
+    back = decoded(encoded(set_up, record), set_up)
+    assert (back.at, back.passed) == (record.at, passes)
+    assert back.found.isprintable()
+    assert len(back.found) <= compared.MOST_FOUND
+
+
+@given(st.one_of(st.binary(), st.recursive(
+    st.none() | st.booleans() | st.floats() | st.text(),
+    lambda inner: st.lists(inner) | st.dictionaries(
+        st.sampled_from(["at", "passed", "found", "set_up", "x"]), inner
+    ),
+).map(lambda value: json.dumps(value).encode())))  # fmt: skip
+def test_what_is_no_record_is_told_as_such(data: bytes) -> None:
+    with pytest.raises(ValueError, match=r"is damaged|is of another set-up"):
+        decoded(data, compared.set_up_of(CONFIG))
+
+
+@pytest.mark.parametrize("change", OTHERS)
+def test_another_set_up_was_never_compared(change: dict[str, Any], folder: Path) -> None:
+    was_compared(CONFIG)
+    other = CONFIG.model_copy(update=change)
+    assert compared.newest(other) is None
+    # Nor by a file that was copied to its place.
+    (mine, theirs) = (compared.path_of(compared.set_up_of(c)) for c in (CONFIG, other))
+    theirs.write_bytes(mine.read_bytes())
+    assert isinstance(compared.newest(other), Unreadable)
+
+
+def test_what_says_nothing_of_the_axes_is_no_other_set_up() -> None:
+    was_compared(CONFIG)
+    same = CONFIG.model_copy(update={"rate_hz": 50.0, "send": "pose", "hold_s": 0.2})
+    assert isinstance(compared.newest(same), Compared)
+
+
+def spoil(how: str) -> None:
+    path = compared.path_of(compared.set_up_of(CONFIG))
+    if how == "folder":
+        path.unlink()
+        path.mkdir()
+    else:
+        text = {
+            "empty": "", "cut": path.read_text()[:40], "huge": " " * 10**6,
+            "no zone": path.read_text().replace("+00:00", ""),
+            "deep": "[" * 50_000, "of old": path.read_text().replace("202", "102"),
+        }[how]  # fmt: skip
+        path.write_text(text, encoding="utf-8")
+
+
+@pytest.mark.parametrize("how", ["empty", "cut", "huge", "no zone", "deep", "folder", "of old"])
+def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
+    was_compared(CONFIG)
+    positions.check_compared(CONFIG, simulated=False)
+    spoil(how)
+    with pytest.raises(SafetyAbort, match=r"is not known: .*remove that file") as refused:
+        positions.check_compared(CONFIG, simulated=False)
+    assert "\n" not in str(refused.value)
+
+
+# --- `check` -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lifted", [
+    failed("lifted", SWAPPED, ""), warned("lifted", "about too few axes to tell all", ""),
+])  # fmt: skip
+def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
+    was_compared(CONFIG)
+    row = check_compared.kept(lifted, CONFIG, positions.wall_date())
+    assert row.verdict is Verdict.WARN
+    with pytest.raises(SafetyAbort, match=lifted.found):
+        positions.check_compared(CONFIG, simulated=False)
+    again = check_compared.kept(passed("lifted", "fine"), CONFIG, positions.wall_date())
+    assert again.verdict is Verdict.PASS
+    positions.check_compared(CONFIG, simulated=False)
+
+
+def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
+    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, positions.wall_date())
+    assert "was never compared" in row.found
+    was_compared(CONFIG)
+    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, positions.wall_date())
+    assert row.verdict is Verdict.PASS
+
+
+def test_a_record_that_cannot_be_written_warns(folder: Path) -> None:
+    folder.write_text("in the way", encoding="utf-8")
+    row = check_compared.kept(passed("lifted", "fine"), CONFIG, positions.wall_date())
+    assert row.verdict is Verdict.WARN
+    assert "not written" in row.found
+    with pytest.raises(SafetyAbort):
+        positions.check_compared(CONFIG, simulated=False)
+
+
+@pytest.mark.parametrize("removable", [True, False])
+def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
+    removable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    was_compared(CONFIG)
+    monkeypatch.setattr(compared, "write_files", full)
+    if not removable:
+        monkeypatch.setattr(Path, "unlink", full)
+    row = check_compared.kept(failed("lifted", SWAPPED, ""), CONFIG, positions.wall_date())
+    assert row.verdict is (Verdict.WARN if removable else Verdict.FAIL)
+    assert "No space left" in row.found
+    if removable:
+        with pytest.raises(SafetyAbort, match="never compared"):
+            positions.check_compared(CONFIG, simulated=False)
+
+
+def test_decks_and_the_simulator_s_own_room_ask_for_none() -> None:
+    deck = CONFIG.model_copy(update={"by": "deck"})
+    for config, simulated in ((deck, False), (CONFIG, True)):
+        positions.check_compared(config, simulated=simulated)
+        assert check_compared.rows(config, NOW, simulated=simulated) == []
+
+
+# --- `fly` -------------------------------------------------------------------------------
+
+LAB = """extends: sim
+link: {connect_timeout_s: 0.4}
+positioning: {by: mocap, system: vicon, host: lab, body: cf2}
+"""
+
+
+def fly(tmp_path: Path, *words: str) -> Result:
+    profile = tmp_path / "lab.yaml"
+    profile.write_text(LAB, encoding="utf-8")
+    where = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x")
+    logs = ("--log-dir", str(tmp_path / "logs"))
+    done = CliRunner().invoke(app, ["fly", "-p", str(profile), *where, *logs, *words])
+    assert "Traceback" not in done.output
+    return done
+
+
+@pytest.mark.parametrize(("record", "words"), [
+    (None, "was never compared with this vehicle"),
+    ({"ago_s": 25 * 3600.0}, "last compared 25 h ago"),
+    ({"passed": False, "found": SWAPPED}, f"{SWAPPED} (found by check --lift on "),
+])  # fmt: skip
+def test_fly_refuses_before_it_asks_connects_or_logs(
+    record: dict[str, Any] | None, words: str, tmp_path: Path
+) -> None:
+    if record is not None:
+        was_compared(CONFIG, **record)
+    for sure in ((), ("--yes",)):
+        done = fly(tmp_path, *sure)
+        assert done.exit_code == 52, done.output
+        last = done.stderr.strip().splitlines()[-1]
+        assert words in last
+        assert "perchctl check --lift" in last
+        assert "connecting" not in done.stderr
+        assert not (tmp_path / "logs").exists()
+    plan = " ".join(fly(tmp_path, "--dry-run").stdout.split())
+    assert "fly refuses" in plan
+    assert words in plan
+
+
+def test_fly_goes_on_where_it_was_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    was_compared(CONFIG, ago_s=3600.0)
+    plan = " ".join(fly(tmp_path, "--dry-run").stdout.split())
+    assert "compared by hand on" in plan
+    assert "fly refuses" not in plan
+    done = fly(tmp_path)
+    assert done.exit_code == 2  # the next question: there is nobody to ask
+    assert "nobody to ask" in done.stderr
