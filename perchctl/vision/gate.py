@@ -264,9 +264,9 @@ def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
     if not lock.whole:
         return True
     unseen_s = sight.t_s - max(stranger.since_s, lock.track.t_s)
-    # What is not looked at is not empty.
+    # What is not looked at is not empty; where the estimate jumped, it is looked for in vain.
     return (
-        sight.looks_there
+        (sight.looks_there or unseen_s >= 2.0 * REACQUIRE_S)
         and not stranger.another_range
         and stranger.whole >= REACQUIRE_FRAMES
         and unseen_s >= REACQUIRE_S

@@ -337,3 +337,33 @@ def test_an_emergency_stop_is_repeated_a_limited_number_of_times() -> None:
     rig.operator = Operator.STOP
     cuts = [rig.poll(0.2 + 0.05 * i, None) for i in range(1000)]
     assert cuts.count(EmergencyStop()) == MAX_CUTS
+
+
+# --- a position from outside that has stopped coming -------------------------------------
+
+
+def slid(z_m: float, **changes: object) -> Rig:
+    """At the ceiling, while the capture does not see the vehicle."""
+    rig = Rig(RELEASED, AT_CEILING, CEILING_M)
+    rig.dog.turn(T_S, T_S + PERIOD_S, AT_CEILING, RELEASED, telemetry(T_S, CEILING_M), placed=False)
+    rig.z_m = z_m
+    return rig
+
+
+def test_an_estimate_that_slides_is_no_slip() -> None:
+    sinking = {"velocity_mps": (0.0, 0.0, -0.15), "thrust": 1000.0}
+    assert slid(CEILING_M - 0.06).after(0.35, **sinking) == RELEASED
+    caught = slid(CEILING_M - 0.06).after(0.35, acc_z_g=0.2, **sinking)
+    assert isinstance(caught, PositionSetpoint)
+    assert caught.z_m > CEILING_M
+
+
+def test_an_estimate_that_slides_does_not_free_a_vehicle_from_the_ceiling() -> None:
+    """A landing ordered to one that is still held runs by its clock, and ends in a fall."""
+    late_s = PROFILE.safety.loop_late_land_s + 0.1
+    rig = slid(CEILING_M - 0.3)
+    state = replace(AT_CEILING, released_s=None)
+    rig.dog.turn(T_S, T_S + PERIOD_S, state, HOVER, telemetry(T_S, CEILING_M), placed=False)
+    assert isinstance(rig.after(late_s, thrust=60000.0), PositionSetpoint)
+    rig.dog.turn(T_S, T_S + PERIOD_S, state, HOVER, telemetry(T_S, CEILING_M), placed=True)
+    assert isinstance(rig.after(late_s, thrust=60000.0), Land)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from perchctl.mission import planner
-from perchctl.mission.state import Observation, Outcome, Phase, PlannerState
+from perchctl.mission.state import Condition, Observation, Outcome, Phase, PlannerState
 from perchctl.vehicle import LOCKED, Command, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
@@ -448,3 +448,27 @@ def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: 
     assert state.row == "position-astray"
     assert z_m <= 0.0
     assert -1.0 < up_mps < 0.0
+
+
+def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> None:
+    """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
+    state = state_in(Phase.LANDING, z_m=1.0)
+    state = replace(
+        state, contact_z_m=0.6, released_s=9.0, stopped_s=9.9, stale_s=BEGIN_S,
+        since={Condition.WEIGHT_HANGS: 9.5},
+    )  # fmt: skip
+    locked = telemetry(BEGIN_S, 0.6, thrust=0.0, supervisor=READY | LOCKED)
+    seen = observation(BEGIN_S, telemetry=locked, target=None, **hidden(3.0))
+    assert planner.step(state, seen, MOCAP)[0].phase is Phase.ABORTED
+    hung = replace(state, phase=Phase.COMPLETE)
+    assert planner.step(hung, seen, MOCAP)[0].phase is Phase.PERCHED
+
+
+def test_a_release_that_is_held_goes_by_where_the_estimate_is_now() -> None:
+    """It has slid 0.4 m up from the contact: a setpoint at the contact would take the thrust
+    away."""
+    state = replace(state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact_z_m=HANG_Z_M, released_s=9.0)
+    late = telemetry(BEGIN_S - 0.2, HANG_Z_M + 0.4, thrust=1000.0)
+    _, command = planner.step(state, observation(BEGIN_S, telemetry=late, **hidden(4.0)), MOCAP)
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m > late.position_m[2]
