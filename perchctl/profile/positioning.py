@@ -59,6 +59,21 @@ class PositioningConfig(Section):
         return {"by": values} if isinstance(values, str) else values
 
     @model_validator(mode="after")
+    def _meant(self) -> PositioningConfig:
+        """Keys of a capture without `by` would fly by the decks, without a word. (A log's
+        profile has every key, and so `by`, too.)"""
+        of_capture = [key for key in type(self).model_fields if key in self.model_fields_set]
+        if "by" in of_capture:
+            of_capture = ["host"] if self.by == "deck" and self.host.strip() else []
+        if of_capture:
+            verb = "is" if len(of_capture) == 1 else "are"
+            raise ValueError(
+                f"{', '.join(of_capture)} {verb} given, but by is deck: write by: mocap, or only "
+                f"positioning: deck"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _fits(self) -> PositioningConfig:
         if self.hold_s <= self.latency_s + 1.0 / self.rate_hz + SPARE_S:
             raise ValueError(

@@ -10,6 +10,7 @@ from typer.testing import CliRunner, Result
 
 from perchctl.cli import app
 from perchctl.commands.complete import positionings
+from perchctl.profile import Profile
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
 
@@ -33,6 +34,31 @@ def test_the_option_wins_over_the_profile(tmp_path: Path) -> None:
         assert json.loads(done.stdout)["profile"]["positioning"]["by"] == by
     text = fly("-p", str(profile), "--dry-run").stdout
     assert "positioning  motion capture the simulated room's, body 'crazyflie'" in text
+
+
+@pytest.mark.parametrize(("section", "words"), [
+    ("{host: lab, body: cf2}", "host, body are given, but by is deck: write by: mocap"),
+    ("{system: vicon}", "system is given, but by is deck: write by: mocap"),
+    ("{by: deck, host: lab}", "host is given, but by is deck: write by: mocap"),
+])  # fmt: skip
+def test_keys_of_a_capture_are_not_silently_the_deck(
+    tmp_path: Path, section: str, words: str
+) -> None:
+    profile = tmp_path / "lab.yaml"
+    profile.write_text(f"extends: sim\npositioning: {section}\n", encoding="utf-8")
+    done = fly("-p", str(profile), "--dry-run")
+    assert done.exit_code == 30
+    assert words in done.stderr
+
+
+def test_the_deck_over_a_capture_leaves_a_record_that_can_be_read_again(tmp_path: Path) -> None:
+    profile = tmp_path / "lab.yaml"
+    profile.write_text("extends: sim\npositioning: {by: mocap, host: lab}\n", encoding="utf-8")
+    done = fly("-p", str(profile), "--positioning", "deck", "--dry-run", "--json")
+    assert done.exit_code == 0, done.output
+    assert Profile.model_validate(json.loads(done.stdout)["profile"]).positioning.by == "deck"
+    text = fly("-p", str(profile), "--positioning", "deck", "--dry-run").stdout
+    assert "positioning  the vehicle's own deck\n" in text
 
 
 def test_other_words_are_refused() -> None:

@@ -501,7 +501,7 @@ def test_motion_capture_gives_the_median_or_names_the_bodies() -> None:
 
     found = truth_of(Recorded(), "cf").actual(lambda question: "")
     assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
-    mounted = PositioningConfig(body_rpy_deg=(0.0, 0.0, math.degrees(0.4)))
+    mounted = PositioningConfig(by="mocap", body_rpy_deg=(0.0, 0.0, math.degrees(0.4)))
     found = truth_of(Recorded(), "askew", mounted).actual(lambda question: "")
     assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
     with pytest.raises(NotFound, match="rigid body 'drone'; it sees askew, cf, target"):
