@@ -52,6 +52,12 @@ class PositioningConfig(Section):
     land_s: float = Field(0.7, gt=0, le=2, description="without a fresh position it is landed")
     connect_timeout_s: float = Field(5.0, gt=0, le=60, description="for the first frame")
 
+    decks: tuple[str, ...] = Field(
+        (),
+        description="further decks that give a position, of drivers of your own: names as `check` "
+        "has them",
+    )
+
     @model_validator(mode="before")
     @classmethod
     def _one_word(cls, values: Any) -> Any:
@@ -62,7 +68,8 @@ class PositioningConfig(Section):
     def _meant(self) -> PositioningConfig:
         """Keys of a capture without `by` would fly by the decks, without a word. (A log's
         profile has every key, and so `by`, too.)"""
-        of_capture = [key for key in type(self).model_fields if key in self.model_fields_set]
+        keys = [key for key in type(self).model_fields if key != "decks"]
+        of_capture = [key for key in keys if key in self.model_fields_set]
         if "by" in of_capture:
             of_capture = ["host"] if self.by == "deck" and self.host.strip() else []
         if of_capture:
@@ -77,9 +84,9 @@ class PositioningConfig(Section):
     def _fits(self) -> PositioningConfig:
         if self.hold_s <= self.latency_s + 1.0 / self.rate_hz + SPARE_S:
             raise ValueError(
-                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) and a "
-                f"period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to spare: else a "
-                f"position is stale before the next one comes"
+                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) and "
+                f"a period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to spare: "
+                f"else a position is stale before the next one comes"
             )
         if self.land_s <= self.hold_s:
             raise ValueError(
