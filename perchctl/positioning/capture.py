@@ -26,7 +26,7 @@ from perchctl.errors import (
 from perchctl.positioning.child import Arrived, CaptureSetup, Connected, Failed, NotLoaded
 from perchctl.positioning.judge import label
 from perchctl.positioning.types import BodyPose, CaptureFrame
-from perchctl.profile.positioning import CAPTURE_SYSTEMS, PositioningConfig
+from perchctl.profile.positioning import CAPTURE_SYSTEMS, PositioningConfig, host_fault
 
 SILENT_S = 0.3
 KEPT = 64
@@ -50,9 +50,14 @@ def check_reachable(config: PositioningConfig) -> None:
         )
     if not config.host.strip():
         raise InvalidValue(
-            f"the computer of the motion capture ({config.system}) is not named: write its name "
-            f"or address into the profile, as in positioning: {{by: mocap, host: 192.168.1.2}}"
+            f"positioning.host, the computer of the motion capture, is not given: write it into "
+            f"the profile, as in positioning: {{by: mocap, system: vicon, host: 192.168.1.2, body: "
+            f"crazyflie}}; system is one of {', '.join(CAPTURE_SYSTEMS)}, body the vehicle's rigid "
+            f"body there"
         )
+    fault = host_fault(config.host)  # of an option; a profile's is refused when it is read
+    if fault is not None:
+        raise InvalidValue(f"motion capture: {fault}")
     if find_spec("motioncapture") is None:
         raise no_motion_capture()
 

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from perchctl.profile.base import BodyVector3, Section, Vector3
 
 SPARE_S = 0.02
 """Frames do not come to the millisecond."""
 CAPTURE_SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")
+
+
+_HOST = re.compile(r"[^\s:/?#@]+(?::([0-9]{1,5}))?")
+
+
+def host_fault(host: str) -> str | None:
+    """What is wrong with the name of a capture's computer; nothing where none is given."""
+    found = _HOST.fullmatch(host.strip())
+    if not host.strip() or (found and (found[1] is None or 1 <= int(found[1]) <= 65535)):
+        return None
+    return f"host is NAME or NAME:PORT (1 to 65535), found {host!r}"
 
 
 class PositioningConfig(Section):
@@ -63,6 +75,14 @@ class PositioningConfig(Section):
     def _one_word(cls, values: Any) -> Any:
         """`positioning: mocap` names what measures, and leaves the rest as it is."""
         return {"by": values} if isinstance(values, str) else values
+
+    @field_validator("host")
+    @classmethod
+    def _is_host(cls, host: str) -> str:
+        fault = host_fault(host)
+        if fault is not None:
+            raise ValueError(fault)
+        return host
 
     @model_validator(mode="after")
     def _meant(self) -> PositioningConfig:

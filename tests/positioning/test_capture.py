@@ -222,7 +222,7 @@ def _runs(pid: int) -> bool:
 
 
 def test_without_a_host_or_the_library_nothing_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InvalidValue, match=r"positioning: \{by: mocap, host:"):
+    with pytest.raises(InvalidValue, match=r"positioning: \{by: mocap, system: vicon, host:"):
         open_capture(PositioningConfig(by="mocap", host=" "))
     monkeypatch.setattr(capture_module, "find_spec", lambda name: None)
     with pytest.raises(UsageError) as caught:

@@ -10,6 +10,8 @@ from typer.testing import CliRunner, Result
 
 from perchctl.cli import app
 from perchctl.commands.complete import positionings
+from perchctl.errors import InvalidValue
+from perchctl.positioning.capture import open_named
 from perchctl.profile import Profile
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
@@ -72,7 +74,22 @@ def test_other_words_are_refused() -> None:
 def test_a_real_vehicle_needs_the_computer_of_its_capture() -> None:
     done = fly("--positioning", "mocap", *REAL)
     assert done.exit_code == 30
-    assert "the computer of the motion capture (vicon) is not named" in done.stderr
+    for words in ("positioning.host", "one of vicon, optitrack, qualisys, vrpn", "body"):
+        assert words in done.stderr
+    assert "(vicon)" not in done.stderr
+
+
+@pytest.mark.parametrize("host", ["http://lab", "lab:0", "lab:70000", "lab:x", "lab/1", "a b"])
+def test_a_host_that_is_none_is_refused_in_the_profile(tmp_path: Path, host: str) -> None:
+    profile = tmp_path / "lab.yaml"
+    text = f"extends: sim\npositioning: {{by: mocap, host: '{host}'}}\n"
+    profile.write_text(text, encoding="utf-8")
+    done = fly("-p", str(profile), "--dry-run")
+    assert done.exit_code == 30
+    assert f"host is NAME or NAME:PORT (1 to 65535), found '{host}'" in done.stderr
+    pytest.importorskip("motioncapture")
+    with pytest.raises(InvalidValue, match="NAME:PORT"):
+        open_named(f"vrpn:{host}", "cf", "--truth mocap")
 
 
 def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
