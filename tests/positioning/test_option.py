@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -13,6 +16,7 @@ from perchctl.commands.complete import positionings
 from perchctl.errors import InvalidValue
 from perchctl.positioning.capture import open_named
 from perchctl.profile import Profile
+from perchctl.startup import failure_record
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
 
@@ -90,6 +94,25 @@ def test_a_host_that_is_none_is_refused_in_the_profile(tmp_path: Path, host: str
     pytest.importorskip("motioncapture")
     with pytest.raises(InvalidValue, match="NAME:PORT"):
         open_named(f"vrpn:{host}", "cf", "--truth mocap")
+
+
+def test_a_flight_that_is_refused_on_the_ground_is_one_of_the_benchmark_s(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It has no log."""
+    path = Path(__file__).parents[2] / "benchmarks" / "mocap.py"
+    spec = importlib.util.spec_from_file_location("benchmark_mocap", path)
+    assert spec is not None
+    assert spec.loader is not None
+    bench = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, bench)
+    spec.loader.exec_module(bench)
+    said = failure_record("no frame came", 10)
+    monkeypatch.setattr(
+        bench.subprocess, "run", lambda *words, **options: SimpleNamespace(stdout=said, stderr="")
+    )
+    flown = bench.fly("sim", 0, tmp_path)
+    assert (flown.outcome, flown.reason) == ("refused", "no frame came")
 
 
 def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
