@@ -90,7 +90,7 @@ FAULTS = [
     ("self-test", "bad", "fail", "failed at boot"),
     ("supervisor", "bad", "fail", "locked (supervisor 0x"),
     ("decks", "bad", "warn", "none"),
-    ("positioning", "bad", "fail", "no deck, and no position comes"),
+    ("positioning", "bad", "fail", "no positioning deck, and no position comes"),
     ("ground", "bad", "fail", "places the vehicle at 0.6"),
     ("level", "bad", "fail", "pitch 20"),
     ("parameters", "bad", "warn", "stabilizer.estimator 1, profile 2"),
