@@ -43,6 +43,8 @@ def fly(profile: str, seed: int, folder: Path) -> Flown:
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         return Flown("refused", lines[-1], None, float("nan"))
     said = json.loads(done.stdout)
+    if "log" not in said:  # before the take-off
+        return Flown("refused", said.get("error") or said.get("reason", ""), None, float("nan"))
     ages = read_log(Path(said["log"])).column("pos_age_s")
     return Flown(said["outcome"], said["reason"], said["miss_m"], float(ages.max()))
 

@@ -38,6 +38,14 @@ def no_motion_capture(needed_by: str = "positioning by motion capture") -> Usage
     )
 
 
+def broken_motion_capture(why: str) -> UsageError:
+    """Where the extra ``mocap`` is installed, and cannot be loaded."""
+    return UsageError(
+        f"the library motioncapture cannot be loaded: {why}; reinstall it with: "
+        f"{sys.executable} -m pip install --force-reinstall 'perchctl[mocap]'"
+    )
+
+
 class ConnectionFailed(PerchError):
     exit_code = 10
     meaning = "no connection to the vehicle or the motion capture"

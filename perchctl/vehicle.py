@@ -67,7 +67,11 @@ class MeasuredBy:
 
     @property
     def position_decks(self) -> tuple[str, ...]:
-        return tuple(deck for deck in self.decks if deck in POSITION_DECKS)
+        return self.placed_by(())
+
+    def placed_by(self, further: tuple[str, ...]) -> tuple[str, ...]:
+        """The positioning decks, those of names in `further` (`positioning.decks`) among them."""
+        return tuple(deck for deck in self.decks if deck in (*POSITION_DECKS, *further))
 
 
 @dataclass(frozen=True)

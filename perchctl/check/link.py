@@ -259,16 +259,18 @@ def _decks(vehicle: Vehicle, profile: Profile) -> Row:
     return passed("decks", ", ".join(decks))
 
 
+def _position_decks(vehicle: Vehicle, profile: Profile) -> tuple[str, ...]:
+    return vehicle.measured_by.placed_by(profile.positioning.decks)
+
+
 def _positioning(vehicle: Vehicle, profile: Profile) -> Row:
     by = vehicle.measured_by
     problem = criteria.unmeasured(by, profile)
-    if problem is not None and by.external is None:
-        return skipped("positioning", problem.found, problem.advice)
     if problem is not None:
         return failed("positioning", problem.found, problem.advice)
     if profile.positioning.by == "mocap":
         return passed("positioning", f"by {label(profile.positioning)}, see its rows")
-    decks = by.position_decks
+    decks = _position_decks(vehicle, profile)
     return passed("positioning", f"by {', '.join(decks)}" if decks else "by positions from outside")
 
 
@@ -276,7 +278,7 @@ BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 
 
 def _estimator(vehicle: Vehicle, t: Telemetry, profile: Profile) -> Row:
-    if profile.positioning.by == "mocap" and not vehicle.measured_by.position_decks:
+    if profile.positioning.by == "mocap" and not _position_decks(vehicle, profile):
         return skipped("estimator", BY_FLY)
     problem = criteria.unsettled(t, profile)
     if problem is not None:

@@ -39,11 +39,15 @@ def fit_weights(
         str | None, typer.Option("--uri", "-u", help="Vehicle, for --truth estimate.")
     ] = None,
     mocap: Annotated[
-        str | None, typer.Option("--mocap", help="TYPE:HOST, as in vicon:192.168.1.2.")
+        str | None,
+        typer.Option("--mocap", help="TYPE:HOST, as in vicon:192.168.1.2; else the profile's."),
     ] = None,
     bodies: Annotated[
-        str, typer.Option("--bodies", help="Rigid bodies of vehicle and target.")
-    ] = "cf,target",
+        str | None,
+        typer.Option(
+            "--bodies", help="Rigid bodies of vehicle and target; else the profile's, and target."
+        ),
+    ] = None,
     target: Annotated[
         str | None,
         typer.Option("--target", help="Target in the world, 'x y z yaw' in m and deg."),

@@ -21,6 +21,7 @@ from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, UsageError, no_simulator
 from perchctl.positioning.capture import open_named
 from perchctl.profile import Profile, load_profile
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.vision.types import CameraModel
 from perchctl.weights.collect import (
     MarkerReader,
@@ -33,6 +34,8 @@ from perchctl.weights.dialogue import Experiment
 from perchctl.weights.truth import EstimateTruth, MocapTruth, Truth, TypedTruth, four_numbers
 
 TRUTHS = ("typed", "mocap", "estimate", "sim")
+VEHICLE, TARGET = "cf", "target"
+"""Rigid bodies that nobody has named."""
 _DEGREES = (1.0, math.pi / 180.0)
 
 
@@ -138,22 +141,40 @@ def _truth(request: CollectRequest, profile: Profile, now: Callable[[], float]) 
     if request.truth == "typed":
         return TypedTruth()
     if request.truth == "mocap":
-        if request.mocap is None or not request.mocap.partition(":")[2].strip():
-            raise UsageError("--truth mocap needs --mocap TYPE:HOST, as in vicon:192.168.1.2")
-        body, _, target = request.bodies.partition(",")
+        own = profile.positioning if profile.positioning.by == "mocap" else None
+        mocap, (body, target) = _capture_of(request, own)
         return MocapTruth(
-            open_named(request.mocap, body, "--truth mocap"),
-            request.mocap,
+            open_named(mocap, body, "--truth mocap"),
+            mocap,
             body,
             target if given is None else given,
             gear,
-            profile.positioning if profile.positioning.by == "mocap" else None,
+            own,
         )
     from perchctl.link.estimate import EstimateLink
 
     link = EstimateLink(profile.link.uri if request.uri is None else request.uri, profile.link, now)
     link.connect()
     return EstimateTruth(link.telemetry, given, gear, link.close)
+
+
+def _capture_of(
+    request: CollectRequest, own: PositioningConfig | None
+) -> tuple[str, tuple[str, str]]:
+    """``TYPE:HOST``, and the rigid bodies of vehicle and target: of the options, else as the
+    profile (`own`) has them. Errors: UsageError."""
+    mocap = request.mocap
+    if mocap is None and own is not None:
+        mocap = f"{own.system}:{own.host}"
+    if mocap is None or not mocap.partition(":")[2].strip():
+        raise UsageError(
+            "--truth mocap needs --mocap TYPE:HOST, as in vicon:192.168.1.2, or a profile with "
+            "positioning: {by: mocap, system: vicon, host: 192.168.1.2}"
+        )
+    if request.bodies is None:
+        return mocap, (VEHICLE if own is None else own.body, TARGET)
+    body, _, target = request.bodies.partition(",")
+    return mocap, (body, target)
 
 
 def _ask(question: str) -> str:

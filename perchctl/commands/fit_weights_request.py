@@ -18,7 +18,7 @@ class CollectRequest:
     source: str | None = None
     uri: str | None = None
     mocap: str | None = None
-    bodies: str = "cf,target"
+    bodies: str | None = None
     target: str | None = None
     seed: int = 0
     noise: float = 4.0

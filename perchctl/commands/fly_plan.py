@@ -58,7 +58,8 @@ def plan_text(options: FlyOptions) -> str:
         f"camera       {resolved['source']}, calibration {resolved['calibration_file']}"
         + (f" {options.profile.camera.cam}" if options.profile.camera.cam else "")
         + (f", mask {resolved['mask_file']}" if resolved["mask_file"] else ""),
-        *_positioning_line(options),
+        _positioning_line(options),
+        *_compared_lines(options),
         f"profile      {resolved['profile_file']}: {options.profile.description}".rstrip(": "),
         f"target       {target.large.side_m * 1e3:g} mm {target.large.dictionary}/"
         f"{target.large.id} around {target.small.side_m * 1e3:g} mm "
@@ -85,20 +86,20 @@ def plan_text(options: FlyOptions) -> str:
     return "\n".join(lines)
 
 
-def _positioning_line(options: FlyOptions) -> list[str]:
-    """Only where positions are sent: with decks there is nothing to plan."""
+def _positioning_line(options: FlyOptions) -> str:
     config = options.profile.positioning
     if config.by != "mocap":
-        return []
+        return "positioning  the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
-    return [
+    return (
         f"positioning  motion capture {where}, body {config.body!r}, {config.send} at most "
-        f"{config.rate_hz:g} Hz",
-        *(
-            f"{'':{_COLUMN}}{row.found}"
-            for row in _compared(options)
-            if row.verdict == Verdict.PASS
-        ),
+        f"{config.rate_hz:g} Hz"
+    )
+
+
+def _compared_lines(options: FlyOptions) -> list[str]:
+    return [
+        f"{'':{_COLUMN}}{row.found}" for row in _compared(options) if row.verdict == Verdict.PASS
     ]
 
 

@@ -19,5 +19,9 @@ def positioned(profile: Profile, by: str | None) -> Profile:
         raise InvalidValue(
             f"--positioning {by!r} is unknown; allowed are {', '.join(POSITIONINGS)}"
         )
-    config = profile.positioning.model_copy(update={"by": by})
+    config = PositioningConfig(
+        by="deck", decks=profile.positioning.decks
+    )  # a capture's keys would be of no use, and puzzle
+    if by != "deck":
+        config = profile.positioning.model_copy(update={"by": by})
     return profile.model_copy(update={"positioning": config})

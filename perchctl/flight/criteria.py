@@ -16,6 +16,7 @@ from perchctl.vehicle import (
     FLYING,
     LOCKED,
     NO_BATTERY_READING_V,
+    POSITION_DECKS,
     TUMBLED,
     MeasuredBy,
     Telemetry,
@@ -87,13 +88,17 @@ def unsettled(telemetry: Telemetry, profile: Profile) -> Problem | None:
 
 def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
     """Nothing tells the vehicle where it is: it would fly by a sum of accelerations."""
-    if profile.positioning.by == "mocap" or by.position_decks or by.external:
+    config = profile.positioning
+    if config.by == "mocap" or by.placed_by(config.decks) or by.external:
         return None
     if by.external is None:
         found = "no positioning deck; whether positions come from outside is not told"
     else:
         found = "no positioning deck, and no position comes from outside"
     advice = "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap"
+    others = [deck for deck in by.decks if deck not in POSITION_DECKS]
+    if others:
+        advice += f"; if {' or '.join(others)} measures it, name that one in positioning.decks"
     return Problem(found, advice)
 
 

@@ -40,11 +40,14 @@ class Claim:
 def vehicle_of(uri: str) -> str:
     """The URI without what does not tell vehicles apart: a radio's dongle, case, options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
+    scheme = scheme.lower()
     if scheme == "radio":
         given = [part for part in rest.split("/")[1:4] if part]
         channel, rate, address = (*given, *_USUAL[len(given) :])
-        return f"radio/{int(channel)}/{rate}/{address.upper().zfill(len(_USUAL[2]))}"
-    return f"{scheme}/{re.sub('^localhost(?=:)', '127.0.0.1', rest)}"
+        return f"radio/{int(channel)}/{rate.upper()}/{address.upper().zfill(len(_USUAL[2]))}"
+    if scheme != "serial":  # whose place is a file, and its case tells
+        rest = rest.lower()
+    return f"{scheme}/{re.sub('^localhost(?=:|$)', '127.0.0.1', rest)}"
 
 
 def claim(uri: str) -> Claim | None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from perchctl.errors import ConnectionFailed
+from perchctl.files import cannot_be_written
 from perchctl.link.claim import Claim, claim
 from perchctl.link.uri import UDEV_HELP
 from perchctl.profile.places import user_cache_folder
@@ -36,7 +37,11 @@ class Connection:
         from cflib.crazyflie import Crazyflie
 
         cache = user_cache_folder() / "toc"
-        cache.mkdir(parents=True, exist_ok=True)
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            more = ": set XDG_CACHE_HOME to a folder that can be written to"
+            raise cannot_be_written(cache, error, more) from None
         self.cf: Any = Crazyflie(rw_cache=str(cache))
         self.lost: str | None = None
         self.claimed: Claim | None = None
@@ -122,7 +127,7 @@ def open_connection(uri: str, timeout_s: float) -> Connection:
 
     `timeout_s` is shared by `CONNECT_TRIES` tries, since one lost packet can hang cflib's
     connect for good (docs/firmware.md, "Link"). Raises `ConnectionFailed`, also where another
-    program has the vehicle.
+    program has the vehicle; InvalidValue without a folder for cflib's tables.
     """
     claimed = claim(uri)
     try:

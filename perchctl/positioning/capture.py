@@ -17,11 +17,16 @@ from importlib.util import find_spec
 from typing import Any
 
 from perchctl.children import Channel, accept, end, introduce, listen, new_token, spawn
-from perchctl.errors import ConnectionFailed, InvalidValue, no_motion_capture
-from perchctl.positioning.child import Arrived, CaptureSetup, Connected, Failed
+from perchctl.errors import (
+    ConnectionFailed,
+    InvalidValue,
+    broken_motion_capture,
+    no_motion_capture,
+)
+from perchctl.positioning.child import Arrived, CaptureSetup, Connected, Failed, NotLoaded
 from perchctl.positioning.judge import label
 from perchctl.positioning.types import BodyPose, CaptureFrame
-from perchctl.profile.positioning import CAPTURE_SYSTEMS, PositioningConfig
+from perchctl.profile.positioning import CAPTURE_SYSTEMS, PositioningConfig, host_fault
 
 SILENT_S = 0.3
 KEPT = 64
@@ -45,9 +50,14 @@ def check_reachable(config: PositioningConfig) -> None:
         )
     if not config.host.strip():
         raise InvalidValue(
-            f"the computer of the motion capture ({config.system}) is not named: write its name "
-            f"or address into the profile, as in positioning: {{by: mocap, host: 192.168.1.2}}"
+            f"positioning.host, the computer of the motion capture, is not given: write it into "
+            f"the profile, as in positioning: {{by: mocap, system: vicon, host: 192.168.1.2, body: "
+            f"crazyflie}}; system is one of {', '.join(CAPTURE_SYSTEMS)}, body the vehicle's rigid "
+            f"body there"
         )
+    fault = host_fault(config.host)  # of an option; a profile's is refused when it is read
+    if fault is not None:
+        raise InvalidValue(f"motion capture: {fault}")
     if find_spec("motioncapture") is None:
         raise no_motion_capture()
 
@@ -81,8 +91,8 @@ def open_capture(
 ) -> MotionCapture:
     """Connected, and its first frame has come.
 
-    Errors: InvalidValue, UsageError without the library, ConnectionFailed without an answer in
-    `config.connect_timeout_s`.
+    Errors: InvalidValue, UsageError without a library that loads, ConnectionFailed
+    without an answer in `config.connect_timeout_s`.
     """
     check_reachable(config)
     return MotionCapture.start(setup_of(config), label(config), config.body, clock)
@@ -107,6 +117,7 @@ class MotionCapture:
         self._settled = threading.Event()
         self._connected, self._closed = False, False
         self._ended: str | None = None
+        self._not_loaded: str | None = None
         self._last_line = ""
         self._printing = threading.Thread(target=self._read_output, daemon=True)
         self._printing.start()
@@ -119,7 +130,7 @@ class MotionCapture:
         cls, setup: CaptureSetup, who: str, body: str, clock: Callable[[], float] = time.monotonic
     ) -> MotionCapture:
         """`who`: for sentences. `body`: a frame in which it is goes before one in which it is
-        not. Errors: ConnectionFailed."""
+        not. Errors: ConnectionFailed, UsageError for a library that does not load."""
         token = new_token()
         with listen() as listener:
             child = spawn(_CHILD, subprocess.PIPE)
@@ -181,6 +192,8 @@ class MotionCapture:
                 f"no {self._who}: {'connected, but no frame' if connected else 'no answer'} within "
                 f"{setup.timeout_s:g} s (does it stream, is the address right?){self._words()}"
             )
+        if self._not_loaded is not None:
+            raise broken_motion_capture(self._not_loaded)
         if self._ended is not None:
             raise ConnectionFailed(self._ended)
 
@@ -201,6 +214,8 @@ class MotionCapture:
                     self._settled.set()
                 case Connected():
                     self._connected = True
+                case NotLoaded(text):
+                    self._not_loaded = self._ended = text
                 case Failed(text):
                     self._ended = self._gone("" if self._framed_s is None else " failed", text)
         if self._ended is None and not self._closed:

@@ -13,6 +13,7 @@ import signal
 import socket
 import threading
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -54,6 +55,13 @@ class Failed:
     text: str
 
 
+@dataclass(frozen=True)
+class NotLoaded:
+    """The library is there, and Python cannot import it."""
+
+    text: str
+
+
 class Connected:
     """The library has returned from its connecting; whether frames come is another matter."""
 
@@ -64,26 +72,43 @@ def serve_parent() -> None:
     channel = connect_back()
     setup = channel.receive(START_TIMEOUT_S)
     try:
-        client = _connected(setup)
+        with _bounded(setup):
+            connect = _loaded()
+            client = connect(setup.kind, _by_address(setup))
         channel.send(Connected())
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.partial)
     except OSError:
         return  # the parent is gone
+    except _LoadingFailed as error:
+        with contextlib.suppress(OSError):
+            channel.send(NotLoaded(str(error)))
     except Exception as error:  # whatever the library raises
         with contextlib.suppress(OSError):
             channel.send(Failed(str(error) or type(error).__name__))
 
 
-def _connected(setup: CaptureSetup) -> Any:
-    """Bounded by a thread of the interpreter that needs no turn of Python's: it ends the
-    process, also when the parent has been killed meanwhile."""
+class _LoadingFailed(Exception):
+    pass
+
+
+def _loaded() -> Callable[[str, dict[str, str]], Any]:
+    try:
+        import motioncapture
+    except Exception as error:  # whatever its own modules and shared libraries raise
+        raise _LoadingFailed(str(error) or type(error).__name__) from None
+    connect: Callable[[str, dict[str, str]], Any] = motioncapture.connect
+    return connect
+
+
+@contextlib.contextmanager
+def _bounded(setup: CaptureSetup) -> Iterator[None]:
+    """By a thread of the interpreter that needs no turn of Python's: it ends the process, also
+    when the parent has been killed meanwhile."""
     with open(os.devnull, "w") as nowhere:
         faulthandler.dump_traceback_later(setup.timeout_s + AFTER_PARENT_S, exit=True, file=nowhere)
         try:
-            import motioncapture
-
-            return motioncapture.connect(setup.kind, _by_address(setup))
+            yield
         finally:
             faulthandler.cancel_dump_traceback_later()
 

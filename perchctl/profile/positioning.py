@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from perchctl.profile.base import BodyVector3, Section, Vector3
 
 SPARE_S = 0.02
 """Frames do not come to the millisecond."""
 CAPTURE_SYSTEMS = ("vicon", "optitrack", "qualisys", "vrpn")
+
+
+_HOST = re.compile(r"[^\s:/?#@]+(?::([0-9]{1,5}))?")
+
+
+def host_fault(host: str) -> str | None:
+    """What is wrong with the name of a capture's computer; nothing where none is given."""
+    found = _HOST.fullmatch(host.strip())
+    if not host.strip() or (found and (found[1] is None or 1 <= int(found[1]) <= 65535)):
+        return None
+    return f"host is NAME or NAME:PORT (1 to 65535), found {host!r}"
 
 
 class PositioningConfig(Section):
@@ -52,19 +64,49 @@ class PositioningConfig(Section):
     land_s: float = Field(0.7, gt=0, le=2, description="without a fresh position it is landed")
     connect_timeout_s: float = Field(5.0, gt=0, le=60, description="for the first frame")
 
+    decks: tuple[str, ...] = Field(
+        (),
+        description="further decks that give a position, of drivers of your own: names as `check` "
+        "has them",
+    )
+
     @model_validator(mode="before")
     @classmethod
     def _one_word(cls, values: Any) -> Any:
         """`positioning: mocap` names what measures, and leaves the rest as it is."""
         return {"by": values} if isinstance(values, str) else values
 
+    @field_validator("host")
+    @classmethod
+    def _is_host(cls, host: str) -> str:
+        fault = host_fault(host)
+        if fault is not None:
+            raise ValueError(fault)
+        return host
+
+    @model_validator(mode="after")
+    def _meant(self) -> PositioningConfig:
+        """Keys of a capture without `by` would fly by the decks, without a word. (A log's
+        profile has every key, and so `by`, too.)"""
+        keys = [key for key in type(self).model_fields if key != "decks"]
+        of_capture = [key for key in keys if key in self.model_fields_set]
+        if "by" in of_capture:
+            of_capture = ["host"] if self.by == "deck" and self.host.strip() else []
+        if of_capture:
+            verb = "is" if len(of_capture) == 1 else "are"
+            raise ValueError(
+                f"{', '.join(of_capture)} {verb} given, but by is deck: write by: mocap, or only "
+                f"positioning: deck"
+            )
+        return self
+
     @model_validator(mode="after")
     def _fits(self) -> PositioningConfig:
         if self.hold_s <= self.latency_s + 1.0 / self.rate_hz + SPARE_S:
             raise ValueError(
-                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) and a "
-                f"period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to spare: else a "
-                f"position is stale before the next one comes"
+                f"hold_s ({self.hold_s:g}) must be longer than latency_s ({self.latency_s:g}) and "
+                f"a period of rate_hz ({self.rate_hz:g}) together, with {SPARE_S:g} s to spare: "
+                f"else a position is stale before the next one comes"
             )
         if self.land_s <= self.hold_s:
             raise ValueError(

@@ -147,6 +147,11 @@ class MarkerConfig(Section):
         return self
 
 
+FARTHEST_IN_A_ROOM_M = 50.0
+"""No target hangs farther from the zero of a room's positioning, in x or in y."""
+_InARoom = Annotated[float, Field(ge=-FARTHEST_IN_A_ROOM_M, le=FARTHEST_IN_A_ROOM_M)]
+
+
 class TargetConfig(Section):
     """The printed target, and how true it is, standard deviations.
 
@@ -170,13 +175,23 @@ class TargetConfig(Section):
         description="so much times r^2 a place r from the sheet's centre may be off its plane",
     )
 
-    expected_xy_m: tuple[float, float] | None = Field(
+    expected_xy_m: tuple[_InARoom, _InARoom] | None = Field(
         None,
         description="where it hangs, in the estimate's world: of several alike the nearest counts",
     )
     expected_within_m: float = Field(
         0.3, gt=0, le=20, description="one farther from `expected_xy_m` is another vehicle's"
     )
+
+    @model_validator(mode="after")
+    def _within_of_a_place(self) -> TargetConfig:
+        given = self.model_fields_set
+        if "expected_within_m" in given and "expected_xy_m" not in given:
+            raise ValueError(
+                "expected_within_m is given without expected_xy_m, the place it is around: give "
+                "that too, or remove it"
+            )
+        return self
 
     @model_validator(mode="after")
     def _markers_differ(self) -> TargetConfig:

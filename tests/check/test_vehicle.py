@@ -90,7 +90,7 @@ FAULTS = [
     ("self-test", "bad", "fail", "failed at boot"),
     ("supervisor", "bad", "fail", "locked (supervisor 0x"),
     ("decks", "bad", "warn", "none"),
-    ("positioning", "bad", "fail", "no deck, and no position comes"),
+    ("positioning", "bad", "fail", "no positioning deck, and no position comes"),
     ("ground", "bad", "fail", "places the vehicle at 0.6"),
     ("level", "bad", "fail", "pitch 20"),
     ("parameters", "bad", "warn", "stabilizer.estimator 1, profile 2"),
@@ -181,8 +181,8 @@ ALONE: list[tuple[str, str, dict[str, Any]]] = [
             READY | 1 << 12, READY & ~CAN_FLY,
         )
     ),
-    ("positioning", "skipped", {"parameters": parameters(deck__bcBuzzer=1, deck__bcFlow2=0),
-                                "external": None}),
+    ("positioning", "fail", {"parameters": parameters(deck__bcBuzzer=1, deck__bcFlow2=0),
+                             "external": None}),
     ("positioning", "fail", {"parameters": parameters(deck__bcBuzzer=1, deck__bcFlow2=0)}),
     ("estimator", "fail", {"telemetry": said(position_variance_m2=0.5)}),
     ("estimator", "fail", {"telemetry": said(position_variance_m2=math.nan)}),
@@ -214,6 +214,16 @@ def test_a_fault_alone_makes_its_row_and_no_other(
     assert after[name].verdict == verdict
     others = {n for n, row in after.items() if row.verdict in ("warn", "fail")} - {name}
     assert others == set()
+
+
+def test_a_deck_of_one_s_own_is_believed_where_it_is_named() -> None:
+    vehicle = replace(GOOD, parameters=parameters(deck__labUwb=1, deck__bcFlow2=0), external=None)
+    known = Profile.model_validate({"positioning": {"decks": ["labUwb"]}})
+    rows = {row.name: row for row in link.rows(vehicle, known)}
+    assert rows["positioning"].found == "by labUwb"
+    before = next(row for row in link.rows(vehicle, PROFILE) if row.name == "positioning")
+    assert before.verdict is Verdict.FAIL
+    assert "positioning.decks" in before.advice
 
 
 def test_a_position_that_slides_at_rest_is_seen() -> None:

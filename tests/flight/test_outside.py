@@ -20,6 +20,7 @@ from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission.state import Operator, Outcome
 from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition, MeasuredBy, PositionSetpoint
 from tests.flight.test_loop import PROFILE, Rig, Vehicle
 from tests.helpers.capture import TURNS, named_up
@@ -27,6 +28,9 @@ from tests.helpers.mission import READY, telemetry
 
 MOCAP = PROFILE.model_copy(
     update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
+)
+WITH_OWN_DECK = PROFILE.model_copy(
+    update={"positioning": PositioningConfig.model_validate({"decks": ["labUwb"]})}
 )
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 REST = telemetry(1.0, 0.02, thrust=0.0, supervisor=READY)
@@ -93,6 +97,8 @@ def test_the_estimate_has_to_agree(place: ExternalPosition, agrees: bool) -> Non
 
 @pytest.mark.parametrize(("by", "profile", "words"), [
     (MeasuredBy(("bcFlow2",)), PROFILE, None),
+    (MeasuredBy(("labUwb",), False), WITH_OWN_DECK, None),
+    (MeasuredBy(("bcLedRing",), False), WITH_OWN_DECK, "if bcLedRing measures it, name"),
     (MeasuredBy(("bcLedRing", "bcLighthouse4")), PROFILE, None),
     (MeasuredBy(("bcLoco",), False), PROFILE, None),
     (MeasuredBy((), True), PROFILE, None),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.errors import ConnectionFailed
+from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.link import connection
 from perchctl.link.claim import claim, vehicle_of
 from perchctl.link.connection import open_connection, plain_cause
@@ -58,6 +58,10 @@ def another_program(uri: str) -> Iterator[subprocess.Popen[str]]:
         (RADIO, "radio://0/80/1M/E7E7E7E701", False),
         (RADIO, "radio://0/80/2M/E7E7E7E702", False),
         ("udp://localhost:19850", "udp://127.0.0.1:19850", True),
+        ("udp://LocalHost:19850", "UDP://127.0.0.1:19850", True),
+        ("tcp://Bench:5000", "tcp://bench:5000", True),
+        ("Radio://0/80/2m/E7E7E7E701", RADIO, True),
+        ("serial:///dev/ttyA", "serial:///dev/ttya", False),
         ("udp://127.0.0.1:19851", "udp://127.0.0.1:19850", False),
         ("usb://0", "usb://1", False),
     ],
@@ -116,6 +120,15 @@ def test_a_connection_that_comes_to_nothing_keeps_nothing(monkeypatch: pytest.Mo
 def test_without_a_place_for_the_lock_it_flies_all_the_same(folder: Path) -> None:
     (folder / "perchctl").write_text("")
     assert claim(RADIO) is None
+
+
+def test_a_cache_folder_that_is_a_file_is_told_by_what_chooses_it(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "file").write_text("")
+    monkeypatch.setattr(connection, "user_cache_folder", lambda: folder / "file" / "perchctl")
+    with pytest.raises(InvalidValue, match=r"cannot be written: .*: set XDG_CACHE_HOME to"):
+        connection.Connection()
 
 
 def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:

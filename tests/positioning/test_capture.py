@@ -97,6 +97,19 @@ def test_none_is_one_sentence_in_bounded_time(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("why", ["libvrpn.so.7: cannot open", "No module named 'yaml_of_it'"])
+def test_a_library_that_does_not_load_is_not_a_capture_that_is_gone(
+    faulty: Callable[..., MotionCapture], tmp_path: Path, why: str
+) -> None:
+    (tmp_path / "motioncapture.py").write_text(f"raise ImportError({why!r})\n")
+    with pytest.raises(UsageError) as caught:
+        faulty("good")
+    said = str(caught.value)
+    assert f"the library motioncapture cannot be loaded: {why}; reinstall it with: " in said
+    assert said.endswith("'perchctl[mocap]'")
+    assert caught.value.exit_code == 2
+
+
 def test_vrpn_answers_by_bodies_alone(faulty: Callable[..., MotionCapture]) -> None:
     """Its loop turns also where nobody serves."""
     with pytest.raises(ConnectionFailed, match="no answer within"):
@@ -209,7 +222,7 @@ def _runs(pid: int) -> bool:
 
 
 def test_without_a_host_or_the_library_nothing_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(InvalidValue, match=r"positioning: \{by: mocap, host:"):
+    with pytest.raises(InvalidValue, match=r"positioning: \{by: mocap, system: vicon, host:"):
         open_capture(PositioningConfig(by="mocap", host=" "))
     monkeypatch.setattr(capture_module, "find_spec", lambda name: None)
     with pytest.raises(UsageError) as caught:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from perchctl.cli import app
 from perchctl.commands.complete import positionings
+from perchctl.errors import InvalidValue
+from perchctl.positioning.capture import open_named
+from perchctl.profile import Profile
+from perchctl.startup import failure_record
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
 
@@ -35,6 +42,31 @@ def test_the_option_wins_over_the_profile(tmp_path: Path) -> None:
     assert "positioning  motion capture the simulated room's, body 'crazyflie'" in text
 
 
+@pytest.mark.parametrize(("section", "words"), [
+    ("{host: lab, body: cf2}", "host, body are given, but by is deck: write by: mocap"),
+    ("{system: vicon}", "system is given, but by is deck: write by: mocap"),
+    ("{by: deck, host: lab}", "host is given, but by is deck: write by: mocap"),
+])  # fmt: skip
+def test_keys_of_a_capture_are_not_silently_the_deck(
+    tmp_path: Path, section: str, words: str
+) -> None:
+    profile = tmp_path / "lab.yaml"
+    profile.write_text(f"extends: sim\npositioning: {section}\n", encoding="utf-8")
+    done = fly("-p", str(profile), "--dry-run")
+    assert done.exit_code == 30
+    assert words in done.stderr
+
+
+def test_the_deck_over_a_capture_leaves_a_record_that_can_be_read_again(tmp_path: Path) -> None:
+    profile = tmp_path / "lab.yaml"
+    profile.write_text("extends: sim\npositioning: {by: mocap, host: lab}\n", encoding="utf-8")
+    done = fly("-p", str(profile), "--positioning", "deck", "--dry-run", "--json")
+    assert done.exit_code == 0, done.output
+    assert Profile.model_validate(json.loads(done.stdout)["profile"]).positioning.by == "deck"
+    text = fly("-p", str(profile), "--positioning", "deck", "--dry-run").stdout
+    assert "positioning  the vehicle's own deck\n" in text
+
+
 def test_other_words_are_refused() -> None:
     done = fly("--positioning", "gps", "--dry-run")
     assert done.exit_code == 30
@@ -46,7 +78,41 @@ def test_other_words_are_refused() -> None:
 def test_a_real_vehicle_needs_the_computer_of_its_capture() -> None:
     done = fly("--positioning", "mocap", *REAL)
     assert done.exit_code == 30
-    assert "the computer of the motion capture (vicon) is not named" in done.stderr
+    for words in ("positioning.host", "one of vicon, optitrack, qualisys, vrpn", "body"):
+        assert words in done.stderr
+    assert "(vicon)" not in done.stderr
+
+
+@pytest.mark.parametrize("host", ["http://lab", "lab:0", "lab:70000", "lab:x", "lab/1", "a b"])
+def test_a_host_that_is_none_is_refused_in_the_profile(tmp_path: Path, host: str) -> None:
+    profile = tmp_path / "lab.yaml"
+    text = f"extends: sim\npositioning: {{by: mocap, host: '{host}'}}\n"
+    profile.write_text(text, encoding="utf-8")
+    done = fly("-p", str(profile), "--dry-run")
+    assert done.exit_code == 30
+    assert f"host is NAME or NAME:PORT (1 to 65535), found '{host}'" in done.stderr
+    pytest.importorskip("motioncapture")
+    with pytest.raises(InvalidValue, match="NAME:PORT"):
+        open_named(f"vrpn:{host}", "cf", "--truth mocap")
+
+
+def test_a_flight_that_is_refused_on_the_ground_is_one_of_the_benchmark_s(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It has no log."""
+    path = Path(__file__).parents[2] / "benchmarks" / "mocap.py"
+    spec = importlib.util.spec_from_file_location("benchmark_mocap", path)
+    assert spec is not None
+    assert spec.loader is not None
+    bench = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, bench)
+    spec.loader.exec_module(bench)
+    said = failure_record("no frame came", 10)
+    monkeypatch.setattr(
+        bench.subprocess, "run", lambda *words, **options: SimpleNamespace(stdout=said, stderr="")
+    )
+    flown = bench.fly("sim", 0, tmp_path)
+    assert (flown.outcome, flown.reason) == ("refused", "no frame came")
 
 
 def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

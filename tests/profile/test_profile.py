@@ -101,6 +101,14 @@ def _refusal(tmp_path: Path, text: str) -> str:
         ("[" * 3000, ["nested too deeply"]),
         ("- a list", ["keys and values"]),
         ("kalman: {alpha: 0.85", ["line", "YAML"]),
+        (
+            "target: {expected_xy_m: [400, -1200]}\n",
+            ["target.expected_xy_m", "50", "metres: were millimetres or centimetres meant?"],
+        ),
+        (
+            "target: {expected_within_m: 0.2}\n",
+            ["target", "expected_within_m is given without expected_xy_m"],
+        ),
     ],
 )  # fmt: skip
 def test_faults_are_one_sentence(tmp_path: Path, text: str, expected: list[str]) -> None:

@@ -98,7 +98,7 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
     settings = replace(EXACT, body_rpy_rad=(roll, pitch, yaw), body_position_m=offset_m)
     R = rotation_from_rpy(0.1, -0.2, 1.3)
     seen = last(settings, room=Room(quaternion=quaternion_from_rotation(R)))
-    config = PositioningConfig(body_rpy_deg=rpy_deg, body_position_m=offset_m)
+    config = PositioningConfig(by="mocap", body_rpy_deg=rpy_deg, body_position_m=offset_m)
     placed = place_of(seen.bodies["crazyflie"], config)
     assert placed.position_m == pytest.approx(AT)
     assert np.allclose(placed.R, R, atol=1e-6)

@@ -18,6 +18,7 @@ from typer.testing import CliRunner, Result
 
 from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
+from perchctl.commands import fit_weights_collect
 from perchctl.commands.fit_weights_collect import _truth
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, UsageError
@@ -501,7 +502,7 @@ def test_motion_capture_gives_the_median_or_names_the_bodies() -> None:
 
     found = truth_of(Recorded(), "cf").actual(lambda question: "")
     assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
-    mounted = PositioningConfig(body_rpy_deg=(0.0, 0.0, math.degrees(0.4)))
+    mounted = PositioningConfig(by="mocap", body_rpy_deg=(0.0, 0.0, math.degrees(0.4)))
     found = truth_of(Recorded(), "askew", mounted).actual(lambda question: "")
     assert found.pose == pytest.approx([0.0, 0.05, 0.17, 0.4], abs=2e-4)
     with pytest.raises(NotFound, match="rigid body 'drone'; it sees askew, cf, target"):
@@ -524,6 +525,29 @@ def test_motion_capture_is_asked_for_with_its_computer(monkeypatch: pytest.Monke
     monkeypatch.setattr(capture, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match="--truth mocap needs the library motioncapture"):
         _truth(CollectRequest(truth="mocap", mocap="vicon:h"), load_profile("sim"), lambda: 0.0)
+
+
+def test_motion_capture_is_the_profile_s_where_no_option_names_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[str, str]] = []
+
+    def opened(system: str, body: str, needed_by: str) -> Recorded:
+        asked.append((system, body))
+        return Recorded()
+
+    monkeypatch.setattr(fit_weights_collect, "open_named", opened)
+    own = PositioningConfig(by="mocap", system="qualisys", host="lab:22223", body="cf2")
+    plain = load_profile("sim")
+    lab = plain.model_copy(update={"positioning": own})
+    for request, profile, expected in (
+        (CollectRequest(), lab, ("qualisys:lab:22223", "cf2")),
+        (CollectRequest(mocap="vicon:h"), lab, ("vicon:h", "cf2")),
+        (CollectRequest(bodies="cf7,board"), lab, ("qualisys:lab:22223", "cf7")),
+        (CollectRequest(mocap="vicon:h"), plain, ("vicon:h", "cf")),
+    ):
+        _truth(replace(request, truth="mocap"), profile, lambda: 0.0)
+        assert asked[-1] == expected
 
 
 def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:
