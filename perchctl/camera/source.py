@@ -88,6 +88,8 @@ class LiveSource:
 
     live = True
     finished = False
+    _converted = False
+    """Whether an analogue converter may stand before it, as a receiver's: its repetitions differ."""
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
         self._name = name
@@ -97,7 +99,7 @@ class LiveSource:
         self._stop = threading.Event()
         self._first = threading.Event()  # set by the first frame, or by failing before it
         self._thread: threading.Thread | None = None
-        self._slot = NewestSlot()
+        self._slot = NewestSlot(self._converted)
         self._last_arrival_s = clock()
         self._failure: str | None = None
         self._size_px: tuple[int, int] | None = None
