@@ -101,6 +101,7 @@ class LiveSource:
         self._thread: threading.Thread | None = None
         self._slot = NewestSlot(self._converted)
         self._last_arrival_s = clock()
+        self._arrived = 0  # pictures, a receiver's repetitions too
         self._failure: str | None = None
         self._size_px: tuple[int, int] | None = None
 
@@ -158,6 +159,7 @@ class LiveSource:
         with self._lock:
             self._slot.put(grey, t_s, arrival_s)
             self._last_arrival_s = arrival_s
+            self._arrived += 1
             self._size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 

@@ -267,6 +267,17 @@ def test_reconnects_are_bounded(server: Server, opened: list[LiveSource]) -> Non
     assert "5 attempts: the stream ended" in str(source.problem(100.0))
 
 
+def test_a_server_of_one_picture_a_connection_is_kept_though_they_are_equal(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    for _ in range(2 * MAX_FAILED_CONNECTIONS):
+        server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = stream(server, Clock(), opened)
+    wait_for(lambda: source._arrived == 1 + 2 * MAX_FAILED_CONNECTIONS)
+    assert source.problem(100.0) is None
+
+
 def test_silence_is_a_problem_and_ends_with_the_next_frame(
     server: Server, opened: list[LiveSource]
 ) -> None:
