@@ -89,7 +89,7 @@ class LiveSource:
     live = True
     finished = False
     _converted = False
-    """Whether an analogue converter may stand before it, as a receiver's: its repetitions differ."""
+    """Whether an analogue converter may stand before it: then its repetitions differ."""
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
         self._name = name

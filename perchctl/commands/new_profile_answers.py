@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from perchctl.calibration.files import load_calibration
 from perchctl.camera.aideck import aideck_address
+from perchctl.camera.credentials import without_password
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, scheme_of
 from perchctl.check.limits import OVERDUE
 from perchctl.errors import InvalidValue
@@ -236,9 +237,10 @@ def made(texts: Texts, output: Path) -> Profile:
     answer = {q.name: q.check(texts[q.name], texts) for q in QUESTIONS}
     uri, mounted = texts["uri"], mount_from_edges(str(answer["front"]), str(answer["left"]))
     heights = _heights(_number(answer["ceiling"]))
+    shown = without_password(texts["source"])
     values: dict[str, Any] = {
         "name": output.stem,
-        "description": f"a vehicle at {uri}, with its camera at {texts['source']}",
+        "description": f"a vehicle at {uri}, with its camera at {shown}",
         "camera": {
             "source": answer["source"],
             "calibration": _named(answer["calibration"], output, texts["source"]),
