@@ -57,8 +57,8 @@ def _source(text: str, answers: Texts) -> str:
         aideck_address(text)
     if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
         raise InvalidValue(
-            f"{text} is no camera that flies with {answers['uri']}; allowed are camera:N, "
-            f"camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, aideck://HOST"
+            f"{without_password(text)} is no camera that flies with {answers['uri']}; allowed are "
+            f"camera:N, camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, aideck://HOST, gst:PIPELINE"
         )
     return text
 
