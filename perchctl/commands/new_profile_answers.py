@@ -58,7 +58,8 @@ def _source(text: str, answers: Texts) -> str:
     if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
         raise InvalidValue(
             f"{without_password(text)} is no camera that flies with {answers['uri']}; allowed are "
-            f"camera:N, camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, aideck://HOST, gst:PIPELINE"
+            f"camera:N, camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, "
+            f"aideck://HOST, gst:PIPELINE"
         )
     return text
 
