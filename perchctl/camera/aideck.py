@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.cpx import CpxPicture, CpxSplitter
+from perchctl.camera.credentials import without_password
 from perchctl.camera.mosaic import MosaicFilter
 from perchctl.camera.source import Clock
 from perchctl.camera.stream import (
@@ -50,7 +51,7 @@ class AiDeckAddress:
 def aideck_address(spec: str) -> AiDeckAddress:
     """Of ``aideck://HOST[:PORT][?colour=auto|yes|no]``. Errors: InvalidValue."""
     wrong = InvalidValue(
-        f"camera source {spec!r} is no AI-deck's address; write {FORM}, as in "
+        f"camera source {without_password(spec)!r} is no AI-deck's address; write {FORM}, as in "
         f"aideck://192.168.4.1, and behind it ?colour=yes or ?colour=no where the picture "
         f"does not tell"
     )

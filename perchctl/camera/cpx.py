@@ -130,7 +130,7 @@ class CpxSplitter:
             if not _is_packet(length, routing, function):
                 raise Damaged
             begin, end = self._at + _PACKET.size, self._at + 2 + length
-            if function != _APP:
+            if function != _APP or length == _PACKET.size - 2:  # an empty one leads nowhere
                 self._other_bytes += 2 + length
                 if self._other_bytes > _MOST_OTHER_BYTES:
                     raise Damaged

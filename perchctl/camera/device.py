@@ -166,6 +166,8 @@ class DeviceSource(CaptureSource):
     Errors: NotFound; InvalidValue, a control or format that the driver does not take.
     """
 
+    _converted = True
+
     def __init__(
         self,
         number: int,
@@ -216,8 +218,15 @@ class DeviceSource(CaptureSource):
                 told += self._controls_again(call)
         except OSError:
             with contextlib.suppress(cv2.error, AttributeError):
-                told = differences(asked, _by_opencv(self._capture, self._size_px), (), self._name)
+                told = differences(asked, self._without_driver(), (), self._name)
         return told
+
+    def _without_driver(self) -> Delivered:
+        """The size is the pictures': OpenCV is only asked for what they do not tell, as the
+        grabbing thread is reading from it."""
+        if self._asked.format is None and self._asked.rate_hz is None:
+            return Delivered("", self._size_px or (0, 0), None)
+        return _by_opencv(self._capture, self._size_px)
 
     def _controls_again(self, call: Call) -> list[str]:
         asked = self._asked.controls

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.camera.credentials import without_password
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision.types import Frame
@@ -74,7 +75,7 @@ class VideoSource(Recording):
 
     def __init__(self, path: Path, latency_s: float = 0.0) -> None:
         if not path.is_file():
-            raise NotFound(f"video file {path} was not found")
+            raise NotFound(f"video file {without_password(str(path))} was not found")
         self._capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
         rate_hz, count = (
             float(self._capture.get(key)) if self._capture.isOpened() else 0.0
@@ -84,7 +85,8 @@ class VideoSource(Recording):
             rate_hz = DEFAULT_RATE_HZ
         self._period_s = 1.0 / rate_hz
         self._last_s = -self._period_s
-        super().__init__(f"video:{path}", latency_s, rate_hz, round(count) if count > 0 else None)
+        name = f"video:{without_password(str(path))}"
+        super().__init__(name, latency_s, rate_hz, round(count) if count > 0 else None)
 
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
         ok, image = self._capture.read()
@@ -115,7 +117,9 @@ class ImagesSource(Recording):
         self._paths = image_files(where)
         self._next = 0
         named = where if isinstance(where, str) else self._paths[0]
-        super().__init__(f"images:{named}", latency_s, rate_hz, len(self._paths))
+        super().__init__(
+            f"images:{without_password(str(named))}", latency_s, rate_hz, len(self._paths)
+        )
 
     @property
     def paths(self) -> list[Path]:
@@ -181,7 +185,8 @@ def image_files(where: str | Sequence[Path]) -> list[Path]:
         names = (Path(name) for name in glob.glob(where))
         found = [p for p in names if p.is_file() and p.suffix.lower() in IMAGE_SUFFIXES]
         if not found:
-            raise NotFound(f"{where} is neither a folder nor a pattern that names pictures")
+            shown = without_password(where)
+            raise NotFound(f"{shown} is neither a folder nor a pattern that names pictures")
     if not found:
         allowed = " ".join(sorted(IMAGE_SUFFIXES))
         raise NotFound(f"folder {where} holds no pictures ({allowed})")

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 from cv2 import videoio_registry
 
+from perchctl.camera.credentials import without_password
 from perchctl.errors import InvalidValue, NotFound
 
 READ_TIMEOUT_MS = 2000
@@ -34,7 +35,7 @@ def open_pipeline(text: str) -> Any:
     if not capture.isOpened():
         capture.release()
         raise NotFound(
-            f"the pipeline gst:{text} does not run; try it with gst-launch-1.0, and let it end in "
-            f"appsink drop=true max-buffers=1 sync=false"
+            f"the pipeline gst:{without_password(text)} does not run; try it with gst-launch-1.0, "
+            f"and let it end in appsink drop=true max-buffers=1 sync=false"
         )
     return capture

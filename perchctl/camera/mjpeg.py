@@ -185,7 +185,8 @@ class MjpegSource(StreamSource):
     def _answered(
         self, connection: http.client.HTTPConnection, parts: SplitResult
     ) -> http.client.HTTPResponse:
-        """The response; with name and password once the server has asked for them."""
+        """The response; with name and password once the server has asked for them, or has
+        refused the nameless without asking (403)."""
         path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
         who = credentials_of(parts)
         for _ in range(MOST_REQUESTS):
@@ -196,7 +197,9 @@ class MjpegSource(StreamSource):
             connection.request("GET", path, headers=headers)
             response = connection.getresponse()
             asked = _challenge(response)
-            if response.status != 401 or who is None or asked is None:
+            # After an answer 403 is the last word: nobody asked for less than a digest then.
+            asks = response.status == 401 or (response.status == 403 and self._challenge is None)
+            if not asks or who is None or asked is None:
                 break
             # A nonce of an earlier connection may be too old: a new one is answered once more.
             if self._challenge is not None and asked.asks_the_same(self._challenge):

@@ -22,7 +22,7 @@ from perchctl.profile import CameraConfig
 
 REAL = (
     "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
-    f"rtsp://HOST/PATH, {FORM}"
+    f"rtsp://HOST/PATH, {FORM}, gst:PIPELINE"
 )
 ALLOWED = f"{REAL}, sim:"
 
@@ -43,18 +43,18 @@ def source_spec(source: str) -> str:
         return f"images:{source}"
     if path.is_file():
         return f"{'images' if path.suffix.lower() in IMAGE_SUFFIXES else 'video'}:{source}"
-    if scheme_of(source) and not path.suffix and "/" not in source:
+    if "://" in source or (scheme_of(source) and not path.suffix and "/" not in source):
         return source  # `open_source` names what is allowed
     raise NotFound(
-        f"{source} does not exist; a source is a video, picture or folder of pictures, or "
-        f"one of {REAL}"
+        f"{without_password(source)} does not exist; a source is a video, picture or folder of "
+        f"pictures, or one of {REAL}"
     )
 
 
 def scheme_of(spec: str) -> str:
-    """What stands before the colon; the empty string where there is none."""
+    """What stands before the colon, in small letters; the empty string where there is none."""
     scheme, colon, _ = spec.partition(":")
-    return scheme if colon else ""
+    return scheme.lower() if colon else ""
 
 
 def is_live(spec: str) -> bool:
@@ -100,7 +100,9 @@ def open_source(
         unreadable content, a control or format that the camera lacks. TimedOut: no
         first frame in time.
     """
-    scheme, _, rest = spec.partition(":")
+    scheme, rest = scheme_of(spec), spec.partition(":")[2]
+    if scheme in SCHEMES:
+        spec = f"{scheme}:{rest}"  # FFmpeg knows rtsp:// and not RTSP://
     if scheme == "video" and rest:
         return VideoSource(Path(rest).expanduser(), latency_s)
     if scheme == "images" and rest:
@@ -109,7 +111,7 @@ def open_source(
         asked = asked_of(config, size_px)
         return _started(DeviceSource(camera_number(rest), latency_s, asked, clock), timeout_s, tell)
     if scheme == "gst" and rest.strip():
-        pipeline = CaptureSource(spec, latency_s, clock, open_pipeline(rest))
+        pipeline = CaptureSource(without_password(spec), latency_s, clock, open_pipeline(rest))
         pipeline.begin()
         return _started(pipeline, timeout_s, tell)
     if (stream := _stream(spec, scheme, rest, latency_s, clock)) is not None:

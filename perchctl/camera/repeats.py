@@ -7,9 +7,11 @@ Most repeat byte for byte. One that was converted to analogue and back in betwee
 converter's own noise on it, and is told by that: the sensor's noise, which differs from picture
 to picture, is the same in both. What two pictures differ by, where they differ least, is then
 far below the noise that each has along its columns. A picture at rest on a rough ceiling can
-look so, too, and so can one of which a codec has left nothing but the outlines: it only counts
-in a stream that shows both kinds by turns, and no more than four times in a row. So nothing but
-equal bytes can starve a flight of its pictures.
+look so, too, as can one that wobbles where it turns back, and one of which a codec has left
+nothing but the outlines: it only counts in a stream that shows both kinds by turns, the
+repetitions all equally alike and nothing between the two, and no more than four times in a row.
+So nothing but equal bytes can starve a flight of its pictures. Only a camera of this computer has
+a converter before it: pictures that come over a network repeat by their bytes or not at all.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ MOST_AGAIN = 4
 """15 pictures a second in a stream of 60 come three times again."""
 _WINDOW = 24
 _ALIKE, _UNLIKE = 0.6, 0.8
+_SPREAD = 1.5  # among repetitions: the converter's noise is the same in each
 _LEAST_OF_EACH = 4
 _CALM = 0.7  # of the pixels: what moved, and edges, are no noise
 _LEAST_NOISE = 1.0
@@ -43,13 +46,16 @@ class RepeatState:
     again: int = 0
 
 
-def repeated(state: RepeatState, image: Grey) -> tuple[RepeatState, bool]:
-    """Whether the picture is the one before once more. Grey, (h, w)."""
+def repeated(state: RepeatState, image: Grey, by_noise: bool = True) -> tuple[RepeatState, bool]:
+    """Whether the picture is the one before once more. Grey, (h, w). `by_noise`: also where a
+    converter has put its own noise on it; else by equal bytes alone."""
     last = state.last
     if last is None or last.shape != image.shape:
         return RepeatState(image), False
     if np.array_equal(last[::_STEP], image[::_STEP]) and np.array_equal(last, image):
         return state, True
+    if not by_noise:
+        return RepeatState(image), False
     ratios = (*state.ratios[1 - _WINDOW :], _unlike(last, image))
     again = state.again + 1
     if _alike(ratios[-1]) and again <= MOST_AGAIN and _by_turns(ratios):
@@ -63,9 +69,13 @@ def _alike(ratio: float | None) -> bool:
 
 def _by_turns(ratios: tuple[float | None, ...]) -> bool:
     alike = [_alike(ratio) for ratio in ratios]
-    new = sum(ratio is not None and ratio > _UNLIKE for ratio in ratios)
-    longest = max((len(list(run)) for kind, run in groupby(alike) if kind), default=0)
-    return sum(alike) >= _LEAST_OF_EACH <= new and longest <= MOST_AGAIN
+    same = [ratio for ratio in ratios if ratio is not None and ratio < _ALIKE]
+    new = [ratio for ratio in ratios if ratio is not None and ratio >= _ALIKE]
+    if not len(same) >= _LEAST_OF_EACH <= len(new):
+        return False
+    longest = max(len(list(run)) for kind, run in groupby(alike) if kind)
+    apart = min(new) > _UNLIKE and max(same) < _SPREAD * min(same)
+    return apart and longest <= MOST_AGAIN
 
 
 def _unlike(last: Grey, image: Grey) -> float | None:

@@ -17,6 +17,9 @@ CONNECT_TIMEOUT_S = 5.0
 MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
 WINDOW_S = 10.0
+CLOCK_SLOW = 0.02
+"""By which a camera's clock may run slow before its pictures look older than they are. Allowing
+for it is safer than a short window: that would forget the fastest amid a heap."""
 
 _OPTIONS = {
     "rtsp_flags": "prefer_tcp",  # a lost packet costs every picture up to the next whole one
@@ -35,13 +38,14 @@ class Waiting:
     """How long a picture was under way beyond the fastest of the last ten seconds; pure.
 
     The camera's own time of a picture tells it. What piles up behind a radio that stalls
-    comes in a heap, and would look as if it had just been taken. A camera whose clock is set
-    back meanwhile starts anew: nothing else makes its time go backwards.
+    comes in a heap, and would look as if it had just been taken. Where the camera's time goes
+    backwards, as when its clock is set back, it starts anew, and one set forward makes the next
+    picture the fastest.
     """
 
     def __init__(self) -> None:
         self._camera_s = -math.inf
-        self._ways: deque[tuple[float, float]] = deque()  # arrival, and arrival less camera's time
+        self._ways: deque[tuple[float, float]] = deque()  # arrival, and `way_s`
 
     def of(self, camera_s: float | None, arrival_s: float) -> float:
         """s; 0 where the camera gives no time."""
@@ -50,7 +54,7 @@ class Waiting:
         if camera_s < self._camera_s:
             self._ways.clear()
         self._camera_s = camera_s
-        way_s = arrival_s - camera_s
+        way_s = arrival_s * (1.0 - CLOCK_SLOW) - camera_s
         while self._ways and self._ways[-1][1] >= way_s:
             self._ways.pop()  # a window's minimum: none of these will be it any more
         self._ways.append((arrival_s, way_s))

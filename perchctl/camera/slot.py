@@ -11,17 +11,18 @@ class NewestSlot:
 
     One that a receiver gives out again takes no new one's place: it would make it look younger
     than it is. Where the new one has been taken already it comes with the same index, and
-    `Frame.repeated`: a sign of life, and no measurement.
+    `Frame.repeated`: a sign of life, and no measurement. `by_noise`: as `repeated` has it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, by_noise: bool = False) -> None:
+        self._by_noise = by_noise
         self._frame: Frame | None = None
         self._repeats = RepeatState()
         self.count = 0
 
     def put(self, image: Grey, t_s: float, t_arrival_s: float) -> None:
         """Times of exposure and of arrival."""
-        self._repeats, again = repeated(self._repeats, image)
+        self._repeats, again = repeated(self._repeats, image, self._by_noise)
         if not again:
             self._frame = Frame(self.count, t_s, image, t_arrival_s)
             self.count += 1

@@ -88,6 +88,8 @@ class LiveSource:
 
     live = True
     finished = False
+    _converted = False
+    """Whether an analogue converter may stand before it: then its repetitions differ."""
 
     def __init__(self, name: str, latency_s: float, clock: Clock) -> None:
         self._name = name
@@ -97,8 +99,9 @@ class LiveSource:
         self._stop = threading.Event()
         self._first = threading.Event()  # set by the first frame, or by failing before it
         self._thread: threading.Thread | None = None
-        self._slot = NewestSlot()
+        self._slot = NewestSlot(self._converted)
         self._last_arrival_s = clock()
+        self._arrived = 0  # pictures, a receiver's repetitions too
         self._failure: str | None = None
         self._size_px: tuple[int, int] | None = None
 
@@ -156,6 +159,7 @@ class LiveSource:
         with self._lock:
             self._slot.put(grey, t_s, arrival_s)
             self._last_arrival_s = arrival_s
+            self._arrived += 1
             self._size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 

@@ -59,7 +59,7 @@ class StreamSource(LiveSource):
     def _run(self) -> None:
         failed = 0
         while not self._stop.is_set():
-            before = self._count
+            before = self._arrived
             self.connections += 1
             try:
                 reason = self._connection()
@@ -68,7 +68,7 @@ class StreamSource(LiveSource):
             if self.not_found:
                 self._fail(f"{self._name}: {reason}")
                 return
-            failed = 0 if self._count > before else failed + 1
+            failed = 0 if self._arrived > before else failed + 1
             if failed >= MAX_FAILED_CONNECTIONS:
                 self._fail(f"{self._name} gave no picture in {failed} attempts: {reason}")
                 return

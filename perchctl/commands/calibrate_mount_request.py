@@ -10,6 +10,7 @@ from pathlib import Path
 
 from perchctl.calibration.files import camera_of
 from perchctl.calibration.mounting.recording import Part
+from perchctl.camera.credentials import without_password
 from perchctl.camera.open import is_live, source_spec
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_output, check_place
@@ -111,7 +112,7 @@ def resolve(request: MountRequest, output: Path | None, force: bool, page: bool)
     if request.truth and request.write and not is_simulated(profile):
         raise UsageError(
             f"--truth sim measures a simulated vehicle, and {name} flies {profile.link.uri} with "
-            f"{profile.camera.source}: leave --write out"
+            f"{without_password(profile.camera.source)}: leave --write out"
         )
     live = not (request.logs or request.truth)
     source, uri = _live(request, profile, parts) if live else ("", None)
@@ -158,8 +159,8 @@ def _live(
         return source, None
     if not is_live(source):
         raise UsageError(
-            f"{source} is a recording, and has not the vehicle's clock: the carry needs a live "
-            f"camera; --part pivot needs no vehicle"
+            f"{without_password(source)} is a recording, and has not the vehicle's clock: the "
+            f"carry needs a live camera; --part pivot needs no vehicle"
         )
     uri = profile.link.uri if named is None else named
     if check_uri(uri) == "sim":

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from perchctl.camera.credentials import profile_record
 from perchctl.check.profile import rows
 from perchctl.check.row import Verdict
 from perchctl.commands.new_profile_answers import (
@@ -185,7 +186,7 @@ def _report(request: NewProfileRequest, profile: Profile, answers: Mapping[str, 
     for row in doubts:
         say(f"{row.name}: {row.found}; {row.advice}")
     if request.as_json:
-        print_record({"file": str(request.output), "profile": profile.model_dump(mode="json")})
+        print_record({"file": str(request.output), "profile": profile_record(profile)})
         return
     shown = shlex.quote(str(request.output))
     print(f"wrote {request.output}\nlook at the plan: perchctl fly -p {shown} --dry-run")

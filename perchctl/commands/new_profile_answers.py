@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from perchctl.calibration.files import load_calibration
 from perchctl.camera.aideck import aideck_address
+from perchctl.camera.credentials import without_password
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, scheme_of
 from perchctl.check.limits import OVERDUE
 from perchctl.errors import InvalidValue
@@ -56,8 +57,9 @@ def _source(text: str, answers: Texts) -> str:
         aideck_address(text)
     if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
         raise InvalidValue(
-            f"{text} is no camera that flies with {answers['uri']}; allowed are camera:N, "
-            f"camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, aideck://HOST"
+            f"{without_password(text)} is no camera that flies with {answers['uri']}; allowed are "
+            f"camera:N, camera:NAME, http://HOST:PORT/PATH, rtsp://HOST/PATH, "
+            f"aideck://HOST, gst:PIPELINE"
         )
     return text
 
@@ -236,9 +238,10 @@ def made(texts: Texts, output: Path) -> Profile:
     answer = {q.name: q.check(texts[q.name], texts) for q in QUESTIONS}
     uri, mounted = texts["uri"], mount_from_edges(str(answer["front"]), str(answer["left"]))
     heights = _heights(_number(answer["ceiling"]))
+    shown = without_password(texts["source"])
     values: dict[str, Any] = {
         "name": output.stem,
-        "description": f"a vehicle at {uri}, with its camera at {texts['source']}",
+        "description": f"a vehicle at {uri}, with its camera at {shown}",
         "camera": {
             "source": answer["source"],
             "calibration": _named(answer["calibration"], output, texts["source"]),

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from dataclasses import dataclass
 
+from perchctl.camera.credentials import profile_record, without_passwords
 from perchctl.check.profile import rows
 from perchctl.check.row import Verdict
 from perchctl.commands.output import print_record, say
@@ -41,12 +42,12 @@ def run(request: ProfileRequest) -> int:
     if request.as_json:
         record = {
             "profile_file": str(find_profile(name)),
-            "profile": profile.model_dump(mode="json"),
+            "profile": profile_record(profile),
             "check": [dataclasses.asdict(row) for row in found],
         }
         print_record(record)
         return 0
-    print(profile_text(profile), end="")
+    print(profile_text(without_passwords(profile)), end="")
     for row in found:
         if row.verdict in (Verdict.WARN, Verdict.FAIL):
             say(f"{row.name}: {row.found}; {row.advice}")

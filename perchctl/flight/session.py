@@ -69,17 +69,17 @@ def check_options(options: FlyOptions) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     check_uri(options.uri)
     check_positioning(options.profile, simulated=options.simulated)
+    shown = without_password(options.source)
     if scheme_of(options.source) not in SCHEMES:
-        shown = without_password(options.source)
         raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
-            f"source {options.source} belongs to the simulated vehicle, but the URI is "
+            f"source {shown} belongs to the simulated vehicle, but the URI is "
             f"{options.uri}; name the camera with --source (camera:N, http://..., aideck://HOST)"
         )
     if not is_live(options.source) and not options.simulated:
         raise UsageError(
-            f"source {options.source} is a recording, and {options.uri} a real vehicle: it would "
+            f"source {shown} is a recording, and {options.uri} a real vehicle: it would "
             f"be steered by pictures of another flight; fly sim://, or name a camera with --source"
         )
     if options.seed < 0:

@@ -13,6 +13,7 @@ import re
 import sys
 from pathlib import Path
 
+from perchctl.camera.credentials import without_password
 from perchctl.errors import ConnectionFailed
 from perchctl.profile.places import user_runtime_folder
 
@@ -85,7 +86,9 @@ def _in_use(uri: str, holder: str) -> str:
 
 
 def _myself() -> str:
-    words = [Path(sys.argv[0]).name, *sys.argv[1:]] if sys.argv else ["perchctl"]
+    name, *words = sys.argv or [""]
+    name = Path(name).name
+    words = ["perchctl" if name in ("", "__main__.py") else name, *map(without_password, words)]
     return f"process {os.getpid()}: {' '.join(words)}"[:200]
 
 

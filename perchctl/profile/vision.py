@@ -69,7 +69,7 @@ class CameraConfig(Section):
     source: str = Field(
         "sim:",
         description="`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
-        "`video:FILE`, `images:DIR`, `sim:`",
+        "`gst:PIPELINE`, `video:FILE`, `images:DIR`, `sim:`",
     )
     calibration: str = Field(
         "example_640x480.yaml", description="file beside the profile, in `calib/`, or a whole path"

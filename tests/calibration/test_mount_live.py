@@ -231,6 +231,36 @@ def test_the_advice_names_what_is_in_the_way_first() -> None:
     assert "camera.mirrored" in moments[-1].advice
 
 
+class _Receiver(_Film):
+    """Gives each picture three times, and from `stuck_s` on the last one again and again."""
+
+    def __init__(self, stuck_s: float = np.inf) -> None:
+        super().__init__()
+        self._stuck_s = stuck_s
+
+    def poll(self, now_s: float) -> Frame | None:
+        frame = super().poll(now_s)
+        again = self._count % 3 != 1 or now_s > self._stuck_s
+        return frame if frame is None else replace(frame, repeated=again)
+
+
+class _SeesEachNew(_Looks):
+    def look(self, frame: Frame) -> list[SeenPose]:
+        return [] if frame.repeated else [replace(self._poses[0], t_s=frame.t_s)]
+
+
+def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
+    looks, moments = _SeesEachNew(seen(hand("pivot")).poses), []
+    film, tape = _Receiver(), Tape("pivot")
+    ended = lambda: film.now_s > 4.0  # noqa: E731
+    capture(tape, film, looks, Sensors(), moments.append, film.clock, film.sleep, ended)
+    assert {moment.share for moment in moments} == {1.0}
+    assert len(moments) == len(tape.poses) == pytest.approx(20, abs=2)
+    film = _Receiver(stuck_s=1.0)
+    capture(Tape("pivot"), film, looks, Sensors(), lambda _: None, film.clock, film.sleep)
+    assert film.now_s == pytest.approx(MOST_S, abs=1.0), "and it ends though none is new"
+
+
 def test_a_mirrored_picture_ends_it_soon() -> None:
     film, tape = _Film(), Tape("carry")
     with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):

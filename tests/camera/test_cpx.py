@@ -159,6 +159,14 @@ def test_what_is_held_is_bounded() -> None:
         assert len(splitter._buffer) < 70_000
 
 
+def test_empty_packets_without_end_are_no_picture_to_wait_for() -> None:
+    splitter = CpxSplitter()
+    assert splitter.feed(raw_packets(B)[0] + packet(b"") * 20_000, 0.0) == []
+    assert splitter.damaged == 1
+    assert len(splitter._buffer) < 100
+    assert splitter.feed(raw(C), 0.0) == split(raw(C))
+
+
 def test_a_picture_of_two_is_none() -> None:
     """A lost chunk, and the next header lost with it: the bytes would fit."""
     stream = without(raw_packets(B), 1) + b"".join(raw_packets(C)[1:]) + raw(D)

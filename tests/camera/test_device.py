@@ -280,6 +280,30 @@ def test_without_v4l2_the_pictures_come_and_only_controls_are_refused() -> None:
         DeviceSource(0, 0.0, Asked(controls=FIXED), lambda: 1.0, lambda n, a: device, nothing)
 
 
+def test_without_v4l2_a_size_is_told_by_the_pictures_alone() -> None:
+    @contextlib.contextmanager
+    def nothing(number: int) -> Iterator[Call]:
+        raise OSError(errno.ENOSYS, "this system has no V4L2")
+        yield
+
+    class Reading(FakeDevice):
+        asked = 0
+
+        def get(self, prop: int) -> float:
+            self.asked += 1
+            return 0.0
+
+    device = Reading()
+    wanted = Asked((720, 576))
+    source = DeviceSource(0, 0.0, wanted, lambda: 1.0, lambda n, a: device, nothing)
+    assert source.wait_first(WAIT_S)
+    (told,) = source.remarks()
+    source.close()
+    assert "720x576" in told
+    assert "640x480" in told
+    assert device.asked == 0, "while its thread reads"
+
+
 def test_opencv_is_asked_for_format_then_size_then_rate() -> None:
     class Capture:
         def __init__(self) -> None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera.credentials import without_password
+from perchctl.camera.credentials import profile_record, without_password
 from perchctl.camera.files import (
     BrokenPicture,
     ImagesSource,
@@ -18,7 +18,7 @@ from perchctl.camera.files import (
     VideoSource,
     read_grey,
 )
-from perchctl.camera.open import is_live, open_source, source_spec
+from perchctl.camera.open import is_live, open_source, scheme_of, source_spec
 from perchctl.camera.source import FrameSource, check_size, to_grey
 from perchctl.commands.calibrate_source import Source, sized
 from perchctl.errors import InvalidValue, NotFound, UsageError
@@ -120,6 +120,59 @@ def test_a_bare_path_becomes_a_source(tmp_path: Path) -> None:
     for path in ("none.mp4", "none"):
         with pytest.raises(NotFound, match=f"^{path} does not exist"):
             source_spec(path)
+
+
+@pytest.mark.parametrize("text", [
+    "rtsp:admin:secret@cam", "http:/admin:secret@cam/x", "rtsp:///admin:secret@cam/s",
+    "rtsp://admin:12/secret@cam/s", "RTSP://admin:12/34secret@cam/s", "Http:admin:secret@cam",
+    "http://cam/x?user=admin&password=secret", "http://cam/x?PWD=secret&y=1",
+    "http://cam/x?loginpass=secret", "rtsp://admin:se cret@cam/s", "video:rtsp://a:secret@cam",
+    "gst:rtspsrc location=rtsp://admin:secret@cam/s latency=0 ! decodebin ! appsink",
+    'gst:rtspsrc location="rtsp://admin:secret@cam/s" ! appsink',
+    'gst:rtspsrc location=rtsp://cam/s user-id=admin user-pw="secret" ! appsink',
+    "--source=rtsp://admin:secret@cam/s", "a vehicle with its camera at rtsp://admin:secret@cam",
+])  # fmt: skip
+def test_no_form_of_a_password_is_shown(text: str) -> None:
+    shown = without_password(text)
+    assert "cret" not in shown
+    assert "cam" in shown
+    for part in ("latency=0 ! decodebin", "a vehicle with its camera at"):
+        assert (part in shown) == (part in text)
+
+
+@pytest.mark.parametrize("text", [
+    "sim:", "camera:0", "images:/a@b/*.png", "radio://0/80/2M/E7E7E7E7E7", "http://host:81/a",
+    "udp://127.0.0.1:19850", "aideck://192.168.4.1:5000?colour=yes", "-p", "",
+])  # fmt: skip
+def test_what_has_no_password_is_shown_as_it_is(text: str) -> None:
+    assert without_password(text) == text
+
+
+def test_no_message_and_no_record_shows_a_password(tmp_path: Path) -> None:
+    at = "://me:secret@h/"
+    for spec in (f"ftp{at}", f"video:rtsp{at}s", f"images:http{at}*", f"aideck{at}",
+                 "http:me:secret@host", "RTSP:/me:secret@host"):  # fmt: skip
+        with pytest.raises((InvalidValue, NotFound)) as caught:
+            open_source(source_spec(spec), 0.0, None, clock)
+        assert "secret" not in str(caught.value)
+    with pytest.raises(NotFound) as missing:
+        source_spec("me:secret/http:x:secret@host.mp4")
+    assert "x:secret" not in str(missing.value)
+    profile = Profile.model_validate({
+        "description": "at http://me:secret@h/s", "camera": {"source": "RTSP://me:secret@h/s"},
+    })  # fmt: skip
+    assert "secret" not in str(profile_record(profile))
+
+
+def test_an_unknown_scheme_is_told_from_a_missing_file_and_known_ones_in_any_case() -> None:
+    for spec in ("rtmp://host/live", "ftp://host/a.mp4"):
+        with pytest.raises(InvalidValue, match=r"is unknown; allowed are .*gst:PIPELINE"):
+            open_source(source_spec(spec), 0.0, None, clock)
+    for spec in ("RTSP://host/s", "Http://host/s", "AIDECK://192.168.4.1", "Camera:0"):
+        assert source_spec(spec) == spec
+        assert scheme_of(spec) == spec.partition(":")[0].lower()
+        assert is_live(spec)
+    assert not is_live("VIDEO:x.mp4")
 
 
 def test_a_password_is_not_shown() -> None:

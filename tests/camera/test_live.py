@@ -108,6 +108,7 @@ class Server:
         self.paths: list[str] = []
         self.authorization: list[str | None] = []
         self.challenges: list[str] = []
+        self.refusal = 401
         self.nonce = "n1"
         outer = self
 
@@ -120,10 +121,10 @@ class Server:
                 outer.paths.append(self.path)
                 given = self.headers["Authorization"]
                 outer.authorization.append(given)
-                if outer.challenges and not (
+                if (outer.challenges or outer.refusal == 403) and not (
                     given and (given.startswith("Basic") or f'nonce="{outer.nonce}"' in given)
                 ):
-                    self.send_response(401)
+                    self.send_response(outer.refusal)
                     for challenge in outer.challenges:
                         self.send_header("WWW-Authenticate", challenge)
                     self.end_headers()
@@ -267,6 +268,17 @@ def test_reconnects_are_bounded(server: Server, opened: list[LiveSource]) -> Non
     assert "5 attempts: the stream ended" in str(source.problem(100.0))
 
 
+def test_a_server_of_one_picture_a_connection_is_kept_though_they_are_equal(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    for _ in range(2 * MAX_FAILED_CONNECTIONS):
+        server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = stream(server, Clock(), opened)
+    wait_for(lambda: source._arrived == 1 + 2 * MAX_FAILED_CONNECTIONS)
+    assert source.problem(100.0) is None
+
+
 def test_silence_is_a_problem_and_ends_with_the_next_frame(
     server: Server, opened: list[LiveSource]
 ) -> None:
@@ -375,6 +387,27 @@ def test_a_nonce_that_is_too_old_is_changed(server: Server, opened: list[LiveSou
     server.nonce = "n2"
     wait_for(lambda: source._count == 2)
     assert 'nonce="n2"' in str(server.authorization[-1])
+
+
+def test_a_camera_that_forbids_the_nameless_without_asking_gets_the_name(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    server.refusal = 403
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = MjpegSource(server.url.replace("http://", "http://me:p%40ss@"), 0.0, Clock())
+    opened.append(source)
+    assert level(next_frame(source)) == 60
+    assert server.authorization == [None, "Basic bWU6cEBzcw=="]
+
+
+@pytest.mark.parametrize("who", ["", "me:wrong@"])
+def test_one_that_forbids_it_for_good_is_told_at_once(server: Server, who: str) -> None:
+    server.status = 403
+    with pytest.raises(NotFound, match="403"):
+        open_source(
+            server.url.replace("http://", f"http://{who}"), 0.0, None, Clock(), timeout_s=WAIT_S
+        )
+    assert len(server.authorization) == (2 if who else 1)
 
 
 @pytest.mark.parametrize(("challenges", "who", "sentence"), [

@@ -9,8 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from perchctl.camera.aideck import AiDeckSource
+from perchctl.camera.device import DeviceSource
 from perchctl.camera.health import HealthState, assess
+from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.repeats import MOST_AGAIN, RepeatState, repeated
+from perchctl.camera.rtsp import RtspSource
 from perchctl.camera.slot import NewestSlot
 from perchctl.sim.receiver import BLUE_GREY
 from perchctl.vision.types import Frame
@@ -71,6 +75,40 @@ def test_a_rough_ceiling_at_rest_and_one_smoothed_by_a_codec_are_no_repetitions(
     assert not any(judged([noisy(rough, 3.0, 1 + k) for k in range(40)]))
     smooth = [cv2.GaussianBlur(noisy(128.0, 3.0, k), (0, 0), 4.0) for k in range(40)]
     assert not any(judged(smooth))
+
+
+@pytest.mark.parametrize("wobble_hz", [5.8, 6.1])
+def test_a_camera_that_wobbles_under_a_rough_ceiling_repeats_nothing(wobble_hz: float) -> None:
+    """By 3 px: at a turn of it two pictures are nearly the same."""
+    grain = np.random.default_rng(7).standard_normal((500, 700)).astype(np.float32)
+    rough = np.clip(128.0 + 120.0 * cv2.GaussianBlur(grain, (0, 0), 2.0), 0, 255)
+
+    def at(k: int) -> Grey:
+        x_px = 30.0 + 3.0 * np.sin(2 * np.pi * wobble_hz * k / 30.0)
+        shift = np.array([[1.0, 0.0, -x_px], [0.0, 1.0, -8.0]])
+        return noisy(cv2.warpAffine(rough, shift, (640, 480)), 1.0, k)
+
+    assert sum(judged([at(k) for k in range(60)])) <= 1
+
+
+def test_over_a_network_only_equal_bytes_are_a_repetition() -> None:
+    pictures, truth = of_25_in_60(1.0)
+
+    def taken(slot: NewestSlot) -> list[bool]:
+        told = []
+        for k, picture in enumerate(pictures):
+            slot.put(picture, k / 60, k / 60)
+            frame = slot.take()
+            assert frame is not None
+            told.append(frame.repeated)
+        return told
+
+    assert taken(NewestSlot(by_noise=True))[24:] == truth[24:]
+    assert not any(taken(NewestSlot()))
+    assert DeviceSource._converted
+    assert not MjpegSource._converted
+    assert not RtspSource._converted
+    assert not AiDeckSource._converted
 
 
 def test_nothing_but_equal_bytes_goes_on_for_long() -> None:

@@ -140,3 +140,17 @@ def test_a_radio_that_another_program_has_open_is_named_as_that() -> None:
     assert "another program has it open" in said
     assert "radio://1" in said
     assert "udev" not in said
+
+
+def test_who_holds_it_is_told_without_a_password(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["/x/perchctl/__main__.py", "fly", "--source", "rtsp://me:secret@cam/s"]
+    monkeypatch.setattr(sys, "argv", words)
+    held = claim(RADIO)
+    assert held is not None
+    try:
+        with pytest.raises(ConnectionFailed, match="perchctl fly --source rtsp://cam/s") as caught:
+            claim(RADIO)
+        assert "secret" not in str(caught.value)
+        assert "__main__" not in str(caught.value)
+    finally:
+        held.release()

@@ -106,6 +106,17 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
     assert one.link.uri.startswith("radio://")
 
 
+def test_a_password_is_in_the_source_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, source = tmp_path / "mine.yaml", "rtsp://me:secret@cam/s"
+    assert run(NewProfileRequest(output, {"source": source}, defaults=True)) == 0
+    assert load_profile(str(output)).camera.source == source
+    assert load_profile(str(output)).description.endswith("rtsp://cam/s")
+    shown = capsys.readouterr()
+    assert "secret" not in shown.out + shown.err
+
+
 WRONG: dict[str, tuple[str, str]] = {
     "uri": ("bogus", "radio://0/80/2M"),
     "source": ("webcam", "camera:N"),

@@ -104,6 +104,9 @@ def capture(
         frame = source.poll(now_s)
         if frame is not None:
             poses = eye.look(frame)
+            if frame.repeated and not eye.trouble:  # no picture without a target: no picture
+                run.alive(now_s)
+                continue
             tape.poses += poses
             tape.mirrored = eye.mirrored
             if tape.mirrored >= MIRRORED_PICTURES and not tape.poses:
@@ -146,10 +149,14 @@ class _Run:
         while attitudes and attitudes[0].t_s < self._oldest_s:
             attitudes.pop(0)
 
-    def judge(self, now_s: float, seen: bool) -> None:
+    def alive(self, now_s: float) -> None:
+        """The camera is; time goes on."""
         if self._start_s is None:
             self._start_s = now_s
         self.last_s, self._seconds = now_s, now_s - self._start_s
+
+    def judge(self, now_s: float, seen: bool) -> None:
+        self.alive(now_s)
         self._with_target.append(seen)
         if self._seconds - self._judged_s >= JUDGED_EVERY_S:
             self._judged_s = self._seconds
