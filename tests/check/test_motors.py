@@ -21,7 +21,7 @@ from perchctl.check.session import Wanted
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vehicle import FLYING, LOCKED, Telemetry
-from tests.helpers.checks import AT_REST, NOWHERE, PROFILE, options, said
+from tests.helpers.checks import AT_REST, NOWHERE, PROFILE, said
 from tests.helpers.mission import READY
 
 
@@ -242,7 +242,7 @@ def by_hand(rig: Lockstep, moment: str, told: bool, patch: pytest.MonkeyPatch) -
     patch.setattr(session.link, "look", lambda *_: Vehicle(NOWHERE, telemetry=AT_REST))
     patch.setattr(session, "time", SimpleNamespace(sleep=rig.wait))
     wanted = Wanted(yes, lift=True, lift_s=0.5, tell=at)
-    rows = session._vehicle(rig, options(NOWHERE), wanted)  # type: ignore[arg-type]
+    rows = session._vehicle(rig, NOWHERE, PROFILE, None, wanted)  # type: ignore[arg-type]
     return {row.name: row for row in rows}
 
 

@@ -302,13 +302,15 @@ def test_ctrl_c_does_not_reach_the_vehicle(stepped: SimProcess) -> None:
 
 def test_a_foreign_connection_cannot_take_the_parents_place() -> None:
     """A connection without the token is closed before anything is unpickled."""
-    from perchctl.sim.process import control
+    from perchctl import children
 
-    with control.listen() as listener:
+    with children.listen() as listener:
         foreign = socket.create_connection(listener.getsockname())
         foreign.sendall(b"0" * 64)
-        friend = control.connect(listener.getsockname()[1], "f" * 64)
-        channel = control.accept(listener, "f" * 64, 5.0, lambda: True)
+        connection = socket.create_connection(listener.getsockname())
+        connection.sendall(b"f" * 64)
+        friend = children.Channel(connection)
+        channel = children.accept(listener, "f" * 64, 5.0, lambda: True)
         assert channel is not None
         friend.send({"a": 1})
         assert channel.receive(5.0) == {"a": 1}
