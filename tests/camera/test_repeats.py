@@ -53,6 +53,7 @@ def of_25_in_60(noise: float, quality: int | None = None) -> tuple[list[Grey], l
     return pictures, [False] + [not each for each in new]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("noise", "quality"), [(0.0, None), (0.0, 80), (1.0, None), (1.0, 90)])
 def test_every_repetition_is_told_and_no_new_picture_is(noise: float, quality: int | None) -> None:
     pictures, truth = of_25_in_60(noise, quality)
@@ -63,6 +64,7 @@ def test_every_repetition_is_told_and_no_new_picture_is(noise: float, quality: i
     assert not any(t and not r for t, r in zip(told, truth, strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_a_camera_without_a_receiver_repeats_nothing(at_rest: bool) -> None:
     still = {"velocity_mps": (0.0, 0.0, 0.0), "turn_radps": 0.0} if at_rest else {}
@@ -170,6 +172,7 @@ def test_the_receiver_gives_out_at_its_own_rate_the_newest_that_has_arrived() ->
     assert all(frame.t_arrival_s - frame.t_s >= 0.06 - 1e-9 for frame in frames)
 
 
+@pytest.mark.long
 def test_blue_screens_come_by_the_seed_and_change_no_other_picture() -> None:
     plain = list(Pass().frames(25))
     blanks = list(Pass(camera_blank_rate=0.3).frames(25))

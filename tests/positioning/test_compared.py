@@ -84,6 +84,7 @@ def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None
     assert len(back.found) <= compared.MOST_FOUND
 
 
+@pytest.mark.long
 @given(st.one_of(st.binary(), st.recursive(
     st.none() | st.booleans() | st.floats() | st.text(),
     lambda inner: st.lists(inner) | st.dictionaries(

@@ -129,6 +129,7 @@ def test_the_expected_one_is_chosen_though_the_other_is_nearer(below_m: float) -
     assert all(p == pytest.approx(OWN_M, abs=0.02) for p in places if p is not None)
 
 
+@pytest.mark.long
 def test_another_s_is_refused_with_the_reason_until_the_own_comes_into_view() -> None:
     flown = flight(expected_xy_m=OWN_M)
     beyond_m = between_both(1.75)  # the own one is out of the picture
@@ -158,6 +159,7 @@ def test_a_lock_goes_on_where_the_estimate_has_drifted_out_of_the_circle() -> No
     assert place(flown.at(OWN_M, BOTH_READ_M)) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("beyond", "taken"), [(1.75, False), (1.0, True)])
 def test_a_lock_goes_over_only_where_its_own_place_is_looked_at_and_empty(
     beyond: float, taken: bool
