@@ -279,8 +279,10 @@ def test_calibrate_through_it(deck: AiDeck, tmp_path: Path) -> None:
     renderer = BoardRenderer(CAMERA, CHARUCO)
     script: list[bytes | threading.Event | Pause] = []
     for pose in draw_poses(rng, CAMERA, CHARUCO, 16):
-        image = raw(renderer.render(pose, rng))
-        script += [image, Pause(0.2), image, Pause(0.2), image, Pause(0.2)]
+        image = renderer.render(pose, rng)
+        for _ in range(3):  # held still; the same picture to the bit would be no new one
+            noise = rng.integers(0, 2, image.shape, dtype=np.uint8)
+            script += [raw(np.maximum(image, noise) - noise), Pause(0.2)]
     deck.scripts.put(script)  # and then it is gone, which ends the capture
     output = tmp_path / "mine.yaml"
     said = run("calibrate", deck.url, "--board", CHARUCO.notation(), "-o", str(output))

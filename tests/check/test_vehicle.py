@@ -91,7 +91,7 @@ FAULTS = [
     ("supervisor", "bad", "fail", "locked (supervisor 0x"),
     ("decks", "bad", "warn", "none"),
     ("positioning", "bad", "fail", "no positioning deck, and no position comes"),
-    ("ground", "bad", "fail", "places the vehicle at 0.6"),
+    ("ground", "bad", "fail", "places the vehicle at 0."),
     ("level", "bad", "fail", "pitch 20"),
     ("parameters", "bad", "warn", "stabilizer.estimator 1, profile 2"),
     ("battery", "bad", "fail", "rests at 3.5"),
