@@ -1,0 +1,17 @@
+"""Limits of a capture's section that no capture could keep."""
+
+from __future__ import annotations
+
+import pytest
+from pydantic import ValidationError
+
+from perchctl.profile.positioning import PositioningConfig
+
+
+@pytest.mark.parametrize(
+    "late", [{"rate_hz": 10.0, "latency_s": 0.06}, {"latency_s": 0.2}, {"hold_s": 0.03}]
+)
+def test_a_hold_that_each_perfect_frame_would_reach_is_refused(late: dict[str, float]) -> None:
+    with pytest.raises(ValidationError, match="a position is stale before the next one comes"):
+        PositioningConfig(by="mocap", host="lab", **late)
+    PositioningConfig(by="mocap", host="lab", **{**late, "hold_s": 0.4})
