@@ -222,11 +222,21 @@ def test_ctrl_c_in_flight_lands(tmp_path: Path) -> None:
     assert log.summary["cause"] == "operator"
 
 
+def logged_until(log: Path, phase: str) -> None:
+    """What is said at once is written by a thread of its own, a moment later."""
+    end_s = time.monotonic() + 2.0
+    pause = threading.Event()
+    while not any(span.phase == phase for span in read_log(log).phases):
+        assert time.monotonic() < end_s, f"{log}: no {phase} yet"
+        pause.wait(0.05)
+
+
 def test_kill_9_in_flight_leaves_a_log_and_a_vehicle_that_ends_by_itself(tmp_path: Path) -> None:
     """Firmware facts, "When setpoints stop": levelled 0.5 s after the last packet, cut and
     locked 2.0 s after it."""
     with vehicle(tmp_path) as own, flying_until("ALIGN", own.sim, tmp_path) as process:
         own.wait_for(lambda t: bool(t["supervisor_info"] & FLYING), 1.0)
+        logged_until(the_log(tmp_path), "ALIGN")
         before_s = own.sim.truth()["t_s"]
         process.kill()
         process.wait(FLIGHT_LIMIT_S)
