@@ -31,8 +31,9 @@ R_MARKER_TARGET: Array = np.diag([1.0, -1.0, -1.0])
 
 
 def finite(values: Array) -> bool:
-    """Whether all values are (none so great that their sum is not)."""
-    return math.isfinite(values.sum())
+    """Whether all values are (none so great that their squares' sum is not)."""
+    flat = values.ravel()
+    return math.isfinite(flat.dot(flat))
 
 
 def wrap_rad(angle_rad: float) -> float:

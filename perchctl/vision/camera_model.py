@@ -48,17 +48,22 @@ def pinhole_px(normalised: Array, camera: CameraModel) -> Array:
 
 def distort(normalised: Array, camera: CameraModel) -> Array:
     """Normalised coordinates (n, 2) to pixels (n, 2); inverse of `undistort`."""
-    rays = np.ones((len(normalised), 3))
-    rays[:, :2] = normalised
-    return project(rays, _ZERO, _ZERO, camera)
+    rays = np.ones((len(normalised), 1, 3))
+    rays[:, 0, :2] = normalised
+    return _projected(rays, _ZERO, _ZERO, camera)
 
 
 def project(points_m: Array, rvec_rad: Array, tvec_m: Array, camera: CameraModel) -> Array:
     """Points (n, 3) of a frame with pose rvec, tvec in the camera to pixels (n, 2)."""
-    if len(points_m) == 0:
-        return np.empty((0, 2))
     points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 1, 3)
-    call = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
     rvec, tvec = np.asarray(rvec_rad, float).ravel(), np.asarray(tvec_m, float).ravel()
-    image, _ = call(points, rvec, tvec, camera.K, camera.dist)
-    return np.asarray(image, dtype=np.float64).reshape(-1, 2)
+    return _projected(points, rvec, tvec, camera)
+
+
+def _projected(points: Array, rvec: Array, tvec: Array, camera: CameraModel) -> Array:
+    """`project` of points (n, 1, 3)."""
+    if len(points) == 0:
+        return np.empty((0, 2))
+    call = cv2.fisheye.projectPoints if camera.model == "fisheye" else cv2.projectPoints
+    image = np.asarray(call(points, rvec, tvec, camera.K, camera.dist)[0], dtype=np.float64)
+    return image.reshape(-1, 2)

@@ -221,11 +221,10 @@ def _level_pose(
     G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
     cov_e = G @ cov @ G.T
     # A target that is larger by a share is farther away by that share of the way to it.
-    print_m = np.empty((3, 2))
-    print_m[:, 0] = setup.size_sigma * (R_level_cam @ solution.tvec)
-    print_m[:, 1] = R_level_cam @ curl[3:]
+    print_cam = np.array([setup.size_sigma * solution.tvec, curl[3:]])
+    print_m = R_level_cam @ print_cam.T
     cov_e[:3, :3] += print_m @ print_m.T
-    variance = np.maximum(np.diagonal(cov_e), 0.0)
+    sigma = np.sqrt(np.maximum(cov_e.diagonal(), 0.0))
     return MarkerPose(
         source=source,
         t_s=t_s,
@@ -233,8 +232,8 @@ def _level_pose(
         tvec_m=solution.tvec,
         e_m=e_m,
         e_yaw_rad=yaw_of(heading),
-        sigma_m=np.sqrt(variance[:3]),
-        sigma_yaw_rad=math.sqrt(variance[3]),
+        sigma_m=sigma[:3],
+        sigma_yaw_rad=float(sigma[3]),
         reprojection_px=solution.rms_px,
         chi2=chi2,
         cov=cov_e,

@@ -52,7 +52,8 @@ class Scored(Candidate):
     @property
     def rms_px(self) -> float:
         """Over the corners."""
-        return math.sqrt(float((self.error_px * self.error_px).sum()) / len(self.error_px))
+        flat = self.error_px.ravel()
+        return math.sqrt(float(flat.dot(flat)) / len(self.error_px))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,7 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
         gain = float(step @ g)  # of the step, in squared standard deviations
         moved_px = (scored.jacobian @ step).reshape(-1, 2)
         small = gain < _SMALL_GAIN or float(np.abs(moved_px).max()) < _SMALL_MOVE_PX
-        if small and float(np.abs(step).max()) < _SMALL_STEP:
+        if small and max(map(abs, step.tolist())) < _SMALL_STEP:
             # Errors are linear in such a step.
             error_px = scored.error_px - moved_px
             rvec, tvec = scored.rvec - step[:3], scored.tvec - step[3:]

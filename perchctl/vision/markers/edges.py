@@ -18,18 +18,35 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.markers.profiles import ALONG, MIDDLES, PROFILES, STEPS, Floats
 
+
+def _single(value: float) -> Floats:
+    """A number as arrays meet it soonest: beside one of numpy's scalars they take twice as long."""
+    return np.array(value, dtype=np.float32)
+
+
 _ALONG32 = ALONG.astype(np.float32)
+_ZERO, _ONE, _TINY = _single(0.0), _single(1.0), _single(1e-9)
+_QUARTER_OF, _MINUS_HALF = _single(0.25), _single(-0.5)
+_WINDOW2, _MOST_SHARE = _single(2.25), _single(0.9)
+_LEAST_MOMENT2, _MOST_MOMENT = _single(0.01), _single(0.8)
+_PER_NEAR = _single(1.0 / 0.6)  # of the wide window's spread
+_TUKEY = _single(3.5 * 1.4826)
 _POWERS: Floats = (ALONG[:, None] ** np.arange(3)).astype(np.float32)
-_ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-9)
 _PROFILE_ONES: Floats = np.ones(PROFILES, dtype=np.float32)
 _ONES: Floats = np.ones(STEPS, dtype=np.float32)
-_LEAST_SHARE = np.float32(0.3)  # of the row's mean gradient, for a profile to count
-_WIDE_FLOOR_PX, _FLOOR_PX = 0.3, 0.05  # of the scatter that is taken for noise
+_LEAST_SHARE = _single(0.3)  # of the row's mean gradient, for a profile to count
+_TUKEY_FLOOR_PX = _single(3.5 * 0.05)  # of the scatter that is taken for noise
 _CENTRED_PX = 0.2  # a wide window that is off by less needs only one narrow round
 _SETTLED_PX = 0.06
 _ROUNDS = 3
-_LEAST_WINDOW2 = np.float32(0.81)  # square of its sigma, px^2
-_FAR = np.float32(1e6)
+_LEAST_WINDOW2 = _single(0.81)  # square of its sigma, px^2
+_FAR = _single(1e6)
+_LOST = _single(1e5)  # further off than any edge: some of the others are among them
+_QUARTER = PROFILES // 4
+_MIDDLE_MEAN: Floats = np.full(_QUARTER, 1.0 / _QUARTER, dtype=np.float32)
+# The line through values in the middles of both halves of the profiles, (2, n).
+_SLOPE: Floats = _ALONG32 * _single(0.5 / float(ALONG[PROFILES // 2 :].mean()))
+_THROUGH_HALVES: Floats = np.stack([_single(0.5) - _SLOPE, _single(0.5) + _SLOPE])
 _HIGH_LOW: Floats = np.where(np.arange(PROFILES) % 2, _FAR, -_FAR).astype(np.float32)
 
 
@@ -43,8 +60,8 @@ class Surroundings:
     """
 
     depth_px: Array
-    inside: Array
-    outside: Array
+    inside: Floats
+    outside: Floats
     possible: NDArray[np.bool_]
 
 
@@ -62,7 +79,7 @@ class Edges:
 @dataclass(frozen=True, eq=False)
 class _Gradients:
     """The profiles' gradients at places `u` (rows, steps) and what every window over them
-    needs: its reach `near`, the squares of the cells' width and of its largest sigma, the
+    needs: its reach `near`, the cells' width, the square of its largest sigma, the
     flanks with a neighbouring edge (`both`, `side`: outside less inside), the
     profiles that `can` show an edge, and `part`, which makes of a row's sum the least
     value that counts."""
@@ -70,7 +87,7 @@ class _Gradients:
     gradient: Floats
     u: Floats
     near: Floats
-    depth2: Floats
+    depth: Floats
     most2: Floats
     both: Floats
     side: Floats
@@ -96,14 +113,14 @@ def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -
     """
     gradients = _gradients(grey, half_px, near_px, around)
     seen = _wide(gradients)
-    line, weight = robust_line(seen.edge, seen.usable, _WIDE_FLOOR_PX, 2)
+    line = weight = _halves_line(seen.edge, seen.usable)
     moved_px = np.inf
     for k in range(_ROUNDS):
         if k == 1 and moved_px < _CENTRED_PX:
             continue
         seen = _narrow(gradients, line, seen.blur2)
         rounds = 2 if k == _ROUNDS - 1 else 1
-        centre, weight = robust_line(seen.edge, seen.usable, _FLOOR_PX, rounds)
+        centre, weight = _robust_line(seen.edge, seen.usable, rounds)
         moved_px, line = float(np.abs(centre - line).max()), centre
         if moved_px < _SETTLED_PX:
             break
@@ -115,30 +132,33 @@ def locate(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -
 
 
 def _gradients(grey: Floats, half_px: Array, near_px: Array, around: Surroundings) -> _Gradients:
-    inside, outside = around.inside.astype(np.float32), around.outside.astype(np.float32)
-    near = near_px.astype(np.float32)
-    can = around.possible.astype(np.float32)
+    inside, outside, can = around.inside, around.outside, around.possible.astype(np.float32)
+    near, depth = near_px.astype(np.float32), around.depth_px.astype(np.float32)
     return _Gradients(
         gradient=grey[:, :, 1:] - grey[:, :, :-1],
         u=half_px.astype(np.float32)[:, None] * MIDDLES,
         near=near,
-        depth2=(around.depth_px * around.depth_px).astype(np.float32),
-        most2=(0.25 * near * near).astype(np.float32),
+        depth=depth,
+        most2=_QUARTER_OF * near * near,
         both=inside + outside,
         side=outside - inside,
         can=can,
         # Multiplies a sum over a row's profiles: a part of the mean over those possible.
-        part=_LEAST_SHARE / np.maximum(can @ _PROFILE_ONES, _ONE),
+        part=_LEAST_SHARE / np.maximum(can.dot(_PROFILE_ONES), _ONE),
     )
 
 
 def _wide(g: _Gradients) -> _Centroids:
     """By one window around the middle of all profiles; the blur is not measured yet."""
-    window = np.exp(-0.5 * (g.u / (0.6 * g.near[:, None])) ** 2)
-    moments = np.maximum(g.gradient, _ZERO) @ np.stack([window, window * g.u], axis=2)
+    spread = g.u * (_PER_NEAR / g.near)[:, None]
+    spread *= spread
+    window = np.empty((*g.u.shape, 2), dtype=np.float32)
+    np.exp(_MINUS_HALF * spread, out=window[..., 0])
+    np.multiply(window[..., 0], g.u, out=window[..., 1])
+    moments: Floats = np.maximum(g.gradient, _ZERO) @ window
     total = moments[..., 0] * g.can
-    usable = total > ((total @ _PROFILE_ONES) * g.part)[:, None]
-    edge = moments[..., 1] / np.where(usable, total, _ONE)
+    usable = total > (total.dot(_PROFILE_ONES) * g.part)[:, None]
+    edge = np.divide(moments[..., 1], np.where(usable, total, _ONE))
     return _Centroids(edge, usable, np.ones(len(g.near), dtype=np.float32))
 
 
@@ -146,27 +166,27 @@ def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
     """By a window around the row's line (rows, n), as wide as its blur so far demands."""
     relative = g.u[:, None, :] - line[:, :, None]
     # The second moment under a Gaussian window w gives 1/m2 = 1/blur^2 + 1/w^2.
-    w2 = np.minimum(np.maximum(np.float32(2.25) * blur2, _LEAST_WINDOW2), g.most2)
+    w2 = np.minimum(np.maximum(_WINDOW2 * blur2, _LEAST_WINDOW2), g.most2)
     squared = relative * relative
-    mass = squared * (np.float32(-0.5) / w2)[:, None, None]
+    mass = squared * (_MINUS_HALF / w2)[:, None, None]
     np.exp(mass, out=mass)
     mass *= g.gradient
     total = (mass @ _ONES) * g.can
-    usable = total > np.maximum((total @ _PROFILE_ONES) * g.part, _TINY)[:, None]
+    usable = total > np.maximum(total.dot(_PROFILE_ONES) * g.part, _TINY)[:, None]
     # A neighbour seen through the window has this share, at this place, with this
     # spread; the one outside lies at the same distance on the other flank.
     wide2 = w2 + blur2
-    lost = np.exp(np.float32(-0.5) * g.depth2 / wide2)
-    place = np.sqrt(g.depth2) * w2 / wide2
-    share = np.minimum(g.both * lost[:, None], np.float32(0.9))
+    place = g.depth * w2 / wide2
+    lost = np.exp(_MINUS_HALF * g.depth * g.depth / wide2)
+    share = np.minimum(g.both * lost[:, None], _MOST_SHARE)
     total = np.where(usable, total / (_ONE - share), _ONE)
     relative *= mass
     first = relative @ _ONES + total * g.side * (lost * place)[:, None]
     mass *= squared
     second = mass @ _ONES + total * share * (place * place + w2 * blur2 / wide2)[:, None]
-    moment = (second * usable) @ _PROFILE_ONES
-    moment /= np.maximum((total * usable) @ _PROFILE_ONES, _TINY)
-    moment = np.minimum(np.maximum(moment, np.float32(0.01)), np.float32(0.8) * w2)
+    moment = (second * usable).dot(_PROFILE_ONES)
+    moment /= np.maximum((total * usable).dot(_PROFILE_ONES), _TINY)
+    moment = np.minimum(np.maximum(moment, _LEAST_MOMENT2), _MOST_MOMENT * w2)
     found2 = moment * w2 / (w2 - moment)
     # The window pulls the centroid towards its own middle: undo that.
     centroid = first / total * (_ONE + found2 / w2)[:, None]
@@ -174,28 +194,33 @@ def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
     return _Centroids(line + np.minimum(np.maximum(centroid, -limit), limit), usable, found2)
 
 
-def robust_line(
-    edge: Floats, usable: NDArray[np.bool_], floor_px: float, rounds: int
-) -> tuple[Floats, Floats]:
+def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
+    """Straight lines (rows, n) through the middles of the two halves of each row: where a
+    window is put, whatever a quarter of either half shows."""
+    halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
+    halves.sort(axis=2)
+    first = _QUARTER // 2
+    middles = halves[:, :, first : first + _QUARTER] @ _MIDDLE_MEAN
+    return np.where(np.abs(middles) < _LOST, middles, _ZERO) @ _THROUGH_HALVES
+
+
+def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
     """Straight lines edge(s) a row with Tukey's weights; returns (line, weight)."""
-    error = edge - median(edge, usable)[:, None]
-    line = weight = edge
+    line = median(edge, usable)[:, None]
     for _ in range(rounds):
-        size = np.abs(error)
-        scale = np.maximum(np.float32(1.4826) * median(size, usable), np.float32(floor_px))
-        size /= (np.float32(3.5) * scale)[:, None]
+        size = np.abs(edge - line)
+        size /= np.maximum(_TUKEY * median(size, usable), _TUKEY_FLOOR_PX)[:, None]
         size *= size
         weight = np.maximum(_ONE - size, _ZERO)
         weight *= weight
         weight *= usable
-        w = weight @ _POWERS
-        e = (weight * edge) @ _POWERS
+        w = weight.dot(_POWERS)
+        e = (weight * edge).dot(_POWERS)
         w0, w1 = np.maximum(w[:, 0], _TINY), w[:, 1]
         mean, middle = e[:, 0] / w0, w1 / w0
         slope = (e[:, 1] - mean * w1) / np.maximum(w[:, 2] - middle * w1, _TINY)
         line = slope[:, None] * (_ALONG32 - middle[:, None])
         line += mean[:, None]
-        error = edge - line
     return line, weight
 
 

@@ -24,7 +24,7 @@ from perchctl.vision.markers.pattern import (
     resembles,
 )
 from perchctl.vision.markers.seen_edges import ROOM_PX
-from perchctl.vision.markers.square import mean_side_px, nested, side_lengths_px, within
+from perchctl.vision.markers.square import mean_side_px, nested, shortest_side_px, within
 from perchctl.vision.types import MARKERS, CameraModel, EdgeShift, MarkerName
 
 _LEAST_CELL_PX = 2.5  # for lines
@@ -47,11 +47,11 @@ def follow(
         for name in MARKERS
         if name in expected
         and within(expected[name], image.shape, ROOM_PX)
-        and side_lengths_px(expected[name]).min() > _LEAST_CELL_PX * patterns[name].rim.cells
+        and shortest_side_px(expected[name]) > _LEAST_CELL_PX * patterns[name].rim.cells
     ]
     seen: dict[MarkerName, RefinedCorners] = {}
     if names:
-        raw = np.stack([expected[name] for name in names])
+        raw = np.array([expected[name] for name in names])
         fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
         for name, result in zip(names, fitted, strict=True):
             if (

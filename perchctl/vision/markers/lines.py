@@ -147,34 +147,36 @@ def _refined_once(
         return nothing
     corners_px = distort(corners.reshape(-1, 2), camera).reshape(raw_px.shape)
     accepted = _accepted(markers, sides, fit, corners_px)
-    ends2 = _ends_px2(markers, sides, fit)
-    sigma_px = _sigma_px(markers, sides, ends2, clipped)
-    row_px = _row_px(fit, ends2)
-    return [
-        RefinedCorners(
+    ends_px2 = _ends_px2(markers, sides, fit).tolist()
+    blurs_px, normals_x = sides.blur_px.tolist(), fit.lines[:, 0].tolist()
+    found = nothing
+    for i, rim in enumerate(rims):
+        if not accepted[i]:
+            continue
+        four = slice(4 * i, 4 * i + 4)
+        ends, blurs = ends_px2[four], blurs_px[four]
+        cell_px, blur_px = float(markers.cell_px[i]), sum(blurs) / 4.0
+        found[i] = RefinedCorners(
             corners_px=corners_px[i],
-            sigma_px=float(sigma_px[i]),
+            sigma_px=_sigma_px(cell_px, blur_px, sum(ends) / 4.0, bool(clipped[i]), rim.tolerance),
             refined=True,
             shift_sigma_px=applied.sigma_px,
-            blur_px=float(sides.blur_px[4 * i : 4 * i + 4].max()),
+            blur_px=max(blurs),
             edge_shift=shift,
-            row_sigma_px=float(row_px[i]),
-            least_blur_px=float(sides.blur_px[4 * i : 4 * i + 4].min()),
+            row_sigma_px=_row_px(normals_x[four], ends),
+            least_blur_px=min(blurs),
         )
-        if accepted[i]
-        else None
-        for i in range(len(raw_px))
-    ]
+    return found
 
 
 def _fit_lines(markers: Markers, sides: Samples) -> _Lines:
     """Total least squares on the points of each side."""
-    w = sides.weight / np.maximum(sides.weight @ _ONES, 1e-9)[:, None]
+    w = sides.weight / np.maximum(sides.weight.dot(_ONES), 1e-9)[:, None]
     x, y = sides.points[..., 0], sides.points[..., 1]
-    cx, cy = (w * x) @ _ONES, (w * y) @ _ONES
+    cx, cy = (w * x).dot(_ONES), (w * y).dot(_ONES)
     dx, dy = x - cx[:, None], y - cy[:, None]
     wx = w * dx
-    sxx, sxy, syy = (wx * dx) @ _ONES, (wx * dy) @ _ONES, (w * dy * dy) @ _ONES
+    sxx, sxy, syy = (wx * dx).dot(_ONES), (wx * dy).dot(_ONES), (w * dy * dy).dot(_ONES)
     direction = 0.5 * np.arctan2(2.0 * sxy, sxx - syy)
     nx, ny = -np.sin(direction), np.cos(direction)
     residual2 = nx * nx * sxx + 2.0 * nx * ny * sxy + ny * ny * syy
@@ -256,26 +258,31 @@ def _outwards(markers: Markers, fit: _Lines) -> Array:
     return np.asarray(np.sign(fit.lines[:, 0] * out[:, 0] + fit.lines[:, 1] * out[:, 1]))
 
 
-def _accepted(
-    markers: Markers, sides: Samples, fit: _Lines, corners_px: Array
-) -> NDArray[np.bool_]:
+def _accepted(markers: Markers, sides: Samples, fit: _Lines, corners_px: Array) -> list[bool]:
     """Which of the m markers have lines for sides, near to where they were expected."""
-    inliers = (sides.weight > 0.0) @ _ONES32
+    inliers = (sides.weight > 0.0).dot(_ONES32)
     # Half a cell to both sides, but not beyond the samples: dark inside, white outside.
-    contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]) @ _ONES32 / PROFILES
-    good = (
-        (fit.residual_px < _MAX_RESIDUAL_PX)
-        & (inliers >= _MIN_INLIERS * PROFILES)
-        & (contrast > _MIN_CONTRAST)
-        & (sides.blur_px < 0.9 * sides.near_px)
-    ).reshape(-1, 4)
-    moved = corners_px - markers.raw_px
-    moved_px = np.sqrt((moved * moved).sum(axis=2).max(axis=1))
-    return np.asarray(
-        good.all(axis=1)
-        & (moved_px < np.maximum(1.6, 0.6 * markers.cell_px))  # False for NaN
-        & (markers.cell_px > _MIN_CELL_PX)
-    )
+    contrast = np.abs(sides.grey[:, :, -3] - sides.grey[:, :, 2]).dot(_ONES32)
+    sharp = sides.blur_px < 0.9 * sides.near_px
+    good = [
+        residual < _MAX_RESIDUAL_PX
+        and count >= _MIN_INLIERS * PROFILES
+        and grey > _MIN_CONTRAST * PROFILES
+        and is_sharp
+        for residual, count, grey, is_sharp in zip(
+            fit.residual_px.tolist(), inliers.tolist(), contrast.tolist(), sharp.tolist(),
+            strict=True,
+        )
+    ]  # fmt: skip
+    return [
+        cell_px > _MIN_CELL_PX
+        and all(good[4 * i : 4 * i + 4])
+        # False for NaN.
+        and all(math.dist(a, b) < max(1.6, 0.6 * cell_px) for a, b in zip(*both, strict=True))
+        for i, (cell_px, *both) in enumerate(
+            zip(markers.cell_px.tolist(), corners_px.tolist(), markers.raw_px.tolist(), strict=True)
+        )
+    ]
 
 
 def _clipped(sides: Samples) -> Array:
@@ -288,36 +295,39 @@ def _clipped(sides: Samples) -> Array:
 
 
 def _ends_px2(markers: Markers, sides: Samples, fit: _Lines) -> Array:
-    """Variance of the ends of the sides of the m markers, (m, 4): a line fitted to n samples
-    spreads twice as far there as in its middle."""
-    independent = np.maximum(np.minimum(sides.weight @ _ONES, markers.sides_px.ravel()), 4.0)
-    return (_TAILS * 4.0 * fit.residual_px * fit.residual_px / independent).reshape(-1, 4)
+    """Variance of the ends of the sides, (4m,): a line fitted to n samples spreads twice as far
+    there as in its middle."""
+    independent = np.maximum(np.minimum(sides.weight.dot(_ONES), markers.sides_px.ravel()), 4.0)
+    residual_px = fit.residual_px
+    return np.asarray(4.0 * _TAILS * residual_px * residual_px / independent)
 
 
 def _sigma_px(
-    markers: Markers, sides: Samples, ends_px2: Array, clipped: NDArray[np.bool_]
-) -> Array:
-    """Spread of the corners of the m markers."""
-    cell_px = markers.cell_px
-    blur_px = np.maximum(sides.blur_px.reshape(-1, 4) @ _QUARTERS, 1e-3)
-    noise2 = np.maximum(ends_px2 @ _QUARTERS, MIN_LINE_SIGMA_PX**2)
+    cell_px: float, blur_px: float, noise_px2: float, clipped: bool, tolerance: float
+) -> float:
+    """Spread of a marker's corners; `noise_px2` is the variance of its sides' ends, and
+    `tolerance` that of the print, in cells."""
+    blur_px = max(blur_px, 1e-3)
     # Cells of few pixels let the inner pattern's blur reach the border's edge.
-    bend_px = _BEND * blur_px * np.exp(-cell_px / (_BEND_BLURS * blur_px))
+    bend_px = _BEND * blur_px * math.exp(-cell_px / (_BEND_BLURS * blur_px))
     reach_px = _REACH * blur_px**3
-    clipped_px = np.where(clipped, CLIPPED_SIGMA_PX, 0.0)
+    clipped_px = CLIPPED_SIGMA_PX if clipped else 0.0
     # Edges are not where they were meant to be printed.
-    print_px = np.array([rim.tolerance for rim in markers.rims]) * cell_px
-    return np.asarray(np.sqrt(noise2 + bend_px**2 + reach_px**2 + clipped_px**2 + print_px**2))
+    print_px = tolerance * cell_px
+    noise_px = max(math.sqrt(noise_px2), MIN_LINE_SIGMA_PX)
+    return math.hypot(noise_px, bend_px, reach_px, clipped_px, print_px)
 
 
-def _row_px(fit: _Lines, ends_px2: Array) -> Array:
-    """Spread of the corners of the m markers by what shakes a picture's rows, each along
-    itself: it moves upright sides, both of a marker's alike, and lying ones not. As the
-    sides' residuals show it; 0 where the marker stands on a corner and nothing shows."""
-    upright = (fit.lines[:, 0] ** 2).reshape(-1, 4)
-    off = upright - (upright @ _QUARTERS)[:, None]
-    aspect = (off * off) @ _QUARTERS
-    slope = ((ends_px2 * off) @ _QUARTERS) / np.maximum(aspect, 1e-9)
-    still = ends_px2 @ _QUARTERS - slope * (upright @ _QUARTERS)
-    shaken = (aspect > _LEAST_ASPECT) & (slope > (_LEAST_ROWS - 1.0) * np.maximum(still, 0.0))
-    return np.asarray(np.sqrt(np.where(shaken, np.maximum(slope, 0.0), 0.0)))
+def _row_px(normals_x: Sequence[float], ends_px2: Sequence[float]) -> float:
+    """Spread of a marker's corners by what shakes a picture's rows, each along itself: it moves
+    upright sides, both of a marker's alike, and lying ones not. As the residuals of its four
+    sides show it; 0 where the marker stands on a corner and nothing shows."""
+    upright = [x * x for x in normals_x]
+    mean = sum(upright) / 4.0
+    aspect = sum((each - mean) ** 2 for each in upright) / 4.0
+    if aspect <= _LEAST_ASPECT:
+        return 0.0
+    both = zip(ends_px2, upright, strict=True)
+    slope = sum(end * (each - mean) for end, each in both) / 4.0 / aspect
+    still = sum(ends_px2) / 4.0 - slope * mean
+    return math.sqrt(slope) if slope > (_LEAST_ROWS - 1.0) * max(still, 0.0) else 0.0

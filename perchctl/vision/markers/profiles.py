@@ -21,12 +21,16 @@ Floats = NDArray[np.float32]
 
 ALONG: Array = np.linspace(-1.0, 1.0, PROFILES)  # a side, between its margins
 _OFFSETS: Floats = np.linspace(-1.0, 1.0, STEPS + 1).astype(np.float32)
+_ALONG_PROFILE: Floats = np.stack([np.ones_like(_OFFSETS), _OFFSETS])
 MIDDLES: Floats = (_OFFSETS[1:] + _OFFSETS[:-1]) * np.float32(0.5)  # of the gradients
 # Values and slopes at the profiles from a polynomial through the nodes.
 _NODES: Array = np.array([-1.0, -0.7, 0.0, 0.7, 1.0])
 _INVERSE: Array = np.linalg.inv(_NODES[:, None] ** np.arange(5.0))
 _VALUES: Array = (ALONG[:, None] ** np.arange(5)) @ _INVERSE
 _SLOPES: Array = (np.arange(1, 5) * ALONG[:, None] ** np.arange(4)) @ _INVERSE[1:]
+
+
+_TO_THE_LEFT = np.array(-1j)
 
 
 def places(lengths_px: Array) -> Array:
@@ -52,13 +56,10 @@ def side_profiles(starts: Array, ends: Array, s: Array, camera: CameraModel) -> 
     points = starts[:, None] + at * (ends - starts)[:, None]
     nodes = distort(points.reshape(-1, 2), camera).reshape(points.shape)
     origin = np.matmul(_VALUES, nodes)
-    tangent = np.matmul(_SLOPES, nodes)
-    tx, ty = tangent[..., 0], tangent[..., 1]
-    length = np.maximum(np.sqrt(tx * tx + ty * ty), 1e-12)
-    normal = np.empty_like(tangent)
-    np.divide(ty, length, out=normal[..., 0])
-    np.divide(tx, -length, out=normal[..., 1])
-    return origin, normal
+    # As complex numbers x + iy a quarter turn is one product.
+    tangent = np.matmul(_SLOPES, nodes).view(np.complex128)
+    normal = tangent * (_TO_THE_LEFT / np.maximum(np.abs(tangent), 1e-12))
+    return origin, normal.view(np.float64)
 
 
 def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Array) -> Floats:
@@ -76,14 +77,12 @@ def sample(image: NDArray[np.uint8], origin: Array, normal: Array, half_px: Arra
     right, bottom = min(int(x1 + reach) + 1, w), min(int(y1 + reach) + 1, h)
     right, bottom = max(right, left + 2), max(bottom, top + 2)
     patch = image[top:bottom, left:right].astype(np.float32)
-    at = (origin - (left, top)).astype(np.float32)
-    way = (normal * half_px[:, None, None]).astype(np.float32)
     rows, n = origin.shape[:2]
-    x = way[:, :, 0, None] * _OFFSETS
-    x += at[:, :, 0, None]
-    y = way[:, :, 1, None] * _OFFSETS
-    y += at[:, :, 1, None]
-    shape = (rows, n * (STEPS + 1))
-    grey = cv2.remap(patch, x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR,
-                     borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    lines = np.empty((2, rows, n, 2), dtype=np.float32)  # of x and y: where, and which way
+    np.subtract(origin[..., 0], left, out=lines[0, ..., 0], casting="same_kind")
+    np.subtract(origin[..., 1], top, out=lines[1, ..., 0], casting="same_kind")
+    np.multiply(normal[..., 0], half_px[:, None], out=lines[0, ..., 1], casting="same_kind")
+    np.multiply(normal[..., 1], half_px[:, None], out=lines[1, ..., 1], casting="same_kind")
+    x, y = (lines.reshape(-1, 2) @ _ALONG_PROFILE).reshape(2, rows, n * (STEPS + 1))
+    grey = cv2.remap(patch, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(grey, dtype=np.float32).reshape(rows, n, STEPS + 1)

@@ -152,8 +152,8 @@ def _rows(H: Array, pattern: Pattern, camera: CameraModel) -> _Rows | None:
 def _surroundings(s: Array, pattern: Pattern, depth_px: Array) -> Surroundings:
     """Which profiles at places `s` (rows, n) have a neighbouring edge, and which have one."""
     rim, four = pattern.rim, np.arange(4)[:, None]
-    inside, outside = np.zeros_like(s), np.zeros_like(s)
-    possible = np.ones(s.shape, dtype=np.bool_)
+    inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
+    possible = np.ones(s.shape, np.bool_)
     inside[:4] = rim.white[four, (s[:4] * rim.cells).astype(np.intp)]
     if len(s) > 4:
         along = 1.0 + s[4:] * (rim.cells - 2)  # in cells from the border's corner

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +78,7 @@ def known_from(earlier: EdgeShift | None) -> EdgeShift | None:
     light, lens and ink change slowly."""
     if earlier is None or earlier.age + 1 >= _PICTURES:
         return None
-    return replace(earlier, age=earlier.age + 1)
+    return EdgeShift(earlier.shift_px, earlier.sigma_px, earlier.age + 1)
 
 
 def _mean_of_sides(

@@ -94,7 +94,8 @@ def markers_of(raw_px: Array, rims: Sequence[Rim], camera: CameraModel) -> Marke
     cells = np.array([rim.cells for rim in rims], dtype=np.float64)
     corners = undistort(raw_px.reshape(-1, 2), camera).reshape(raw_px.shape)
     turn = np.sign(doubled_area(raw_px))
-    if not (finite(corners) and turn.all() and sides_px.min() > 1e-6):
+    is_square = turn.all() and sides_px.min() > 1e-6
+    if not (is_square and finite(corners)):
         return None
     along = corners.take(NEXT, axis=1) - corners
     across_px = sides_px.take(BEFORE, axis=1) + sides_px.take(NEXT, axis=1)
@@ -176,8 +177,8 @@ def measure(
 
 def _surroundings(s: Array, rims: Sequence[Rim], rows: _Rows) -> Surroundings:
     """Which profiles at places `s` have a neighbouring edge, and which have an edge."""
-    inside, outside = np.zeros_like(s), np.zeros_like(s)
-    possible = np.ones(s.shape, dtype=np.bool_)
+    inside, outside = np.zeros(s.shape, np.float32), np.zeros(s.shape, np.float32)
+    possible = np.ones(s.shape, np.bool_)
     for i, rim in enumerate(rims):
         four = slice(4 * i, 4 * i + 4)
         inside[four] = rim.white[_SIDES, (s[four] * rim.cells).astype(np.intp)]

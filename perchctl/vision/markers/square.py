@@ -6,6 +6,7 @@ The unit square is a marker in its own coordinates: corners at (-1, -1), (1, -1)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import cv2
@@ -60,7 +61,14 @@ def side_lengths_px(corners_px: Array) -> Array:
 
 def mean_side_px(corners_px: Array) -> float:
     """Mean length of the sides of one square (4, 2)."""
-    return float(side_lengths_px(corners_px).sum()) / 4.0
+    a, b, c, d = corners_px.tolist()
+    return (math.dist(a, b) + math.dist(b, c) + math.dist(c, d) + math.dist(d, a)) / 4.0
+
+
+def shortest_side_px(corners_px: Array) -> float:
+    """Of the sides of one square (4, 2); NaN where a corner is."""
+    a, b, c, d = corners_px.tolist()
+    return min(math.dist(a, b), math.dist(b, c), math.dist(c, d), math.dist(d, a))
 
 
 def doubled_area(corners: Array) -> Array:

@@ -193,5 +193,6 @@ def test_none_leaves_the_corners_alone_and_both_markers_go_together() -> None:
     together = refine(image, raw, [RIMS[6], RIMS[7]], CAMERA, "line")
     alone = [refine(image, raw[i : i + 1], [RIMS[6 + i]], CAMERA, "line")[0] for i in (0, 1)]
     for a, b in zip(together, alone, strict=True):
-        assert np.allclose(a.corners_px, b.corners_px, atol=1e-6)
+        # All sides take as many rounds as the one that needs most.
+        assert np.abs(a.corners_px - b.corners_px).max() < 0.03
     assert refine(image, np.empty((0, 4, 2)), [], CAMERA, "line") == []

@@ -89,7 +89,7 @@ def test_corners_out_of_sight_are_claimed_to_be_known_less() -> None:
     assert found.cov_px2 is not None
     spread = np.sqrt(np.diagonal(found.cov_px2).reshape(4, 2).sum(axis=1))
     gone = int(corners("large", pose)[:, 0].argmin())
-    assert spread[gone] > 1.5 * np.delete(spread, gone).min()
+    assert spread[gone] > 1.1 * np.delete(spread, gone).max()
 
 
 @pytest.mark.parametrize("share", [0.02, 0.04, 0.25, 0.4])
