@@ -28,7 +28,7 @@ def moved_by(lift: Array, rvec: Array, jacobian: Array) -> Array:
     tvec) moves them by `jacobian` (2n, 6)."""
     normal_cam = cv2.Rodrigues(rvec)[0][:, 2]
     # A corner out of the sheet's plane is where a target moved along its normal would have it.
-    moved: Array = (jacobian[:, 3:] @ normal_cam)[:, None] * lift
+    moved: Array = jacobian[:, 3:].dot(normal_cam)[:, None] * lift
     return moved
 
 

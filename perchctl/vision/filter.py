@@ -221,9 +221,9 @@ def step_track(
     F, Q = transition(dt_s), process_noise(dt_s, track.x[POSITION], setup)
     x, P = predict(track.x, track.P, F=F, Q=Q)
     x, P, gain = _updated(x, P, measured.z, setup.R if measured.R is None else measured.R)
-    bias = F @ track.bias
+    bias = F.dot(track.bias)
     if measured.bias is not None:
-        bias += gain @ (measured.bias - bias[MEASURED])
+        bias += gain.dot(measured.bias - bias[MEASURED])
     return MarkerTrack(t_s=t_s, x=x, P=P, unseen=0, bias=bias)
 
 
@@ -238,11 +238,11 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
     if not regular:  # no covariance: it tells nothing
         return x, P, np.zeros((8, 4))
     gain = np.asarray(solved.T, dtype=np.float64)
-    x = x + gain @ off
+    x = x + gain.dot(off)
     x[YAW] = wrap_rad(float(x[YAW]))
     left = _STILL.copy()
     left[:, MEASURED] -= gain
-    return x, left @ P @ left.T + gain @ R @ gain.T, gain
+    return x, left.dot(P).dot(left.T) + gain.dot(R).dot(gain.T), gain
 
 
 def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:

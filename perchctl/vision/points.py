@@ -21,11 +21,13 @@ from perchctl.geometry import Array
 from perchctl.vision.types import Detection
 
 _EACH = np.eye(8)
+_TILT = np.array(1.0 / math.sqrt(3.0))
 _BEFORE = np.array([3, 0, 1, 2])
 _START = np.arange(4)  # side k runs from corner k ...
 _END = np.array([1, 2, 3, 0])  # ... to corner k + 1
 _ROWS = np.concatenate([2 * np.tile(_START, 4), 2 * np.tile(_START, 4) + 1])
 _COLUMNS = np.concatenate([2 * _START, 2 * _START + 1, 2 * _END, 2 * _END + 1] * 2)
+_SIDES = 8 * _ROWS + _COLUMNS  # in an (8, 8) matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +59,6 @@ def make_points(
     W, shift = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 + 2 * m))
     corners_px = image_px.reshape(m, 4, 2)
     normals = _outward_normals(corners_px)
-    sigma_px = np.array([d.sigma_px for d in detections])
     # A corner moves a pixel along the normals of both of its sides.
     moved = (normals + normals.take(_BEFORE, axis=1)).reshape(m, 8)
     for i, d in enumerate(detections):
@@ -67,7 +68,9 @@ def make_points(
             W[rows, rows] = _whitened(d.cov_px2)
         elif d.refined:
             spread_px = d.sigma_px if d.lying_sigma_px == 0.0 else _lying_px(d, corners)
-            W[_ROWS + 8 * i, _COLUMNS + 8 * i] = _of_lines(normals[i], spread_px)
+            own = np.zeros(64)
+            own[_SIDES] = _of_lines(normals[i], spread_px)
+            W[rows, rows] = own.reshape(8, 8)
         else:
             W[rows, rows] = _EACH / d.sigma_px
         if d.common_px is not None:
@@ -79,7 +82,8 @@ def make_points(
             along_x = slice(8 * i, 8 * i + 8, 2)
             shift[along_x, 2 + 2 * i] = 0.5 * d.row_sigma_px
             shift[along_x, 3 + 2 * i] = 0.5 * math.sqrt(3.0) * d.row_sigma_px * down
-    return Points(object_m, image_px, sigma_px.repeat(4), W, W @ shift, K, lift)
+    sigma_px = np.array([d.sigma_px for d in detections]).repeat(4)
+    return Points(object_m, image_px, sigma_px, W, W.dot(shift), K, lift)
 
 
 def _outward_normals(corners: Array) -> Array:
@@ -113,7 +117,7 @@ def _lying_px(d: Detection, corners: Array) -> Array:
 
 def _of_lines(normals: Array, sigma_px: float | Array) -> Array:
     """Whitening of the corners of four fitted lines with normals (4, 2), by the offset and the
-    tilt of each, at `_ROWS` and `_COLUMNS`; `sigma_px` of all or of each, (4,)."""
+    tilt of each, at `_SIDES`; `sigma_px` of all or of each, (4,)."""
     across = (normals.T / sigma_px).ravel()
-    tilt = across / math.sqrt(3.0)
+    tilt = across * _TILT
     return np.concatenate([across, across, -tilt, tilt])

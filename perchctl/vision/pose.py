@@ -138,7 +138,7 @@ def estimate_pose(
         return None
     R_level_body = level_rotation(attitude)
     if attitude is not None:
-        R_level_cam = R_level_body @ setup.T_body_cam[:3, :3]
+        R_level_cam = R_level_body.dot(setup.T_body_cam[:3, :3])
         prior = TiltPrior(-R_level_cam[2], _ATTITUDE_TILT_RAD)
     else:
         prior = TiltPrior(previous_normal_cam, _PREVIOUS_TILT_RAD)
@@ -211,19 +211,19 @@ def _level_pose(
 ) -> MarkerPose:
     """The solution, relative to the gear in the level frame, with its covariance there."""
     R_body_cam, t_body_cam_m = setup.T_body_cam[:3, :3], setup.T_body_cam[:3, 3]
-    R_level_cam = R_level_body @ R_body_cam
+    R_level_cam = R_level_body.dot(R_body_cam)
     R, dR = (np.asarray(m, dtype=np.float64) for m in cv2.Rodrigues(solution.rvec))
     cov, chi2, curl = covariance(points, solution)
-    e_m = R_level_body @ (R_body_cam @ solution.tvec + t_body_cam_m - setup.gear_body_m)
-    heading = R_level_cam @ R @ R_MARKER_TARGET
+    e_m = R_level_body.dot(R_body_cam.dot(solution.tvec) + t_body_cam_m - setup.gear_body_m)
+    heading = R_level_cam.dot(R).dot(R_MARKER_TARGET)
     G = np.zeros((4, 6))  # change of (e, e_yaw) with (rvec, tvec)
     G[:3, 3:] = R_level_cam
     G[3, :3] = _yaw_gradient(R_level_cam, heading, dR)
-    cov_e = G @ cov @ G.T
+    cov_e = G.dot(cov).dot(G.T)
     # A target that is larger by a share is farther away by that share of the way to it.
     print_cam = np.array([setup.size_sigma * solution.tvec, curl[3:]])
-    print_m = R_level_cam @ print_cam.T
-    cov_e[:3, :3] += print_m @ print_m.T
+    print_m = R_level_cam.dot(print_cam.T)
+    cov_e[:3, :3] += print_m.dot(print_m.T)
     sigma = np.sqrt(np.maximum(cov_e.diagonal(), 0.0))
     return MarkerPose(
         source=source,
@@ -258,6 +258,6 @@ def normal_cam(pose: MarkerPose) -> Array:
 def _yaw_gradient(R_level_cam: Array, heading: Array, dR: Array) -> Array:
     """Change of atan2(h[1, 0], h[0, 0]) with rvec through ``dR/drvec`` (3, 9); the
     target's x axis is the marker's. (3,)"""
-    dx = dR.reshape(3, 3, 3)[:, :, 0] @ R_level_cam.T  # (rvec component, level axis)
+    dx = dR.reshape(3, 3, 3)[:, :, 0].dot(R_level_cam.T)  # (rvec component, level axis)
     hx, hy = float(heading[0, 0]), float(heading[1, 0])
     return np.asarray((hx * dx[:, 1] - hy * dx[:, 0]) / max(hx * hx + hy * hy, 1e-12))

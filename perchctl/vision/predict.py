@@ -29,11 +29,11 @@ def expected_corners(
         return None, Candidate(pose.rvec_rad, pose.tvec_m)
     R_then, t_then = _world_cam(then, setup)
     R_now, t_now = _world_cam(attitude, setup)
-    R = R_now.T @ R_then
-    tvec = R @ pose.tvec_m + R_now.T @ (t_then - t_now)
+    R = R_now.T.dot(R_then)
+    tvec = R.dot(pose.tvec_m) + R_now.T.dot(t_then - t_now)
     if tvec[2] <= 0.0:
         return None, None
-    rvec = rotation_vector(R @ rotation_matrix(pose.rvec_rad))
+    rvec = rotation_vector(R.dot(rotation_matrix(pose.rvec_rad)))
     corners = project(setup.all_points, rvec, tvec, setup.camera)
     moved = Candidate(rvec, tvec)
     if not finite(corners):
@@ -54,5 +54,5 @@ def is_in_view(place_m: Array, attitude: Attitude, setup: PoseSetup) -> bool:
 
 def _world_cam(attitude: Attitude, setup: PoseSetup) -> tuple[Array, Array]:
     """Rotation (3, 3) and place (3,) of the camera in the world."""
-    R_world_body, T_body_cam = attitude.R_world_body, setup.T_body_cam
-    return R_world_body @ T_body_cam[:3, :3], R_world_body @ T_body_cam[:3, 3] + attitude.position_m
+    R, T_body_cam = attitude.R_world_body, setup.T_body_cam
+    return R.dot(T_body_cam[:3, :3]), R.dot(T_body_cam[:3, 3]) + attitude.position_m

@@ -100,22 +100,22 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
     W = points.whitening
     for _ in range(_MAX_STEPS):
         scored = _scored(candidate, points)
-        A, error = W @ scored.jacobian, W @ scored.error_px.ravel()
+        A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
         B, weighed = A, error
         if points.curled:
             weight = weight_with(_curl(points, scored))
             B, weighed = weight @ A, weight @ error
-        cost = float(error @ weighed)
+        cost = float(error.dot(weighed))
         if cost > before * (1.0 + 1e-6) + 1e-9 or not math.isfinite(cost):
             return None
-        g = B.T @ error
+        g = B.T.dot(error)
         # OpenCV's is three times as fast on matrices of this size.
-        regular, solved = cv2.solve(B.T @ A, g[:, None], flags=cv2.DECOMP_CHOLESKY)
+        regular, solved = cv2.solve(B.T.dot(A), g[:, None], flags=cv2.DECOMP_CHOLESKY)
         if not regular:
             return None
         step = solved[:, 0]
-        gain = float(step @ g)  # of the step, in squared standard deviations
-        moved_px = (scored.jacobian @ step).reshape(-1, 2)
+        gain = float(step.dot(g))  # of the step, in squared standard deviations
+        moved_px = scored.jacobian.dot(step).reshape(-1, 2)
         small = gain < _SMALL_GAIN or float(np.abs(moved_px).max()) < _SMALL_MOVE_PX
         if small and max(map(abs, step.tolist())) < _SMALL_STEP:
             # Errors are linear in such a step.
@@ -137,21 +137,22 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
     The covariance is that of the corners' noise, grown as far as the residuals show that they
     spread more than they claim, and what common shifts do to the pose, and a twist; not the curl.
     """
-    A, error = points.whitening @ scored.jacobian, points.whitening @ scored.error_px.ravel()
+    W = points.whitening
+    A, error = W.dot(scored.jacobian), W.dot(scored.error_px.ravel())
     freedom = len(error) - 6
     curl = _curl(points, scored)
     weight = weight_with(curl) if points.curled else None
     B, weighed = (A, error) if weight is None else (weight @ A, weight @ error)
-    regular, inverse = cv2.invert(B.T @ A, flags=cv2.DECOMP_CHOLESKY)
+    regular, inverse = cv2.invert(B.T.dot(A), flags=cv2.DECOMP_CHOLESKY)
     if not regular:
         return np.full((6, 6), np.inf), math.inf, np.zeros(6)
-    gain = inverse @ B.T
-    chi2 = float(error @ weighed)
+    gain = inverse.dot(B.T)
+    chi2 = float(error.dot(weighed))
     growth = max((_TRUST + chi2) / (_TRUST + freedom), 0.7)
-    common = gain @ points.shift
+    common = gain.dot(points.shift)
     noise = inverse if weight is None else gain @ gain.T
-    cov = noise * growth + common @ common.T
-    curled, twisted = (gain @ curl).T
+    cov = noise * growth + common.dot(common.T)
+    curled, twisted = gain.dot(curl).T
     if weight is not None:
         cov += np.multiply.outer(twisted, twisted)
     return cov, chi2 / freedom, curled
@@ -159,7 +160,7 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
 
 def _curl(points: Points, scored: Scored) -> Array:
     lift = np.zeros((len(points.whitening), 2)) if points.lift is None else points.lift
-    return points.whitening @ moved_by(lift, scored.rvec, scored.jacobian)
+    return points.whitening.dot(moved_by(lift, scored.rvec, scored.jacobian))
 
 
 def mirror_solution(rvec: Array, tvec: Array) -> Array | None:
