@@ -12,6 +12,7 @@ import numpy as np
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
 from perchctl.log.fields import FIELDS
+from perchctl.log.foreign import why_no_log
 from perchctl.log.jsonl import decode
 from perchctl.log.write import FORMAT, SCHEMA_VERSION
 
@@ -136,15 +137,16 @@ def _lines(path: Path) -> list[bytes]:
 
 def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
     if not lines:
-        raise InvalidValue(f"{path}: line 1: the file is empty, a flight log begins with a header")
+        raise InvalidValue(
+            f"{path}: line 1: the file is empty: nothing was recorded, or it was lost in copying"
+        )
     try:
         header = decode(lines[0])
     except ValueError:
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
         raise InvalidValue(
-            f"{path}: line 1: not a flight log of perchctl (its header is missing); logs are "
-            f"the .jsonl files in the profile's log.directory"
+            f"{path}: line 1: not a flight log of perchctl: {why_no_log(path, lines[0])}"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
