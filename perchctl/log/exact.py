@@ -30,26 +30,10 @@ def to_exact(value: Any) -> Any:
 
     Raises TypeError for what has no exact form.
     """
-    match value:
-        case None | bool() | str():
-            return value if not isinstance(value, Enum) else value.value
-        case Enum():
-            return to_exact(value.value)
-        case np.ndarray() | np.generic() if not isinstance(value, float):
-            return _array_to(value)
-        case float():
-            return _float_to(float(value))
-        case int():
-            return value
-        case dict():
-            if all(type(key) is str for key in value):
-                return {key: to_exact(v) for key, v in value.items()}
-            return [[to_exact(key), to_exact(v)] for key, v in value.items()]
-        case list() | tuple():
-            return [to_exact(v) for v in value]
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _fields_to(value)
-    raise TypeError(f"{type(value).__name__} has no exact form in a flight log")
+    write = _WRITERS.get(type(value))
+    if write is None:
+        write = _WRITERS[type(value)] = _writer_for(type(value))
+    return write(value)
 
 
 def from_exact(kind: type[T], data: Any) -> T:
@@ -63,13 +47,28 @@ def from_exact(kind: type[T], data: Any) -> T:
 # --- out ----------------------------------------------------------------------------
 
 
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
 def _float_to(value: float) -> float | str:
+    value = float(value)
     return value if math.isfinite(value) else repr(value)
+
+
+def _list_to(value: Any) -> list[Any]:
+    return [to_exact(v) for v in value]
+
+
+def _dict_to(value: dict[Any, Any]) -> Any:
+    if all(type(key) is str for key in value):
+        return {key: to_exact(v) for key, v in value.items()}
+    return [[to_exact(key), to_exact(v)] for key, v in value.items()]
 
 
 def _array_to(array: Any) -> Any:
     array = np.asarray(array)
-    flat = [to_exact(v) for v in array.ravel().tolist()]
+    flat = _list_to(array.ravel().tolist())
     if array.dtype == np.float64 and array.ndim == 1:
         return flat
     if array.dtype.kind not in "fiub":
@@ -77,29 +76,54 @@ def _array_to(array: Any) -> Any:
     return {"dtype": array.dtype.str, "shape": list(array.shape), "data": flat}
 
 
-def _fields_to(value: Any) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    kind: Any = type(value)
-    for name, left_out, named in _written(kind):
-        part = getattr(value, name)
-        if part is None and left_out:
-            continue
-        exact = to_exact(part)
-        found[name] = [type(part).__name__, exact] if named and part is not None else exact
-    return found
-
-
-@cache
-def _written(kind: Any) -> tuple[tuple[str, bool, bool], ...]:
-    """Of each field: its name, whether None is left out, whether its class has to be named."""
+def _fields_writer(kind: Any) -> _Plan:
     hints = typing.get_type_hints(kind)
-    return tuple(
+    plan = [
         (field.name, field.default is None, len(_classes_in(hints[field.name])) > 1)
         for field in dataclasses.fields(kind)
-    )
+    ]
+
+    def write(value: Any) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name, left_out, named in plan:
+            part = getattr(value, name)
+            if part is None:
+                if not left_out:
+                    found[name] = None
+            else:
+                exact = to_exact(part)
+                found[name] = [type(part).__name__, exact] if named else exact
+        return found
+
+    return write
+
+
+_WRITERS: dict[type, _Plan] = {
+    type(None): _as_it_is,
+    bool: _as_it_is,
+    int: _as_it_is,
+    str: _as_it_is,
+    float: _float_to,
+    np.float64: _float_to,
+    np.ndarray: _array_to,
+    list: _list_to,
+    tuple: _list_to,
+    dict: _dict_to,
+}
+
+
+def _writer_for(kind: Any) -> _Plan:
+    if issubclass(kind, Enum):
+        return lambda value: to_exact(value.value)
+    if dataclasses.is_dataclass(kind):
+        return _fields_writer(kind)
+    if issubclass(kind, np.generic):
+        return _array_to
+    raise TypeError(f"{kind.__name__} has no exact form in a flight log")
 
 
 def _classes_in(hint: Any) -> list[Any]:
+    """The dataclasses that a field may hold."""
     return [part for part in _members(hint) if dataclasses.is_dataclass(part)]
 
 
