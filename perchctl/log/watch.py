@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,6 +15,7 @@ from perchctl.log.read import PhaseSpan
 from perchctl.log.recording import SUFFIX, recording_of
 from perchctl.log.summary import FlightSummary
 from perchctl.log.write import FlightLogWriter, log_path, make_header
+from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.profile import Profile
 from perchctl.vehicle import NO_BATTERY_READING_V
@@ -59,8 +61,8 @@ class LogWatcher:
         """A new file in `directory`, written behind the flight.
 
         Errors: InvalidValue."""
-        started = datetime.now(UTC)
-        header = make_header(profile, uri=uri, source=source, seed=seed, started=started)
+        started, t0_s = datetime.now(UTC), time.monotonic()
+        header = make_header(profile, uri=uri, source=source, seed=seed, started=started, t0_s=t0_s)
         path = log_path(directory, profile.name, started)
         return cls._opened(path, header, profile, record, live=True)
 
@@ -101,8 +103,14 @@ class LogWatcher:
         position_m, miss_m = (None, None) if self.truth is None else self.truth()
         record = flight_record(tick, position_m, miss_m)
         self.writer.write(record)
+        if tick.turn is not None:
+            self.writer.turn(tick.turn)
         if self._recorder is not None:
             self._recorder.tick(record)
+
+    def turn(self, turn: Turn) -> None:
+        """One without a tick."""
+        self.writer.turn(turn)
 
     def event(self, event: Event) -> None:
         self.writer.event(event)
