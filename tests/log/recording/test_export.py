@@ -1,4 +1,4 @@
-"""An MCAP file of a log: what the recording would say, with its pictures where it lies beside it."""
+"""An MCAP file of a log: what the recording would say, with its pictures where they are."""
 
 from __future__ import annotations
 
