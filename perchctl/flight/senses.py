@@ -11,6 +11,7 @@ from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import History, attitude_at, attitude_of, extended
 from perchctl.flight.noticed import Noticed, noticed
 from perchctl.link.protocol import Link
+from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile
 from perchctl.vision.consistency import Consistency, solved
@@ -38,6 +39,7 @@ class Senses:
     history: History = field(default_factory=History)
     state: PipelineState = field(default_factory=PipelineState)
     output: PipelineOutput | None = None
+    taken: Taken = field(default_factory=Taken)  # in this turn
     blind: bool = False
     repeated: bool = False
     last_good_frame_s: float = -math.inf
@@ -56,13 +58,18 @@ class Senses:
     def take_in(self, now_s: float, *, look: bool = True) -> None:
         """Telemetry and at most one frame. Without `look` the frame only counts as a sign
         of the camera's life."""
-        self.history = extended(self.history, self.link.telemetry(), self.profile.safety)
+        samples = self.link.telemetry()
+        self.history = extended(self.history, samples, self.profile.safety)
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
+        problem = self.source.problem(now_s)
+        self.taken = Taken(
+            tuple(samples), frame=_seen(frame), problem=problem, ended=self.source.finished,
+            live=self.source.live, look=look,
+        )  # fmt: skip
         used_s = self.noticed.used_s
         if frame is not None and used_s:
             frame = replace(frame, t_s=frame.t_s - used_s)
-        problem = self.source.problem(now_s)
         if frame is None:
             if problem is None and self.source.finished:
                 problem = f"{self.source.describe()} has ended"
@@ -89,6 +96,20 @@ class Senses:
                 self._notice(self.output, used_s)
         mirrored = self._mirrored >= MIRRORED_FRAMES
         self.camera_problem = MIRRORED if mirrored else self._note
+
+    def present(self) -> None:
+        """What has arrived while camera or vision hung."""
+        before, late = self.history, self.link.telemetry()
+        after = extended(before, late, self.profile.safety)
+        turned_rad = max(before.turned_rad, after.turned_rad)
+        self.history = replace(after, jumped=before.jumped or after.jumped, turned_rad=turned_rad)
+        self.taken = replace(self.taken, late=tuple(late))
+
+    @property
+    def poses(self) -> dict[str, PoseSeen]:
+        """The unfiltered ones of this turn's picture."""
+        poses = {} if self.output is None else self.output.poses
+        return {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def _notice(self, output: PipelineOutput, used_s: float) -> None:
         """Latency and mounting, from a picture whose pose was taken for the target's."""
@@ -161,6 +182,12 @@ class Senses:
         if live and age_s > self.profile.safety.max_frame_age_s:
             return f"the picture is {age_s:.1f} s late"
         return None
+
+
+def _seen(frame: Frame | None) -> FrameSeen | None:
+    if frame is None:
+        return None
+    return FrameSeen(frame.index, frame.t_s, frame.t_arrival_s, frame.fields, frame.repeated)
 
 
 def _mirrored_frames(before: int, found: Detections) -> int:

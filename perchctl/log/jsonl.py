@@ -19,6 +19,8 @@ def to_plain(value: Any) -> Any:
 
     Raises TypeError for a value that has no place in a log.
     """
+    if type(value) is float:  # nearly all of a record, and a match is slow
+        return round(value, DECIMALS) + 0.0 if math.isfinite(value) else None
     match value:
         case None | bool() | str():
             return value
@@ -47,7 +49,11 @@ def encode(record: Mapping[str, Any]) -> bytes:
 
     Top-level keys whose value is None are left out.
     """
-    plain = {k: v for k, v in to_plain(record).items() if v is not None}
+    return line_of({k: v for k, v in to_plain(record).items() if v is not None})
+
+
+def line_of(plain: Mapping[str, Any]) -> bytes:
+    """JSON's own types as one line; no number is rounded."""
     text = json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.encode("utf-8", errors="backslashreplace") + b"\n"
 
