@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,10 +11,12 @@ from perchctl.commands.output import print_record, say
 from perchctl.errors import ReplayDiffers
 from perchctl.files import check_output
 from perchctl.log.read import FlightLog
+from perchctl.log.recording import pictures_of, recording_of
 from perchctl.log.setup import profile_of
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.changed import changed
 from perchctl.replay.run import replay
+from perchctl.replay.sense import Picture
 from perchctl.replay.told import replay_lines, replay_record
 from perchctl.replay.whatif import changes_of, gates_of
 
@@ -40,8 +43,10 @@ def run(request: ReplayRequest) -> int:
     if request.output is not None:
         check_output(request.output, FORMATS, request.force, "what plots are drawn in")
     with opened(path) as log:
-        pictures = None
-        found = replay(log, pictures, _profile(request, log))
+        wanted = _profile(request, log)
+        found = replay(log, _pictures(request, path), wanted)
+        if wanted is not None and not found.changed:
+            say("nothing was changed: that is what was flown")
         gates = gates_of(found) if found.changed else []
         changes = changes_of(found) if found.changed else []
         if request.output is not None:
@@ -65,3 +70,9 @@ def _profile(request: ReplayRequest, log: FlightLog) -> Profile | None:
         return None
     base = profile_of(log.header) if request.profile is None else load_profile(request.profile)
     return changed(base, request.settings)
+
+
+def _pictures(request: ReplayRequest, log: Path) -> Iterator[Picture] | None:
+    """Those of the recording that lies beside the log; None without one."""
+    recording = recording_of(log.with_suffix("") if log.suffix == ".gz" else log)
+    return pictures_of(recording) if request.pictures and recording.is_file() else None

@@ -208,6 +208,9 @@ class Senses:
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
         self._health, verdict = assess(self._health, frame, live)
+        if self.taken.frame is not None:
+            seen = replace(self.taken.frame, checksum=self._health.checksum)
+            self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen:
         # such pictures are searched all the same, but the user is shown why.
         self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
