@@ -10,7 +10,7 @@ from perchctl.calibration.files import camera_of
 from perchctl.errors import InvalidValue
 from perchctl.flight.senses import SENSED
 from perchctl.log.read import FlightLog
-from perchctl.log.setup import camera_in, mask_in, profile_of
+from perchctl.log.setup import camera_in, mask_in, other_computer, profile_of
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import Turn
 from perchctl.pipeline import Pipeline, make_pipeline
@@ -67,18 +67,23 @@ def replay(
     log: FlightLog,
     pictures: Iterable[Picture] | None = None,
     profile: Profile | None = None,
+    pipeline: Pipeline | None = None,
 ) -> Replay:
     """The flight again, by its own profile; or, with `profile`, what that would have changed.
 
     As it was flown the planner is given the recorded observations, and the pictures are compared
-    for themselves; with another profile it is given what that sees in the pictures.
+    for themselves; with another profile it is given what that sees in the pictures. `pipeline`
+    looks at them; by default the profile's, with the flown calibration and mask.
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
     flown = profile_of(log.header)
     whole = whole_turns(log)
     turns, used = whole.turns, profile or flown
     changed = changed_keys(flown, used)
-    seen = None if pictures is None else _seen(log, turns, used, pictures, changed)
+    seen = None
+    if pictures is not None:
+        pipeline = pipeline or pipeline_of(log, used, changed)
+        seen = _seen(log, turns, used, pictures, pipeline)
     observations: dict[int, Observation | None] = {}
     if seen is not None and changed:
         observations = {each.turn.number: each.observation for each in seen.turns}
@@ -133,9 +138,8 @@ def _seen(
     turns: Sequence[Turn],
     profile: Profile,
     pictures: Iterable[Picture],
-    changed: Sequence[str],
+    pipeline: Pipeline,
 ) -> Seen:
-    pipeline = pipeline_of(log, profile, changed)
     found: list[Sensed] = []
     ended = ""
     with one_thread():
@@ -184,6 +188,9 @@ def _notes(log: FlightLog, gap: str, seen: Seen | None, changed: Sequence[str]) 
             f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may be "
             f"what has been changed on purpose since"
         )
+    elsewhere = other_computer(log.header)
+    if elsewhere:
+        yield f"it was flown with {elsewhere}: the last bits of a number may differ for that alone"
     if log.truncated:
         yield "the log ends in the flight, without its summary: replayed is what is there"
     if gap:
