@@ -1,9 +1,9 @@
 """THE pipeline: one frame through detection, pose, filter and merge.
 
 `step` is the only way from a picture to a pose; flying, weight fitting, tracking and
-replaying (`perchctl.replay.sense`) all call it. `estimate` carries its result to any later moment. Neither keeps a
-memory of its own: what must be remembered is in `PipelineState`, which goes in and comes
-out.
+replaying (`perchctl.replay.sense`) all call it. `estimate` carries its result to any later
+moment. Neither keeps a memory of its own: what must be remembered is in `PipelineState`, which
+goes in and comes out.
 """
 
 from __future__ import annotations

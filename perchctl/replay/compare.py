@@ -48,7 +48,9 @@ def first_differing(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | N
 
 
 def same(one: Any, other: Any) -> bool:
-    """To the bit: 0.0 is not -0.0, and NaN is NaN."""
+    """To the bit: 0.0 is not -0.0, and NaN is NaN. Two commands without a field are two."""
+    if dataclasses.is_dataclass(one) and type(one) is not type(other):
+        return False
     return json.dumps(to_exact(one)) == json.dumps(to_exact(other))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from perchctl.errors import InvalidValue
@@ -33,8 +34,9 @@ class Decided:
 
     @property
     def differs(self) -> bool:
-        return self.difference() is not None
+        return self.difference is not None
 
+    @cached_property
     def difference(self) -> tuple[str, Any, Any] | None:
         """The first field in which it does."""
         turn, state = self.turn, self.state
@@ -98,7 +100,7 @@ def decide(
 def first_of(decided: Iterable[Decided], t0_s: float) -> Difference | None:
     """The first turn that was decided otherwise than it was flown."""
     for each in decided:
-        found = each.difference()
+        found = each.difference
         if found is not None:
             return Difference(each.tick, each.turn.t_s - t0_s, *found)
     return None

@@ -61,9 +61,9 @@ def test_each_flight_of_the_corpus_can_be_made_anew() -> None:
 
 def _beyond_last_bits(found: Replay) -> list[Any]:
     return [
-        each.difference()
+        each.difference
         for each in found.decided
-        if (d := each.difference()) is not None and not _near(d[1], d[2])
+        if (d := each.difference) is not None and not _near(d[1], d[2])
     ]
 
 
