@@ -13,8 +13,9 @@ from perchctl.flight.turns import Turns
 from perchctl.mission.state import Observation, Operator
 from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Tick, TurnWatcher
-from tests.flight.test_loop import Rig, SleepyClock, Vehicle
+from tests.flight.test_loop import Rig, Vehicle
 from tests.flight.test_loop import Watcher as LooksOn
+from tests.helpers.hangs import hang_in_the_planner
 
 
 @dataclass
@@ -38,10 +39,11 @@ def flown(rig: Rig, for_s: float = 1.0) -> Told:
     return told
 
 
-def test_each_turn_is_told_once_and_in_order() -> None:
+def test_each_turn_is_told_once_and_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those with a tick by it; those before take-off, and those decided anew, by themselves."""
     link = Vehicle()
-    told = flown(Rig(link=link, clock=SleepyClock(link, 0.5, 0.8)))
+    hang_in_the_planner(link, monkeypatch, at_s=0.5)
+    told = flown(Rig(link=link), 0.3)
     with_tick = [tick.turn for tick in told.ticks if tick.turn is not None]
     assert len(with_tick) == len(told.ticks)
     assert {turn.role for turn in told.turns} == {"waiting", "redone"}

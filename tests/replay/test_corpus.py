@@ -42,14 +42,12 @@ def test_the_planner_decides_as_it_did(name: str) -> None:
 
 
 def test_the_corpus_is_worth_its_place() -> None:
-    """Small, and with every way in which a flight ends, and a turn that was decided anew."""
+    """Small, with every way in which a flight ends, every phase, and positions from outside."""
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < MOST_BYTES
     ends = {str((corpus(name).summary or {}).get("outcome")) for name in NAMES}
     assert {"perched", "landed", "aborted"} <= ends
     flown = {turn.phase for name in NAMES for turn in corpus(name).turns if turn.phase}
     assert flown == set(Phase)
-    roles = {turn.role for name in NAMES for turn in corpus(name).turns}
-    assert roles == {"waiting", "redone", "flown"}
     assert any(turn.outside for name in NAMES for turn in corpus(name).turns)
 
 

@@ -18,6 +18,7 @@ from perchctl.replay.run import Replay, replay
 from perchctl.replay.sense import Picture
 from perchctl.vision.types import Frame
 from tests.flight.test_loop import PROFILE, Rig, SleepyClock, Vehicle
+from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 
 
 @dataclass
@@ -77,12 +78,22 @@ def test_what_was_seen_is_seen_again(flight: tuple[FlightLog, list[Picture]]) ->
     assert any(turn.role == "waiting" for turn in log.turns)
 
 
-def test_a_turn_that_hung_is_seen_again(tmp_path: Path) -> None:
-    """What came while it hung is taken in as then; what was decided before is not sent."""
+def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Suspended between two turns; in the camera, where more telemetry comes meanwhile; and in
+    the planner, whose decision is then not sent, and made anew."""
     link = Vehicle()
-    log, pictures = flown(tmp_path, Rig(link=link, clock=SleepyClock(link, 0.7, 0.8)))
+    rig = Rig(link=link, clock=SleepyClock(link, 0.4, 0.2))
+    hang_in_the_camera(link, rig.camera, at_s=0.7)
+    hang_in_the_planner(link, monkeypatch, at_s=1.6)
+    log, pictures = flown(tmp_path, rig)
+    assert any(turn.taken.late for turn in log.turns)
+    redone = [turn for turn in log.turns if turn.role == "redone"]
+    assert redone
     found = seen_again(log, pictures)
     assert found.same, found.first or (found.seen and found.seen.first)
+    assert found.ticks == len(log.records) == len(found.decided) - len(redone)
+    assert found.seen is not None
+    assert not found.seen.ended
 
 
 def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> None:

@@ -53,7 +53,7 @@ FLIGHTS: dict[str, Callable[[Path], None]] = {
     "external-occluded": partial(_fault, fault="external-occluded", seed=6),
 }
 """Perched; landed without a target; a contact that fails; cut by the operator; and faults of the
-link, of the loop (turns decided anew) and of positions from outside."""
+link, of the loop and of positions from outside."""
 
 
 def made(name: str) -> Path:
