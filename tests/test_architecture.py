@@ -54,7 +54,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.sim",),
     ("perchctl.link", "perchctl.log"),
     ("perchctl.flight",),
-    ("perchctl.weights", "perchctl.faults", "perchctl.check"),
+    ("perchctl.weights", "perchctl.faults", "perchctl.check", "perchctl.replay"),
     ("perchctl.display",),
     ("perchctl.track",),
     ("perchctl.commands",),

@@ -201,9 +201,7 @@ def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:
     now_s = parts.clock.now()
     if now_s - began_s <= HUNG_S:
         return began_s
-    senses.present()
-    if senses.last_good_frame_s == began_s:
-        senses.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
+    senses.present(began_s, now_s)
     return now_s
 
 
@@ -241,26 +239,12 @@ def _is_blind(state: PlannerState | None) -> bool:
 def _observe(
     parts: FlightParts, senses: Senses, now_s: float, late_s: float, outside: FeedStatus | None
 ) -> Observation:
-    newest = senses.history.newest
-    assert newest is not None
-    changed_s = senses.history.battery_changed_s
-    return Observation(
-        t_s=now_s,
-        telemetry=newest,
-        target=senses.target(now_s),
-        new_frame=senses.output is not None,
-        camera_age_s=now_s - senses.last_good_frame_s,
-        camera_problem=senses.camera_problem,
+    return replace(
+        senses.observation(now_s),
         link_problem=parts.link.problem(now_s),
-        battery_age_s=0.0 if changed_s is None else now_s - changed_s,
-        jumped=senses.history.jumped,
-        turned_rad=senses.history.turned_rad,
         loop_late_s=late_s,
-        disagreeing_frames=senses.state.disagreeing_frames,
         operator=parts.operator(),
         log_problem=next((w.problem for w in parts.watchers if w.problem), None),
-        delay_s=senses.noticed.used_s,
         position_age_s=0.0 if outside is None else outside.age_s,
         position_problem=None if outside is None else outside.problem,
-        target_refused=senses.refused,
     )

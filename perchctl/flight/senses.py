@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from perchctl.camera.health import MEANING, HealthState, assess
 from perchctl.camera.mirror import MIRRORED
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import History, attitude_at, attitude_of, extended
 from perchctl.flight.noticed import Noticed, noticed
-from perchctl.link.protocol import Link
+from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile
+from perchctl.vehicle import Telemetry
 from perchctl.vision.consistency import Consistency, solved
 from perchctl.vision.fields import BLENDED, INTERLACED
 from perchctl.vision.own import ANOTHERS
@@ -22,6 +24,17 @@ from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineSta
 
 MIRRORED_FRAMES = 5
 REMARK_PICTURES = 3
+SENSED = (
+    "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
+    "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused",
+)  # fmt: skip
+"""The fields of an `Observation` that come from here; the others are the loop's."""
+
+
+class GivesTelemetry(Protocol):
+    """What the senses need of a `perchctl.link.protocol.Link`."""
+
+    def telemetry(self) -> list[Telemetry]: ...
 
 
 @dataclass(eq=False)
@@ -32,7 +45,7 @@ class Senses:
     was the one before once more.
     """
 
-    link: Link
+    link: GivesTelemetry
     source: FrameSource
     pipeline: Pipeline
     profile: Profile
@@ -97,13 +110,35 @@ class Senses:
         mirrored = self._mirrored >= MIRRORED_FRAMES
         self.camera_problem = MIRRORED if mirrored else self._note
 
-    def present(self) -> None:
-        """What has arrived while camera or vision hung."""
+    def present(self, began_s: float, now_s: float) -> None:
+        """What has arrived while camera or vision hung, since the turn of `began_s`."""
         before, late = self.history, self.link.telemetry()
         after = extended(before, late, self.profile.safety)
         turned_rad = max(before.turned_rad, after.turned_rad)
         self.history = replace(after, jumped=before.jumped or after.jumped, turned_rad=turned_rad)
         self.taken = replace(self.taken, late=tuple(late))
+        if self.last_good_frame_s == began_s:
+            self.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
+
+    def observation(self, now_s: float) -> Observation:
+        """The part of it that is seen: the fields of `SENSED`."""
+        newest = self.history.newest
+        assert newest is not None
+        changed_s = self.history.battery_changed_s
+        return Observation(
+            t_s=now_s,
+            telemetry=newest,
+            target=self.target(now_s),
+            new_frame=self.output is not None,
+            camera_age_s=now_s - self.last_good_frame_s,
+            camera_problem=self.camera_problem,
+            battery_age_s=0.0 if changed_s is None else now_s - changed_s,
+            jumped=self.history.jumped,
+            turned_rad=self.history.turned_rad,
+            disagreeing_frames=self.state.disagreeing_frames,
+            delay_s=self.noticed.used_s,
+            target_refused=self.refused,
+        )
 
     @property
     def poses(self) -> dict[str, PoseSeen]:
@@ -173,6 +208,9 @@ class Senses:
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
         self._health, verdict = assess(self._health, frame, live)
+        if self.taken.frame is not None:
+            seen = replace(self.taken.frame, checksum=self._health.checksum)
+            self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen:
         # such pictures are searched all the same, but the user is shown why.
         self._note = verdict.text if verdict.kind in ("dark", "uniform") else None

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import platform
 import zlib
 from collections.abc import Mapping
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
@@ -35,6 +37,32 @@ def camera_record(profile: Profile) -> dict[str, Any]:
             record["mask"] = _packed(read_mask(profile.camera.mask, camera.size_px))
         return record
     return {}
+
+
+def computer_record() -> dict[str, Any]:
+    """``computer``: what the last bits of a sum may depend on."""
+    return {
+        "computer": {
+            "system": platform.system(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "opencv": cv2.__version__,
+        }
+    }
+
+
+def other_computer(header: Mapping[str, Any]) -> str:
+    """In what the flight's differed from this one, in words; empty where it did not, or where
+    the log does not say."""
+    was, here = header.get("computer"), computer_record()["computer"]
+    if not isinstance(was, dict):
+        return ""
+    return ", ".join(
+        f"{key} {was[key]} there and {here[key]} here"
+        for key in here
+        if key in was and was[key] != here[key]
+    )
 
 
 def profile_of(header: Mapping[str, Any]) -> Profile:

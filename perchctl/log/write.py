@@ -27,7 +27,7 @@ from perchctl.log.behind import Behind
 from perchctl.log.exact import to_exact
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
 from perchctl.log.jsonl import encode, line_of
-from perchctl.log.setup import camera_record
+from perchctl.log.setup import camera_record, computer_record
 from perchctl.log.turn import TURN_NOTE, turn_line
 from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event
@@ -68,6 +68,7 @@ def make_header(
         "t0_s": t0_s,
         "profile": profile_record(profile),
         **camera_record(profile),
+        **computer_record(),
         "fields": FIELDS,
         "event_fields": EVENT_FIELDS,
         "turns": TURN_NOTE,

@@ -30,13 +30,15 @@ class Outside:
 
 @dataclass(frozen=True)
 class FrameSeen:
-    """A frame as its source gave it, without its picture: a `perchctl.vision.types.Frame`."""
+    """A frame as its source gave it, without its picture: a `perchctl.vision.types.Frame`.
+    `checksum`: the picture's, None where nobody looked at it."""
 
     index: int
     t_s: float
     t_arrival_s: float
     fields: PictureKind | None = None
     repeated: bool = False
+    checksum: int | None = None
 
 
 @dataclass(frozen=True)

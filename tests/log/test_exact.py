@@ -1,0 +1,196 @@
+"""The exact codec: what comes back is what was written, to the bit."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.errors import InvalidValue
+from perchctl.log.exact import from_exact, to_exact
+from perchctl.log.jsonl import decode
+from perchctl.log.turn import turn_line, turn_of
+from perchctl.mission.state import Condition, Observation, Operator, Outcome, Phase
+from perchctl.mission.turn import FrameSeen, Outside, PoseSeen, Taken, Turn, TurnTiming
+from perchctl.positioning.feed import FeedStatus
+from perchctl.vehicle import (
+    Command,
+    EmergencyStop,
+    ExternalPosition,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+    Telemetry,
+)
+from perchctl.vision.types import CameraModel, Stage, TargetEstimate
+
+floats = st.floats(width=64)
+vectors = st.tuples(floats, floats, floats)
+
+
+def there_and_back(kind: Any, value: Any) -> Any:
+    return from_exact(kind, json.loads(json.dumps(to_exact(value), allow_nan=False)))
+
+
+def bits(value: Any) -> Any:
+    """Of everything in it; what a comparison of floats would overlook as well."""
+    if isinstance(value, np.ndarray):
+        return (value.dtype.str, value.shape, value.tobytes())
+    if isinstance(value, float):
+        return "nan" if math.isnan(value) else np.float64(value).tobytes()
+    if isinstance(value, dict):
+        return {key: bits(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [bits(v) for v in value]
+    if hasattr(value, "__dataclass_fields__"):
+        return (type(value), [bits(getattr(value, f.name)) for f in fields(value)])
+    return (type(value), value)
+
+
+def estimate(e_m: Any, world_m: Any, sigma: float) -> TargetEstimate:
+    return TargetEstimate(
+        t_s=sigma, measured_s=-math.inf, small_measured_s=math.nan, stage=Stage.BOTH,
+        measured=True, tracked=False, unseen=3, e_m=np.array(e_m), e_yaw_rad=-0.0,
+        velocity_mps=np.zeros(3), sigma_m=np.full(3, sigma), sigma_yaw_rad=sigma,
+        world_m=None if world_m is None else np.array(world_m), world_yaw_rad=None,
+    )  # fmt: skip
+
+
+@given(vectors, vectors, st.none() | vectors, floats, st.sampled_from(Operator))
+def test_an_observation_comes_back(
+    place: Any, e_m: Any, world_m: Any, number: float, operator: Operator
+) -> None:
+    telemetry = Telemetry(
+        number, place, place, number, -0.0, 5e-324, 1e308, 0.1 + 0.2, math.inf, 542,
+        position_variance_m2=None,
+    )  # fmt: skip
+    obs = Observation(
+        number, telemetry, estimate(e_m, world_m, number), True, math.inf,
+        camera_problem="no picture \u2028 for 1 s", operator=operator, position_age_s=number,
+    )  # fmt: skip
+    assert bits(there_and_back(Observation, obs)) == bits(obs)
+    bare = Observation(0.0, telemetry)
+    assert bits(there_and_back(Observation, bare)) == bits(bare)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [Idle(), PositionSetpoint(0.1, -0.0, 1e-300, math.pi), RawThrust(48000), StopMotors(),
+     Land(-0.05, 2.5), EmergencyStop()],
+)  # fmt: skip
+def test_a_command_keeps_its_kind(command: Command) -> None:
+    """Three of them have no field at all."""
+    turn = Turn(0, "flown", 0.0, 0.0, Taken(), command=command)
+    back = there_and_back(Turn, turn).command
+    assert type(back) is type(command)
+    assert bits(back) == bits(command)
+
+
+@dataclass(frozen=True)
+class Since:
+    since: dict[Condition, float]
+    outcome: Outcome | None = Outcome.SAFETY
+
+
+def test_keys_that_are_enums_come_back() -> None:
+    for value in (Since({Condition.ALIGNED: 0.1 + 0.2, Condition.DOWN: -0.0}), Since({}, None)):
+        assert bits(there_and_back(Since, value)) == bits(value)
+
+
+def test_positions_from_outside_come_back() -> None:
+    pose = ExternalPosition((0.1, 0.2, 0.3), (1.0, 0.0, -0.0, 1e-17))
+    for status in (FeedStatus(), FeedStatus(0.01, "hidden", 3, pose, 99.5, None)):
+        assert bits(there_and_back(FeedStatus, status)) == bits(status)
+
+
+@pytest.mark.parametrize(
+    "array",
+    [np.zeros((0, 2)), np.float64(3.0) * np.ones((2, 3)), np.arange(3, dtype=np.uint8),
+     np.array([0.1, math.inf], dtype=np.float32), np.array([True, False]), np.zeros(0)],
+)  # fmt: skip
+def test_an_array_keeps_its_type_and_shape(array: np.ndarray) -> None:
+    camera = CameraModel((640, 480), np.eye(3), array)
+    assert bits(there_and_back(CameraModel, camera)) == bits(camera)
+
+
+def test_a_number_of_numpy_s_keeps_its_width() -> None:
+    """A float32 that became a float would be multiplied otherwise."""
+    back = there_and_back(RawThrust, RawThrust(np.float32(0.1)))  # type: ignore[arg-type]
+    assert type(back.thrust) is np.float32
+    assert there_and_back(Land, Land(np.float64(0.1), 1)).height_m == 0.1
+
+
+def whole_turn() -> Turn:
+    sample = Telemetry(1.0, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 1.0, 4e4, 3.9, 542)
+    return Turn(
+        7, "redone", 1.0, 1.3, Taken((replace(sample, t_s=0.9), sample), look=False,
+        frame=FrameSeen(3, 0.9, 0.95, "woven", True, 12)),
+        {"joint": PoseSeen(0.9, np.ones(3), 0.1)},
+        Observation(1.3, sample, estimate((1.0, 2.0, 3.0), None, 0.1)), Land(0.0, 2.0),
+        Phase.LANDING, "fence", True, 2, Outside(0.1, None, 3, 99.0, None),
+        TurnTiming(0.01, 0.001, 0.0001, 0.02),
+    )  # fmt: skip
+
+
+def test_a_turn_is_one_line_and_comes_back() -> None:
+    turn = whole_turn()
+    line = turn_line(turn)
+    assert line.count(b"\n") == 1
+    assert line.count(b"position_m") == 2  # the newest sample stands there once
+    assert bits(turn_of(decode(line))) == bits(turn)
+
+
+def test_an_observation_of_older_telemetry_has_its_own() -> None:
+    """A sample that was left out as nonsense is the newest of its turn all the same."""
+    turn = whole_turn()
+    assert turn.observation is not None
+    older = replace(turn.observation, telemetry=turn.taken.samples[0])
+    turn = replace(turn, observation=older)
+    back = turn_of(decode(turn_line(turn)))
+    assert bits(back) == bits(turn)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [({"phase": "HOVER"}, "phase: 'HOVER' is not a valid Phase"),
+     ({"speed": 1}, "Turn has no field speed"),
+     ({"t_s": "soon"}, "t_s: float is needed, found 'soon'"),
+     ({"t_s": True}, "t_s: float is needed"),
+     ({"command": ["Jump", {}]}, "command: one of Idle, "),
+     ({"poses": {"joint": {"t_s": 0.0, "e_m": [0.0, "x"], "e_yaw_rad": 0.0}}}, "poses: e_m: "),
+     ({"observation": {}}, "observation: "),
+     ({"role": "flying"}, "role: 'flying' is none of waiting, redone, flown")],
+)  # fmt: skip
+def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
+    record = decode(turn_line(whole_turn())) | changes
+    with pytest.raises(InvalidValue) as caught:
+        turn_of(record)
+    assert "turn 7 cannot be read" in str(caught.value)
+    assert why in str(caught.value)
+
+
+def test_a_field_of_a_later_version_that_is_missing_has_its_default() -> None:
+    record = decode(turn_line(whole_turn()))
+    del record["attempts"]
+    assert turn_of(record).attempts == 0
+    del record["began_s"]
+    with pytest.raises(InvalidValue, match="began_s"):
+        turn_of(record)
+
+
+def test_what_has_no_exact_form_is_refused() -> None:
+    @dataclass(frozen=True)
+    class Odd:
+        what: Any
+
+    for value in (object(), {1, 2}, np.array([object()])):
+        with pytest.raises(TypeError, match="no exact form"):
+            to_exact(Odd(value))

@@ -1,0 +1,70 @@
+"""The regression corpus: flights of an earlier day, decided again by today's planner.
+
+A planner that is meant to decide otherwise gets the corpus anew: docs/replay.md, "The corpus".
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from perchctl.log.read import FlightLog, read_log
+from perchctl.log.setup import other_computer
+from perchctl.mission.state import Phase
+from perchctl.replay.run import Replay, replay
+from perchctl.replay.told import difference_text
+from tests.helpers.flights import ROOT
+
+FOLDER = ROOT / "tests" / "data" / "flights"
+NAMES = sorted(path.name.removesuffix(".jsonl.gz") for path in FOLDER.glob("*.jsonl.gz"))
+MOST_BYTES = 1_500_000
+LAST_BITS = 1e-9
+"""By so much sums may differ on a computer with other libraries; what is decided may not."""
+ANEW = "if that was meant: python tests/data/flights/make.py (docs/replay.md, The corpus)"
+
+
+@cache
+def corpus(name: str) -> FlightLog:
+    return read_log(FOLDER / f"{name}.jsonl.gz")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_planner_decides_as_it_did(name: str) -> None:
+    found = replay(corpus(name))
+    if found.first is None:
+        assert found.ticks > 50
+        return
+    assert other_computer(found.log.header), f"{difference_text(found.first)}; {ANEW}"
+    assert not _beyond_last_bits(found), f"{difference_text(found.first)}; {ANEW}"
+
+
+def test_the_corpus_is_worth_its_place() -> None:
+    """Small, with every way in which a flight ends, every phase, and positions from outside."""
+    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < MOST_BYTES
+    ends = {str((corpus(name).summary or {}).get("outcome")) for name in NAMES}
+    assert {"perched", "landed", "aborted"} <= ends
+    flown = {turn.phase for name in NAMES for turn in corpus(name).turns if turn.phase}
+    assert flown == set(Phase)
+    assert any(turn.outside for name in NAMES for turn in corpus(name).turns)
+
+
+def test_each_flight_of_the_corpus_can_be_made_anew() -> None:
+    text = Path(FOLDER / "make.py").read_text(encoding="utf-8")
+    assert NAMES
+    assert all(f'"{name}": ' in text for name in NAMES)
+
+
+def _beyond_last_bits(found: Replay) -> list[Any]:
+    return [
+        each.difference
+        for each in found.decided
+        if (d := each.difference) is not None and not _near(d[1], d[2])
+    ]
+
+
+def _near(one: Any, other: Any) -> bool:
+    numbers = isinstance(one, float) and isinstance(other, float)
+    return numbers and abs(one - other) <= LAST_BITS * max(1.0, abs(one))

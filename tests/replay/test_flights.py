@@ -1,0 +1,95 @@
+"""Whole simulated flights, faults included, decided and seen again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.faults.catalogue import FAULTS
+from perchctl.faults.flight import fly_fault_seed
+from perchctl.flight.campaign import fly_seed
+from perchctl.log.read import read_log
+from perchctl.log.recording import pictures_of
+from perchctl.profile.changed import changed
+from perchctl.replay.run import Replay, replay
+from perchctl.replay.whatif import changes_of
+from tests.helpers.flights import short_profile
+
+EVERY_FAULT = tuple(fault.name for fault in FAULTS)
+PLAIN, FAULTY, RECORDED = range(10, 35), range(100, 125), range(10)
+
+
+def flown(folder: Path, seed: int, faults: tuple[str, ...] = ()) -> Replay | None:
+    """Fly, and decide again; None where the log could not hold the flight, which a fault may
+    forbid, or the flight was refused."""
+    path = folder / "f.jsonl"
+    if faults:
+        fly_fault_seed(short_profile(), seed, faults, path)
+    else:
+        fly_seed(short_profile(), seed, path)
+    log = read_log(path)
+    return replay(log) if log.turn_records else None
+
+
+def recorded(folder: Path, seed: int) -> Replay:
+    """Fly with pictures; decide and see again."""
+    path = folder / "f.jsonl"
+    fly_seed(short_profile(), seed, path, record=True)
+    return replay(read_log(path), pictures_of(path))
+
+
+def check_seen(found: Replay) -> None:
+    assert found.first is None
+    assert found.seen is not None
+    assert (found.seen.first, found.seen.ended) == (None, "")
+    assert found.seen.frames > 50
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("faults", [(), ("hung",), ("external-occluded",)], ids=str)
+def test_a_flight_replays(tmp_path: Path, faults: tuple[str, ...]) -> None:
+    found = flown(tmp_path, 101, faults)
+    assert found is not None
+    assert found.same, found.first
+    assert found.ticks > 100
+
+
+@pytest.mark.long
+def test_a_recorded_flight_is_seen_again(tmp_path: Path) -> None:
+    check_seen(recorded(tmp_path, 0))
+    path = tmp_path / "f.jsonl"
+    log = read_log(path)
+    nearer = changed(short_profile(), ["vehicle.gear_body_m=[0, 0, 0.031]"])
+    found = replay(log, pictures_of(path), nearer)
+    assert found.changed == ("vehicle.gear_body_m",)
+    joint = next(change for change in changes_of(found) if change.name == "joint")
+    moved_m = 0.031 - short_profile().vehicle.gear_body_m[2]
+    assert joint.z_m == pytest.approx(abs(moved_m), rel=0.05)
+    assert (joint.only_flown, joint.only_changed) == (0, 0)
+    assert found.first is not None
+    assert found.first.field.startswith(("command.", "phase"))
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", PLAIN)
+def test_seeded_flights_replay(tmp_path: Path, seed: int) -> None:
+    found = flown(tmp_path, seed)
+    assert found is not None
+    assert found.same, found.first
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", FAULTY)
+def test_seeded_flights_with_faults_replay(tmp_path: Path, seed: int) -> None:
+    """Each with one of all faults, in a phase and at a moment of its seed's."""
+    found = flown(tmp_path, seed, EVERY_FAULT)
+    assert found is None or found.same, found and found.first
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("seed", RECORDED)
+def test_recorded_flights_are_seen_again(tmp_path: Path, seed: int) -> None:
+    check_seen(recorded(tmp_path, seed))

@@ -1,0 +1,314 @@
+"""A flight decided again: what differs is named, what is lost is said, what if is told."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import perchctl
+from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
+from perchctl.log.exact import to_exact
+from perchctl.log.jsonl import line_of
+from perchctl.log.read import FlightLog, read_log
+from perchctl.log.setup import camera_in, mask_in, profile_of
+from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.mission import conditions, guidance
+from perchctl.profile import Profile
+from perchctl.profile.changed import changed
+from perchctl.replay.compare import first_differing, same
+from perchctl.replay.run import changed_keys, replay
+from perchctl.replay.told import replay_lines, replay_record
+from perchctl.replay.whatif import CAUTION, gates_of
+from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
+from tests.helpers.commands import run
+from tests.replay.test_corpus import FOLDER, corpus
+
+PERCHED = FOLDER / "perched.jsonl.gz"
+
+
+def lines_of(path: Path = PERCHED) -> list[bytes]:
+    return gzip.decompress(path.read_bytes()).splitlines(keepends=True)
+
+
+def log_of(folder: Path, lines: list[bytes], name: str = "f.jsonl") -> Path:
+    path = folder / name
+    path.write_bytes(b"".join(lines))
+    return path
+
+
+def altered(line: bytes, **changes: Any) -> bytes:
+    return line_of(json.loads(line) | changes)
+
+
+# --- the same planner, and another ---------------------------------------------------------
+
+
+def test_a_changed_constant_is_named_by_tick_and_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the last bit: 0.25 s and the next number above it."""
+    log = corpus("perched")
+    monkeypatch.setattr(guidance, "HEIGHT_RATE_S", 0.25000000000000006)
+    found = replay(log)
+    assert found.first is not None
+    assert found.first.field == "command.z_m"
+    assert isinstance(found.first.recorded, float)
+    assert found.first.recorded != found.first.replayed
+    assert found.first.recorded == pytest.approx(found.first.replayed, abs=1e-12)
+    at = next(each for each in found.decided if each.tick == found.first.tick)
+    assert found.first.t_s == at.turn.t_s - log.t0_s
+    assert isinstance(at.turn.command, PositionSetpoint)
+    assert at.turn.command.z_m == found.first.recorded
+    assert 0 < found.differences <= found.ticks
+    assert all(not each.differs for each in found.decided if each.tick < at.tick)
+    assert any("command.z_m was" in line for line in replay_lines(found, [], []))
+
+
+def test_a_gate_that_falls_later_is_a_difference_of_the_phase(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(conditions.CONDITIONS, conditions.Condition.SETTLED, lambda c: False)
+    found = replay(corpus("perched"))
+    assert found.first is not None
+    assert (found.first.field, found.first.recorded) == ("phase", "PERCH")
+    assert found.first.replayed == "ASCEND"
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "name"),
+    [
+        (PositionSetpoint(0.0, 1.0, 2.0, 0.0), PositionSetpoint(-0.0, 1.0, 2.0, 0.0), "c.x_m"),
+        (RawThrust(1), RawThrust(2), "c.thrust"),
+        (Idle(), StopMotors(), "c"),
+        ((1.0, 2.0), (1.0, 2.5), "c[1]"),
+        ({"a": 1.0}, {"a": 1.0, "b": 2.0}, "c.b"),
+        (1, 1.0, "c"),
+        (None, Idle(), "c"),
+    ],
+)
+def test_the_first_field_is_named(one: Any, other: Any, name: str) -> None:
+    found = first_differing("c", one, other)
+    assert found is not None
+    assert found[0] == name
+    assert not same(found[1], found[2])
+    assert first_differing("c", one, one) is None
+    assert first_differing("c", float("nan"), float("nan")) is None
+
+
+# --- what a log holds ----------------------------------------------------------------------
+
+
+def test_of_a_killed_flight_what_is_there_is_replayed(tmp_path: Path) -> None:
+    lines = lines_of()
+    cut = [*lines[:300], lines[300][:200]]
+    found = replay(read_log(log_of(tmp_path, cut)))
+    assert found.same
+    assert 100 < found.ticks < 300
+    assert any("ends in the flight" in note for note in found.notes)
+
+
+def test_a_packed_log_that_is_cut_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "cut.jsonl.gz"
+    path.write_bytes(PERCHED.read_bytes()[:60_000])
+    log = read_log(path)
+    assert log.truncated
+    assert replay(log).same
+
+
+def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
+    """What the planner remembered of that turn is not known."""
+    lines = lines_of()
+    found = replay(read_log(log_of(tmp_path, [*lines[:200], *lines[205:]])))
+    assert found.same
+    assert found.ticks < 200
+    assert any("is not in the log" in note for note in found.notes)
+
+
+def test_a_log_of_before_has_no_turns(tmp_path: Path) -> None:
+    header = {**json.loads(lines_of()[0]), "version": 2, "perchctl": "0.1.0"}
+    log = read_log(log_of(tmp_path, [line_of(header)]))
+    assert log.turns == []
+    with pytest.raises(InvalidValue, match=r"perchctl 0\.1\.0 wrote it.*cannot be replayed"):
+        replay(log)
+    bare = read_log(log_of(tmp_path, lines_of()[:1], "bare.jsonl"))
+    with pytest.raises(InvalidValue, match="no turn of a flight"):
+        replay(bare)
+
+
+def test_another_version_is_said(tmp_path: Path) -> None:
+    lines = lines_of()
+    lines[0] = altered(lines[0], perchctl="0.0.9")
+    found = replay(read_log(log_of(tmp_path, lines[:100])))
+    assert any(
+        f"perchctl 0.0.9 flew it, and this is {perchctl.__version__}" in n for n in found.notes
+    )
+
+
+def test_the_header_s_profile_is_the_flown_one_to_the_bit(tmp_path: Path) -> None:
+    """A rounded threshold would be another flight's."""
+    profile = Profile.model_validate(
+        {"name": "x", "kalman": {"n_max": 7}, "safety": {"jump_m": 0.1 + 0.2},
+         "camera": {"source": "rtsp://me:secret@10.0.0.2/a", "latency_s": 1 / 14}}
+    )  # fmt: skip
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
+    writer.close()
+    log = read_log(writer.path)
+    back = profile_of(log.header)
+    assert changed_keys(profile, back) == ("camera.source",)
+    assert back.safety.jump_m == 0.1 + 0.2
+    assert b"secret" not in writer.path.read_bytes()
+    camera = camera_in(log.header)
+    assert camera is not None
+    assert mask_in(log.header, camera) is None
+
+
+def test_a_mask_goes_with_the_log(tmp_path: Path) -> None:
+    import cv2
+    import numpy as np
+
+    picture = np.zeros((480, 640), np.uint8)
+    picture[400:, 5:123] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), picture)
+    profile = Profile.model_validate({"camera": {"mask": str(tmp_path / "mask.png")}})
+    header = json.loads(json.dumps(to_exact(make_header(profile, uri="", source=""))))
+    (tmp_path / "mask.png").unlink()
+    camera = camera_in(header)
+    assert camera is not None
+    mask = mask_in(header, camera)
+    assert mask is not None
+    assert np.array_equal(mask, picture > 0)
+
+
+# --- what if -------------------------------------------------------------------------------
+
+
+def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
+    log = corpus("perched")
+    dwell_s = profile_of(log.header).planner.ascend.settle_dwell_s
+    later = changed(profile_of(log.header), [f"planner.ascend.settle_dwell_s={dwell_s + 0.2}"])
+    found = replay(log, None, later)
+    assert found.changed == ("planner.ascend.settle_dwell_s",)
+    assert found.first is not None
+    assert (found.first.recorded, found.first.replayed) == ("PERCH", "ASCEND")
+    gate = next(g for g in gates_of(found) if g.name == "row settled")
+    assert gate.flown_s == (found.first.t_s,)
+    text = "\n".join(replay_lines(found, gates_of(found), []))
+    assert "gate:      row settled: at " in text
+    assert CAUTION in text
+    record = replay_record(found, gates_of(found), [])
+    assert record["what_if"]["changed"] == ["planner.ascend.settle_dwell_s"]
+    assert record["first_difference"]["field"] == "phase"
+    json.dumps(record, allow_nan=False)
+
+
+def test_what_if_nothing_would_differ() -> None:
+    log = corpus("perched")
+    wider = changed(profile_of(log.header), ["safety.max_height_m=9"])
+    found = replay(log, None, wider)
+    assert found.same
+    assert gates_of(found) == []
+    assert any("no command would have been another" in s for s in replay_lines(found, [], []))
+
+
+def test_what_acts_on_pictures_only_is_said() -> None:
+    log = corpus("perched")
+    found = replay(
+        log, None, changed(profile_of(log.header), ["kalman.n_max=3", "link.loop_hz=20"])
+    )
+    assert any(
+        n.startswith("kalman.n_max: what it would change in the pictures") for n in found.notes
+    )
+    assert any(n.startswith("link.loop_hz: a replay has nothing") for n in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("setting", "error", "why"),
+    [
+        ("planner.align.xy_m", UsageError, "must be KEY=VALUE"),
+        ("=3", UsageError, "must be KEY=VALUE"),
+        ("planer.align.xy_m=3", InvalidValue, "planer is unknown; allowed here are name"),
+        ("planner.align.xy=3", InvalidValue, "planner.align.xy: this key is unknown"),
+        ("name.x=3", InvalidValue, "name is no section"),
+        ("planner.align.xy_m=wide", InvalidValue, "planner.align.xy_m: "),
+        ("planner.align.xy_m=-1", InvalidValue, "planner.align.xy_m: "),
+        ("planner.align.xy_m=[", InvalidValue, "not YAML"),
+    ],
+)
+def test_a_setting_that_is_none(setting: str, error: type[Exception], why: str) -> None:
+    with pytest.raises(error) as caught:
+        changed(Profile(), [setting])
+    assert why in str(caught.value)
+    assert "--set" in str(caught.value)
+
+
+def test_settings_follow_one_another() -> None:
+    profile = changed(
+        Profile(),
+        ["planner.align.xy_m=0.02", "planner.align.xy_m=0.03", "link.parameters={a.b: 1}"],
+    )
+    assert profile.planner.align.xy_m == 0.03
+    assert profile.link.parameters == {"a.b": 1}
+
+
+# --- the command ---------------------------------------------------------------------------
+
+
+def test_the_command_says_so_and_leaves_with_0(tmp_path: Path) -> None:
+    path = log_of(tmp_path, lines_of()[:150])
+    said = run("log", "replay", str(path))
+    assert said.code == 0
+    assert "all with the same commands" in said.stdout
+    assert "ends in the flight" in said.stderr
+    record = json.loads(run("log", "replay", str(path), "--json").stdout)
+    assert (record["differences"], record["first_difference"], record["what_if"]) == (0, None, None)
+    assert record["ticks"] > 50
+
+
+def test_the_command_leaves_with_its_own_code_where_something_differs(tmp_path: Path) -> None:
+    path = log_of(tmp_path, lines_of())
+    said = run("log", "replay", str(path), "--set", "planner.ascend.settle_dwell_s=0.6")
+    assert said.code == ReplayDiffers.exit_code == 61
+    assert 61 in EXIT_CODES
+    assert 'phase was "PERCH", would be "ASCEND"' in said.stdout
+    assert "world would have answered differently" in said.stdout
+
+
+@pytest.mark.long
+def test_both_are_drawn(tmp_path: Path) -> None:
+    path = log_of(tmp_path, lines_of())
+    picture = tmp_path / "then.svg"
+    words = ("log", "replay", str(path), "--set", "planner.ascend.settle_dwell_s=0.6")
+    assert run(*words, "-o", str(picture)).code == 61
+    assert picture.read_bytes().startswith(b"<?xml")
+    again = run(*words, "-o", str(picture))
+    assert again.code == 30
+    assert "--force" in again.complaint
+
+
+def test_the_command_compares_with_another_profile(tmp_path: Path) -> None:
+    path = log_of(tmp_path, lines_of()[:120])
+    said = run("log", "replay", str(path), "--profile", "sim", "--json")
+    record = json.loads(said.stdout)
+    assert "planner.takeoff_height_m" in record["what_if"]["changed"]
+    assert record["first_difference"]["tick"] >= 0
+    assert said.code == 61
+
+
+def test_what_was_set_as_it_was_flown_is_said(tmp_path: Path) -> None:
+    path = log_of(tmp_path, lines_of()[:100])
+    said = run("log", "replay", str(path), "--set", "planner.takeoff_height_m=0.6")
+    assert said.code == 0
+    assert "nothing was changed" in said.stderr
+
+
+def test_turns_reach_watchers_and_log_alike() -> None:
+    log: FlightLog = corpus("perched")
+    assert [turn.number for turn in log.turns] == list(range(len(log.turns)))
+    assert all(turn.timing is None for turn in log.turns)  # in lockstep
+    turn = next(turn for turn in log.turns if turn.role == "flown")
+    assert turn.observation is not None
+    assert turn.observation.t_s == turn.t_s == turn.began_s
+    assert any(turn.taken.samples for turn in log.turns)
+    assert any(turn.taken.frame for turn in log.turns)

@@ -1,0 +1,136 @@
+"""Pictures seen again: the loop's own senses, fed by what a flight took in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from perchctl.flight.loop import fly
+from perchctl.log.read import FlightLog, read_log
+from perchctl.log.watch import LogWatcher
+from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.mission.state import Operator, Phase
+from perchctl.mission.watch import Tick
+from perchctl.replay.run import Replay, replay
+from perchctl.replay.sense import Picture
+from perchctl.vision.types import Frame
+from tests.flight.test_loop import PROFILE, Rig, SleepyClock, Vehicle
+from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
+
+
+@dataclass
+class Kept:
+    """The pictures of a flight, as a recording has them: without the repeated ones."""
+
+    pictures: list[Picture] = field(default_factory=list)
+
+    def keep(self, frame: Frame) -> Frame:
+        if frame.index % 7 == 0:  # a receiver that gives one out again, with noise or without
+            index, _, image = self.pictures[-1]
+            again = image.copy()
+            again[0, 0] ^= np.uint8(frame.index % 2)
+            return replace(frame, index=index, image=again, repeated=True)
+        self.pictures.append((frame.index, frame.t_s, frame.image))
+        return frame
+
+
+def flown(folder: Path, rig: Rig) -> tuple[FlightLog, list[Picture]]:
+    """A flight on a scripted vehicle, ended by the operator while it approaches."""
+    kept, pressed = Kept(), [Operator.NONE]
+    rig.camera.alter = kept.keep
+    rig.operator = lambda: pressed[0]
+
+    def press(tick: Tick) -> None:
+        if tick.t_s > 1.0 and tick.state.phase is Phase.APPROACH:
+            pressed[0] = Operator.LAND
+
+    rig.watcher.on_tick = press
+    header = make_header(PROFILE, uri="sim://", source="sim:", lockstep=True)
+    writer = FlightLogWriter.open(folder / "f.jsonl", header)
+    log = LogWatcher(writer)
+    parts = rig.parts()
+    report = fly(replace(parts, watchers=(*parts.watchers, log)))
+    log.close(report)
+    return read_log(writer.path), kept.pictures
+
+
+def seen_again(log: FlightLog, pictures: list[Picture]) -> Replay:
+    """By the pipeline of the rig: its camera is smaller than the profile's."""
+    return replay(log, pictures, pipeline=Rig().setup)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[FlightLog, list[Picture]]:
+    return flown(tmp_path_factory.mktemp("flight"), Rig())
+
+
+def test_what_was_seen_is_seen_again(flight: tuple[FlightLog, list[Picture]]) -> None:
+    log, pictures = flight
+    found = seen_again(log, pictures)
+    assert found.seen is not None
+    assert (found.first, found.seen.first, found.seen.ended) == (None, None, "")
+    assert found.same
+    assert len(found.seen.turns) == len(log.turns)
+    assert found.ticks == len(log.records)
+    assert any(turn.role == "waiting" for turn in log.turns)
+
+
+def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Suspended between two turns; in the camera, where more telemetry comes meanwhile; and in
+    the planner, whose decision is then not sent, and made anew."""
+    link = Vehicle()
+    rig = Rig(link=link, clock=SleepyClock(link, 0.4, 0.2))
+    hang_in_the_camera(link, rig.camera, at_s=0.7)
+    hang_in_the_planner(link, monkeypatch, at_s=1.6)
+    log, pictures = flown(tmp_path, rig)
+    assert any(turn.taken.late for turn in log.turns)
+    redone = [turn for turn in log.turns if turn.role == "redone"]
+    assert redone
+    found = seen_again(log, pictures)
+    assert found.same, found.first or (found.seen and found.seen.first)
+    assert found.ticks == len(log.records) == len(found.decided) - len(redone)
+    assert found.seen is not None
+    assert not found.seen.ended
+
+
+def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> None:
+    log, pictures = flight
+    index, t_s, image = pictures[20]
+    other = image.copy()
+    other[3, 4] ^= 1
+    found = seen_again(log, [*pictures[:20], (index, t_s, other), *pictures[21:]])
+    assert found.seen is not None
+    assert f"the picture of frame {index} is another one" in found.seen.ended
+    assert not found.seen.differences
+
+
+def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> None:
+    """From there on the pipeline would remember another flight; what came before counts."""
+    log, pictures = flight
+    for rest in ([*pictures[:20], *pictures[21:]], pictures[:20]):
+        found = seen_again(log, rest)
+        assert found.seen is not None
+        assert f"frame {pictures[20][0]} was not recorded" in found.seen.ended
+        assert 0 < len(found.seen.turns) < len(log.turns)
+        assert not found.seen.differences
+        assert found.ticks == len(log.records)  # the planner needs no picture
+
+
+def test_a_pose_that_differs_is_named(flight: tuple[FlightLog, list[Picture]]) -> None:
+    log, pictures = flight
+    turns = list(log.turns)
+    at = next(k for k, turn in enumerate(turns) if turn.role == "flown") + 10
+    obs = turns[at].observation
+    assert obs is not None
+    turns[at] = replace(turns[at], observation=replace(obs, camera_age_s=obs.camera_age_s + 1e-15))
+    changed = replace(log)
+    changed.__dict__["turns"] = turns
+    found = seen_again(changed, pictures)
+    assert found.seen is not None
+    assert found.seen.first is not None
+    assert (found.seen.first.tick, found.seen.first.field) == (10, "camera_age_s")
+    assert found.seen.differences == 1
+    assert not found.same
