@@ -7,7 +7,7 @@ lockstep with a simulated vehicle.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from perchctl.camera.source import FrameSource
@@ -49,7 +49,8 @@ HUNG_S = 0.25
 @dataclass(frozen=True, eq=False)
 class FlightParts:
     """The edges. `simulated` says what the scenario of a simulated flight did that explains
-    an event; `positions` how it goes with those from outside, None where decks measure them."""
+    an event; `positions` how it goes with those from outside, None where decks measure them;
+    `remarks` what is new about what goes along and matters to nobody's safety, as a recording."""
 
     link: Link
     source: FrameSource
@@ -60,6 +61,7 @@ class FlightParts:
     operator: Callable[[], Operator] = lambda: Operator.NONE
     simulated: Callable[[Event], str] = lambda event: ""
     positions: Callable[[float], FeedStatus] | None = None
+    remarks: Callable[[], Sequence[str]] = tuple
 
 
 def fly(parts: FlightParts) -> FlightReport:
@@ -171,7 +173,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
             log_noted = True
             text = f"the log of this flight is incomplete: {obs.log_problem}"
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
-        for text in senses.take_remarks():
+        for text in (*senses.take_remarks(), *parts.remarks()):
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
         for event in events:
             event = replace(event, simulated=parts.simulated(event))

@@ -110,8 +110,16 @@ class FlightLogWriter:
         return self._dropped + self._failed
 
     @classmethod
-    def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> FlightLogWriter:
+    def open(
+        cls,
+        path: Path,
+        header: Mapping[str, Any],
+        live: bool = False,
+        beside: tuple[str, ...] = (),
+    ) -> FlightLogWriter:
         """Create the file and its folder and write the header.
+
+        `beside`: suffixes of files of the same name that must not be there, either.
 
         `live` (for flights in real time): a thread of its own writes, and brings the records
         to the disk about once a second of the loop's time; otherwise each record is in the
@@ -120,7 +128,7 @@ class FlightLogWriter:
         """
         make_log_folder(path.parent)
         try:
-            free, fd = _create(path)
+            free, fd = _create(path, beside)
         except OSError as error:
             raise InvalidValue(_cannot_start(path, error)) from None
         behind = Behind(MOST_BEHIND, "perchctl-log") if live else None
@@ -246,11 +254,13 @@ def make_log_folder(directory: Path) -> None:
         raise InvalidValue(f"{directory} cannot hold flight logs ({why}): {_ELSEWHERE}") from None
 
 
-def _create(path: Path) -> tuple[Path, int]:
+def _create(path: Path, beside: tuple[str, ...] = ()) -> tuple[Path, int]:
     """A file that did not exist before, by `path`'s name or the next free one."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
     for number in count(1):
         free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        if any(free.with_suffix(suffix).exists() for suffix in beside):
+            continue
         with suppress(FileExistsError):
             return free, os.open(free, flags, 0o644)
     raise AssertionError("unreachable")
