@@ -11,14 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from perchctl.log.recording.export import Exported
     from perchctl.log.recording.pictures import Picture
 
 SUFFIX = ".mcap"
+LAYOUT_SUFFIX = ".foxglove.json"
+_PACKED = ".gz"
 
 
 def recording_of(path: Path | str) -> Path:
     """The recording's place, of a log's path or the recording's own."""
-    return Path(path).with_suffix(SUFFIX)
+    path = Path(path)
+    return (path.with_suffix("") if path.suffix == _PACKED else path).with_suffix(SUFFIX)
 
 
 def pictures_of(path: Path | str, *, exact: bool = True) -> Iterator[Picture]:
@@ -34,3 +38,18 @@ def pictures_of(path: Path | str, *, exact: bool = True) -> Iterator[Picture]:
     from perchctl.log.recording.pictures import pictures_in
 
     return pictures_in(recording_of(path), exact)
+
+
+def export_mcap(log_path: Path | str, out_path: Path | str, overwrite: bool = False) -> Exported:
+    """Write a flight log as an MCAP file, with the pictures of the recording that lies beside it,
+    and beside the file a layout for Foxglove.
+
+    Args:
+        overwrite: what is there already may be replaced, the recording itself among it.
+
+    Errors: those of `perchctl.log.read.read_log`; InvalidValue for a place that cannot be
+    written to.
+    """
+    from perchctl.log.recording.export import exported
+
+    return exported(Path(log_path), Path(out_path), overwrite)

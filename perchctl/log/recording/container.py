@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
@@ -49,6 +50,7 @@ class DiskStream:
         Raises OSError, where one is there already, too."""
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         self._fd = os.open(path, flags, 0o644)
+        self._path = path
         self._sync = sync
         self._good_bytes = 0
 
@@ -79,8 +81,7 @@ class DiskStream:
                 raise
 
     def free_bytes(self) -> int:
-        disk = os.fstatvfs(self._fd)
-        return disk.f_bavail * disk.f_frsize
+        return shutil.disk_usage(self._path).free
 
     def close(self) -> None:
         os.close(self._fd)

@@ -14,10 +14,14 @@ from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Point2_pb2 import Point2
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
@@ -36,6 +40,7 @@ WORLD, BODY, GEAR, CAMERA, TARGET = "world", "body", "gear", "camera", "target"
 IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
 TF, VEHICLE, PATH, TARGET_POSE = "/tf", "/vehicle/pose", "/vehicle/path", "/target/pose"
 SETPOINT, SCENE, LOG, TICK = "/setpoint", "/scene", "/log", "/tick"
+CORNERS = "/camera/corners"
 
 PATH_PERIOD_S = 1.0
 """The whole path so far is said so often: who jumps into the middle sees what was flown."""
@@ -44,6 +49,7 @@ PATH_STEP_S = 0.1
 _MODELS = {"fisheye": "kannala_brandt"}
 """Foxglove's name of OpenCV's fisheye; the others are called alike."""
 _LEVELS = {"hold": Log.WARNING, "back off": Log.WARNING, "land": Log.ERROR, "stop": Log.FATAL}
+_OUTLINE = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 
 Said = tuple[str, Message]
 """A topic and its message."""
@@ -92,6 +98,25 @@ def log_message(ns: int, record: Mapping[str, Any]) -> Log:
         message=text,
         name="perchctl",
         file=record.get("row") or "",
+    )
+
+
+def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
+    """The markers' outlines in the frame of a tick's record; none of one without the target,
+    so that no old one stays in the picture."""
+    return ImageAnnotations(
+        timestamp=stamp(ns),
+        points=[
+            PointsAnnotation(
+                timestamp=stamp(ns),
+                type=PointsAnnotation.LINE_LOOP,
+                points=[Point2(x=x, y=y) for x, y in zip(px[::2], px[1::2], strict=True)],
+                outline_color=_OUTLINE,
+                thickness=2.0,
+            )
+            for px in (record.get("large_px"), record.get("small_px"))
+            if px is not None
+        ],
     )
 
 
@@ -153,6 +178,9 @@ class Said3d:
         setpoint = _turned(record, "cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
         if setpoint is not None:
             yield SETPOINT, _pose_in_world(ns, setpoint)
+
+        if record.get("frame_t_s") is not None:
+            yield CORNERS, corners_message(self._epoch.ns(float(record["frame_t_s"])), record)
 
     def _path_with(self, pose: Pose, t_s: float, ns: int) -> Iterator[Said]:
         if t_s - self._point_s >= PATH_STEP_S:

@@ -13,11 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from perchctl.calibration.files import camera_of
 from perchctl.errors import InvalidValue
 from perchctl.log.behind import Behind
 from perchctl.log.recording.container import DiskStream, Stream
 from perchctl.log.recording.end import RecordingEnd
-from perchctl.log.recording.writing import Writing
+from perchctl.log.recording.writing import Writing, encoded, told_of
 from perchctl.profile import Profile
 from perchctl.vision.types import Frame
 
@@ -69,7 +70,7 @@ class Recorder:
         self._handed_bytes = 0
         self._closed = False
         # Of the thread that writes.
-        self._writing = Writing(stream, header, profile)
+        self._writing = Writing(stream, header, profile, camera_of(profile.camera))
         self._over = False
         self._done_bytes = 0
         self._flushed_s: float | None = None
@@ -79,14 +80,19 @@ class Recorder:
     def open(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, live: bool = False
     ) -> Recorder:
-        """A new file beside the log. Errors: InvalidValue, before the flight."""
+        """A new file beside the log. Errors: NotFound, InvalidValue, before the flight."""
         try:
-            return cls(path, DiskStream(path, sync=live), header, profile, live)
+            stream = DiskStream(path, sync=live)
         except OSError as error:
-            raise InvalidValue(
-                f"{path}: the recording cannot be begun ({error.strerror or error}): free the "
-                f"place, or fly with --no-record"
-            ) from None
+            raise _cannot_begin(path, error) from None
+        try:
+            return cls(path, stream, header, profile, live)
+        except BaseException as error:
+            stream.close()
+            path.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                raise _cannot_begin(path, error) from None
+            raise
 
     def frame(self, frame: Frame) -> None:
         """One that the source gave. Never raises."""
@@ -163,7 +169,8 @@ class Recorder:
         writing = self._writing
         if turn.frame is not None:
             full = writing.size_bytes + turn.picture_bytes > self._most_bytes
-            writing.frame(turn.frame, with_picture=not full)
+            kept = None if full or turn.frame.repeated else encoded(turn.frame)
+            writing.frame(told_of(turn.frame), kept)
             if full:
                 self._remember(
                     f"the recording is full (log.max_mb in the profile, "
@@ -212,3 +219,10 @@ class Recorder:
         if self._problem is None:
             self._problem = sentence
             self._remarks.append(sentence)
+
+
+def _cannot_begin(path: Path, error: OSError) -> InvalidValue:
+    return InvalidValue(
+        f"{path}: the recording cannot be begun ({error.strerror or error}): free the place, or "
+        f"fly with --no-record"
+    )

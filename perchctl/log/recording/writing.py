@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 
-from perchctl.calibration.files import camera_of
 from perchctl.log.jsonl import encode
 from perchctl.log.recording import messages as m
 from perchctl.log.recording.container import Container, Stream
@@ -36,15 +35,15 @@ class Writing:
         self,
         stream: Stream,
         header: Mapping[str, Any],
-        profile: Profile,
-        camera: CameraModel | None = None,
+        profile: Profile | None,
+        camera: CameraModel | None,
     ) -> None:
-        """`camera` is the profile's where it is not given. Errors: NotFound, InvalidValue."""
+        """None of profile and camera: without what follows from them."""
         self.pictures = 0
         self.newest_s = 0.0
         self._header = header
         self._profile = profile
-        self._camera = camera_of(profile.camera) if camera is None else camera
+        self._camera = camera
         self._container = Container(stream)
         self._epoch: Epoch | None = None
         self._said = m.Said3d(Epoch(0, 0.0), None)
@@ -53,23 +52,16 @@ class Writing:
     def size_bytes(self) -> int:
         return self._container.size_bytes
 
-    def frame(self, frame: Frame, with_picture: bool = True) -> None:
-        """The frame as the source gave it; its picture, where it is a new one."""
-        ns = self._at(frame.t_arrival_s)
-        number = frame.index & 0xFFFFFFFF
-        if with_picture and not frame.repeated:
-            data, form = encoded(frame)
-            taken_ns = self._epoch_at(frame.t_s).ns(frame.t_s)
-            self._container.say(m.IMAGE, ns, m.image_message(taken_ns, data, form), number)
+    def frame(self, told: Mapping[str, Any], picture: tuple[bytes, str] | None) -> None:
+        """A frame as its source gave it (`told_of`), and its picture with its format (`encoded`)
+        where it is to be kept."""
+        ns = self._at(told["t_arrival_s"])
+        number = told["number"] & 0xFFFFFFFF
+        if picture is not None:
+            taken_ns = self._epoch_at(told["t_s"]).ns(told["t_s"])
+            self._container.say(m.IMAGE, ns, m.image_message(taken_ns, *picture), number)
             self.pictures += 1
-        told = {
-            "number": frame.index,
-            "t_s": frame.t_s,
-            "t_arrival_s": frame.t_arrival_s,
-            "repeated": frame.repeated,
-            "crc32": zlib.crc32(np.ascontiguousarray(frame.image).data),
-        }
-        # With all digits: a replay needs the very time.
+        # With all digits: a replay needs the very times.
         self._container.say_json(m.FRAME, ns, json.dumps(told).encode(), number)
 
     def tick(self, record: Mapping[str, Any]) -> None:
@@ -109,11 +101,25 @@ class Writing:
         if self._epoch is None:
             self._epoch = epoch = epoch_of(self._header, t_s)
             ns = epoch.ns(t_s)
-            self._said = m.Said3d(epoch, m.mounts_of(self._profile))
+            mounts = None if self._profile is None else m.mounts_of(self._profile)
+            self._said = m.Said3d(epoch, mounts)
             self._container.attach(HEADER_NAME, ns, self._header)
-            self._container.say(m.CALIBRATION, ns, m.calibration_message(ns, self._camera))
-            self._container.say(m.SCENE, ns, scene_message(ns, self._profile))
+            if self._camera is not None:
+                self._container.say(m.CALIBRATION, ns, m.calibration_message(ns, self._camera))
+            if self._profile is not None:
+                self._container.say(m.SCENE, ns, scene_message(ns, self._profile))
         return self._epoch
+
+
+def told_of(frame: Frame) -> dict[str, Any]:
+    """The frame without its picture, but with what tells whether one is it."""
+    return {
+        "number": frame.index,
+        "t_s": frame.t_s,
+        "t_arrival_s": frame.t_arrival_s,
+        "repeated": frame.repeated,
+        "crc32": zlib.crc32(np.ascontiguousarray(frame.image).data),
+    }
 
 
 def encoded(frame: Frame) -> tuple[bytes, str]:

@@ -1,0 +1,340 @@
+"""What a recording holds: pictures to the bit, Foxglove's own messages, where everything is."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf import (
+    CameraCalibration_pb2,
+    CompressedImage_pb2,
+    FrameTransforms_pb2,
+    ImageAnnotations_pb2,
+    Log_pb2,
+    PoseInFrame_pb2,
+    PosesInFrame_pb2,
+    SceneUpdate_pb2,
+)
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from perchctl.calibration.files import camera_of
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.geometry import (
+    Array,
+    make_T,
+    rot_z,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+)
+from perchctl.log.recording import pictures_of
+from perchctl.log.recording.layout import layout
+from perchctl.log.recording.messages import calibration_message
+from perchctl.log.recording.shapes import SCHEMAS
+from perchctl.vision.types import CameraModel
+from tests.helpers import recorded
+
+OFFICIAL = {
+    "/camera/image": CompressedImage_pb2.CompressedImage,
+    "/camera/calibration": CameraCalibration_pb2.CameraCalibration,
+    "/camera/corners": ImageAnnotations_pb2.ImageAnnotations,
+    "/tf": FrameTransforms_pb2.FrameTransforms,
+    "/vehicle/pose": PoseInFrame_pb2.PoseInFrame,
+    "/vehicle/path": PosesInFrame_pb2.PosesInFrame,
+    "/target/pose": PoseInFrame_pb2.PoseInFrame,
+    "/setpoint": PoseInFrame_pb2.PoseInFrame,
+    "/scene": SceneUpdate_pb2.SceneUpdate,
+    "/log": Log_pb2.Log,
+}
+STARTED = {"started": None, "t0_s": 1.0}
+FLIGHT = recorded.flown(120)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "flight.mcap"
+    recorder = recorded.recorder(path, **STARTED)
+    recorded.fly(recorder, FLIGHT)
+    end = recorder.close()
+    assert (end.pictures, end.missing, end.problem) == (len(FLIGHT.frames), 0, None)
+    return path
+
+
+@pytest.fixture(scope="module")
+def found(recording: Path) -> dict[str, list[Any]]:
+    return recorded.messages(recording)
+
+
+def test_each_picture_is_the_pipeline_s_to_the_bit(recording: Path) -> None:
+    found = list(pictures_of(recording))
+    assert [(p.number, p.t_s) for p in found] == [(f.index, f.t_s) for f in FLIGHT.frames]
+    for got, frame in zip(found, FLIGHT.frames, strict=True):
+        assert got.image.dtype == np.uint8
+        np.testing.assert_array_equal(got.image, frame.image)
+
+
+def test_a_jpeg_lies_there_as_it_came(found: dict[str, list[Any]]) -> None:
+    stored = found["/camera/image"]
+    assert [image.format for image in stored[:4]] == ["jpeg", "png", "jpeg", "png"]
+    assert stored[0].data == FLIGHT.frames[0].encoded
+
+
+def test_the_logs_own_path_names_it_too(recording: Path) -> None:
+    assert next(pictures_of(recording.with_suffix(".jsonl"))).number == 0
+
+
+def test_a_picture_that_decodes_otherwise_here_is_said(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import cv2
+
+    real = cv2.imdecode
+    monkeypatch.setattr(cv2, "imdecode", lambda *args: real(*args) // 2)
+    with pytest.raises(InvalidValue, match="picture 0 decodes to other pixels"):
+        next(pictures_of(recording))
+    assert next(pictures_of(recording, exact=False)).number == 0
+
+
+def test_no_recording_and_none_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(NotFound, match="does not exist"):
+        next(pictures_of(tmp_path / "flight.jsonl"))
+    (tmp_path / "flight.mcap").write_bytes(b"GIF89a and more")
+    with pytest.raises(InvalidValue, match="no recording"):
+        next(pictures_of(tmp_path / "flight.jsonl"))
+
+
+def test_readers_find_it_whole(recording: Path, found: dict[str, list[Any]]) -> None:
+    """By the index, with every checksum; from the beginning; and both find the same."""
+    with recording.open("rb") as stream:
+        summary = make_reader(stream, validate_crcs=True).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    counted = {c.topic: 0 for c in summary.channels.values()}
+    with recording.open("rb") as stream:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            channel = getattr(record, "channel_id", None)
+            if type(record).__name__ == "Message":
+                counted[summary.channels[channel].topic] += 1
+    indexed = {
+        summary.channels[number].topic: count
+        for number, count in summary.statistics.channel_message_counts.items()
+    }
+    assert counted == indexed
+    assert counted == {topic: len(said) for topic, said in found.items()}
+    assert counted["/camera/image"] == counted["/camera/frame"] == len(FLIGHT.frames)
+    assert counted["/tick"] == counted["/tf"] == len(FLIGHT.ticks)
+    assert summary.chunk_indexes[0].compression == "lz4"
+
+
+def test_the_schemas_are_foxgloves_own(recording: Path) -> None:
+    """Each definition in the file is, field by field, that of Foxglove's package, with all that
+    it needs to be understood without it."""
+    with recording.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    found = {c.topic: summary.schemas[c.schema_id] for c in summary.channels.values()}
+    assert set(found) == set(OFFICIAL) | set(SCHEMAS)
+    for topic, official in OFFICIAL.items():
+        schema = found[topic]
+        assert (schema.encoding, schema.name) == ("protobuf", official.DESCRIPTOR.full_name)
+        files = FileDescriptorSet.FromString(schema.data)
+        pool = DescriptorPool()
+        for file in files.file:
+            pool.Add(file)
+        assert _shape(pool.FindMessageTypeByName(schema.name)) == _shape(official.DESCRIPTOR)
+        assert schema.name.startswith("foxglove.")
+    for topic, (name, schema) in SCHEMAS.items():
+        assert (found[topic].encoding, found[topic].name) == ("jsonschema", name)
+        assert json.loads(found[topic].data) == schema
+
+
+def _shape(message: Any, known: tuple[str, ...] = ()) -> list[Any]:
+    """Names, numbers and types of all fields, into the depth."""
+    if message.full_name in known:
+        return [message.full_name]
+    known = (*known, message.full_name)
+    return [
+        (
+            field.name,
+            field.number,
+            field.type,
+            field.is_repeated,
+            _shape(field.message_type, known) if field.message_type else None,
+            [(v.name, v.number) for v in field.enum_type.values] if field.enum_type else None,
+        )
+        for field in message.fields
+    ]
+
+
+KINDS: dict[str, tuple[type, ...]] = {
+    "number": (int, float),
+    "integer": (int,),
+    "string": (str,),
+    "boolean": (bool,),
+    "array": (list,),
+}
+
+
+@pytest.mark.parametrize("topic", sorted(SCHEMAS))
+def test_what_is_json_is_as_its_schema_says(found: dict[str, list[Any]], topic: str) -> None:
+    properties = SCHEMAS[topic][1]["properties"]
+    seen: set[str] = set()
+    for data in found[topic]:
+        for key, value in json.loads(data).items():
+            assert isinstance(value, KINDS[properties[key]["type"]]), key
+            assert isinstance(value, bool) is (properties[key]["type"] == "boolean"), key
+            seen.add(key)
+    assert "t_s" in seen
+
+
+def test_times_count_from_the_logs_start(recording: Path, found: dict[str, list[Any]]) -> None:
+    first = json.loads(found["/tick"][0])
+    assert first["t_s"] == pytest.approx(FLIGHT.ticks[0]["t_s"] - 1.0)
+    with recording.open("rb") as stream:
+        times = [m.log_time for _, c, m in make_reader(stream).iter_messages(topics=["/tick"])]
+    told = [round((tick["t_s"] - 1.0) * 1e9) for tick in FLIGHT.ticks]
+    assert times == pytest.approx(told, abs=1)
+
+
+def test_the_wall_clock_is_the_headers(tmp_path: Path) -> None:
+    from datetime import UTC, datetime
+
+    started = datetime(2024, 5, 17, 12, 30, 15, tzinfo=UTC)
+    recorder = recorded.recorder(tmp_path / "f.mcap", started=started, t0_s=1.0)
+    recorded.fly(recorder, recorded.flown(2))
+    recorder.close()
+    with (tmp_path / "f.mcap").open("rb") as stream:
+        first = next(make_reader(stream).iter_messages(topics=["/tick"]))[2].log_time
+    assert first == pytest.approx(started.timestamp() * 1e9 + 0.1e9, abs=1000)
+
+
+def _transforms(message: Any) -> dict[str, Array]:
+    """By ``parent child``."""
+    found = {}
+    for each in message.transforms:
+        q, t = each.rotation, each.translation
+        R = rotation_from_quaternion((q.w, q.x, q.y, q.z))
+        found[f"{each.parent_frame_id} {each.child_frame_id}"] = make_T(R, (t.x, t.y, t.z))
+    return found
+
+
+def test_the_transforms_lead_from_the_world_to_camera_gear_and_target(
+    found: dict[str, list[Any]],
+) -> None:
+    said = found["/tf"]
+    mount = recorded.PROFILE.camera.mount.T_body_cam
+    for n in (0, 60, len(FLIGHT.ticks) - 1):
+        tick, T = FLIGHT.ticks[n], _transforms(said[n])
+        R = rotation_from_rpy(tick["roll_rad"], tick["pitch_rad"], tick["yaw_rad"])
+        T_world_body = make_T(R, (tick["x_m"], tick["y_m"], tick["z_m"]))
+        np.testing.assert_allclose(T["world body"], T_world_body, atol=1e-12)
+        np.testing.assert_allclose(T["body camera"], mount, atol=1e-12)
+        gear = T["body gear"]
+        np.testing.assert_allclose(gear[:3, 3], recorded.PROFILE.vehicle.gear_body_m)
+    tick = FLIGHT.ticks[-1]
+    T_world_target = make_T(rot_z(tick["tyaw_rad"]), (tick["tx_m"], tick["ty_m"], tick["tz_m"]))
+    np.testing.assert_allclose(T["world target"], T_world_target, atol=1e-12)
+
+
+def test_the_body_is_where_it_was_when_that_was_measured(found: dict[str, list[Any]]) -> None:
+    said = found["/tf"][50].transforms
+    (body,) = [each for each in said if each.child_frame_id == "body"]
+    told_s = FLIGHT.ticks[50]["t_s"] - FLIGHT.ticks[50]["tel_age_s"] - 1.0
+    assert body.timestamp.seconds + body.timestamp.nanos * 1e-9 == pytest.approx(told_s, abs=1e-8)
+
+
+def test_a_target_out_of_sight_stays_where_it_was(tmp_path: Path) -> None:
+    recorder = recorded.recorder(tmp_path / "f.mcap")
+    seen = next(tick for tick in recorded.flown(120).ticks if tick["tx_m"] is not None)
+    gone = {**seen, "t_s": seen["t_s"] + 5.0, "tx_m": None}
+    for tick in (seen, gone):
+        recorder.tick(tick)
+    recorder.close()
+    first, second = recorded.messages(tmp_path / "f.mcap")["/tf"]
+    found = [t for message in (first, second) for t in message.transforms]
+    target = [each for each in found if each.child_frame_id == "target"]
+    assert len(target) == 2
+    assert str(target[0].translation) == str(target[1].translation)
+    assert target[1].timestamp.seconds == target[0].timestamp.seconds + 5
+
+
+def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
+    recorder = recorded.recorder(tmp_path / "f.mcap")
+    recorder.tick({**FLIGHT.ticks[0], "x_m": float("nan"), "cmd_z_m": float("inf")})
+    recorder.close()
+    found = recorded.messages(tmp_path / "f.mcap")
+    assert set(_transforms(found["/tf"][0])) == {"body camera", "body gear"}
+    assert not {"/vehicle/pose", "/setpoint"} & set(found)
+
+
+def test_the_calibration_is_the_flights(found: dict[str, list[Any]]) -> None:
+    (said,) = found["/camera/calibration"]
+    camera = camera_of(recorded.PROFILE.camera)
+    assert (said.width, said.height, said.frame_id) == (*camera.size_px, "camera")
+    assert said.distortion_model == "plumb_bob"
+    assert list(said.D) == list(camera.dist)
+    np.testing.assert_array_equal(np.reshape(said.K, (3, 3)), camera.K)
+    np.testing.assert_array_equal(np.reshape(said.R, (3, 3)), np.eye(3))
+    np.testing.assert_array_equal(np.reshape(said.P, (3, 4))[:, :3], camera.K)
+
+
+def test_a_fisheye_has_foxgloves_name() -> None:
+    said = calibration_message(0, CameraModel((8, 6), np.eye(3), np.zeros(4), "fisheye"))
+    assert said.distortion_model == "kannala_brandt"
+
+
+def test_events_are_log_lines_with_their_gravity(found: dict[str, list[Any]]) -> None:
+    (said,) = found["/log"]
+    assert said.message == "LANDING: target not found"
+    assert said.level == Log_pb2.Log.ERROR
+    assert (said.name, said.file) == ("perchctl", "searched-out")
+
+
+def test_the_path_grows(found: dict[str, list[Any]]) -> None:
+    said = found["/vehicle/path"]
+    lengths = [len(message.poses) for message in said]
+    assert lengths == sorted(set(lengths))
+    assert len(said) == 5  # 4.8 s, each second
+    assert said[-1].poses[-1].position.z > said[0].poses[0].position.z
+
+
+def test_corners_lie_on_the_picture(found: dict[str, list[Any]]) -> None:
+    said = found["/camera/corners"]
+    tick = next(tick for tick in FLIGHT.ticks if tick["large_px"] is not None)
+    outline = next(message for message in said if message.points).points[0]
+    assert [v for p in outline.points for v in (p.x, p.y)] == tick["large_px"]
+
+
+def test_the_header_goes_along(recording: Path) -> None:
+    with recording.open("rb") as stream:
+        (attached,) = make_reader(stream).iter_attachments()
+    header = json.loads(attached.data)
+    assert header["profile"]["name"] == "sim"
+
+
+def test_the_layout_shows_what_is_there(found: dict[str, list[Any]]) -> None:
+    shown = layout()
+    topics = set(found)
+    text = json.dumps(shown)
+    named = {word for word in text.replace(".", '"').split('"') if word.startswith("/")}
+    assert named <= topics
+    assert {"/camera/image", "/camera/calibration", "/scene", "/vehicle/path", "/log"} <= named
+    plotted = {
+        path["value"].removeprefix("/tick.")
+        for panel in shown["configById"].values()
+        for path in panel.get("paths", ())
+    }
+    assert plotted <= set(SCHEMAS["/tick"][1]["properties"])
+
+    def leaves(part: Any) -> list[str]:
+        return [part] if isinstance(part, str) else leaves(part["first"]) + leaves(part["second"])
+
+    assert sorted(leaves(shown["layout"])) == sorted(shown["configById"])
+    assert {name.split("!")[0] for name in shown["configById"]} == {
+        "3D", "Image", "Plot", "StateTransitions", "RosOut"
+    }  # fmt: skip
