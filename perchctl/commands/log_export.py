@@ -9,16 +9,18 @@ from typing import Any
 
 from perchctl.commands.log_file import log_file, opened
 from perchctl.commands.log_plot import beside
-from perchctl.commands.output import print_record
+from perchctl.commands.output import print_record, say
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_output, same_file, write_files
-from perchctl.log import recording
 from perchctl.log.export.as_csv import csv_text
 from perchctl.log.export.as_parquet import check_parquet, parquet_bytes
 from perchctl.log.export.table import columns_of
+from perchctl.log.recording import export_mcap, recording_of
 
 STDOUT = Path("-")
 ENDINGS = {"csv": ".csv", "parquet": ".parquet", "mcap": ".mcap"}
+
+_COUNTS = ("rows", "columns", "pictures")
 
 
 @dataclass(frozen=True)
@@ -52,12 +54,15 @@ def run(request: ExportRequest) -> int:
         return 0
     place = request.output or beside(path, ("_export" if form == "mcap" else "") + ENDINGS[form])
     check_output(place, (ENDINGS[form],), request.force, f"what --{form} writes")
-    size = _mcap(path, place, request.force) if form == "mcap" else _table(path, place, form)
+    write = _write_mcap if form == "mcap" else _write_table
+    done = write(path, place, request.force)
     if request.as_json:
-        print_record({"log": str(path), "output": str(place), "format": form, **size})
-    else:
-        told = f" ({size['rows']} rows, {size['columns']} columns)" if size else ""
-        print(f"export:    {place}{told}")
+        print_record({"log": str(path), "output": str(place), "format": form, **done})
+        return 0
+    counted = ", ".join(f"{done[key]} {key}" for key in _COUNTS if key in done)
+    print(f"export:    {place} ({counted})")
+    if "layout" in done:
+        print(f"layout:    {done['layout']}, for Foxglove")
     return 0
 
 
@@ -79,10 +84,10 @@ def _form(request: ExportRequest) -> str:
     )
 
 
-def _table(path: Path, place: Path, form: str) -> dict[str, Any]:
+def _write_table(path: Path, place: Path, _force: bool) -> dict[str, Any]:
     with opened(path) as log:
         columns = columns_of(log)
-        if form == "csv":
+        if place.suffix.lower() == ENDINGS["csv"]:
             content = csv_text(columns).encode("utf-8", errors="backslashreplace")
         else:
             content = parquet_bytes(log, columns)
@@ -90,15 +95,14 @@ def _table(path: Path, place: Path, form: str) -> dict[str, Any]:
     return {"rows": len(columns[0].values), "columns": len(columns)}
 
 
-def _mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
-    own = recording.recording_of(path)
+def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
+    own = recording_of(path)
     if same_file(place, own):
         raise InvalidValue(
             f"{own} is the flight's own recording, with its pictures: open that, or name another "
             f"file with -o"
         )
-    export_mcap = getattr(recording, "export_mcap", None)
-    if export_mcap is None:
-        raise UsageError("--mcap is not part of this version: record the flight with fly --record")
-    export_mcap(path, place, force)
-    return {}
+    done = export_mcap(path, place, force)
+    for note in done.notes:
+        say(note)
+    return {"layout": str(done.layout), "pictures": done.pictures}

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogFormatter
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
@@ -54,6 +55,7 @@ def plot_comparison(one: FlightLog, other: FlightLog, path: Path) -> None:
     _overlay(axes[4], logs, common, [_aside_mm(log) for log in logs])
     axes[4].set_yscale("log")
     axes[4].set_ylim(ASIDE_MM)
+    axes[4].yaxis.set_major_formatter(LogFormatter())
     axes[4].set_ylabel("aside [mm]")
     for ax, key, scale, label in (
         (axes[5], "z_m", 1.0, "height [m]"),
