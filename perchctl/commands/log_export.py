@@ -102,7 +102,8 @@ def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
             f"{own} is the flight's own recording, with its pictures: open that, or name another "
             f"file with -o"
         )
-    done = export_mcap(path, place, force)
+    with opened(path):  # what of it is no flight's is told as of the other forms
+        done = export_mcap(path, place, force)
     for note in done.notes:
         say(note)
     return {"layout": str(done.layout), "pictures": done.pictures}
