@@ -31,8 +31,8 @@ def test_the_newest_is_shown_and_named(logs: Path) -> None:
     said = run("log", "show")
     assert (said.code, said.complaint) == (0, "the newest log: perchctl-logs/flight_new.jsonl")
     assert said.stdout.startswith("UNKNOWN: the log ends in APPROACH")
-    elsewhere = json.loads(run("log", "show", "--log-dir", str(logs), "--json").stdout)
-    assert elsewhere["log"] == str(logs / "flight_new.jsonl")
+    told = json.loads(run("log", "show", "--log-dir", str(logs), "--json").stdout)
+    assert told["log"] == str(logs / "flight_new.jsonl")
     Path("mine.yaml").write_text("extends: sim\nlog: {directory: other}\n")
     synthetic.write(Path("other/flight_x.jsonl"), summary=synthetic.SUMMARY, most=3)
     assert run("log", "show", "-p", "mine.yaml").stdout.startswith("PERCHED")
@@ -104,7 +104,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
         (["show", "none.jsonl"], 20, "does not exist"),
         (["show", "perchctl-logs"], 20, "is a folder"),
         (["show", "--log-dir", "nowhere"], 20, "there is no folder nowhere"),
-        (["show", "--log-dir", "."], 20, "holds no flight log"),
+        (["show", "--log-dir", "empty"], 20, "holds no flight log"),
         (["show", "-p", "smi"], 20, "'smi'"),
         (["show", "a.csv"], 30, "a table"),
         (["show", "a.jsonl", "--list"], 2, "--list is of a folder"),
@@ -132,6 +132,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
 def test_what_goes_wrong_is_one_sentence(
     words: list[str], code: int, said: str, logs: Path
 ) -> None:
+    Path("empty").mkdir()
     Path("a.csv").write_text("t_s,phase\n0,x\n")
     synthetic.write(Path("bare.jsonl"), most=0)
     good = synthetic.write(Path("damaged.jsonl"), most=1, summary=synthetic.SUMMARY).read_bytes()
