@@ -109,6 +109,21 @@ def quaternion_from_rotation(R: Array) -> tuple[float, float, float, float]:
     return w, x, y, z
 
 
+def quaternion_from_rpy(
+    roll_rad: float, pitch_rad: float, yaw_rad: float
+) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z) of `rotation_from_rpy`, without a matrix on the way."""
+    cr, sr = math.cos(0.5 * roll_rad), math.sin(0.5 * roll_rad)
+    cp, sp = math.cos(0.5 * pitch_rad), math.sin(0.5 * pitch_rad)
+    cy, sy = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
+    return (
+        cy * cp * cr + sy * sp * sr,
+        cy * cp * sr - sy * sp * cr,
+        cy * sp * cr + sy * cp * sr,
+        sy * cp * cr - cy * sp * sr,
+    )
+
+
 def make_T(R: Array, t_m: Array | tuple[float, float, float]) -> Array:
     """Homogeneous matrix of a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)

@@ -14,7 +14,9 @@ from perchctl.geometry import (
     circular_mean,
     invert_T,
     make_T,
+    quaternion_from_rpy,
     rot_z,
+    rotation_from_quaternion,
     rotation_from_rpy,
     rpy_from_rotation,
     wrap_rad,
@@ -53,6 +55,16 @@ def test_inverse(T_a_b: np.ndarray) -> None:
 @given(transforms(), transforms(), transforms())
 def test_inner_letters_cancel(T_a_b: np.ndarray, T_b_c: np.ndarray, T_c_d: np.ndarray) -> None:
     assert np.allclose((T_a_b @ T_b_c) @ T_c_d, T_a_b @ (T_b_c @ T_c_d), atol=1e-8)
+
+
+@given(angles, angles, angles)
+def test_a_quaternion_of_angles_turns_as_their_matrix(
+    roll: float, pitch: float, yaw: float
+) -> None:
+    q = quaternion_from_rpy(roll, pitch, yaw)
+    assert math.hypot(*q) == pytest.approx(1.0)
+    R = rotation_from_rpy(roll, pitch, yaw)
+    assert np.allclose(rotation_from_quaternion(q), R, atol=1e-9)
 
 
 @given(angles, small_angles, angles)

@@ -15,7 +15,8 @@ from perchctl.files import check_output, same_file, write_files
 from perchctl.log.export.as_csv import csv_text
 from perchctl.log.export.as_parquet import check_parquet, parquet_bytes
 from perchctl.log.export.table import columns_of
-from perchctl.log.recording import export_mcap, recording_of
+from perchctl.log.recording import export_mcap
+from perchctl.log.recording.place import recording_of
 
 STDOUT = Path("-")
 ENDINGS = {"csv": ".csv", "parquet": ".parquet", "mcap": ".mcap"}

@@ -19,6 +19,8 @@ def to_plain(value: Any) -> Any:
 
     Raises TypeError for a value that has no place in a log.
     """
+    if type(value) is float:  # nearly all of a record, and a match is slow
+        return round(value, DECIMALS) + 0.0 if math.isfinite(value) else None
     match value:
         case None | bool() | str():
             return value

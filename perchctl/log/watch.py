@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from perchctl.camera.source import FrameSource, WatchedSource
 from perchctl.log.fields import event_record, tick_record
 from perchctl.log.read import PhaseSpan
-from perchctl.log.recording import SUFFIX, recording_of
+from perchctl.log.recording.place import SUFFIX, recording_of
 from perchctl.log.summary import FlightSummary
 from perchctl.log.write import FlightLogWriter, log_path, make_header
 from perchctl.mission.turn import Turn

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -174,6 +175,22 @@ def test_a_colour_camera_gives_a_smooth_picture(deck: AiDeck, opened: Opened) ->
     deck.forever = [raw(bayer(np.full_like(flat, 150)))]
     frame = next_frame(opened(deck))
     assert int(frame.image.max()) - int(frame.image.min()) <= 1
+
+
+def test_a_frame_has_the_jpeg_that_it_came_as(deck: AiDeck, opened: Opened) -> None:
+    deck.forever = [jpeg(picture(60))]
+    frame = next_frame(opened(deck))
+    assert frame.encoded is not None
+    decoded = cv2.imdecode(np.frombuffer(frame.encoded, np.uint8), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(decoded, frame.image)
+
+
+@pytest.mark.parametrize("sent", [jpeg(bayer(picture(150))), raw(picture(60))])
+def test_a_raw_picture_and_one_without_its_mosaic_are_no_jpeg(
+    sent: bytes, deck: AiDeck, opened: Opened
+) -> None:
+    deck.forever = [sent]
+    assert next_frame(opened(deck)).encoded is None
 
 
 def test_another_size_than_the_calibrations_is_refused(deck: AiDeck) -> None:

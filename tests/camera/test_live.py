@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.camera.device import LOST_AFTER_FAILURES, Asked, DeviceSource, open_capture
+from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.mjpeg import MAX_PICTURE_BYTES, JpegSplitter, MjpegSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
@@ -209,6 +210,23 @@ def test_frames_are_stamped_at_arrival_less_the_latency(
     go.set()
     second = next_frame(source)
     assert (second.index, level(second), second.t_arrival_s) == (1, 160, 101.0)
+
+
+def test_a_frame_has_the_jpeg_that_it_came_as(server: Server, opened: list[LiveSource]) -> None:
+    picture = jpeg(90)
+    server.scripts.put([part(picture), threading.Event()])
+    frame = next_frame(stream(server, Clock(), opened))
+    assert frame.encoded == picture
+    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(decoded, frame.image)
+
+
+def test_a_picture_that_was_turned_right_is_none_of_its_jpeg(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    server.scripts.put([part(jpeg(90)), threading.Event()])
+    frame = next_frame(UnmirroredSource(stream(server, Clock(), opened)))
+    assert frame.encoded is None
 
 
 def test_the_newest_frame_wins(server: Server, opened: list[LiveSource]) -> None:

@@ -10,19 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from perchctl.log.recording.place import recording_of
+
 if TYPE_CHECKING:
     from perchctl.log.recording.export import Exported
     from perchctl.log.recording.pictures import Picture
-
-SUFFIX = ".mcap"
-LAYOUT_SUFFIX = ".foxglove.json"
-_PACKED = ".gz"
-
-
-def recording_of(path: Path | str) -> Path:
-    """The recording's place, of a log's path or the recording's own."""
-    path = Path(path)
-    return (path.with_suffix("") if path.suffix == _PACKED else path).with_suffix(SUFFIX)
 
 
 def pictures_of(path: Path | str, *, exact: bool = True) -> Iterator[Picture]:

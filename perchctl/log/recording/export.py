@@ -16,10 +16,10 @@ from perchctl.calibration.files import camera_of
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
 from perchctl.log.read import FlightLog, read_log
-from perchctl.log.recording import LAYOUT_SUFFIX, SUFFIX, recording_of
 from perchctl.log.recording.container import DiskStream
 from perchctl.log.recording.layout import layout
 from perchctl.log.recording.messages import FRAME, IMAGE
+from perchctl.log.recording.place import LAYOUT_SUFFIX, SUFFIX, recording_of
 from perchctl.log.recording.walk import Walked, walk
 from perchctl.log.recording.writing import Writing
 from perchctl.log.setup import camera_in, profile_of

@@ -8,8 +8,7 @@ one made of its log say the same. Frames: `world` (of the state estimate), `body
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from perchctl.geometry import Array, quaternion_from_rotation, rot_z, rotation_from_rpy
+from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
 from perchctl.log.recording.times import NS, Epoch
 from perchctl.profile import Profile
 from perchctl.vision.types import CameraModel
@@ -120,24 +119,15 @@ def corners_message(ns: int, record: Mapping[str, Any]) -> ImageAnnotations:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Mounts:
-    """What does not move against the body, as messages without their time."""
-
-    T_body_cam: Array
-    gear_body_m: tuple[float, float, float]
-
-    def transforms(self, ns: int) -> list[FrameTransform]:
-        R, t_m = self.T_body_cam[:3, :3], self.T_body_cam[:3, 3]
-        return [
-            _transform(ns, BODY, CAMERA, t_m, quaternion_from_rotation(R)),
-            _transform(ns, BODY, GEAR, self.gear_body_m, (1.0, 0.0, 0.0, 0.0)),
-        ]
-
-
-def mounts_of(profile: Profile) -> Mounts:
-    x, y, z = (float(v) for v in profile.vehicle.gear_body_m)
-    return Mounts(profile.camera.mount.T_body_cam, (x, y, z))
+def mounts_of(profile: Profile) -> list[FrameTransform]:
+    """What does not move against the body."""
+    T_body_cam = profile.camera.mount.T_body_cam
+    q = quaternion_from_rotation(T_body_cam[:3, :3])
+    gear_m = profile.vehicle.gear_body_m
+    return [
+        _transform(0, BODY, CAMERA, T_body_cam[:3, 3], q),
+        _transform(0, BODY, GEAR, gear_m, (1.0, 0.0, 0.0, 0.0)),
+    ]
 
 
 class Said3d:
@@ -147,7 +137,7 @@ class Said3d:
     newest message of each topic, and no older one.
     """
 
-    def __init__(self, epoch: Epoch, mounts: Mounts | None) -> None:
+    def __init__(self, epoch: Epoch, mounts: Sequence[FrameTransform] = ()) -> None:
         self._epoch = epoch
         self._mounts = mounts
         self._target: FrameTransform | None = None  # where it was last
@@ -158,7 +148,10 @@ class Said3d:
         """Of a tick's record (`perchctl.log.fields.FIELDS`)."""
         t_s = float(record["t_s"])
         ns = self._epoch.ns(t_s)
-        transforms = [] if self._mounts is None else self._mounts.transforms(ns)
+        now = stamp(ns)
+        for mount in self._mounts:
+            mount.timestamp.CopyFrom(now)
+        transforms = list(self._mounts)
         body = _body_of(record)
         if body is not None:
             sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
@@ -171,7 +164,7 @@ class Said3d:
             self._target = _transform(ns, WORLD, TARGET, *target)
             yield TARGET_POSE, _pose_in_world(ns, target)
         elif self._target is not None:
-            self._target.timestamp.CopyFrom(stamp(ns))
+            self._target.timestamp.CopyFrom(now)
         if self._target is not None:
             transforms.append(self._target)
         yield TF, FrameTransforms(transforms=transforms)
@@ -202,7 +195,7 @@ def _body_of(record: Mapping[str, Any]) -> Placed | None:
     if any(value is None for value in values):
         return None
     x, y, z, roll, pitch, yaw = (float(v) for v in values if v is not None)
-    return (x, y, z), quaternion_from_rotation(rotation_from_rpy(roll, pitch, yaw))
+    return (x, y, z), quaternion_from_rpy(roll, pitch, yaw)
 
 
 def _turned(record: Mapping[str, Any], *keys: str) -> Placed | None:
@@ -211,7 +204,7 @@ def _turned(record: Mapping[str, Any], *keys: str) -> Placed | None:
     if any(value is None for value in values):
         return None
     x, y, z, yaw = (float(v) for v in values if v is not None)
-    return (x, y, z), quaternion_from_rotation(rot_z(yaw))
+    return (x, y, z), quaternion_from_rpy(0.0, 0.0, yaw)
 
 
 def _number(record: Mapping[str, Any], key: str) -> float | None:

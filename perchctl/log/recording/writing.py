@@ -46,7 +46,7 @@ class Writing:
         self._camera = camera
         self._container = Container(stream)
         self._epoch: Epoch | None = None
-        self._said = m.Said3d(Epoch(0, 0.0), None)
+        self._said = m.Said3d(Epoch(0, 0.0))
 
     @property
     def size_bytes(self) -> int:
@@ -100,8 +100,8 @@ class Writing:
         said once."""
         if self._epoch is None:
             self._epoch = epoch = epoch_of(self._header, t_s)
-            ns = epoch.ns(t_s)
-            mounts = None if self._profile is None else m.mounts_of(self._profile)
+            ns = epoch.ns(epoch.t0_s)
+            mounts = [] if self._profile is None else m.mounts_of(self._profile)
             self._said = m.Said3d(epoch, mounts)
             self._container.attach(HEADER_NAME, ns, self._header)
             if self._camera is not None:

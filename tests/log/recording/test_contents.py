@@ -51,6 +51,18 @@ OFFICIAL = {
     "/scene": SceneUpdate_pb2.SceneUpdate,
     "/log": Log_pb2.Log,
 }
+# Of the definitions that Foxglove publishes (foxglove/foxglove-sdk, schemas/proto).
+PUBLISHED = {
+    "/camera/image": {"timestamp": 1, "data": 2, "format": 3, "frame_id": 4},
+    "/camera/calibration": {
+        "timestamp": 1, "width": 2, "height": 3, "distortion_model": 4, "D": 5, "K": 6, "R": 7,
+        "P": 8, "frame_id": 9,
+    },
+    "/tf": {"transforms": 1},
+    "/vehicle/pose": {"timestamp": 1, "frame_id": 2, "pose": 3},
+    "/vehicle/path": {"timestamp": 1, "frame_id": 2, "poses": 3},
+    "/log": {"timestamp": 1, "level": 2, "message": 3, "name": 4, "file": 5, "line": 6},
+}  # fmt: skip
 STARTED = {"started": None, "t0_s": 1.0}
 FLIGHT = recorded.flown(120)
 
@@ -148,6 +160,9 @@ def test_the_schemas_are_foxgloves_own(recording: Path) -> None:
             pool.Add(file)
         assert _shape(pool.FindMessageTypeByName(schema.name)) == _shape(official.DESCRIPTOR)
         assert schema.name.startswith("foxglove.")
+        if topic in PUBLISHED:
+            numbers = {f.name: f.number for f in pool.FindMessageTypeByName(schema.name).fields}
+            assert numbers == PUBLISHED[topic]
     for topic, (name, schema) in SCHEMAS.items():
         assert (found[topic].encoding, found[topic].name) == ("jsonschema", name)
         assert json.loads(found[topic].data) == schema
