@@ -46,6 +46,14 @@ def broken_motion_capture(why: str) -> UsageError:
     )
 
 
+def no_parquet() -> UsageError:
+    """Where the extra ``parquet`` is not installed."""
+    return UsageError(
+        f"--parquet needs the library pyarrow; install it with: "
+        f"{sys.executable} -m pip install 'perchctl[parquet]'"
+    )
+
+
 class ConnectionFailed(PerchError):
     exit_code = 10
     meaning = "no connection to the vehicle or the motion capture"

@@ -26,6 +26,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "mcap_protobuf": ("perchctl.log.recording",),
     "foxglove_schemas_protobuf": ("perchctl.log.recording",),
     "google": ("perchctl.log.recording",),
+    "pyarrow": ("perchctl.log.export.as_parquet",),
     "av": ("perchctl.track.files", "perchctl.camera.rtsp"),
 }
 

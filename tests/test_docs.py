@@ -106,6 +106,8 @@ def cheap(line: str) -> list[str]:
             words += ["--positions", "3", "--frames", "10"]
         case ["perchctl", "calibrate"] if "--mount" in words:  # without a vehicle in a hand
             words = [*words[:3], "-p", "my_vehicle.yaml", "--from", "hand.jsonl"]
+        case ["perchctl", "log"]:
+            words = ["short.jsonl" if word.endswith(".jsonl") else word for word in words]
         case ["perchctl", "track"]:  # without a camera
             words = [WITHOUT_A_CAMERA.get(word, word) for word in words]
             words = ["video:flight.mp4" if w.startswith("camera:") else w for w in words]
@@ -172,7 +174,12 @@ def run_python(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 
 ONCE = {tuple(cheap(line)): line for line in command_lines() if not line.startswith(TOOLS)}
 """Lines that come to the same command are run once."""
-LONG = ("perchctl simulate", "python docs/pictures/make.py")
+LONG = (
+    "perchctl log plot",
+    "perchctl log compare",
+    "perchctl simulate",
+    "python docs/pictures/make.py",
+)
 
 
 @pytest.mark.parametrize(
@@ -196,8 +203,13 @@ def test_every_command_line_runs(
     shutil.copytree(place, tmp_path, dirs_exist_ok=True)
     if "--collect" in words:
         (tmp_path / "session.csv").unlink()
+    if "--parquet" in words:
+        pytest.importorskip("pyarrow", reason="Parquet needs the extra [parquet]")
     if "short.jsonl" in words:
         shutil.copyfile(request.getfixturevalue("short_log"), tmp_path / "short.jsonl")
+    if words[:2] == ["perchctl", "log"]:
+        (tmp_path / "perchctl-logs").mkdir()
+        shutil.copy(request.getfixturevalue("short_log"), tmp_path / "perchctl-logs")
     before = set(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     if words[0] == "python":

@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from perchctl.errors import UsageError
+from perchctl.commands.log_file import opened
+from perchctl.commands.log_plot import DRAWN_IN, FORMATS
+from perchctl.commands.output import print_record
+from perchctl.files import check_output
+from perchctl.log.compare.table import compared, comparison_record, comparison_text
 
 
 @dataclass(frozen=True)
@@ -20,5 +24,24 @@ class CompareRequest:
 
 
 def run(request: CompareRequest) -> int:
-    """Errors: UsageError, as it is not there yet."""
-    raise UsageError("perchctl log compare is not part of this version")
+    """Print the differences, draw both where asked to; returns the exit code.
+
+    Errors: NotFound, InvalidValue.
+    """
+    picture = request.output
+    if picture is not None:
+        check_output(picture, FORMATS, request.force, DRAWN_IN)
+    with opened(request.one) as one, opened(request.other) as other:
+        found = compared(one, other)
+        record, text = comparison_record(found), comparison_text(found)
+        if picture is not None:
+            from perchctl.log.compare.plot import plot_comparison
+
+            plot_comparison(one, other, picture)
+    if request.as_json:
+        print_record(record | {"plot": None if picture is None else str(picture)})
+        return 0
+    print(text)
+    if picture is not None:
+        print(f"\nplot:      {picture}")
+    return 0

@@ -1,11 +1,27 @@
-"""The work behind `perchctl log export`."""
+"""The work behind `perchctl log export`: a log in a form that other programs open."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from perchctl.errors import UsageError
+from perchctl.commands.log_file import log_file, opened
+from perchctl.commands.log_plot import beside
+from perchctl.commands.output import print_record, say
+from perchctl.errors import InvalidValue, UsageError
+from perchctl.files import check_output, same_file, write_files
+from perchctl.log.export.as_csv import csv_text
+from perchctl.log.export.as_parquet import check_parquet, parquet_bytes
+from perchctl.log.export.table import columns_of
+from perchctl.log.recording import export_mcap
+from perchctl.log.recording.place import recording_of
+
+STDOUT = Path("-")
+ENDINGS = {"csv": ".csv", "parquet": ".parquet", "mcap": ".mcap"}
+
+_COUNTS = ("rows", "columns", "pictures")
 
 
 @dataclass(frozen=True)
@@ -24,5 +40,71 @@ class ExportRequest:
 
 
 def run(request: ExportRequest) -> int:
-    """Errors: UsageError, as it is not there yet."""
-    raise UsageError("perchctl log export is not part of this version")
+    """Write; returns the exit code. Errors: NotFound, InvalidValue, UsageError."""
+    form = _form(request)
+    if request.output == STDOUT and (form != "csv" or request.as_json):
+        beside_it = "--json" if form == "csv" else f"--{form}"
+        raise UsageError(f"-o - is CSV on stdout, which {beside_it} does not go with: name a file")
+    if form == "parquet":
+        check_parquet()
+    path = log_file(request.file, request.profile, request.log_dir)
+    if request.output == STDOUT:
+        with opened(path) as log:
+            text = csv_text(columns_of(log))
+        sys.stdout.write(text)
+        return 0
+    place = request.output or beside(path, ("_export" if form == "mcap" else "") + ENDINGS[form])
+    check_output(place, (ENDINGS[form],), request.force, f"what --{form} writes")
+    write = _write_mcap if form == "mcap" else _write_table
+    done = write(path, place, request.force)
+    if request.as_json:
+        print_record({"log": str(path), "output": str(place), "format": form, **done})
+        return 0
+    counted = ", ".join(f"{done[key]} {key}" for key in _COUNTS if key in done)
+    print(f"export:    {place} ({counted})")
+    if "layout" in done:
+        print(f"layout:    {done['layout']}, for Foxglove")
+    return 0
+
+
+def _form(request: ExportRequest) -> str:
+    """What is asked for by name, or else by the output's ending. Errors: UsageError."""
+    asked = [form for form in ENDINGS if getattr(request, form)]
+    if len(asked) > 1:
+        raise UsageError(f"--{asked[0]} and --{asked[1]} are two files: ask for one at a time")
+    if asked:
+        return asked[0]
+    if request.output == STDOUT:
+        return "csv"
+    if request.output is not None:
+        for form, ending in ENDINGS.items():
+            if request.output.suffix.lower() == ending:
+                return form
+    raise UsageError(
+        "say in which form: --csv, --parquet or --mcap, or by the name, as in -o flight.csv"
+    )
+
+
+def _write_table(path: Path, place: Path, _force: bool) -> dict[str, Any]:
+    with opened(path) as log:
+        columns = columns_of(log)
+        if place.suffix.lower() == ENDINGS["csv"]:
+            content = csv_text(columns).encode("utf-8", errors="backslashreplace")
+        else:
+            content = parquet_bytes(log, columns)
+    write_files({place: content})
+    return {"rows": len(columns[0].values), "columns": len(columns)}
+
+
+def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
+    own = recording_of(path)
+    if same_file(place, own):
+        raise InvalidValue(
+            f"{own} is the flight's own recording, with its pictures: open that, or name another "
+            f"file with -o"
+        )
+    with opened(path):  # what of it is no flight's is told as of the other forms
+        done = export_mcap(path, place, force)
+    for note in done.notes:
+        say(note)
+    return {"layout": str(done.layout), "pictures": done.pictures}

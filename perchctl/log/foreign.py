@@ -17,14 +17,16 @@ _BEGINS: tuple[tuple[bytes, str], ...] = (
     (b"RIFF", "a video or a picture"),
     (b"<", "a page or a drawing"),
 )
+_HEADER = b'{"kind":"header"'
 _BOX = b"ftyp"  # MP4 and MOV, four bytes in
 _TEXT_BYTES = 512
 
 
 def why_no_log(path: Path, first_line: bytes) -> str:
     """What the file holds in place of a flight log, and what to do: the end of a sentence."""
-    kind = _kind_of(first_line)
-    return f"{kind}; {_remedy(path)}"
+    if first_line.startswith(_HEADER) and not first_line.endswith(b"\n"):
+        return f"it is cut off in its header, after {len(first_line)} bytes: take the original"
+    return f"{_kind_of(first_line)}; {_remedy(path)}"
 
 
 def _kind_of(line: bytes) -> str:
@@ -33,8 +35,6 @@ def _kind_of(line: bytes) -> str:
             return f"it is {name}"
     if line[4:8] == _BOX:
         return "it is a video"
-    if line.startswith(b'{"kind":"header"') and not line.endswith(b"\n"):
-        return f"it is cut off in its header, after {len(line)} bytes"
     if _is_binary(line[:_TEXT_BYTES]):
         return "it is a binary file"
     if not line.strip():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+import re
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from typing import Any
 
@@ -16,6 +17,7 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 
 SETTLED_S = 1.0
 """So long before the contact begins is looked at for how well the vehicle has settled."""
+_NUMBER = re.compile(r"[0-9.]+")
 _SETTLING, _CONTACT = "ASCEND", "PERCH"
 
 
@@ -99,24 +101,26 @@ def shown(measures: Measures, name: str) -> str:
 
 
 def holds_of(log: FlightLog) -> tuple[Held, ...]:
-    """Each stretch of turns that were held for one and the same reason."""
+    """Each stretch of turns in one phase that were held for one and the same reason, whatever
+    its numbers, which are the last ones'."""
     found: list[Held] = []
-    before = None
+    before: tuple[str, str] | None = None
     for record in log.records:
-        t_s, reason = float(record["t_s"]), record.get("hold") or None
-        if found and before is not None:
+        t_s, phase = float(record["t_s"]), str(record.get("phase") or "")
+        reason = str(record.get("hold") or "")
+        this = (phase, _NUMBER.sub("", reason)) if reason else None
+        if before is not None:
             last = found[-1]
-            found[-1] = Held(last.start_s, t_s, last.phase, last.reason)
-        if reason is not None and reason != before:
-            found.append(Held(t_s, t_s, str(record.get("phase") or ""), str(reason)))
-        before = reason
+            found[-1] = replace(last, end_s=t_s, reason=reason if this == before else last.reason)
+        if this is not None and this != before:
+            found.append(Held(t_s, t_s, phase, reason))
+        before = this
     return tuple(found)
 
 
 def last_contact(log: FlightLog) -> PhaseSpan | None:
     """The ascent from which the last contact was begun."""
-    spans = log.phases
-    ascents = [a for a, b in pairwise(spans) if (a.phase, b.phase) == (_SETTLING, _CONTACT)]
+    ascents = [a for a, b in pairwise(log.phases) if (a.phase, b.phase) == (_SETTLING, _CONTACT)]
     return ascents[-1] if ascents else None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -35,6 +36,8 @@ SHADES = ("#EEF3F8", "#FFFFFF")
 SIZE_IN = (11.0, 17.0)
 TITLE_COLUMNS = 110
 LAST_S, AFTER_S, LEAST_SPAN_MM = 5.0, 0.5, 5.0
+Span = tuple[str, float, float]
+"""A phase's name, and from when to when on the axis."""
 NAME_GAP = 0.02
 """Share of the time axis between the names of two phases, so that they do not overlap."""
 
@@ -68,10 +71,10 @@ def plot_flight(log: FlightLog, path: Path | str) -> None:
         ax.set_xlim(whole_s)
         ax.tick_params(labelbottom=ax is axes[-1])
     for ax in (*axes, last_ax):
-        _shade_phases(ax, log)
+        shade_spans(ax, spans_of(log))
         ax.grid(True, color=GRID, linewidth=0.6)
         ax.set_axisbelow(True)
-    _name_phases(axes[0], log, whole_s)
+    name_spans(axes[0], spans_of(log), whole_s)
     for ax in (axes[-1], last_ax):
         ax.set_xlabel("time [s]")
     figure.align_ylabels([*axes, last_ax])
@@ -96,10 +99,10 @@ def _plot_errors(ax: Axes, log: FlightLog, t_s: Array) -> None:
     """The merged error e = (e_x, e_y, e_z, e_psi) on two scales."""
     lines: list[Line2D] = []
     for (name, unit, scale, _), colour in zip(AXES, (BLUE, VERMILLION, BLACK), strict=True):
-        e = scale * _while_tracked(log, log.column(f"e{name}_{unit}"))
+        e = scale * while_tracked(log, log.column(f"e{name}_{unit}"))
         lines += ax.plot(t_s, e, color=colour, linewidth=1.4, label=f"$e_{name}$ [cm]")
     yaw_ax = ax.twinx()
-    yaw = YAW[2] * _unbroken(_while_tracked(log, log.column("eyaw_rad")))
+    yaw = YAW[2] * unbroken(while_tracked(log, log.column("eyaw_rad")))
     lines += yaw_ax.plot(
         t_s, yaw, color=PURPLE, linewidth=1.4, linestyle="--", label=r"$e_\psi$ [deg], right"
     )
@@ -118,16 +121,16 @@ def _plot_raw_and_filtered(
     for source, colour, marker in (("j", GREEN, "s"), ("l", SKY, "o"), ("s", ORANGE, "^")):
         raw = scale * log.column(f"{source}{key}")
         ax.plot(frame_s, raw, linestyle="none", marker=marker, markersize=3, color=colour)
-    filtered = _while_tracked(log, log.column(f"e{key}"))
+    filtered = while_tracked(log, log.column(f"e{key}"))
     if key.startswith("yaw"):
-        filtered = _unbroken(filtered)
+        filtered = unbroken(filtered)
     ax.plot(t_s, scale * filtered, color=BLACK, linewidth=1.1)
     coasting = np.array([r.get("measured") is False for r in log.records])
     ax.plot(t_s, np.where(coasting, scale * filtered, np.nan), color=VERMILLION, linewidth=2.4)
     ax.set_ylabel(label)
 
 
-def _while_tracked(log: FlightLog, values: Array) -> Array:
+def while_tracked(log: FlightLog, values: Array) -> Array:
     """NaN where the target is only remembered."""
     remembered = [record.get("tracked") is False for record in log.records]
     return np.where(remembered, np.nan, values)
@@ -209,7 +212,7 @@ def _mark_lost(ax: Axes, frames: Frames, low: float, high: float) -> None:
 def _plot_last_seconds(ax: Axes, log: FlightLog, t_s: Array, frames: Frames) -> None:
     """What the contact was made with: x and y in millimetres up to the moment in which the
     target was seen last, z on a scale of its own."""
-    tracked = np.isfinite(_while_tracked(log, log.column("ex_m")))
+    tracked = np.isfinite(while_tracked(log, log.column("ex_m")))
     end_s = float(frames.seen_s[-1]) if frames.seen_s.size else float(t_s[-1])
     shown_s = (end_s - LAST_S, end_s + AFTER_S)
     inside = (t_s >= shown_s[0]) & (t_s <= shown_s[1])
@@ -220,7 +223,7 @@ def _plot_last_seconds(ax: Axes, log: FlightLog, t_s: Array, frames: Frames) -> 
         for source, marker in (("j", "s"), ("l", "o"), ("s", "^")):
             raw_mm = 1e3 * log.column(f"{source}{name}_m")
             ax.plot(frame_s, raw_mm, marker, markersize=3, color=colour, fillstyle="none")
-        e_mm = 1e3 * _while_tracked(log, log.column(f"e{name}_m"))
+        e_mm = 1e3 * while_tracked(log, log.column(f"e{name}_m"))
         lines += ax.plot(t_s, e_mm, color=colour, linewidth=1.4, label=f"$e_{name}$ [mm]")
         span_mm.append(float(np.nanmax(np.abs(e_mm[inside & tracked]), initial=0.0)))
     miss_mm = 1e3 * log.column("true_miss_m")
@@ -230,7 +233,7 @@ def _plot_last_seconds(ax: Axes, log: FlightLog, t_s: Array, frames: Frames) -> 
         )
         span_mm.append(float(np.nanmax(miss_mm[inside])))
     z_ax = ax.twinx()
-    z_mm = 1e3 * _while_tracked(log, log.column("ez_m"))
+    z_mm = 1e3 * while_tracked(log, log.column("ez_m"))
     lines += z_ax.plot(t_s, z_mm, color=BLACK, linewidth=1.1, linestyle="--",
                        label="$e_z$ [mm], right")  # fmt: skip
     _mark_lost(ax, frames, 0.0, 0.05)
@@ -242,35 +245,38 @@ def _plot_last_seconds(ax: Axes, log: FlightLog, t_s: Array, frames: Frames) -> 
     ax.set_ylabel("last 5 s with\nthe target [mm]")
     z_ax.set_ylabel("height to go [mm]")
     ax.legend(handles=lines, loc="upper right", ncols=4, fontsize=8)
-    _name_phases(ax, log, shown_s)
+    name_spans(ax, spans_of(log), shown_s)
 
 
-def _shade_phases(ax: Axes, log: FlightLog) -> None:
+def spans_of(log: FlightLog) -> list[Span]:
+    return [(p.phase, p.start_s - log.start_s, p.end_s - log.start_s) for p in log.phases]
+
+
+def shade_spans(ax: Axes, spans: Sequence[Span]) -> None:
+    """By turns, and a line where one begins."""
     first_s, last_s = ax.get_xlim()
-    for i, span in enumerate(log.phases):
-        start, end = span.start_s - log.start_s, span.end_s - log.start_s
-        if end < first_s or start > last_s:
+    for i, (_, start_s, end_s) in enumerate(spans):
+        if end_s < first_s or start_s > last_s:
             continue
-        if end > start:
-            ax.axvspan(start, end, facecolor=SHADES[i % 2], edgecolor="none", zorder=-2)
+        if end_s > start_s:
+            ax.axvspan(start_s, end_s, facecolor=SHADES[i % 2], edgecolor="none", zorder=-2)
         if i:
-            ax.axvline(start, color=GREY, linewidth=0.6, zorder=-1)
+            ax.axvline(start_s, color=GREY, linewidth=0.6, zorder=-1)
 
 
-def _name_phases(ax: Axes, log: FlightLog, shown_s: tuple[float, float]) -> None:
+def name_spans(ax: Axes, spans: Sequence[Span], shown_s: tuple[float, float]) -> None:
     """Names above a panel, slanted; where phases crowd, some go unnamed."""
     gap_s = NAME_GAP * (shown_s[1] - shown_s[0])
     named_s = -math.inf
-    for i, span in enumerate(log.phases):
-        start_s = max(span.start_s - log.start_s, shown_s[0])
-        end_s = min(span.end_s - log.start_s, shown_s[1])
+    for i, (name, start_s, end_s) in enumerate(spans):
+        start_s, end_s = max(start_s, shown_s[0]), min(end_s, shown_s[1])
         if end_s < start_s:
             continue
         at_s = max((start_s + end_s) / 2, named_s + gap_s)
-        if at_s > end_s + 2 * gap_s and i < len(log.phases) - 1:
+        if at_s > end_s + 2 * gap_s and i < len(spans) - 1:
             continue
         ax.annotate(
-            span.phase,
+            name,
             xy=(at_s, 1.03),
             xycoords=("data", "axes fraction"),
             rotation=45,
@@ -284,7 +290,7 @@ def _commands(log: FlightLog) -> Any:
     return np.array([r.get("cmd") or "" for r in log.records])
 
 
-def _unbroken(angle_rad: Array) -> Array:
+def unbroken(angle_rad: Array) -> Array:
     """The angle with a gap, not a line across the panel, where it wraps."""
     result = angle_rad.copy()
     jumps = np.flatnonzero(np.abs(np.diff(angle_rad)) > math.pi)

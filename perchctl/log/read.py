@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from perchctl import __version__
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
 from perchctl.log.fields import FIELDS
@@ -24,9 +25,8 @@ KINDS = ("tick", "turn", "event", "summary")
 READABLE_VERSIONS = (1, 2, SCHEMA_VERSION)
 """1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
 turns."""
-
-
 _GZIP = b"\x1f\x8b"
+_BEGIN_BYTES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -148,16 +148,23 @@ def read_log(path: Path | str) -> FlightLog:
 
 def _lines(path: Path) -> list[bytes]:
     try:
-        data = path.read_bytes()
-        if data.startswith(_GZIP):
-            data = _unpacked(data)
-        return data.splitlines(keepends=True)
+        with path.open("rb") as stream:
+            data = stream.read(_BEGIN_BYTES)
+            if data.startswith((b"{", _GZIP)):  # else it is no log, and may be a video of gigabytes
+                data += stream.read()
     except FileNotFoundError:
         raise NotFound(f"flight log {path} does not exist") from None
     except IsADirectoryError:
         raise NotFound(f"flight log {path} is a folder; name one of its .jsonl files") from None
     except OSError as error:
         raise NotFound(f"flight log {path} cannot be read: {error.strerror}") from None
+    if data.startswith(_GZIP):
+        data = _unpacked(data)
+        if not data:
+            raise InvalidValue(
+                f"{path}: it is packed by gzip, and its begin is damaged: take the original"
+            )
+    return data.splitlines(keepends=True)
 
 
 def _unpacked(data: bytes) -> bytes:
@@ -184,9 +191,11 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
     version = header.get("version")
     if version not in READABLE_VERSIONS:
         readable = f"1 to {READABLE_VERSIONS[-1]}"
+        newer = isinstance(version, int) and version > SCHEMA_VERSION
         raise InvalidValue(
             f"{path}: line 1: schema version {version!r}, this perchctl reads {readable}; "
-            f"the log was written by perchctl {header.get('perchctl', 'of unknown version')}"
+            f"the log was written by perchctl {header.get('perchctl', 'of unknown version')}, "
+            f"this is {__version__}" + (": update perchctl" if newer else "")
         )
     return header
 

@@ -165,7 +165,7 @@ def _origin(log: FlightLog) -> str:
         f"profile {profile_name(header) or '?'}",
         "" if seed is None else f"seed {seed}",
         f"{header.get('uri', '?')} with {header.get('source', '?')}",
-        "" if not started else f"begun {str(started).replace('+00:00', ' UTC').replace('T', ' ')}",
+        "" if not started else f"begun {str(started).replace('T', ' ').replace('+00:00', ' UTC')}",
         f"perchctl {header.get('perchctl', '?')}, version {header.get('version')}",
     ]
     return ", ".join(part for part in parts if part)
@@ -212,7 +212,7 @@ def _phase_lines(log: FlightLog) -> Iterator[str]:
         row = row_of(log, span)
         why = span.reason + (f" ({row})" if row else "")
         at_s, for_s = _after(log, span.start_s), span.duration_s
-        yield from _hung(f"{at_s:8.2f} {for_s:8.2f}  {plain(span.phase):<9} ", why)
+        yield from hung(f"{at_s:8.2f} {for_s:8.2f}  {plain(span.phase):<9} ", why)
 
 
 def _hold_lines(log: FlightLog, holds: Sequence[Held]) -> Iterator[str]:
@@ -222,7 +222,7 @@ def _hold_lines(log: FlightLog, holds: Sequence[Held]) -> Iterator[str]:
     yield "  at [s]  for [s]  held in   because"
     for hold in holds[:_MOST_HOLDS]:
         at_s, for_s = _after(log, hold.start_s), hold.end_s - hold.start_s
-        yield from _hung(f"{at_s:8.2f} {for_s:8.2f}  {plain(hold.phase):<9} ", hold.reason)
+        yield from hung(f"{at_s:8.2f} {for_s:8.2f}  {plain(hold.phase):<9} ", hold.reason)
     if len(holds) > _MOST_HOLDS:
         yield f"                   and {len(holds) - _MOST_HOLDS} more: --json has all"
 
@@ -235,7 +235,7 @@ def _note_lines(log: FlightLog) -> Iterator[str]:
     yield "  at [s]  note"
     for event in notes[:_MOST_HOLDS]:
         at_s = _after(log, float(event["t_s"]))
-        yield from _hung(f"{at_s:8.2f}  ", str(event.get("reason") or ""))
+        yield from hung(f"{at_s:8.2f}  ", str(event.get("reason") or ""))
     if len(notes) > _MOST_HOLDS:
         yield f"          and {len(notes) - _MOST_HOLDS} more: --json has all"
 
@@ -249,15 +249,16 @@ def _after(log: FlightLog, t_s: float) -> float:
 
 
 def _named(name: str, text: str) -> list[str]:
-    return list(_hung(f"{name + ':':<{_HANG}}", text))
+    return list(hung(f"{name + ':':<{_HANG}}", text))
 
 
-def _hung(begin: str, text: str) -> Iterator[str]:
+def hung(begin: str, text: str) -> Iterator[str]:
     """The text behind its begin, its further lines below it."""
     room = " " * len(begin)
-    yield from wrap(plain(text), COLUMNS, initial_indent=begin, subsequent_indent=room) or [
-        begin.rstrip()
-    ]
+    lines = wrap(
+        plain(text), COLUMNS, initial_indent=begin, subsequent_indent=room, break_on_hyphens=False
+    )
+    yield from lines or [begin.rstrip()]
 
 
 def _cut(text: str, room: int) -> str:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from perchctl.log.fields import tick_record
-from perchctl.log.write import make_header
+from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.mission.watch import Event
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     Command,
@@ -159,6 +162,24 @@ def _command(phase: str, z_m: float) -> Command:
         case "LANDING":
             return Land(-0.05, 2.0)
     return PositionSetpoint(0.6, -0.4, z_m + 0.05, 0.5)
+
+
+def write(
+    path: Path,
+    changes: Mapping[str, Any] | None = None,
+    summary: Mapping[str, Any] | None = None,
+    events: Sequence[Event] = (),
+    most: int | None = None,
+) -> Path:
+    """The flight as a file: its first `most` ticks, the header's `changes`, and `events` at the
+    end; without a summary it was killed."""
+    writer = FlightLogWriter.open(path, header() | dict(changes or {}))
+    for record in islice(ticks(), most):
+        writer.write(record)
+    for event in events:
+        writer.event(event)
+    writer.close(summary)
+    return writer.path
 
 
 SUMMARY = {
