@@ -8,6 +8,8 @@ from perchctl.cli.calibrate import calibrate
 from perchctl.cli.check import check
 from perchctl.cli.fit_weights import fit_weights
 from perchctl.cli.fly import fly
+from perchctl.cli.log import SUMMARY as LOG_SUMMARY
+from perchctl.cli.log import log
 from perchctl.cli.make_target import make_target
 from perchctl.cli.new_profile import new_profile
 from perchctl.cli.profile import profile
@@ -32,3 +34,5 @@ for _name, _command in (
     _summary = (_command.__doc__ or "").split("\n\n")[0]
     _epilog = EXIT_TABLE if _command is fly else None
     app.command(_name, short_help=_summary, epilog=_epilog)(_command)
+
+app.add_typer(log, name="log", short_help=LOG_SUMMARY)

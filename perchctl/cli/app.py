@@ -9,6 +9,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Annotated, Any, NoReturn, TextIO, TypeVar
 
 import typer
@@ -98,6 +99,18 @@ ViewOption = Annotated[
 ViewPortOption = Annotated[
     int,
     typer.Option("--view-port", min=0, max=65535, help="Port of the live page; 0: any free one."),
+]
+LogProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        "-p",
+        help="Whose log.directory holds the newest log; by default sim's.",
+        autocompletion=complete_profile,
+    ),
+]
+LogDirOption = Annotated[
+    Path | None, typer.Option("--log-dir", help="The folder that holds the newest log instead.")
 ]
 CamOption = Annotated[
     str | None,

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 
+def complete_log(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import logs
+
+    return logs(incomplete)
+
+
 def complete_positioning(incomplete: str) -> list[str]:
     from perchctl.commands.complete import positionings
 

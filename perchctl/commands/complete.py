@@ -15,12 +15,17 @@ from perchctl.profile.places import listing
 _DEVICES = Path("/dev")
 _SCHEMES = ("video:", "images:", "http://", "rtsp://", "aideck://", "sim:")
 _YAML = (".yaml", ".yml")
+_LOGS = (".jsonl", ".jsonl.gz")
 _PICTURES = (*IMAGE_SUFFIXES, ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 
 
 def profiles(begun: str) -> list[str]:
     """Names that go on from what was typed, then profile files and folders."""
     return [*_that_begin(begun, listing("profiles")), *_files(begun, _YAML)]
+
+
+def logs(begun: str) -> list[str]:
+    return _files(begun, _LOGS)
 
 
 def positionings(begun: str) -> list[str]:

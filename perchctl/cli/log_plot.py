@@ -1,0 +1,41 @@
+"""The options of `perchctl log plot`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perchctl.cli.app import (
+    ForceOption,
+    JsonOption,
+    LogDirOption,
+    LogProfileOption,
+    perform,
+    reported,
+)
+from perchctl.cli.complete import complete_log
+
+
+def plot(
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", help="The picture: .png, .pdf or .svg. Default: .png beside the log."
+        ),
+    ] = None,
+    force: ForceOption = False,
+    profile: LogProfileOption = None,
+    log_dir: LogDirOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
+    with reported(as_json):
+        from perchctl.commands.log_plot import PlotRequest, run
+
+        perform(run, PlotRequest(file, output, force, profile, log_dir, as_json))

@@ -1,0 +1,24 @@
+"""The options of `perchctl log report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from perchctl.cli.app import ForceOption, JsonOption, perform, reported
+from perchctl.cli.complete import complete_log
+
+
+def report(
+    files: Annotated[list[Path], typer.Argument(help="Flight logs.", autocompletion=complete_log)],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write one page that tells the flight, or several, in sentences and plots."""
+    with reported(as_json):
+        from perchctl.commands.log_report import ReportRequest, run
+
+        perform(run, ReportRequest(tuple(files), output, force, as_json))
