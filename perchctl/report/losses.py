@@ -69,7 +69,8 @@ def _loss(
         return None
     phase = _phase_at(track, start_s)
     left = next(
-        (s for s in track.steps if s.start_s > start_s and s.phase not in SEEN_IN | {"SEARCH"}), None
+        (s for s in track.steps if s.start_s > start_s and s.phase not in SEEN_IN | {"SEARCH"}),
+        None,
     )
     if left is not None and left.phase in AT_THE_CEILING and left.start_s <= end_s:
         if phase == "PERCH":

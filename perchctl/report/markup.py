@@ -28,7 +28,7 @@ def text(content: Content) -> Markup:
     return Markup("".join(text(part) for part in content))
 
 
-def tag(name: str, content: Content = None, **attributes: str | None) -> Markup:
+def tag(name: str, content: Content = None, /, **attributes: str | None) -> Markup:
     """One element. An attribute's trailing underscore is dropped (`class_`), None leaves it out."""
     written = "".join(
         f' {key.rstrip("_").replace("_", "-")}="{html.escape(value)}"'

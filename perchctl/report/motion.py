@@ -106,7 +106,8 @@ def _angular_rate(log: FlightLog, velocity_mps: Array) -> Array:
         axis=1,
     )
     x, y, up_m = _to_camera(log.header)
-    place = np.stack([log.column(f"e{axis}_m") for axis in "xyz"], axis=1) + (x, y, up_m)
+    place = np.stack([log.column(f"e{axis}_m") for axis in "xyz"], axis=1)
+    place = place + np.array([x, y, up_m])
     cos, sin = np.cos(yaw), np.sin(yaw)
     level = np.stack(
         [

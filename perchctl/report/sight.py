@@ -61,9 +61,7 @@ class Sight:
 
 def sight_of(track: Track) -> Sight:
     """Of the whole flight and of each phase in which the camera leads."""
-    taken = [
-        (i, r) for i, r in enumerate(track.log.records) if r.get("frame_t_s") is not None
-    ]
+    taken = [(i, r) for i, r in enumerate(track.log.records) if r.get("frame_t_s") is not None]
     leading = [(i, r) for i, r in taken if r.get("phase") in PHASES]
     each = tuple(
         _seen(track, phase, [(i, r) for i, r in leading if r.get("phase") == phase])

@@ -41,3 +41,8 @@ def share(part: float) -> str:
 def count(number: int, noun: str) -> str:
     """``1 frame``, ``14 frames``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def times(number: int) -> str:
+    """``once``, ``3 times``."""
+    return "once" if number == 1 else f"{number} times"
