@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from perchctl.mission.findings import latency_text, turn_text
 from perchctl.report.edges import timings_of
@@ -21,8 +22,7 @@ WORDS = {
     UNFINISHED: "Unfinished: the log has no end",
 }
 GRADES = {"perched": "good", "landed": "warn"}
-LABEL_SHARE = 0.09
-"""Of the strip: a narrower phase's name stands only beneath it."""
+_UNIT = re.compile(r"(?<=\d) (?=(?:%|s|ms|mm|cm|m|m/s|px|deg|V|mAh)\b|%)")
 
 
 def headline(told: Told) -> Markup:
@@ -52,7 +52,7 @@ def headline(told: Told) -> Markup:
             tag("h2", title, class_=GRADES.get(told.outcome, "bad")),
             tag("p", told.name, class_="file"),
             *(tag("p", fault, class_="note") for fault in _faults(told)),
-            pairs(facts),
+            tag("div", pairs(facts), class_="facts"),
         ],
     )
 
@@ -83,7 +83,7 @@ def _faults(told: Told) -> list[str]:
 
 def story(told: Told) -> Markup | None:
     rows = [
-        tag("li", [tag("time", f"{s.t_s:.1f} s"), tag("span", f"{s.text}.")], class_=s.grade)
+        tag("li", [tag("time", f"{s.t_s:.1f} s"), tag("span", _prose(s.text))], class_=s.grade)
         for s in told.story
     ]
     return tag("ol", rows, class_="story") if rows else None
@@ -94,7 +94,14 @@ def advice(told: Told) -> Markup | None:
     if told.advice:
         rows = [
             tag(
-                "li", [tag("b", a.about), " ", _upper(a.text), ". ", tag("small", f"{a.evidence}.")]
+                "li",
+                [
+                    tag("b", a.about),
+                    ": ",
+                    _prose(a.text.removeprefix(f"{a.about} ")),
+                    " ",
+                    tag("small", _prose(_upper(a.evidence))),
+                ],
             )
             for a in told.advice
         ]
@@ -118,7 +125,6 @@ def phases(told: Told) -> Markup | None:
     steps = told.track.steps
     if not steps:
         return None
-    whole_s = max(told.track.end_s, 1e-9)
     strip, spent, stays = [], dict.fromkeys(PAPERS, 0.0), dict.fromkeys(PAPERS, 0)
     for step in steps:
         stay_s = step.end_s - step.start_s
@@ -129,7 +135,7 @@ def phases(told: Told) -> Markup | None:
             strip.append(
                 tag(
                     "span",
-                    step.phase if stay_s / whole_s > LABEL_SHARE else "",
+                    tag("span", step.phase),
                     class_=f"p {step.phase.lower()}",
                     style=f"flex-grow:{stay_s:.2f}",
                     title=f"{step.phase}, {step.start_s:.1f} to {step.end_s:.1f} s: {step.reason}",
@@ -319,6 +325,11 @@ def timing(told: Told) -> Markup | None:
         return tag("p", f"Each turn began at its time: {why}.")
     parts = [tag("div", table(("", "median", "99 %", "most"), rows)), tag("figure", figure)]
     return tag("div", parts, class_="plots")
+
+
+def _prose(sentence: str) -> str:
+    """With its end, and each figure beside its unit."""
+    return _UNIT.sub("\N{NO-BREAK SPACE}", f"{sentence}.")
 
 
 def _upper(sentence: str) -> str:
