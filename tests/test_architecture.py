@@ -50,7 +50,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.sim",),
     ("perchctl.link", "perchctl.log"),
     ("perchctl.flight",),
-    ("perchctl.weights", "perchctl.faults", "perchctl.check"),
+    ("perchctl.weights", "perchctl.faults", "perchctl.check", "perchctl.report"),
     ("perchctl.display",),
     ("perchctl.track",),
     ("perchctl.commands",),

@@ -9,12 +9,13 @@ from importlib.resources import files
 
 import perchctl
 from perchctl.report import sections
-from perchctl.report.markup import Markup, table, tag, text
+from perchctl.report.markup import Markup, table, tag
 from perchctl.report.plot import trend
 from perchctl.report.told import Told
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
+SESSION = "flights"
 PARTS: tuple[tuple[str, Callable[[Told], Markup | None]], ...] = (
     ("What happened", sections.story),
     ("What to change", sections.advice),
@@ -33,10 +34,11 @@ def page_of(flights: Sequence[Told]) -> str:
     """HTML that needs nothing else. `flights` has at least one."""
     several = len(flights) > 1
     title = f"{len(flights)} flights" if several else flights[0].name
-    parts = [tag("h1", title if several else "A flight with perchctl")]
+    parts = [tag("h1", counted(flights) if several else "A flight with perchctl")]
     if several:
         parts.append(_session(flights))
-    parts += [_flight(told, number) for number, told in enumerate(flights, start=1)]
+    back = SESSION if several else ""
+    parts += [_flight(told, number, back) for number, told in enumerate(flights, start=1)]
     parts.append(tag("footer", f"perchctl {perchctl.__version__}"))
     style = files("perchctl.report").joinpath("page.css").read_text(encoding="utf-8")
     head = [
@@ -50,8 +52,8 @@ def page_of(flights: Sequence[Told]) -> str:
     return f"<!doctype html>\n{html}\n"
 
 
-def _flight(told: Told, number: int) -> Markup:
-    parts = [sections.headline(told)]
+def _flight(told: Told, number: int, back: str) -> Markup:
+    parts = [sections.headline(told, back)]
     for title, make in PARTS:
         made = make(told)
         if made is not None:
@@ -92,11 +94,10 @@ def _session(flights: Sequence[Told]) -> Markup:
     ]
     figures = [tag("figure", figure) for figure in trends if figure is not None]
     parts = [
-        tag("p", text(counted(flights))),
         table(head, rows, numbers_from=3),
         tag("div", figures, class_="plots"),
     ]
-    return _own_ids(tag("section", parts), "session-")
+    return _own_ids(tag("section", parts, id=SESSION), "session-")
 
 
 def counted(flights: Sequence[Told]) -> str:

@@ -113,3 +113,8 @@ def _jpeg(decision: Decision, image: NDArray[np.uint8]) -> bytes:
             cv2.polylines(drawn, [fixed], True, colour, 2, cv2.LINE_AA, 4)
     _, data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return bytes(data)
+
+
+def pictures_of(recording: Path) -> Recorded:
+    """A seam until recordings are there."""
+    return ()

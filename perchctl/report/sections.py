@@ -25,8 +25,8 @@ GRADES = {"perched": "good", "landed": "warn"}
 _UNIT = re.compile(r"(?<=\d) (?=(?:%|s|ms|mm|cm|m|m/s|px|deg|V|mAh)\b|%)")
 
 
-def headline(told: Told) -> Markup:
-    """How it ended, and what one asks first."""
+def headline(told: Told, back: str = "") -> Markup:
+    """How it ended, and what one asks first; with a way back to the place `back`."""
     flight = told.summary
     title = WORDS.get(told.outcome, told.outcome)
     if flight.miss_m is not None:
@@ -34,8 +34,7 @@ def headline(told: Told) -> Markup:
     facts = [
         ("why", flight.reason + (f" ({flight.cause})" if _adds(flight.cause, told) else "")),
         ("duration", f"{flight.duration_s:.1f} s"),
-        ("failed attempts", str(flight.attempts)) if told.outcome != "perched" else
-        ("attempts", str(max(1, flight.attempts))),
+        ("failed attempts" if told.log.summary is None else "attempts", str(flight.attempts)),
         ("vehicle", str(told.log.header.get("uri") or "?")),
         ("camera", str(told.log.header.get("source") or "?")),
         ("profile", told.profile),
@@ -50,11 +49,15 @@ def headline(told: Told) -> Markup:
         "header",
         [
             tag("h2", title, class_=GRADES.get(told.outcome, "bad")),
-            tag("p", told.name, class_="file"),
+            tag("p", [told.name, *_way(back)], class_="file"),
             *(tag("p", fault, class_="note") for fault in _faults(told)),
             tag("div", pairs(facts), class_="facts"),
         ],
     )
+
+
+def _way(back: str) -> list[str]:
+    return [" · ", tag("a", "all flights", href=f"#{back}")] if back else []
 
 
 def _adds(cause: str, told: Told) -> bool:
