@@ -91,6 +91,11 @@ class LogIncomplete(PerchError):
     meaning = "perched, but the flight log is incomplete"
 
 
+class ReplayDiffers(PerchError):
+    exit_code = 61
+    meaning = "a replay decides or sees something else than the flight"
+
+
 class Interrupted(PerchError):
     exit_code = 130
     meaning = "Ctrl-C, landed (in the air) or left (on the ground, at the ceiling)"
@@ -120,6 +125,7 @@ ERROR_CLASSES: tuple[type[PerchError], ...] = (
     SafetyAbort,
     EmergencyStopped,
     LogIncomplete,
+    ReplayDiffers,
     Interrupted,
 )
 

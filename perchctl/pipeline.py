@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile
@@ -79,17 +80,19 @@ class Pipeline:
     fields: FieldsMode = "auto"
 
 
-def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
+def make_pipeline(
+    profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None = None
+) -> Pipeline:
     """The profile's pipeline for a calibrated camera. It is never changed: several streams may
-    share one, each with a `PipelineState` of its own. Errors: NotFound, InvalidValue
-    (`camera.mask`)."""
+    share one, each with a `PipelineState` of its own. `covered` is what `camera.mask` holds,
+    which else is read. Errors: NotFound, InvalidValue (`camera.mask`)."""
     mount, gear_body_m = profile.camera.mount, profile.vehicle.gear_body_m
     pose = make_pose_setup(
         profile.pose, profile.target, mount.T_body_cam, gear_body_m, camera,
         profile.camera.readout_s,
     )  # fmt: skip
     strategy = make_strategy(profile.merge, pose)
-    detector = make_detector(profile.detector, profile.target, _mask(profile, camera))
+    detector = make_detector(profile.detector, profile.target, _mask(profile, camera, covered))
     if detector.cut:
         prepare(detector.patterns, camera)
     return Pipeline(
@@ -103,12 +106,15 @@ def make_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
     )
 
 
-def _mask(profile: Profile, camera: CameraModel) -> GearMask | None:
+def _mask(
+    profile: Profile, camera: CameraModel, covered: NDArray[np.bool_] | None
+) -> GearMask | None:
     """What the vehicle's own gear covers. The file is of the camera's own pictures, which
     `camera.mirrored` has turned over since."""
     if profile.camera.mask is None:
         return None
-    covered = read_mask(profile.camera.mask, camera.size_px)
+    if covered is None:
+        covered = read_mask(profile.camera.mask, camera.size_px)
     return make_mask(covered[:, ::-1] if profile.camera.mirrored else covered)
 
 

@@ -9,16 +9,24 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from perchctl.files import write_files
+from perchctl.files import check_output, write_files
 
 # Okabe and Ito's palette: told apart with any colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILLION, PURPLE, GREY = "#0072B2", "#D55E00", "#CC79A7", "#8C8C8C"
 GRID = "#D8D8D8"
 DPI = 110
+_METADATA: dict[str, dict[str, None]] = {  # without what changes from run to run
+    ".png": {"Software": None},
+    ".pdf": {"CreationDate": None},
+    ".svg": {"Date": None},
+}
+FORMATS = tuple(_METADATA)
+"""What a plot's name may end in."""
 
 
 def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
@@ -26,6 +34,17 @@ def new_figure(width_in: float, height_in: float, dpi: float = DPI) -> Figure:
     figure = Figure(figsize=(width_in, height_in), dpi=dpi, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write the figure in the format that the name ends in (`FORMATS`), the same bytes for the
+    same figure; the file is there whole or not at all. Raises InvalidValue."""
+    check_output(path, FORMATS, force=True, content="what plots are drawn in")
+    content = BytesIO()
+    kind = path.suffix.lower().removeprefix(".")
+    with rc_context({"svg.hashsalt": "perchctl"}):
+        figure.savefig(content, format=kind, metadata=_METADATA[f".{kind}"])
+    write_files({path: content.getvalue()})
 
 
 def save_png(figure: Figure, file: Path | BinaryIO) -> None:

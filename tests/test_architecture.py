@@ -22,6 +22,10 @@ HOMES: dict[str, tuple[str, ...]] = {
     "mujoco": ("perchctl.sim",),
     "matplotlib": ("*.plot",),
     "motioncapture": ("perchctl.positioning",),
+    "mcap": ("perchctl.log.recording",),
+    "mcap_protobuf": ("perchctl.log.recording",),
+    "foxglove_schemas_protobuf": ("perchctl.log.recording",),
+    "google": ("perchctl.log.recording",),
     "av": ("perchctl.track.files", "perchctl.camera.rtsp"),
 }
 
@@ -50,7 +54,13 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.sim",),
     ("perchctl.link", "perchctl.log"),
     ("perchctl.flight",),
-    ("perchctl.weights", "perchctl.faults", "perchctl.check", "perchctl.report"),
+    (
+        "perchctl.weights",
+        "perchctl.faults",
+        "perchctl.check",
+        "perchctl.replay",
+        "perchctl.report",
+    ),
     ("perchctl.display",),
     ("perchctl.track",),
     ("perchctl.commands",),

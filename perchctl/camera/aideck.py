@@ -130,7 +130,10 @@ class AiDeckSource(StreamSource):
                 image = decoded(picture)
                 if image is not None:
                     last_s = now_s
-                    self._put(self._grey(image), began_s=picture.began_s)
+                    grey = self._grey(image)
+                    as_came = picture.is_jpeg and grey is image  # no mosaic was taken out of it
+                    encoded = picture.data if as_came else None
+                    self._put(grey, began_s=picture.began_s, encoded=encoded)
                     break
                 splitter.damaged += 1
             self.damaged = earlier + splitter.damaged

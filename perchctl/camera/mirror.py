@@ -21,7 +21,7 @@ class UnmirroredSource(SourceAround):
         frame = super().poll(now_s)
         if frame is None:
             return None
-        return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]))
+        return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None)
 
     def describe(self) -> str:
         return f"{super().describe()}, mirrored"

@@ -223,7 +223,7 @@ class MjpegSource(StreamSource):
             for picture in reversed(pictures):
                 image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
                 if image is not None:
-                    self._put(image)
+                    self._put(image, encoded=picture)
                     break
                 self.damaged += 1
 

@@ -20,11 +20,13 @@ class NewestSlot:
         self._repeats = RepeatState()
         self.count = 0
 
-    def put(self, image: Grey, t_s: float, t_arrival_s: float) -> None:
-        """Times of exposure and of arrival."""
+    def put(
+        self, image: Grey, t_s: float, t_arrival_s: float, encoded: bytes | None = None
+    ) -> None:
+        """Times of exposure and of arrival; `encoded` as `Frame` has it."""
         self._repeats, again = repeated(self._repeats, image, self._by_noise)
         if not again:
-            self._frame = Frame(self.count, t_s, image, t_arrival_s)
+            self._frame = Frame(self.count, t_s, image, t_arrival_s, encoded=encoded)
             self.count += 1
         elif self._frame is None or self._frame.repeated:
             self._frame = Frame(self.count - 1, t_s, image, t_arrival_s, repeated=True)

@@ -149,15 +149,23 @@ class LiveSource:
         self._thread = threading.Thread(target=target, name=self._name, daemon=True)
         self._thread.start()
 
-    def _put(self, image: Any, *, waited_s: float = 0.0, began_s: float | None = None) -> None:
+    def _put(
+        self,
+        image: Any,
+        *,
+        waited_s: float = 0.0,
+        began_s: float | None = None,
+        encoded: bytes | None = None,
+    ) -> None:
         """`waited_s`: for how long it was under way beyond the usual, where that is known.
         `began_s`: when the picture began to arrive, where that is known and tells more of its
-        exposure than its end does: the latency is counted from there."""
+        exposure than its end does: the latency is counted from there. `encoded`: as `Frame`
+        has it."""
         arrival_s = self._clock()
         t_s = (arrival_s if began_s is None else began_s) - self._latency_s - waited_s
         grey = to_grey(image)
         with self._lock:
-            self._slot.put(grey, t_s, arrival_s)
+            self._slot.put(grey, t_s, arrival_s, encoded)
             self._last_arrival_s = arrival_s
             self._arrived += 1
             self._size_px = (grey.shape[1], grey.shape[0])
@@ -199,3 +207,17 @@ class SourceAround:
 
     def close(self) -> None:
         self._source.close()
+
+
+class WatchedSource(SourceAround):
+    """The same source; each frame that it gives is shown to `seen`, which must not raise."""
+
+    def __init__(self, source: FrameSource, seen: Callable[[Frame], None]) -> None:
+        super().__init__(source)
+        self._seen = seen
+
+    def poll(self, now_s: float) -> Frame | None:
+        frame = super().poll(now_s)
+        if frame is not None:
+            self._seen(frame)
+        return frame

@@ -30,6 +30,13 @@ def fly(
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Folder for the flight log and its plot.")
     ] = None,
+    record: Annotated[
+        bool | None,
+        typer.Option(
+            "--record/--no-record",
+            help="Keep the pictures, in an MCAP file beside the log; by default of real vehicles.",
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show the resolved plan; connect nothing.")
     ] = False,
@@ -55,6 +62,7 @@ def fly(
             positioning=positioning,
             seed=seed,
             log_dir=log_dir,
+            record=record,
             dry_run=dry_run,
             yes=yes,
             as_json=as_json,

@@ -7,16 +7,56 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, perform, reported
-from perchctl.cli.complete import complete_log
+from perchctl.cli.app import ForceOption, JsonOption, perform, reported
+from perchctl.cli.complete import complete_log, complete_profile
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(help="A flight log.", autocompletion=complete_log)],
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="What if this key of the profile had been another; may be given several times.",
+        ),
+    ] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile",
+            "-p",
+            help="What if this profile had been flown, by name or path.",
+            autocompletion=complete_profile,
+        ),
+    ] = None,
+    pictures: Annotated[
+        bool,
+        typer.Option(
+            "--pictures/--no-pictures", help="See the recorded pictures again, where there are any."
+        ),
+    ] = True,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Draw both into it: .png, .pdf or .svg."),
+    ] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Feed a flight's observations to the planner again, and demand the same commands."""
+    """Decide a flight again from its log, and demand the same commands, bit by bit.
+
+    With pictures beside the log they are looked at again, too, and have to give the same poses.
+    With --set or --profile it says what would have been decided otherwise.
+
+    Exit codes: 0 where nothing differs, 61 where something does.
+    """
     with reported(as_json):
         from perchctl.commands.log_replay import ReplayRequest, run
 
-        perform(run, ReplayRequest(file, as_json))
+        perform(
+            run,
+            ReplayRequest(file, tuple(settings or ()), profile, pictures, output, force, as_json),
+        )

@@ -50,6 +50,9 @@ def simulate(
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Log the flights, into this folder.")
     ] = None,
+    record: Annotated[
+        bool, typer.Option("--record", help="Keep the pictures, in an MCAP file beside each log.")
+    ] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -65,6 +68,7 @@ def simulate(
             jobs=jobs,
             only=only,
             log_dir=log_dir,
+            record=record,
             as_json=as_json,
             faults=faults,
             heat_map=heat_map,

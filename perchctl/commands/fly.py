@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,7 @@ class FlyRequest:
     positioning: str | None = None
     seed: int | None = None
     log_dir: Path | None = None
+    record: bool | None = None
     dry_run: bool = False
     yes: bool = False
     as_json: bool = False
@@ -104,6 +105,8 @@ def resolve(request: FlyRequest) -> FlyOptions:
         seed=PLAIN_SEED if request.seed is None else request.seed,
         log_dir=request.log_dir or Path(profile.log.directory),
     )
+    record = not options.simulated if request.record is None else request.record
+    options = replace(options, record=record)
     check_options(options)
     if request.seed is not None and not options.simulated:
         say(f"--seed {request.seed} is of simulated flights: it changes nothing at {options.uri}")
@@ -129,8 +132,9 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
     """Fly, log, plot, report how it ended; returns the exit code. `port` of the live page."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
-        options.log_dir, options.profile, options.uri, options.source, simulated_seed
-    )
+        options.log_dir, options.profile, options.uri, options.source, simulated_seed,
+        options.record,
+    )  # fmt: skip
     reporter = make_reporter(stream=sys.stderr)
     merges = ""
     if options.profile.merge.method == "weights":
@@ -139,7 +143,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
     say(f"connecting to {options.uri}{merges}")
     with unheeded():  # once it has landed nothing is left to stop, but much to tell
         try:
-            result = _session(options, (log, DisplayWatcher(reporter)), port)
+            result = _session(options, log, DisplayWatcher(reporter), port)
         except BaseException as error:
             log.abandon(str(error) or type(error).__name__)
             raise
@@ -178,13 +182,18 @@ def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
     return LogIncomplete.exit_code if code == 0 and summary.log_problem is not None else code
 
 
-def _session(options: FlyOptions, watchers: tuple[Watcher, ...], port: int | None) -> SessionResult:
+def _session(
+    options: FlyOptions, log: LogWatcher, display: Watcher, port: int | None
+) -> SessionResult:
     """The session with the signals on its switch, and with the live page where there is a port."""
     switch = OperatorSwitch()
+    watchers: tuple[Watcher, ...] = (log, display)
+    watched = log.watched
     with signals_to_operator(switch, say), live_page(options, port, switch) as page:
-        if page is None:
-            return fly_session(options, watchers, switch)
-        return fly_session(options, (*watchers, page), switch, page.watched)
+        if page is not None:
+            watchers = (*watchers, page)
+            watched = lambda source: page.watched(log.watched(source))  # noqa: E731
+        return fly_session(options, watchers, switch, watched, log.remarks)
 
 
 def live_page(

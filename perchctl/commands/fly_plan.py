@@ -32,6 +32,7 @@ def plan(options: FlyOptions) -> dict[str, Any]:
         "calibration_file": str(calibration),
         "mask_file": None if mask is None else str(find_mask(mask)),
         "log_directory": str(options.log_dir),
+        "record": options.record,
         "profile": profile_record(options.profile),
         "check": [
             dataclasses.asdict(row)
@@ -80,7 +81,8 @@ def plan_text(options: FlyOptions) -> str:
         f"{planner.complete.watch_s:g} s",
         f"attempts     {planner.attempts}, perching time {planner.perching_time_s:g} s",
         *_limit_lines(options.profile),
-        f"log          {resolved['log_directory']}",
+        f"log          {resolved['log_directory']}"
+        + (f", with pictures up to {options.profile.log.max_mb:g} MB" if options.record else ""),
         *_doubts(resolved["check"]),
     ]
     return "\n".join(lines)

@@ -5,7 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from perchctl.errors import UsageError
+from perchctl.commands.log_file import log_file, opened
+from perchctl.commands.output import print_record
+from perchctl.files import check_output
+from perchctl.log.summary import summary_of
+
+FORMATS = (".png", ".pdf", ".svg")
+DRAWN_IN = "what plots are drawn in"
 
 
 @dataclass(frozen=True)
@@ -21,5 +27,24 @@ class PlotRequest:
 
 
 def run(request: PlotRequest) -> int:
-    """Errors: UsageError, as it is not there yet."""
-    raise UsageError("perchctl log plot is not part of this version")
+    """Draw; returns the exit code. Errors: NotFound, InvalidValue, UsageError."""
+    path = log_file(request.file, request.profile, request.log_dir)
+    picture = request.output or beside(path, ".png")
+    with opened(path) as log:
+        check_output(picture, FORMATS, request.force, DRAWN_IN)
+        from perchctl.log.plot import plot_flight
+
+        plot_flight(log, picture)
+        if request.as_json:
+            print_record(
+                {"log": str(path), "plot": str(picture), "outcome": summary_of(log).outcome}
+            )
+        else:
+            print(f"plot:      {picture}")
+    return 0
+
+
+def beside(log: Path, suffix: str) -> Path:
+    """The file of the log's name with another ending."""
+    stem = log.name.removesuffix(".gz").removesuffix(".jsonl")
+    return log.with_name(stem + suffix)

@@ -5,17 +5,63 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from perchctl.errors import UsageError
+from perchctl.commands.log_file import log_file, opened
+from perchctl.commands.output import print_record, say
+from perchctl.errors import ReplayDiffers
+from perchctl.files import check_output
+from perchctl.log.read import FlightLog
+from perchctl.log.setup import profile_of
+from perchctl.profile import Profile, load_profile
+from perchctl.profile.changed import changed
+from perchctl.replay.run import replay
+from perchctl.replay.told import replay_lines, replay_record
+from perchctl.replay.whatif import changes_of, gates_of
+
+FORMATS = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True)
 class ReplayRequest:
     """The command line as it was given; None is not given."""
 
-    file: Path
+    file: Path | None = None
+    settings: tuple[str, ...] = ()
+    profile: str | None = None
+    pictures: bool = True
+    output: Path | None = None
+    force: bool = False
     as_json: bool = False
 
 
 def run(request: ReplayRequest) -> int:
-    """Errors: UsageError, as it is not there yet."""
-    raise UsageError("perchctl log replay is not part of this version")
+    """Replay and say what came of it; returns the exit code. Errors: NotFound, InvalidValue,
+    UsageError."""
+    path = log_file(request.file, None, None)
+    if request.output is not None:
+        check_output(request.output, FORMATS, request.force, "what plots are drawn in")
+    with opened(path) as log:
+        pictures = None
+        found = replay(log, pictures, _profile(request, log))
+        gates = gates_of(found) if found.changed else []
+        changes = changes_of(found) if found.changed else []
+        if request.output is not None:
+            from perchctl.replay.plot import plot_replay
+
+            plot_replay(found, request.output)
+        if request.as_json:
+            print_record(replay_record(found, gates, changes))
+        else:
+            for note in found.notes:
+                say(note)
+            print("\n".join(replay_lines(found, gates, changes)))
+            if request.output is not None:
+                print(f"plot:      {request.output}")
+    return 0 if found.same else ReplayDiffers.exit_code
+
+
+def _profile(request: ReplayRequest, log: FlightLog) -> Profile | None:
+    """What it is to be replayed by; None: as it was flown."""
+    if request.profile is None and not request.settings:
+        return None
+    base = profile_of(log.header) if request.profile is None else load_profile(request.profile)
+    return changed(base, request.settings)

@@ -56,7 +56,7 @@ def _campaign(request: SimulateRequest) -> int:
 
     return fly_each(
         lambda executor, note: run_campaign(
-            profile, request.seeds, executor, note, request.log_dir
+            profile, request.seeds, executor, note, request.log_dir, request.record
         ),
         request,
         report,

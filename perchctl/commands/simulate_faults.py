@@ -46,7 +46,7 @@ def run_faults(request: SimulateRequest) -> int:
 
     return fly_each(
         lambda executor, note: run_fault_campaign(
-            profile, request.seeds, names, executor, note, request.log_dir
+            profile, request.seeds, names, executor, note, request.log_dir, request.record
         ),
         request,
         report,

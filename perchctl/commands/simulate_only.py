@@ -18,7 +18,7 @@ from perchctl.profile import Profile
 def run_only(request: SimulateRequest) -> int:
     """Fly the seed, log it, and print the flight. Errors: NotFound, InvalidValue."""
     profile = request.loaded()
-    fly = partial(fly_logged, profile, request.log_folder(profile))
+    fly = partial(fly_logged, profile, request.log_folder(profile), record=request.record)
 
     def report(flown: list[LoggedFlight], _problem: PerchError | None) -> None:
         for flight in flown:

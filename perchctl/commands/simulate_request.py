@@ -51,6 +51,7 @@ class SimulateRequest:
     heat_map: Path | None = None
     force: bool = False
     positioning: str | None = None
+    record: bool = False
 
     def loaded(self) -> Profile:
         """The profile with the command line on top. Errors: NotFound, InvalidValue."""
@@ -72,6 +73,8 @@ class SimulateRequest:
         InvalidValue for a place that nothing can be written to."""
         if self.heat_map is not None and self.faults is None:
             raise UsageError("--heat-map is drawn of faults: name them with --faults")
+        if self.record and self.only is None and self.log_dir is None:
+            raise UsageError("--record writes beside the logs: name their folder with --log-dir")
         many: dict[str, int | Path | None] = {
             "-n": self.flights,
             "--seed": self.seed,

@@ -68,15 +68,17 @@ class FaultyCamera:
             return None
         match fault.kind:
             case "frozen":
-                return replace(frame, image=(self._last or frame).image)
+                return replace(frame, image=(self._last or frame).image, encoded=None)
             case "snow":
                 noise = self._rng.normal(120.0, SNOW_SIGMA, frame.image.shape)
-                return replace(frame, image=np.clip(noise, 0, 255).astype(np.uint8))
+                return replace(frame, image=np.clip(noise, 0, 255).astype(np.uint8), encoded=None)
             case "dark":
                 dark = cv2.convertScaleAbs(frame.image, alpha=DARK_GAIN)
-                return replace(frame, image=np.asarray(dark, np.uint8))
+                return replace(frame, image=np.asarray(dark, np.uint8), encoded=None)
             case "mirrored":
-                return replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1]))
+                return replace(
+                    frame, image=np.ascontiguousarray(frame.image[:, ::-1]), encoded=None
+                )
         return frame
 
     def _late(self, frame: Frame | None, late_s: float, now_s: float) -> Frame | None:

@@ -20,13 +20,16 @@ def run_fault_campaign(
     executor: Executor | None = None,
     on_result: Callable[[FaultResult], None] = lambda result: None,
     log_dir: Path | None = None,
+    record: bool = False,
 ) -> list[FaultResult]:
     """Fly all seeds, as `perchctl.flight.campaign.run_campaign` does."""
-    return fly_all(partial(_fly_logged, profile, faults, log_dir), seeds, executor, on_result)
+    return fly_all(
+        partial(_fly_logged, profile, faults, log_dir, record), seeds, executor, on_result
+    )
 
 
 def _fly_logged(
-    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, seed: int
+    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
 ) -> FaultResult:
     log = None if log_dir is None else log_of(seed, log_dir)
-    return fly_fault_seed(profile, seed, faults, log)
+    return fly_fault_seed(profile, seed, faults, log, record)

@@ -85,9 +85,11 @@ class FaultyFlight:
             log.truth = self._for_log
             watchers = (*watchers, log)
         pipeline = make_pipeline(profile, camera)
+        seen = source if log is None else log.watched(source)
         self._parts = FlightParts(
-            self._link, source, self._clock, profile, pipeline, watchers, switch.read,
+            self._link, seen, self._clock, profile, pipeline, watchers, switch.read,
             positions=feed_lockstep(self._link, profile),
+            remarks=tuple if log is None else log.remarks,
         )  # fmt: skip
         safety = profile.safety
         self._oracle = Oracle(Limits(safety.fence_radius_m, safety.max_height_m))
@@ -207,15 +209,23 @@ class FaultyFlight:
 
 
 def fly_with_fault(
-    profile: Profile, case: Case, scenario: Scenario, log: Path | None = None
+    profile: Profile,
+    case: Case,
+    scenario: Scenario,
+    log: Path | None = None,
+    record: bool = False,
 ) -> FaultResult:
     """Fly a case to its end and judge it. Errors: NotFound, InvalidValue (calibration, log)."""
-    watcher = None if log is None else LogWatcher.lockstep(log, profile, scenario.seed)
+    watcher = None if log is None else LogWatcher.lockstep(log, profile, scenario.seed, record)
     return FaultyFlight(profile, case, scenario, watcher).fly()
 
 
 def fly_fault_seed(
-    profile: Profile, seed: int, faults: tuple[str, ...], log: Path | None = None
+    profile: Profile,
+    seed: int,
+    faults: tuple[str, ...],
+    log: Path | None = None,
+    record: bool = False,
 ) -> FaultResult:
     """The seed's scenario with the seed's fault out of those named."""
     from perchctl.faults.catalogue import BY_NAME
@@ -223,7 +233,7 @@ def fly_fault_seed(
     cv2.setNumThreads(1)  # a job is one core
     scenario = draw_scenario(profile, seed)
     case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
-    return fly_with_fault(profile, case, scenario, log)
+    return fly_with_fault(profile, case, scenario, log, record)
 
 
 def claim_of(report: FlightReport) -> Claim:

@@ -56,11 +56,14 @@ class LoggedFlight:
         return self.summary.log_problem
 
 
-def fly_seed(profile: Profile, seed: int, log_path: Path | None = None) -> FlightResult:
+def fly_seed(
+    profile: Profile, seed: int, log_path: Path | None = None, record: bool = False
+) -> FlightResult:
     """Fly one seed of the profile's scenario; a function of its own so that any
-    executor can carry it to another process or machine."""
+    executor can carry it to another process or machine. `record`: with the pictures beside
+    the log."""
     began_s = time.perf_counter()
-    log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed)
+    log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
     flight, summary = _flown(profile, seed, log)
     return FlightResult(
         seed=seed,
@@ -77,9 +80,9 @@ def fly_seed(profile: Profile, seed: int, log_path: Path | None = None) -> Fligh
     )
 
 
-def fly_logged(profile: Profile, folder: Path, seed: int) -> LoggedFlight:
+def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) -> LoggedFlight:
     """Fly one seed to look at it closely. Errors: NotFound, InvalidValue (calibration, log)."""
-    log = LogWatcher.lockstep(log_of(seed, folder), profile, seed)
+    log = LogWatcher.lockstep(log_of(seed, folder), profile, seed, record)
     events = EventKeeper()
     flight, summary = _flown(profile, seed, log, events)
     assert summary is not None
@@ -106,14 +109,15 @@ def run_campaign(
     executor: Executor | None = None,
     on_result: Callable[[FlightResult], None] = lambda result: None,
     log_dir: Path | None = None,
+    record: bool = False,
 ) -> list[FlightResult]:
     """Fly all seeds; results in the order of the seeds. With an executor (any of
     `concurrent.futures`' kind) the flights are handed to it, otherwise flown here."""
-    return fly_all(partial(_fly_logged, profile, log_dir), seeds, executor, on_result)
+    return fly_all(partial(_fly_logged, profile, log_dir, record), seeds, executor, on_result)
 
 
-def _fly_logged(profile: Profile, log_dir: Path | None, seed: int) -> FlightResult:
-    return fly_seed(profile, seed, None if log_dir is None else log_of(seed, log_dir))
+def _fly_logged(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
+    return fly_seed(profile, seed, None if log_dir is None else log_of(seed, log_dir), record)
 
 
 def log_of(seed: int, log_dir: Path) -> Path:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from perchctl.calibration.files import camera_of
 from perchctl.camera.slot import NewestSlot
+from perchctl.camera.source import FrameSource
 from perchctl.flight.lockstep_positions import feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.link.mock import MockLink
@@ -162,19 +163,20 @@ def fly_lockstep(
     link = MockLink(vehicle, profile.link.telemetry_period_s)
     positions = feed_lockstep(link, profile)
     assert vehicle.camera is not None
-    source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
+    source: FrameSource = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
     truth = Truth(vehicle)
     watchers = (truth, *watchers)
     if log is not None:
         log.truth = truth.for_log
         watchers = (*watchers, log)
+        source = log.watched(source)
     operator = _OperatorAt(operator_at or {})
     tell = Teller(scenario)
     pipeline = make_pipeline(profile, camera)
     parts = FlightParts(
         link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
         lambda event: tell(event, event.t_s),  # the clock is the simulation's
-        positions,
+        positions, tuple if log is None else log.remarks,
     )  # fmt: skip
     link.connect()
     report = fly(parts)

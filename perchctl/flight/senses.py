@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from perchctl.camera.health import MEANING, HealthState, assess
 from perchctl.camera.mirror import MIRRORED
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import History, attitude_at, attitude_of, extended
 from perchctl.flight.noticed import Noticed, noticed
-from perchctl.link.protocol import Link
+from perchctl.mission.state import Observation
+from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile
+from perchctl.vehicle import Telemetry
 from perchctl.vision.consistency import Consistency, solved
 from perchctl.vision.fields import BLENDED, INTERLACED
 from perchctl.vision.own import ANOTHERS
@@ -21,6 +24,17 @@ from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineSta
 
 MIRRORED_FRAMES = 5
 REMARK_PICTURES = 3
+SENSED = (
+    "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
+    "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused",
+)  # fmt: skip
+"""The fields of an `Observation` that come from here; the others are the loop's."""
+
+
+class GivesTelemetry(Protocol):
+    """What the senses need of a `perchctl.link.protocol.Link`."""
+
+    def telemetry(self) -> list[Telemetry]: ...
 
 
 @dataclass(eq=False)
@@ -31,13 +45,14 @@ class Senses:
     was the one before once more.
     """
 
-    link: Link
+    link: GivesTelemetry
     source: FrameSource
     pipeline: Pipeline
     profile: Profile
     history: History = field(default_factory=History)
     state: PipelineState = field(default_factory=PipelineState)
     output: PipelineOutput | None = None
+    taken: Taken = field(default_factory=Taken)  # in this turn
     blind: bool = False
     repeated: bool = False
     last_good_frame_s: float = -math.inf
@@ -56,13 +71,18 @@ class Senses:
     def take_in(self, now_s: float, *, look: bool = True) -> None:
         """Telemetry and at most one frame. Without `look` the frame only counts as a sign
         of the camera's life."""
-        self.history = extended(self.history, self.link.telemetry(), self.profile.safety)
+        samples = self.link.telemetry()
+        self.history = extended(self.history, samples, self.profile.safety)
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
+        problem = self.source.problem(now_s)
+        self.taken = Taken(
+            tuple(samples), frame=_seen(frame), problem=problem, ended=self.source.finished,
+            live=self.source.live, look=look,
+        )  # fmt: skip
         used_s = self.noticed.used_s
         if frame is not None and used_s:
             frame = replace(frame, t_s=frame.t_s - used_s)
-        problem = self.source.problem(now_s)
         if frame is None:
             if problem is None and self.source.finished:
                 problem = f"{self.source.describe()} has ended"
@@ -89,6 +109,42 @@ class Senses:
                 self._notice(self.output, used_s)
         mirrored = self._mirrored >= MIRRORED_FRAMES
         self.camera_problem = MIRRORED if mirrored else self._note
+
+    def present(self, began_s: float, now_s: float) -> None:
+        """What has arrived while camera or vision hung, since the turn of `began_s`."""
+        before, late = self.history, self.link.telemetry()
+        after = extended(before, late, self.profile.safety)
+        turned_rad = max(before.turned_rad, after.turned_rad)
+        self.history = replace(after, jumped=before.jumped or after.jumped, turned_rad=turned_rad)
+        self.taken = replace(self.taken, late=tuple(late))
+        if self.last_good_frame_s == began_s:
+            self.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
+
+    def observation(self, now_s: float) -> Observation:
+        """The part of it that is seen: the fields of `SENSED`."""
+        newest = self.history.newest
+        assert newest is not None
+        changed_s = self.history.battery_changed_s
+        return Observation(
+            t_s=now_s,
+            telemetry=newest,
+            target=self.target(now_s),
+            new_frame=self.output is not None,
+            camera_age_s=now_s - self.last_good_frame_s,
+            camera_problem=self.camera_problem,
+            battery_age_s=0.0 if changed_s is None else now_s - changed_s,
+            jumped=self.history.jumped,
+            turned_rad=self.history.turned_rad,
+            disagreeing_frames=self.state.disagreeing_frames,
+            delay_s=self.noticed.used_s,
+            target_refused=self.refused,
+        )
+
+    @property
+    def poses(self) -> dict[str, PoseSeen]:
+        """The unfiltered ones of this turn's picture."""
+        poses = {} if self.output is None else self.output.poses
+        return {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
 
     def _notice(self, output: PipelineOutput, used_s: float) -> None:
         """Latency and mounting, from a picture whose pose was taken for the target's."""
@@ -161,6 +217,12 @@ class Senses:
         if live and age_s > self.profile.safety.max_frame_age_s:
             return f"the picture is {age_s:.1f} s late"
         return None
+
+
+def _seen(frame: Frame | None) -> FrameSeen | None:
+    if frame is None:
+        return None
+    return FrameSeen(frame.index, frame.t_s, frame.t_arrival_s, frame.fields, frame.repeated)
 
 
 def _mirrored_frames(before: int, found: Detections) -> int:

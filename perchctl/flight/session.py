@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -51,6 +51,7 @@ class FlyOptions:
     source: str
     seed: int = PLAIN_SEED
     log_dir: Path = Path("perchctl-logs")
+    record: bool = False
 
     @property
     def simulated(self) -> bool:
@@ -91,11 +92,12 @@ def fly_session(
     watchers: tuple[Watcher, ...] = (),
     switch: OperatorSwitch | None = None,
     watch_source: Callable[[FrameSource], FrameSource] = lambda source: source,
+    remarks: Callable[[], Sequence[str]] = tuple,
 ) -> SessionResult:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
 
     `switch` carries the operator's commands. `watch_source` may put a source around the camera's,
-    to look at its frames on their way.
+    to look at its frames on their way. `remarks`: as `FlightParts` has them.
     """
     check_options(options)
     check_compared(options.profile.positioning, simulated=options.simulated)
@@ -128,7 +130,7 @@ def fly_session(
             watched = (*watchers, pace)
             parts = FlightParts(
                 link, source, clock, profile, pipeline, watched, switch.read,
-                _teller(options, lag_s), positions,
+                _teller(options, lag_s), positions, remarks,
             )  # fmt: skip
             report = fly(parts)
             if simulated is not None:

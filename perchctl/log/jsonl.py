@@ -47,7 +47,11 @@ def encode(record: Mapping[str, Any]) -> bytes:
 
     Top-level keys whose value is None are left out.
     """
-    plain = {k: v for k, v in to_plain(record).items() if v is not None}
+    return line_of({k: v for k, v in to_plain(record).items() if v is not None})
+
+
+def line_of(plain: Mapping[str, Any]) -> bytes:
+    """JSON's own types as one line; no number is rounded."""
     text = json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.encode("utf-8", errors="backslashreplace") + b"\n"
 

@@ -28,7 +28,7 @@ from perchctl.plot import (
     SKY,
     VERMILLION,
     new_figure,
-    save_png,
+    save_figure,
 )
 
 SHADES = ("#EEF3F8", "#FFFFFF")
@@ -42,8 +42,8 @@ AXES = (("x", "m", 100.0, "x [cm]"), ("y", "m", 100.0, "y [cm]"), ("z", "m", 100
 YAW = ("yaw", "rad", 180.0 / math.pi, "yaw [deg]")
 
 
-def plot_flight(log: FlightLog, png_path: Path | str) -> None:
-    """Draw the flight into a PNG: errors, detections against the filtered track (as
+def plot_flight(log: FlightLog, path: Path | str) -> None:
+    """Draw the flight into a .png, .pdf or .svg: errors, detections against the filtered track (as
     the paper's figure 6), where frames were lost, height, thrust and battery, over the
     named phases; and the last seconds with the target in millimetres.
 
@@ -76,7 +76,7 @@ def plot_flight(log: FlightLog, png_path: Path | str) -> None:
         ax.set_xlabel("time [s]")
     figure.align_ylabels([*axes, last_ax])
     figure.suptitle(fill(title_of(log, summary_of(log)), TITLE_COLUMNS), fontsize=12)
-    save_png(figure, Path(png_path))
+    save_figure(figure, Path(path))
 
 
 def title_of(log: FlightLog, summary: FlightSummary) -> str:

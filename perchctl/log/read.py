@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import contextlib
+import zlib
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,19 @@ import numpy as np
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
 from perchctl.log.fields import FIELDS
+from perchctl.log.foreign import why_no_log
 from perchctl.log.jsonl import decode
+from perchctl.log.turn import turn_of
 from perchctl.log.write import FORMAT, SCHEMA_VERSION
+from perchctl.mission.turn import Turn
 
-KINDS = ("tick", "event", "summary")
-READABLE_VERSIONS = (1, SCHEMA_VERSION)
-"""1 knew no `tracked` and no events of several fields; its missing values read None."""
+KINDS = ("tick", "turn", "event", "summary")
+READABLE_VERSIONS = (1, 2, SCHEMA_VERSION)
+"""1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
+turns."""
+
+
+_GZIP = b"\x1f\x8b"
 
 
 @dataclass(frozen=True)
@@ -51,6 +60,19 @@ class FlightLog:
     summary: dict[str, Any] | None
     truncated: bool
     ignored_bytes: int = 0
+    turn_records: list[dict[str, Any]] = field(default_factory=list)
+
+    @cached_property
+    def turns(self) -> list[Turn]:
+        """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
+        return [turn_of(record) for record in self.turn_records]
+
+    @property
+    def t0_s(self) -> float:
+        """What every output takes for 0: the loop's clock when the log began; of an older log
+        its first tick."""
+        t0_s = self.header.get("t0_s")
+        return self.start_s if t0_s is None else float(t0_s)
 
     def column(self, key: str) -> Array:
         """A field over the ticks, shape (n,); NaN where it is missing.
@@ -120,12 +142,16 @@ def read_log(path: Path | str) -> FlightLog:
         summary=None if summary is None else _without_kind(summary),
         truncated=summary is None or ignored > 0,
         ignored_bytes=ignored,
+        turn_records=[r for r in good if r["kind"] == "turn"],
     )
 
 
 def _lines(path: Path) -> list[bytes]:
     try:
-        return path.read_bytes().splitlines(keepends=True)
+        data = path.read_bytes()
+        if data.startswith(_GZIP):
+            data = _unpacked(data)
+        return data.splitlines(keepends=True)
     except FileNotFoundError:
         raise NotFound(f"flight log {path} does not exist") from None
     except IsADirectoryError:
@@ -134,21 +160,30 @@ def _lines(path: Path) -> list[bytes]:
         raise NotFound(f"flight log {path} cannot be read: {error.strerror}") from None
 
 
+def _unpacked(data: bytes) -> bytes:
+    """As far as it goes: the end of one that is cut is lost."""
+    unpacker, found = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS), b""
+    with contextlib.suppress(zlib.error):
+        found = unpacker.decompress(data)
+    return found
+
+
 def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
     if not lines:
-        raise InvalidValue(f"{path}: line 1: the file is empty, a flight log begins with a header")
+        raise InvalidValue(
+            f"{path}: line 1: the file is empty: nothing was recorded, or it was lost in copying"
+        )
     try:
         header = decode(lines[0])
     except ValueError:
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:
         raise InvalidValue(
-            f"{path}: line 1: not a flight log of perchctl (its header is missing); logs are "
-            f"the .jsonl files in the profile's log.directory"
+            f"{path}: line 1: not a flight log of perchctl: {why_no_log(path, lines[0])}"
         )
     version = header.get("version")
     if version not in READABLE_VERSIONS:
-        readable = " and ".join(map(str, READABLE_VERSIONS))
+        readable = f"1 to {READABLE_VERSIONS[-1]}"
         raise InvalidValue(
             f"{path}: line 1: schema version {version!r}, this perchctl reads {readable}; "
             f"the log was written by perchctl {header.get('perchctl', 'of unknown version')}"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.log.read import FlightLog, PhaseSpan
+from perchctl.log.recording.end import RecordingEnd
 from perchctl.mission.findings import Findings, latency_text, turn_text
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -24,6 +25,7 @@ class FlightSummary:
         cause: what decided it, such as ``target not found``.
         miss_m: None where no truth is known.
         lost_records, log_problem: what the log lacks, and why; 0 and None for a whole one.
+        recording: what became of it, None of a flight without one.
     """
 
     outcome: str
@@ -39,6 +41,7 @@ class FlightSummary:
     findings: Findings | None = None
     lost_records: int = 0
     log_problem: str | None = None
+    recording: RecordingEnd | None = None
 
     def as_record(self) -> dict[str, Any]:
         """For `FlightLogWriter.close`; the phases are in the ticks already, and what the log
@@ -54,7 +57,32 @@ class FlightSummary:
             "locked": self.locked,
             "fell": self.fell,
             **_found(self.findings),
+            **_recorded(self.recording),
         }
+
+
+def _recorded(recording: RecordingEnd | None) -> dict[str, Any]:
+    """The recording lies beside the log: its name is enough."""
+    if recording is None:
+        return {}
+    return {
+        "recording": recording.path.name,
+        "pictures": recording.pictures,
+        "pictures_missing": recording.missing,
+        "recording_problem": recording.problem,
+    }
+
+
+def _recording_in(end: Mapping[str, Any], beside: Path) -> RecordingEnd | None:
+    name = end.get("recording")
+    if not name:
+        return None
+    return RecordingEnd(
+        beside.parent / Path(str(name)).name,
+        int(end.get("pictures") or 0),
+        int(end.get("pictures_missing") or 0),
+        end.get("recording_problem"),
+    )
 
 
 def _found(findings: Findings | None) -> dict[str, Any]:
@@ -116,6 +144,7 @@ def summary_of(log: FlightLog) -> FlightSummary:
         findings=_findings_in(end),
         lost_records=int(end.get("lost_records") or 0),
         log_problem=end.get("problem"),
+        recording=_recording_in(end, log.path),
     )
 
 
@@ -147,6 +176,8 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
     if flight.fell:
         lines.append("vehicle:   fell")
     lines += faults
+    if flight.recording is not None:
+        lines.append(f"recording: {flight.recording.text}")
     if log_path is not None:
         lines.append(f"log:       {log_path}")
     return "\n".join(lines)

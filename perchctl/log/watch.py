@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from perchctl.log.fields import tick_record
+from perchctl.camera.source import FrameSource, WatchedSource
+from perchctl.log.fields import event_record, tick_record
 from perchctl.log.read import PhaseSpan
+from perchctl.log.recording import SUFFIX, recording_of
 from perchctl.log.summary import FlightSummary
 from perchctl.log.write import FlightLogWriter, log_path, make_header
+from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.profile import Profile
 from perchctl.vehicle import NO_BATTERY_READING_V
+
+if TYPE_CHECKING:
+    from perchctl.log.recording.recorder import Recorder
 
 Truth = tuple[tuple[float, float, float], float]
 """The body's true position (world, m) and the gear's true miss (m)."""
@@ -23,32 +30,66 @@ Truth = tuple[tuple[float, float, float], float]
 class LogWatcher:
     """Writes every tick and event; its problem is the log's.
 
-    `truth`, where a simulation sets it, gives what is true at the time of the tick.
+    `truth`, where a simulation sets it, gives what is true at the time of the tick. A recording
+    goes with it where one is wanted: its pictures come through `watched`, and what is wrong with
+    it is in `remarks`, never in `problem`.
     """
 
-    def __init__(self, writer: FlightLogWriter) -> None:
+    def __init__(self, writer: FlightLogWriter, recorder: Recorder | None = None) -> None:
         self.writer = writer
+        self._recorder = recorder
         self.truth: Callable[[], Truth] | None = None
         self._battery_min_v: float | None = None
         self._ticks = 0
 
     @classmethod
-    def lockstep(cls, path: Path, profile: Profile, seed: int) -> LogWatcher:
+    def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
         """For a simulated flight: the same seed gives the same bytes. Errors: InvalidValue."""
         header = make_header(profile, uri="sim://", source="sim:", seed=seed, lockstep=True)
-        return cls(FlightLogWriter.open(path, header))
+        return cls._opened(path, header, profile, record, live=False)
 
     @classmethod
     def real_time(
-        cls, directory: Path, profile: Profile, uri: str, source: str, seed: int | None = None
+        cls,
+        directory: Path,
+        profile: Profile,
+        uri: str,
+        source: str,
+        seed: int | None = None,
+        record: bool = False,
     ) -> LogWatcher:
         """A new file in `directory`, written behind the flight.
 
         Errors: InvalidValue."""
-        started = datetime.now(UTC)
-        header = make_header(profile, uri=uri, source=source, seed=seed, started=started)
+        started, t0_s = datetime.now(UTC), time.monotonic()
+        header = make_header(profile, uri=uri, source=source, seed=seed, started=started, t0_s=t0_s)
         path = log_path(directory, profile.name, started)
-        return cls(FlightLogWriter.open(path, header, live=True))
+        return cls._opened(path, header, profile, record, live=True)
+
+    @classmethod
+    def _opened(
+        cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
+    ) -> LogWatcher:
+        beside = (SUFFIX,) if record else ()
+        writer = FlightLogWriter.open(path, header, live, beside)
+        if not record:
+            return cls(writer)
+        from perchctl.log.recording.recorder import Recorder
+
+        try:
+            return cls(writer, Recorder.open(recording_of(writer.path), header, profile, live))
+        except BaseException:
+            writer.close()
+            writer.path.unlink(missing_ok=True)
+            raise
+
+    def watched(self, source: FrameSource) -> FrameSource:
+        """The same source; the frames that it gives are recorded, where that is wanted."""
+        return source if self._recorder is None else WatchedSource(source, self._recorder.frame)
+
+    def remarks(self) -> list[str]:
+        """What is new about the recording, a sentence each."""
+        return [] if self._recorder is None else self._recorder.take_remarks()
 
     @property
     def path(self) -> Path:
@@ -60,15 +101,27 @@ class LogWatcher:
         if battery_v >= NO_BATTERY_READING_V:
             self._battery_min_v = min(battery_v, self._battery_min_v or battery_v)
         position_m, miss_m = (None, None) if self.truth is None else self.truth()
-        self.writer.write(flight_record(tick, position_m, miss_m))
+        record = flight_record(tick, position_m, miss_m)
+        self.writer.write(record)
+        if tick.turn is not None:
+            self.writer.turn(tick.turn)
+        if self._recorder is not None:
+            self._recorder.tick(record)
+
+    def turn(self, turn: Turn) -> None:
+        """One without a tick."""
+        self.writer.turn(turn)
 
     def event(self, event: Event) -> None:
         self.writer.event(event)
+        if self._recorder is not None:
+            self._recorder.event(event_record(event))
 
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
     ) -> FlightSummary | None:
         """Write the summary and close; without a report (the flight raised) only close."""
+        recording = None if self._recorder is None else self._recorder.close()
         if report is None:
             self.writer.close()
             return None
@@ -84,6 +137,7 @@ class LogWatcher:
             fell=fell,
             phases=spans_of(report),
             findings=report.findings,
+            recording=recording,
         )
         self.writer.close(summary.as_record())
         lost, problem = self.writer.lost_records, self.writer.problem
@@ -91,9 +145,12 @@ class LogWatcher:
 
     def abandon(self, reason: str) -> None:
         """Close the log of a flight that failed. One that never began leaves no file."""
+        recording = None if self._recorder is None else self._recorder.close()
         self.writer.close({"outcome": "failed", "reason": reason})
         if not self._ticks:
             self.path.unlink(missing_ok=True)
+            if recording is not None:
+                recording.path.unlink(missing_ok=True)
 
     @property
     def problem(self) -> str | None:

@@ -1,7 +1,8 @@
 """The flight log: append-only JSON lines, readable after any crash.
 
-Line 1 is the header; then one `tick` record a turn of the loop, `event` records
-between them, and one `summary` at the end. A flight is never troubled by its
+Line 1 is the header; then a `tick` and a `turn` record for each turn of the loop (the one
+rounded, for people and plots, the other exact and whole), `event` records between them, and one
+`summary` at the end. A flight is never troubled by its
 log: in real time a thread of its own writes it, and a write that fails is remembered
 in `FlightLogWriter.problem`.
 """
@@ -23,17 +24,21 @@ import perchctl
 from perchctl.camera.credentials import profile_record, without_password
 from perchctl.errors import InvalidValue
 from perchctl.log.behind import Behind
+from perchctl.log.exact import to_exact
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
-from perchctl.log.jsonl import encode
+from perchctl.log.jsonl import encode, line_of
+from perchctl.log.setup import camera_record
+from perchctl.log.turn import TURN_NOTE, turn_line
+from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event
 from perchctl.profile import Profile
 
 FORMAT = "perchctl-flight-log"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 3.0
-MOST_BEHIND = 1500
+MOST_BEHIND = 3000
 """Records that may wait for the disk, half a minute of a flight; more are dropped."""
 _ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
 
@@ -46,8 +51,10 @@ def make_header(
     seed: int | None = None,
     lockstep: bool = False,
     started: datetime | None = None,
+    t0_s: float = 0.0,
 ) -> dict[str, Any]:
-    """The first record. Without `started` it depends on nothing but its arguments."""
+    """The first record. Without `started` it depends on nothing but its arguments and the files
+    that the profile names. `t0_s`: the loop's clock when the log began, or at `started`."""
     return {
         "kind": "header",
         "format": FORMAT,
@@ -58,9 +65,12 @@ def make_header(
         "seed": seed,
         "lockstep": lockstep,
         "started_utc": started.astimezone(UTC).isoformat(timespec="seconds") if started else None,
+        "t0_s": t0_s,
         "profile": profile_record(profile),
+        **camera_record(profile),
         "fields": FIELDS,
         "event_fields": EVENT_FIELDS,
+        "turns": TURN_NOTE,
     }
 
 
@@ -100,8 +110,16 @@ class FlightLogWriter:
         return self._dropped + self._failed
 
     @classmethod
-    def open(cls, path: Path, header: Mapping[str, Any], live: bool = False) -> FlightLogWriter:
+    def open(
+        cls,
+        path: Path,
+        header: Mapping[str, Any],
+        live: bool = False,
+        beside: tuple[str, ...] = (),
+    ) -> FlightLogWriter:
         """Create the file and its folder and write the header.
+
+        `beside`: suffixes of files of the same name that must not be there, either.
 
         `live` (for flights in real time): a thread of its own writes, and brings the records
         to the disk about once a second of the loop's time; otherwise each record is in the
@@ -110,13 +128,13 @@ class FlightLogWriter:
         """
         make_log_folder(path.parent)
         try:
-            free, fd = _create(path)
+            free, fd = _create(path, beside)
         except OSError as error:
             raise InvalidValue(_cannot_start(path, error)) from None
         behind = Behind(MOST_BEHIND, "perchctl-log") if live else None
         writer = cls(free, fd, behind)
         try:
-            writer._append(encode(header))
+            writer._append(_header_line(header))
         except OSError as error:
             os.close(fd)
             free.unlink(missing_ok=True)
@@ -126,6 +144,10 @@ class FlightLogWriter:
     def write(self, record: Mapping[str, Any]) -> None:
         """Append one tick record (`perchctl.log.fields.tick_record`). Never raises."""
         self._put({"kind": "tick", **record}, _time_of(record))
+
+    def turn(self, turn: Turn) -> None:
+        """Append a whole turn, exactly (`perchctl.log.turn`). Never raises."""
+        self._put(turn, turn.t_s)
 
     def event(self, event: Event) -> None:
         """Append an event (`perchctl.log.fields.event_record`). Never raises."""
@@ -156,7 +178,7 @@ class FlightLogWriter:
         with suppress(OSError):
             os.close(self._fd)
 
-    def _put(self, record: Mapping[str, Any], t_s: float | None) -> None:
+    def _put(self, record: Mapping[str, Any] | Turn, t_s: float | None) -> None:
         if self._closed:
             self._dropped += 1
         elif self._behind is None:
@@ -165,12 +187,12 @@ class FlightLogWriter:
             self._dropped += 1
             self._remember("the disk does not keep up with the flight log: records are dropped")
 
-    def _store(self, record: Mapping[str, Any], t_s: float | None) -> None:
+    def _store(self, record: Mapping[str, Any] | Turn, t_s: float | None) -> None:
         if self._is_waiting(t_s):
             self._failed += 1
             return
         try:
-            self._append(encode(record))
+            self._append(turn_line(record) if isinstance(record, Turn) else encode(record))
         except (OSError, TypeError, ValueError, RecursionError) as error:
             self._failed += 1
             self._failed_s = t_s
@@ -218,6 +240,11 @@ class FlightLogWriter:
             self.problem = problem
 
 
+def _header_line(header: Mapping[str, Any]) -> bytes:
+    """A replay flies by the profile in it: its numbers are not rounded."""
+    return line_of(to_exact({k: v for k, v in header.items() if v is not None}))
+
+
 def make_log_folder(directory: Path) -> None:
     """Where it is missing. Errors: InvalidValue."""
     try:
@@ -227,11 +254,13 @@ def make_log_folder(directory: Path) -> None:
         raise InvalidValue(f"{directory} cannot hold flight logs ({why}): {_ELSEWHERE}") from None
 
 
-def _create(path: Path) -> tuple[Path, int]:
+def _create(path: Path, beside: tuple[str, ...] = ()) -> tuple[Path, int]:
     """A file that did not exist before, by `path`'s name or the next free one."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
     for number in count(1):
         free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
+        if any(free.with_suffix(suffix).exists() for suffix in beside):
+            continue
         with suppress(FileExistsError):
             return free, os.open(free, flags, 0o644)
     raise AssertionError("unreachable")

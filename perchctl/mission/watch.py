@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from perchctl.mission.findings import Findings
 from perchctl.mission.state import Outcome, Phase, PlannerState, Severity
-from perchctl.vehicle import Command, ExternalPosition, Telemetry
+from perchctl.mission.turn import Outside, Turn
+from perchctl.vehicle import Command, Telemetry
 from perchctl.vision.consistency import Consistency
 from perchctl.vision.types import PipelineOutput, TargetEstimate
 
@@ -40,18 +41,6 @@ class Event:
     simulated: str = ""
 
 
-@dataclass(frozen=True)
-class Outside:
-    """Positions from outside, as the vehicle is handed them: how old the newest is, why none is
-    sent now (None while they are), how many were sent, and how many a second, and the newest."""
-
-    age_s: float
-    problem: str | None
-    sent: int
-    rate_hz: float
-    place: ExternalPosition | None
-
-
 @dataclass(frozen=True, eq=False)
 class Tick:
     """All that one turn of the loop knew and did, for the log and the display.
@@ -59,7 +48,8 @@ class Tick:
     `output` is what this tick's new frame gave, None without one; `target` the estimate
     that the planner steered by. `consistency`: what the flight shows of latency and mounting,
     in the ticks in which that was worked out anew; `delay_used_s` is in the frames' times.
-    `outside`: None where the vehicle's decks measure its position.
+    `outside`: None where the vehicle's decks measure its position. `turn`: the same turn whole
+    and exact, to be decided again.
     """
 
     t_s: float
@@ -74,6 +64,7 @@ class Tick:
     consistency: Consistency | None = None
     delay_used_s: float = 0.0
     outside: Outside | None = None
+    turn: Turn | None = None
 
 
 class Watcher(Protocol):
@@ -85,6 +76,14 @@ class Watcher(Protocol):
 
     @property
     def problem(self) -> str | None: ...
+
+
+@runtime_checkable
+class TurnWatcher(Watcher, Protocol):
+    """One that is told of the turns without a tick, too: before take-off, and those that were
+    decided anew."""
+
+    def turn(self, turn: Turn) -> None: ...
 
 
 class EventKeeper:

@@ -128,6 +128,9 @@ class SimulationConfig(Section):
 class LogConfig(Section):
     directory: str = Field("perchctl-logs", description="for the log and its plot")
     plot: bool = Field(True, description="draw the flight after it")
+    max_mb: float = Field(
+        2000.0, gt=0, le=1e6, description="no more pictures are recorded into a larger recording"
+    )
 
 
 class Profile(Section):

@@ -154,8 +154,8 @@ def looked_at(frame: Frame, mode: FieldsMode) -> Frame:
 def halves(frame: Frame) -> tuple[Frame, Frame]:
     """The top and the bottom field of a woven frame, both at the frame's time."""
     return (
-        replace(frame, image=field_picture(frame.image, 0), fields="top"),
-        replace(frame, image=field_picture(frame.image, 1), fields="bottom"),
+        replace(frame, image=field_picture(frame.image, 0), fields="top", encoded=None),
+        replace(frame, image=field_picture(frame.image, 1), fields="bottom", encoded=None),
     )
 
 

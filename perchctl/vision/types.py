@@ -51,7 +51,9 @@ class Frame:
     `image` is grey, uint8, shape (height, width). `fields` says whether it is a picture of one
     moment: ``whole``; ``woven`` of two fields; the ``top`` or ``bottom`` field of such a one
     at full height; None while nobody has looked (`perchctl.vision.fields`). `repeated`: the
-    source has given out the picture before once more, which is no measurement.
+    source has given out the picture before once more, which is no measurement. `encoded`: the
+    JPEG that came, where `cv2.imdecode(..., IMREAD_GRAYSCALE)` of it is `image` to the bit; who
+    changes the image leaves it out.
     """
 
     index: int
@@ -60,6 +62,7 @@ class Frame:
     t_arrival_s: float = 0.0
     fields: PictureKind | None = None
     repeated: bool = False
+    encoded: bytes | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from functools import partial
 
-from perchctl.camera.source import FrameSource, SourceAround
+from perchctl.camera.source import FrameSource, WatchedSource
 from perchctl.display.page.live import LivePage, State
 from perchctl.display.page.sketch import Sketch
 from perchctl.display.status import status_rows
@@ -40,7 +40,7 @@ class FlightPage:
 
     def watched(self, source: FrameSource) -> FrameSource:
         """The same source; each frame it gives is remembered for the page."""
-        return _Watched(source, self._seen)
+        return WatchedSource(source, self._seen)
 
     def tick(self, tick: Tick) -> None:
         try:
@@ -60,18 +60,6 @@ class FlightPage:
         self._frame = frame
         if not self._flying:  # no ticks yet that would show it
             self.page.show(frame.index, Sketch(frame.image))
-
-
-class _Watched(SourceAround):
-    def __init__(self, source: FrameSource, seen: Callable[[Frame], None]) -> None:
-        super().__init__(source)
-        self._seen = seen
-
-    def poll(self, now_s: float) -> Frame | None:
-        frame = super().poll(now_s)
-        if frame is not None:
-            self._seen(frame)
-        return frame
 
 
 def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Sketch:

@@ -85,7 +85,7 @@ def detect(
     def looked(picture: Frame) -> Detections:
         hidden = hidden_in(picture, setup.mask)
         if hidden is not None:
-            picture = replace(picture, image=filled(picture.image, hidden))
+            picture = replace(picture, image=filled(picture.image, hidden), encoded=None)
         return _looked(picture, hidden, expected, setup, camera, shift, look, lately, turn, own)
 
     if frame.fields == "woven":

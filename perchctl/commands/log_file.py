@@ -1,0 +1,55 @@
+"""Which log a command of `perchctl log` means, and reading it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from perchctl.commands.output import say
+from perchctl.errors import InvalidValue, UsageError
+from perchctl.log.newest import newest_logs
+from perchctl.log.read import FlightLog, read_log
+from perchctl.profile import Profile, load_profile
+
+
+def log_file(file: Path | None, profile: str | None, log_dir: Path | None) -> Path:
+    """The one that is named; else the newest of the folder, which is said.
+
+    Errors: NotFound, InvalidValue (a profile), UsageError.
+    """
+    if file is None:
+        (newest,) = newest_logs(log_folder(profile, log_dir), 1)
+        say(f"the newest log: {newest}")
+        return newest
+    for option, value in (("--profile", profile), ("--log-dir", log_dir)):
+        if value is not None:
+            raise UsageError(f"{option} says where the newest log is, but {file} is named: "
+                             f"leave out one of them")  # fmt: skip
+    return file
+
+
+def log_folder(profile: str | None, log_dir: Path | None) -> Path:
+    """Where `fly` puts the logs. Errors: NotFound, InvalidValue, UsageError."""
+    if log_dir is not None:
+        if profile is not None:
+            raise UsageError("--profile and --log-dir both say where the logs are: leave out one")
+        return log_dir
+    return Path((Profile() if profile is None else load_profile(profile)).log.directory)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[FlightLog]:
+    """The log; a value in it that is of no flight is an error of the file.
+
+    Errors: NotFound, InvalidValue.
+    """
+    log = read_log(path)
+    try:
+        yield log
+    except (TypeError, ValueError, KeyError, AttributeError) as error:
+        if isinstance(error, OSError):
+            raise
+        raise InvalidValue(
+            f"{path}: it holds a value that no flight writes ({error}): take the original"
+        ) from error

@@ -1,0 +1,100 @@
+"""Each turn of the loop as a value, for the log; and how long its parts took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from perchctl.flight.clock import Clock, WallClock
+from perchctl.flight.senses import Senses
+from perchctl.mission.state import Observation, PlannerState
+from perchctl.mission.turn import Outside, Turn, TurnRole, TurnTiming
+from perchctl.mission.watch import TurnWatcher, Watcher
+from perchctl.positioning.feed import FeedStatus
+from perchctl.vehicle import Command
+
+
+class Turns:
+    """Counts them. In lockstep there are no timings: the same seed gives the same turns."""
+
+    def __init__(self, clock: Clock, watchers: Iterable[Watcher]) -> None:
+        self._clock = clock if isinstance(clock, WallClock) else None
+        self._told = [w for w in watchers if isinstance(w, TurnWatcher)]
+        self._count = 0
+        self._began_s = 0.0
+        self._laps_s = [0.0]
+
+    def begin(self, now_s: float) -> None:
+        self._began_s, self._laps_s = now_s, [now_s]
+
+    def lap(self) -> None:
+        """Taken in; decided; sent."""
+        if self._clock is not None:
+            self._laps_s.append(self._clock.now())
+
+    def waiting(self, senses: Senses, now_s: float, outside: FeedStatus | None) -> None:
+        turn = Turn(
+            self._counted(), "waiting", now_s, now_s, senses.taken, senses.poses,
+            outside=told_of(outside),
+        )  # fmt: skip
+        self._tell(turn)
+
+    def redone(self, senses: Senses, obs: Observation, new: PlannerState, command: Command) -> None:
+        self._tell(self._turn("redone", senses, obs, new, command, None))
+
+    def flown(
+        self,
+        senses: Senses,
+        obs: Observation,
+        new: PlannerState,
+        command: Command,
+        outside: FeedStatus | None,
+    ) -> Turn:
+        return self._turn("flown", senses, obs, new, command, told_of(outside))
+
+    def _turn(
+        self,
+        role: TurnRole,
+        senses: Senses,
+        obs: Observation,
+        new: PlannerState,
+        command: Command,
+        outside: Outside | None,
+    ) -> Turn:
+        return Turn(
+            number=self._counted(),
+            role=role,
+            began_s=self._began_s,
+            t_s=obs.t_s,
+            taken=senses.taken,
+            poses=senses.poses,
+            observation=obs,
+            command=command,
+            phase=new.phase,
+            row=new.row,
+            held=bool(new.hold),
+            attempts=new.attempts,
+            outside=outside,
+            timing=self._timing(),
+        )
+
+    def _timing(self) -> TurnTiming | None:
+        if self._clock is None or len(self._laps_s) < 4:
+            return None
+        began_s, seen_s, decided_s, sent_s = self._laps_s[:4]
+        return TurnTiming(
+            seen_s - began_s, decided_s - seen_s, sent_s - decided_s, self._clock.now() - began_s
+        )
+
+    def _counted(self) -> int:
+        self._count += 1
+        return self._count - 1
+
+    def _tell(self, turn: Turn) -> None:
+        for watcher in self._told:
+            watcher.turn(turn)
+
+
+def told_of(status: FeedStatus | None) -> Outside | None:
+    if status is None:
+        return None
+    return Outside(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)

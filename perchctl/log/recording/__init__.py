@@ -1,0 +1,36 @@
+"""A flight's recording: an MCAP file beside the log, with the pictures.
+
+`pictures_of` reads the pictures back, `export_mcap` makes such a file of a log. The libraries
+are loaded with the first call: most flights of a campaign are not recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from perchctl.log.recording.pictures import Picture
+
+SUFFIX = ".mcap"
+
+
+def recording_of(path: Path | str) -> Path:
+    """The recording's place, of a log's path or the recording's own."""
+    return Path(path).with_suffix(SUFFIX)
+
+
+def pictures_of(path: Path | str, *, exact: bool = True) -> Iterator[Picture]:
+    """The pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it lies
+    beside; of one that was cut off, those that are whole.
+
+    Args:
+        exact: every picture must be the flight's to the bit.
+
+    Errors, with the first picture: NotFound without a recording; InvalidValue where it is none,
+    and where this computer's decoder makes other pixels of a JPEG than the flight's did.
+    """
+    from perchctl.log.recording.pictures import pictures_in
+
+    return pictures_in(recording_of(path), exact)

@@ -1,0 +1,222 @@
+"""What a recording says of a log's records: Foxglove's own messages, and JSON where it has none.
+
+Every message is made from the records that the log holds, so that a recording made in flight and
+one made of its log say the same. Frames: `world` (of the state estimate), `body`, `gear`, `camera`
+(OpenCV's axes, which are Foxglove's) and `target`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from perchctl.geometry import Array, quaternion_from_rotation, rot_z, rotation_from_rpy
+from perchctl.log.recording.times import NS, Epoch
+from perchctl.profile import Profile
+from perchctl.vision.types import CameraModel
+
+WORLD, BODY, GEAR, CAMERA, TARGET = "world", "body", "gear", "camera", "target"
+
+IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibration"
+TF, VEHICLE, PATH, TARGET_POSE = "/tf", "/vehicle/pose", "/vehicle/path", "/target/pose"
+SETPOINT, SCENE, LOG, TICK = "/setpoint", "/scene", "/log", "/tick"
+
+PATH_PERIOD_S = 1.0
+"""The whole path so far is said so often: who jumps into the middle sees what was flown."""
+PATH_STEP_S = 0.1
+
+_MODELS = {"fisheye": "kannala_brandt"}
+"""Foxglove's name of OpenCV's fisheye; the others are called alike."""
+_LEVELS = {"hold": Log.WARNING, "back off": Log.WARNING, "land": Log.ERROR, "stop": Log.FATAL}
+
+Said = tuple[str, Message]
+"""A topic and its message."""
+
+
+def stamp(ns: int) -> Timestamp:
+    return Timestamp(seconds=ns // NS, nanos=ns % NS)
+
+
+def image_message(ns: int, data: bytes, form: str) -> CompressedImage:
+    """`form` is ``jpeg`` or ``png``."""
+    return CompressedImage(timestamp=stamp(ns), frame_id=CAMERA, data=data, format=form)
+
+
+def calibration_message(ns: int, camera: CameraModel) -> CameraCalibration:
+    """With its distortion. One camera needs no rectification: R is 1 and P holds K."""
+    width, height = camera.size_px
+    P = np.hstack([camera.K, np.zeros((3, 1))])
+    return CameraCalibration(
+        timestamp=stamp(ns),
+        frame_id=CAMERA,
+        width=width,
+        height=height,
+        distortion_model=_MODELS.get(camera.model, camera.model),
+        D=[float(v) for v in np.ravel(camera.dist)],
+        K=[float(v) for v in np.ravel(camera.K)],
+        R=[float(v) for v in np.eye(3).ravel()],
+        P=[float(v) for v in P.ravel()],
+    )
+
+
+def log_message(ns: int, record: Mapping[str, Any]) -> Log:
+    """An event's record. What goes on is an info, a landing an error, a stop fatal."""
+    level = _LEVELS.get(str(record.get("severity")), Log.INFO)
+    what, phase = record.get("event"), record.get("phase")
+    text = str(record.get("reason") or "")
+    if what == "phase":
+        text = f"{phase}: {text}".rstrip(": ")
+    elif what == "hold":
+        text = f"held: {text}"
+    if record.get("simulated"):
+        text = f"{text} (simulated: {record['simulated']})"
+    return Log(
+        timestamp=stamp(ns),
+        level=level,
+        message=text,
+        name="perchctl",
+        file=record.get("row") or "",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Mounts:
+    """What does not move against the body, as messages without their time."""
+
+    T_body_cam: Array
+    gear_body_m: tuple[float, float, float]
+
+    def transforms(self, ns: int) -> list[FrameTransform]:
+        R, t_m = self.T_body_cam[:3, :3], self.T_body_cam[:3, 3]
+        return [
+            _transform(ns, BODY, CAMERA, t_m, quaternion_from_rotation(R)),
+            _transform(ns, BODY, GEAR, self.gear_body_m, (1.0, 0.0, 0.0, 0.0)),
+        ]
+
+
+def mounts_of(profile: Profile) -> Mounts:
+    x, y, z = (float(v) for v in profile.vehicle.gear_body_m)
+    return Mounts(profile.camera.mount.T_body_cam, (x, y, z))
+
+
+class Said3d:
+    """The messages of each tick for the 3-D panel, and the path that grows with them.
+
+    What stands still is said with every tick: who jumps into the middle of a flight gets the
+    newest message of each topic, and no older one.
+    """
+
+    def __init__(self, epoch: Epoch, mounts: Mounts | None) -> None:
+        self._epoch = epoch
+        self._mounts = mounts
+        self._target: FrameTransform | None = None  # where it was last
+        self._path = PosesInFrame(frame_id=WORLD)
+        self._path_s = self._point_s = -math.inf
+
+    def of(self, record: Mapping[str, Any]) -> Iterator[Said]:
+        """Of a tick's record (`perchctl.log.fields.FIELDS`)."""
+        t_s = float(record["t_s"])
+        ns = self._epoch.ns(t_s)
+        transforms = [] if self._mounts is None else self._mounts.transforms(ns)
+        body = _body_of(record)
+        if body is not None:
+            sampled_ns = self._epoch.ns(t_s - (_number(record, "tel_age_s") or 0.0))
+            transforms.append(_transform(sampled_ns, WORLD, BODY, *body))
+            pose = _pose(*body)
+            yield VEHICLE, PoseInFrame(timestamp=stamp(sampled_ns), frame_id=WORLD, pose=pose)
+            yield from self._path_with(pose, t_s, ns)
+        target = _turned(record, "tx_m", "ty_m", "tz_m", "tyaw_rad")
+        if target is not None:
+            self._target = _transform(ns, WORLD, TARGET, *target)
+            yield TARGET_POSE, _pose_in_world(ns, target)
+        elif self._target is not None:
+            self._target.timestamp.CopyFrom(stamp(ns))
+        if self._target is not None:
+            transforms.append(self._target)
+        yield TF, FrameTransforms(transforms=transforms)
+        setpoint = _turned(record, "cmd_x_m", "cmd_y_m", "cmd_z_m", "cmd_yaw_rad")
+        if setpoint is not None:
+            yield SETPOINT, _pose_in_world(ns, setpoint)
+
+    def _path_with(self, pose: Pose, t_s: float, ns: int) -> Iterator[Said]:
+        if t_s - self._point_s >= PATH_STEP_S:
+            self._point_s = t_s
+            self._path.poses.append(pose)
+        if t_s - self._path_s >= PATH_PERIOD_S:
+            self._path_s = t_s
+            self._path.timestamp.CopyFrom(stamp(ns))
+            yield PATH, self._path
+
+
+Placed = tuple[Any, tuple[float, float, float, float]]
+"""A position (3,), m, and a quaternion (w, x, y, z)."""
+
+
+def _body_of(record: Mapping[str, Any]) -> Placed | None:
+    keys = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
+    values = [_number(record, key) for key in keys]
+    if any(value is None for value in values):
+        return None
+    x, y, z, roll, pitch, yaw = (float(v) for v in values if v is not None)
+    return (x, y, z), quaternion_from_rotation(rotation_from_rpy(roll, pitch, yaw))
+
+
+def _turned(record: Mapping[str, Any], *keys: str) -> Placed | None:
+    """Three keys of a position and one of a heading."""
+    values = [_number(record, key) for key in keys]
+    if any(value is None for value in values):
+        return None
+    x, y, z, yaw = (float(v) for v in values if v is not None)
+    return (x, y, z), quaternion_from_rotation(rot_z(yaw))
+
+
+def _number(record: Mapping[str, Any], key: str) -> float | None:
+    """None for what is missing or not finite: a view of it would fail."""
+    value = record.get(key)
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def _transform(
+    ns: int, parent: str, child: str, t_m: Any, q: tuple[float, float, float, float]
+) -> FrameTransform:
+    return FrameTransform(
+        timestamp=stamp(ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=_vector(t_m),
+        rotation=_quaternion(q),
+    )
+
+
+def _pose(t_m: Any, q: tuple[float, float, float, float]) -> Pose:
+    return Pose(position=_vector(t_m), orientation=_quaternion(q))
+
+
+def _pose_in_world(ns: int, placed: Placed) -> PoseInFrame:
+    return PoseInFrame(timestamp=stamp(ns), frame_id=WORLD, pose=_pose(*placed))
+
+
+def _vector(t_m: Any) -> Vector3:
+    x, y, z = t_m
+    return Vector3(x=x, y=y, z=z)
+
+
+def _quaternion(q: tuple[float, float, float, float]) -> Quaternion:
+    w, x, y, z = q
+    return Quaternion(w=w, x=x, y=y, z=z)

@@ -1,0 +1,53 @@
+"""The pictures of a flight, out of its recording."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from numpy.typing import NDArray
+
+from perchctl.errors import InvalidValue
+from perchctl.log.recording.messages import FRAME, IMAGE
+from perchctl.log.recording.walk import Walked, walk
+
+
+class Picture(NamedTuple):
+    """One frame: its number and time of exposure on the loop's clock, as the source gave
+    them, and the grey picture (height, width) that the pipeline saw."""
+
+    number: int
+    t_s: float
+    image: NDArray[np.uint8]
+
+
+def pictures_in(path: Path, exact: bool) -> Iterator[Picture]:
+    """As `perchctl.log.recording.pictures_of`, of the recording itself."""
+    data: Walked | None = None
+    for each in walk(path, (IMAGE, FRAME)):
+        if each.topic == IMAGE:
+            data = each
+        elif data is not None and data.sequence == each.sequence:
+            yield _picture(path, data, each, exact)
+            data = None
+
+
+def _picture(path: Path, data: Walked, told: Walked, exact: bool) -> Picture:
+    frame = json.loads(told.data)
+    pixels = np.frombuffer(CompressedImage.FromString(data.data).data, np.uint8)
+    image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InvalidValue(f"{path}: picture {frame['number']} cannot be decoded")
+    grey = np.asarray(image, np.uint8)
+    if exact and zlib.crc32(grey.data) != frame["crc32"]:
+        raise InvalidValue(
+            f"{path}: picture {frame['number']} decodes to other pixels here than in the flight: "
+            f"another version of OpenCV decoded it there"
+        )
+    return Picture(frame["number"], frame["t_s"], grey)

@@ -1,0 +1,76 @@
+"""What a flight was set up with, in its log's header: enough to decide it again elsewhere.
+
+The profile stands there with every key. The files that it names for the camera may be others
+by the time of a replay, so what was in them stands there, too.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from perchctl.calibration.files import camera_of
+from perchctl.errors import InvalidValue, PerchError
+from perchctl.log.exact import from_exact, to_exact
+from perchctl.profile import Profile
+from perchctl.profile.load import first_fault
+from perchctl.profile.mask import read_mask
+from perchctl.vision.types import CameraModel
+
+
+def camera_record(profile: Profile) -> dict[str, Any]:
+    """``camera``, the calibration, and ``mask``, what the gear covers in it; of a file that
+    cannot be read, nothing: that is the flight's to say."""
+    with contextlib.suppress(PerchError):
+        camera = camera_of(profile.camera)
+        record = {"camera": to_exact(camera)}
+        if profile.camera.mask is not None:
+            record["mask"] = _packed(read_mask(profile.camera.mask, camera.size_px))
+        return record
+    return {}
+
+
+def profile_of(header: Mapping[str, Any]) -> Profile:
+    """The profile that was flown, but for passwords. Errors: InvalidValue."""
+    try:
+        return Profile.model_validate(header.get("profile"))
+    except ValidationError as error:
+        key, text = first_fault(error)
+        raise InvalidValue(
+            f"the log's profile cannot be used by this version of perchctl: {key or 'profile'}: "
+            f"{text}"
+        ) from None
+
+
+def camera_in(header: Mapping[str, Any]) -> CameraModel | None:
+    """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
+    if header.get("camera") is None:
+        return None
+    try:
+        return from_exact(CameraModel, header["camera"])
+    except ValueError as error:
+        raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
+
+
+def mask_in(header: Mapping[str, Any], camera: CameraModel) -> NDArray[np.bool_] | None:
+    """(height, width), True where the gear covers; None without a mask. Errors: InvalidValue."""
+    text = header.get("mask")
+    if text is None:
+        return None
+    width, height = camera.size_px
+    try:
+        bits = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8)
+        return np.unpackbits(bits)[: width * height].reshape(height, width).astype(bool)
+    except (ValueError, TypeError, zlib.error) as error:
+        raise InvalidValue(f"the log's header holds no mask: mask: {error}") from None
+
+
+def _packed(mask: NDArray[np.bool_]) -> str:
+    return base64.b64encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode("ascii")

@@ -1,0 +1,264 @@
+"""A flight told from its log: as lines of at most `COLUMNS` columns, and as one record."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
+from textwrap import wrap
+from typing import Any
+
+from perchctl.log.measures import Held, Measures, holds_of, measures_of, shown
+from perchctl.log.newest import Listed
+from perchctl.log.read import FlightLog, PhaseSpan
+from perchctl.log.summary import summary_of, summary_text
+
+COLUMNS = 79
+_HANG = 11
+"""Where the text of a line begins, behind its name."""
+_MOST_HOLDS = 12
+
+
+def show_record(log: FlightLog) -> dict[str, Any]:
+    """What `show_text` tells, for programs: SI, times from the flight's first turn."""
+    measures = asdict(measures_of(log))
+    return {
+        "log": str(log.path),
+        "version": log.header.get("version"),
+        "perchctl": log.header.get("perchctl"),
+        "started_utc": log.header.get("started_utc"),
+        "uri": log.header.get("uri"),
+        "source": log.header.get("source"),
+        "profile": profile_name(log.header),
+        "seed": log.header.get("seed"),
+        "whole": not log.truncated,
+        "ignored_bytes": log.ignored_bytes,
+        **_end_record(log),
+        **measures,
+        "phases": [
+            {
+                "phase": span.phase,
+                "start_s": _after(log, span.start_s),
+                "duration_s": round(span.duration_s, 6),
+                "reason": span.reason,
+                "row": row_of(log, span),
+            }
+            for span in log.phases
+        ],
+        "holds": [
+            {
+                "start_s": _after(log, hold.start_s),
+                "duration_s": round(hold.end_s - hold.start_s, 6),
+                "phase": hold.phase,
+                "reason": hold.reason,
+            }
+            for hold in holds_of(log)
+        ],
+        "notes": [
+            {"t_s": _after(log, float(event["t_s"])), "note": str(event.get("reason") or "")}
+            for event in _notes(log)
+        ],
+    }
+
+
+def _end_record(log: FlightLog) -> dict[str, Any]:
+    end = summary_of(log)
+    record = end.as_record()
+    return {
+        key: record.get(key)
+        for key in ("outcome", "cause", "reason", "locked", "fell", "mount_turn_deg",
+                    "mount_turn_sigma_deg")
+    } | {
+        "advice": record.get("advice") or [],
+        "lost_records": end.lost_records,
+        "log_problem": end.log_problem,
+    }  # fmt: skip
+
+
+def show_text(log: FlightLog) -> str:
+    """How it ended, its phases, what held it, and what is known of vision, link and battery."""
+    measures = measures_of(log)
+    return "\n".join(
+        [
+            *_head(log),
+            *_named("record", _origin(log)),
+            *_measured(measures),
+            *_phase_lines(log),
+            *_hold_lines(log, holds_of(log)),
+            *_note_lines(log),
+        ]
+    )
+
+
+def list_lines(logs: Sequence[Listed]) -> Iterator[str]:
+    """One line a log, as wide as a terminal of 80 columns."""
+    width = max([3, *(len(plain(each.path.name)) for each in logs)])
+    width = min(width, 44)
+    yield f"{'log':<{width}}  {'s':>6}  how it ended"
+    room = COLUMNS - width - 10
+    for each in logs:
+        end = each.summary
+        if end is None:
+            seconds, how = "-", each.problem or ""
+        else:
+            seconds = f"{end.duration_s:.1f}"
+            how = f"{end.outcome}: {end.reason}".rstrip(": ")
+            if end.outcome == "perched":
+                how = "perched" if end.miss_m is None else f"perched, {end.miss_m * 1e3:.1f} mm"
+        name = _cut(plain(each.path.name), width)
+        yield f"{name:<{width}}  {seconds:>6}  {_cut(plain(how), room)}".rstrip()
+
+
+def list_record(each: Listed) -> dict[str, Any]:
+    end = each.summary
+    return {
+        "log": str(each.path),
+        "started_utc": each.header.get("started_utc"),
+        "profile": profile_name(each.header),
+        "seed": each.header.get("seed"),
+        "outcome": None if end is None else end.outcome,
+        "reason": None if end is None else end.reason,
+        "duration_s": None if end is None else end.duration_s,
+        "miss_m": None if end is None else end.miss_m,
+        "problem": each.problem,
+    }
+
+
+def profile_name(header: Mapping[str, Any]) -> str | None:
+    profile = header.get("profile")
+    name = profile.get("name") if isinstance(profile, dict) else None
+    return None if name is None else str(name)
+
+
+def plain(text: str) -> str:
+    """Without what a terminal would obey."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
+def row_of(log: FlightLog, span: PhaseSpan) -> str | None:
+    """The row of the mission's table that led into the phase; None where the log has none."""
+    for event in log.events:
+        is_it = event.get("event") == "phase" and event.get("phase") == span.phase
+        if is_it and math.isclose(float(event["t_s"]), span.start_s, abs_tol=1e-6):
+            return event.get("row")
+    return None
+
+
+def _head(log: FlightLog) -> Iterator[str]:
+    """The lines that `fly` ends with, but for the phases, which come as a table."""
+    end = replace(summary_of(log), phases=(), battery_min_v=None)
+    first, *others = summary_text(end).splitlines()
+    yield from wrap(plain(first), COLUMNS, subsequent_indent="  ")
+    for line in others:
+        name, _, text = line.partition(":")
+        yield from _named(name, text.strip())
+    if log.summary is None:
+        yield from _named("log lost", "its end: the program was killed, or the disk failed")
+    if log.ignored_bytes:
+        yield from _named("log lost", f"its tail, {log.ignored_bytes} unreadable bytes")
+
+
+def _origin(log: FlightLog) -> str:
+    header = log.header
+    started, seed = header.get("started_utc"), header.get("seed")
+    parts = [
+        f"profile {profile_name(header) or '?'}",
+        "" if seed is None else f"seed {seed}",
+        f"{header.get('uri', '?')} with {header.get('source', '?')}",
+        "" if not started else f"begun {str(started).replace('+00:00', ' UTC').replace('T', ' ')}",
+        f"perchctl {header.get('perchctl', '?')}, version {header.get('version')}",
+    ]
+    return ", ".join(part for part in parts if part)
+
+
+def _measured(m: Measures) -> Iterator[str]:
+    def of(name: str) -> str:
+        return shown(m, name)
+
+    if m.settled_xy_rms_m is not None:
+        yield from _named(
+            "settled",
+            f"{of('settled_xy_rms_m')} mm aside and {of('settled_yaw_rms_rad')} deg RMS in the "
+            f"last second before the contact",
+        )
+    if m.frames:
+        gaps = "no gap"
+        if m.frame_gaps:
+            gaps = f"{of('frame_gaps')} gaps of {of('frame_gaps_s')} s together"
+        yield from _named(
+            "frames",
+            f"{of('frames')}, {of('frames_unseen')} without the target; {of('frame_rate_hz')} Hz, "
+            f"{of('frame_age_s')} ms old; {gaps}; corners' misfit {of('corner_rms_px')} px",
+        )
+    if m.battery_min_v is not None:
+        ends = ""
+        if m.battery_start_v is not None:
+            ends = f"; {of('battery_start_v')} V at the start, {of('battery_end_v')} V at the end"
+        yield from _named("battery", f"{of('battery_min_v')} V at its lowest{ends}")
+    if m.turns:
+        yield from _named(
+            "loop",
+            f"{of('turns')} turns, late by {of('late_p99_s')} ms, telemetry "
+            f"{of('telemetry_age_p99_s')} ms old (99 % at most)",
+        )
+
+
+def _phase_lines(log: FlightLog) -> Iterator[str]:
+    if not log.phases:
+        return
+    yield ""
+    yield "  at [s]  for [s]  phase     why"
+    for span in log.phases:
+        row = row_of(log, span)
+        why = span.reason + (f" ({row})" if row else "")
+        at_s, for_s = _after(log, span.start_s), span.duration_s
+        yield from _hung(f"{at_s:8.2f} {for_s:8.2f}  {plain(span.phase):<9} ", why)
+
+
+def _hold_lines(log: FlightLog, holds: Sequence[Held]) -> Iterator[str]:
+    if not holds:
+        return
+    yield ""
+    yield "  at [s]  for [s]  held in   because"
+    for hold in holds[:_MOST_HOLDS]:
+        at_s, for_s = _after(log, hold.start_s), hold.end_s - hold.start_s
+        yield from _hung(f"{at_s:8.2f} {for_s:8.2f}  {plain(hold.phase):<9} ", hold.reason)
+    if len(holds) > _MOST_HOLDS:
+        yield f"                   and {len(holds) - _MOST_HOLDS} more: --json has all"
+
+
+def _note_lines(log: FlightLog) -> Iterator[str]:
+    notes = _notes(log)
+    if not notes:
+        return
+    yield ""
+    yield "  at [s]  note"
+    for event in notes[:_MOST_HOLDS]:
+        at_s = _after(log, float(event["t_s"]))
+        yield from _hung(f"{at_s:8.2f}  ", str(event.get("reason") or ""))
+    if len(notes) > _MOST_HOLDS:
+        yield f"          and {len(notes) - _MOST_HOLDS} more: --json has all"
+
+
+def _notes(log: FlightLog) -> list[dict[str, Any]]:
+    return [event for event in log.events if event.get("event") == "note"]
+
+
+def _after(log: FlightLog, t_s: float) -> float:
+    return round(t_s - log.start_s, 6) + 0.0
+
+
+def _named(name: str, text: str) -> list[str]:
+    return list(_hung(f"{name + ':':<{_HANG}}", text))
+
+
+def _hung(begin: str, text: str) -> Iterator[str]:
+    """The text behind its begin, its further lines below it."""
+    room = " " * len(begin)
+    yield from wrap(plain(text), COLUMNS, initial_indent=begin, subsequent_indent=room) or [
+        begin.rstrip()
+    ]
+
+
+def _cut(text: str, room: int) -> str:
+    return text if len(text) <= room else f"{text[: room - 3]}..."

@@ -1,0 +1,48 @@
+"""A profile with some of its keys changed, each named by its dotted path."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from pydantic import ValidationError
+
+from perchctl.errors import InvalidValue, UsageError
+from perchctl.profile.load import first_fault
+from perchctl.profile.plain_yaml import clipped, parse_yaml
+from perchctl.profile.schema import Profile
+
+
+def changed(profile: Profile, settings: Iterable[str]) -> Profile:
+    """With each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as in a profile's
+    file. Errors: UsageError (of another form), InvalidValue."""
+    values = profile.model_dump(mode="json")
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not equals or not key.strip():
+            raise UsageError(
+                f"--set {clipped(setting)} must be KEY=VALUE with a key of the profile, as in "
+                f"--set planner.align.xy_m=0.03"
+            )
+        try:
+            _put(values, key.strip(), parse_yaml(text))
+        except ValueError as error:
+            raise InvalidValue(f"--set {clipped(setting)}: {error}") from None
+    try:
+        return Profile.model_validate(values)
+    except ValidationError as error:
+        key, text = first_fault(error)
+        raise InvalidValue(f"--set: {key or 'profile'}: {text}") from None
+
+
+def _put(values: dict[str, Any], dotted: str, value: Any) -> None:
+    """The key has to be there; below a mapping that a profile may fill, such as
+    `link.parameters`, any key is. What is unknown there, the schema says."""
+    *sections, key = dotted.split(".")
+    for section in sections:
+        inner = values.get(section)
+        if not isinstance(inner, dict):
+            what = "unknown" if section not in values else "no section"
+            raise ValueError(f"{section} is {what}; allowed here are {', '.join(values)}")
+        values = inner
+    values[key] = value

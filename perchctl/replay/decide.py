@@ -1,0 +1,114 @@
+"""A flight decided again: the recorded observations through the planner.
+
+The planner is pure, so the same observations and the same profile have to give the same
+commands, to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from perchctl.errors import InvalidValue
+from perchctl.log.read import FlightLog
+from perchctl.mission import planner
+from perchctl.mission.state import Observation, PlannerState
+from perchctl.mission.turn import Turn
+from perchctl.profile import Profile
+from perchctl.replay.compare import Difference, first_differing
+from perchctl.vehicle import Command
+
+
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """One turn, decided again: `state` and `command` are the replay's, what was flown is in
+    `turn`. `tick` counts the turns that were flown, from 0."""
+
+    tick: int
+    turn: Turn
+    observation: Observation
+    state: PlannerState
+    command: Command
+
+    @property
+    def differs(self) -> bool:
+        return self.difference() is not None
+
+    def difference(self) -> tuple[str, Any, Any] | None:
+        """The first field in which it does."""
+        turn, state = self.turn, self.state
+        return next(
+            (
+                found
+                for name, recorded, replayed in (
+                    ("phase", turn.phase, state.phase),
+                    ("row", turn.row, state.row),
+                    ("held", turn.held, bool(state.hold)),
+                    ("attempts", turn.attempts, state.attempts),
+                    ("command", turn.command, self.command),
+                )
+                if (found := first_differing(name, recorded, replayed)) is not None
+            ),
+            None,
+        )
+
+
+@dataclass(frozen=True)
+class Whole:
+    """The turns of a log up to where the first is missing; `gap` says which, or is empty."""
+
+    turns: Sequence[Turn]
+    gap: str = ""
+
+
+def whole_turns(log: FlightLog) -> Whole:
+    """What can be replayed of a log. Errors: InvalidValue."""
+    if not log.turn_records:
+        raise InvalidValue(_why_no_turns(log))
+    for number, turn in enumerate(log.turns):
+        if turn.number != number:
+            gap = (
+                f"turn {number} is not in the log, which has lost records: what came after it "
+                f"cannot be replayed"
+            )
+            return Whole(log.turns[:number], gap)
+    return Whole(log.turns)
+
+
+def decide(
+    turns: Iterable[Turn],
+    profile: Profile,
+    seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
+) -> Iterator[Decided]:
+    """Each turn of the planner, in order, with the observation that `seen` gives for it: by
+    default the recorded one. A turn that was decided anew is decided, but does not count."""
+    state: PlannerState | None = None
+    tick = 0
+    for turn in turns:
+        obs = seen(turn)
+        if obs is None or turn.role == "waiting":
+            continue
+        new, command = planner.step(state or planner.start(obs), obs, profile)
+        yield Decided(tick, turn, obs, new, command)
+        if turn.role == "flown":
+            state, tick = new, tick + 1
+
+
+def first_of(decided: Iterable[Decided], t0_s: float) -> Difference | None:
+    """The first turn that was decided otherwise than it was flown."""
+    for each in decided:
+        found = each.difference()
+        if found is not None:
+            return Difference(each.tick, each.turn.t_s - t0_s, *found)
+    return None
+
+
+def _why_no_turns(log: FlightLog) -> str:
+    made_by = f"perchctl {log.header.get('perchctl', 'of unknown version')}"
+    if log.header.get("version") in (1, 2):
+        return (
+            f"{log.path}: {made_by} wrote it, which did not record whole turns: it cannot be "
+            f"replayed (perchctl log show and log plot read it)"
+        )
+    return f"{log.path}: it holds no turn of a flight: there is nothing to replay"

@@ -1,0 +1,135 @@
+"""A flight seen again: the recorded telemetry and pictures through the loop's own senses.
+
+The same pictures, samples and times have to give the same poses, to the bit, on one thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.flight.senses import SENSED, Senses
+from perchctl.mission.state import Observation
+from perchctl.mission.turn import FrameSeen, PoseSeen, Taken, Turn
+from perchctl.pipeline import Pipeline
+from perchctl.profile import Profile
+from perchctl.vehicle import Telemetry
+from perchctl.vision.types import Frame
+
+Picture = tuple[int, float, NDArray[np.uint8]]
+"""Of a frame: its number, its time as the source gave it, and the picture that was looked at."""
+
+
+class PictureMissing(Exception):
+    """The replay of pictures ends here; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sensed:
+    """One turn, seen again: `observation` with what the replay sees in the place of what was
+    seen, None before there is any telemetry."""
+
+    turn: Turn
+    poses: dict[str, PoseSeen]
+    observation: Observation | None
+
+
+class _Given:
+    """The recorded edges of one turn after another, as the senses ask for them."""
+
+    def __init__(self, pictures: Iterable[Picture], size_px: tuple[int, int]) -> None:
+        self.size_px: tuple[int, int] | None = size_px
+        self._pictures = iter(pictures)
+        self._next: Picture | None = None
+        self._taken = Taken()
+        self._samples: list[tuple[Telemetry, ...]] = []
+
+    def turn(self, taken: Taken) -> None:
+        self._taken, self._samples = taken, [taken.samples, taken.late]
+
+    # As a link.
+
+    def telemetry(self) -> list[Telemetry]:
+        return list(self._samples.pop(0))
+
+    # As a source of frames.
+
+    @property
+    def live(self) -> bool:
+        return self._taken.live
+
+    @property
+    def finished(self) -> bool:
+        return self._taken.ended
+
+    def poll(self, now_s: float) -> Frame | None:
+        seen = self._taken.frame
+        if seen is None:
+            return None
+        image = self._picture_of(seen)
+        return Frame(seen.index, seen.t_s, image, seen.t_arrival_s, seen.fields, seen.repeated)
+
+    def problem(self, now_s: float) -> str | None:
+        return self._taken.problem
+
+    def describe(self) -> str:
+        return "the recording"
+
+    def close(self) -> None:
+        return None
+
+    def _picture_of(self, seen: FrameSeen) -> NDArray[np.uint8]:
+        while True:
+            if self._next is None:
+                self._next = next(self._pictures, None)
+            if self._next is None:
+                raise PictureMissing(f"the recording of pictures ends before frame {seen.index}")
+            index, t_s, image = self._next
+            if (index, t_s) == (seen.index, seen.t_s):
+                self._next = None
+                return image
+            if t_s > seen.t_s:
+                raise PictureMissing(f"the picture of frame {seen.index} was not recorded")
+            self._next = None  # of a frame that no turn took
+
+
+def sense(
+    turns: Iterable[Turn], profile: Profile, pipeline: Pipeline, pictures: Iterable[Picture]
+) -> Iterator[Sensed]:
+    """Each turn, in order, from the first before take-off on.
+
+    Raises PictureMissing where a frame was taken whose picture is not there: from then on the
+    pipeline would remember another flight.
+    """
+    given = _Given(pictures, pipeline.camera.size_px)
+    senses = Senses(given, given, pipeline, profile)
+    with one_thread():
+        for turn in turns:
+            given.turn(turn.taken)
+            senses.take_in(turn.began_s, look=turn.taken.look)
+            if turn.t_s != turn.began_s:
+                senses.present(turn.began_s, turn.t_s)
+            yield Sensed(turn, senses.poses, _observed(turn, senses))
+
+
+def _observed(turn: Turn, senses: Senses) -> Observation | None:
+    if turn.observation is None or senses.history.newest is None:
+        return None
+    seen = senses.observation(turn.t_s)
+    return replace(turn.observation, **{name: getattr(seen, name) for name in SENSED})
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """OpenCV's sums then have one order."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
