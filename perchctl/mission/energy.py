@@ -103,7 +103,7 @@ def updated(
         known = dt_s / 3.0 if state.mean_load else 1.0
         state = replace(state, mean_load=_towards(state.mean_load, load, known))
     if not battery_v >= NO_BATTERY_READING_V:
-        return replace(state, unknown_s=state.unknown_s + dt_s)
+        return _counted(state, dt_s, battery_mah)
     state = replace(state, unknown_s=0.0)
     if state.load < LEAST_LOAD and not state.loaded_s:
         return replace(state, ground_v=battery_v, rest_v=battery_v) if load == 0.0 else state
@@ -131,11 +131,16 @@ def fitted(state: EnergyState) -> BatteryFit:
     return BatteryFit(max(LEAST_SAG_V, sag_v), min(MOST_HUNGER, max(LEAST_HUNGER, hunger)))
 
 
-def left_s(state: EnergyState, floor: Floor, battery_mah: float) -> float | None:
-    """For how long hovering keeps the voltage above the floor; None where nothing tells it."""
-    if state.rest_v is None or state.loaded_s < LEAST_LOADED_S:
+def left_s(
+    state: EnergyState, floor: Floor, battery_mah: float, hover_load: float | None = None
+) -> float | None:
+    """For how long hovering keeps the voltage above the floor; None where nothing tells it.
+
+    `hover_load`: of the full thrust; by default that of the last seconds."""
+    load = hover_load or state.mean_load
+    if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
-    fit, load = fitted(state), state.mean_load
+    fit = fitted(state)
     end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v)
     share = charge_at(state.rest_v) - charge_at(end_v)
     return max(0.0, share) / (fit.hunger * load * _per_s(battery_mah))
@@ -165,6 +170,15 @@ def resting_v(share: float) -> float:
     i = min(max(bisect_right(_SHARES, share), 1), len(_SHARES) - 1)
     (x0, v0), (x1, v1) = CURVE[i - 1], CURVE[i]
     return v0 + (share - x0) * (v1 - v0) / (x1 - x0)
+
+
+def _counted(state: EnergyState, dt_s: float, battery_mah: float) -> EnergyState:
+    """Without a reading: what was there, less what the thrust takes."""
+    state = replace(state, unknown_s=state.unknown_s + dt_s)
+    if state.rest_v is None:
+        return state
+    share = charge_at(state.rest_v) - fitted(state).hunger * state.load * _per_s(battery_mah) * dt_s
+    return replace(state, rest_v=resting_v(share))
 
 
 def _summed(
