@@ -22,6 +22,7 @@ class LinkHealth:
 
     Attributes:
         fresh_hz: samples that were new in their turn; not above the loop's own rate.
+        samples_hz: all that came, NaN where the log does not hold them (before version 3).
         old: stretches in which the newest sample was older than `GAP_S`: from, to, worst age.
         sent: commands by kind, how many turns each.
         setpoints_hz: position setpoints and raw thrusts, while they were sent.
@@ -29,6 +30,7 @@ class LinkHealth:
 
     turns_hz: float
     fresh_hz: float
+    samples_hz: float
     age_s: float
     age_most_s: float
     age_worst_s: float
@@ -63,6 +65,7 @@ def link_of(track: Track) -> LinkHealth:
     return LinkHealth(
         turns_hz=(t_s.size - 1) / spent if t_s.size > 1 else math.nan,
         fresh_hz=fresh / spent if t_s.size > 1 else math.nan,
+        samples_hz=_samples_hz(track),
         age_s=part_of(age, 50),
         age_most_s=part_of(age, 99),
         age_worst_s=part_of(age, 100),
@@ -70,6 +73,19 @@ def link_of(track: Track) -> LinkHealth:
         sent=tuple((kind, kinds.count(kind)) for kind in dict.fromkeys(kinds)),
         setpoints_hz=1.0 / float(np.mean(between)) if between.size else math.nan,
     )
+
+
+def _samples_hz(track: Track) -> float:
+    """By the samples' own times, so that what came late in one go counts as it was taken."""
+    taken = [r.get("taken") for r in track.log.turn_records]
+    at_s = [
+        s["t_s"]
+        for t in taken
+        if isinstance(t, dict)
+        for s in (*(t.get("samples") or ()), *(t.get("late") or ()))
+    ]
+    spent = max(at_s) - min(at_s) if at_s else 0.0
+    return (len(at_s) - 1) / spent if spent > 0 else math.nan
 
 
 def _old(track: Track, age: Array) -> tuple[tuple[float, float, float], ...]:
@@ -110,6 +126,11 @@ def outside_of(track: Track) -> OutsideHealth | None:
 
 
 def timings_of(track: Track) -> dict[str, Array]:
-    """What each turn took, s, by name: how late it began, and what the log has of its parts."""
+    """What each turn took, s, by name: how late it began, and what a log of today has of its
+    parts; a flight in lockstep has none of them."""
     late = track.log.column("late_s")
-    return {"late": late[np.isfinite(late)]}
+    found = {"late": late[np.isfinite(late)]}
+    timings = [t for r in track.log.turn_records if isinstance(t := r.get("timing"), dict)]
+    for key in dict.fromkeys(key for timing in timings for key in timing):
+        found[key.removesuffix("_s")] = np.array([t.get(key, math.nan) for t in timings], float)
+    return found

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.log.read import FlightLog
+from perchctl.errors import PerchError
 from perchctl.report.losses import losses_of
 from perchctl.report.track import Track
 from perchctl.report.words import length
 
-Recorded = Iterable[tuple[int, float, NDArray[np.uint8]]]
-"""Number of the frame, its time, and the picture as the pipeline had it."""
+Recorded = Callable[[Collection[int]], Iterable[tuple[int, float, NDArray[np.uint8]]]]
+"""Gives the frames of some numbers: number, time, and the picture as the pipeline had it. Raises
+PerchError where the recording cannot be read."""
 
 DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
 MOST = 16
@@ -45,22 +45,14 @@ class Decision:
 
 @dataclass(frozen=True)
 class Shown:
-    """A decision with its picture as a JPEG, the markers drawn as they were found.
-    `brightness`: the mean of the picture, 0..255."""
+    """A decision with its picture as a JPEG, the markers drawn as they were found."""
 
     decision: Decision
     jpeg: bytes
-    brightness: float
 
     @property
     def address(self) -> str:
         return "data:image/jpeg;base64," + base64.b64encode(self.jpeg).decode("ascii")
-
-
-def recording_of(log: FlightLog) -> Path | None:
-    """The recording beside the log; None where none was made."""
-    path = log.path.with_suffix(".mcap")
-    return path if path.is_file() else None
 
 
 def decisions_of(track: Track) -> tuple[Decision, ...]:
@@ -85,18 +77,22 @@ def _frame_before(track: Track, t_s: float) -> dict[str, Any] | None:
     return None
 
 
-def shown_of(decisions: Iterable[Decision], recorded: Recorded) -> tuple[Shown, ...]:
-    """Those whose picture is in the recording; it is read once."""
+def shown_of(decisions: Iterable[Decision], recorded: Recorded) -> tuple[tuple[Shown, ...], str]:
+    """Those whose picture is in the recording, and why others could not be read, or nothing."""
     wanted: dict[int, list[Decision]] = {}
     for decision in decisions:
         wanted.setdefault(decision.frame, []).append(decision)
-    found = []
-    for number, _t_s, image in recorded:
-        for decision in wanted.pop(number, ()):
-            found.append(Shown(decision, _jpeg(decision, image), float(np.mean(image))))
-        if not wanted:
-            break
-    return tuple(sorted(found, key=lambda shown: shown.decision.t_s))
+    found: list[Shown] = []
+    problem = ""
+    try:
+        for number, _t_s, image in recorded(wanted.keys()) if wanted else ():
+            for decision in wanted.pop(number, ()):
+                found.append(Shown(decision, _jpeg(decision, image)))
+            if not wanted:
+                break
+    except PerchError as error:
+        problem = str(error)
+    return tuple(sorted(found, key=lambda shown: shown.decision.t_s)), problem
 
 
 def _jpeg(decision: Decision, image: NDArray[np.uint8]) -> bytes:
@@ -113,8 +109,3 @@ def _jpeg(decision: Decision, image: NDArray[np.uint8]) -> bytes:
             cv2.polylines(drawn, [fixed], True, colour, 2, cv2.LINE_AA, 4)
     _, data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return bytes(data)
-
-
-def pictures_of(recording: Path) -> Recorded:
-    """A seam until recordings are there."""
-    return ()

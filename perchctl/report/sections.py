@@ -7,7 +7,7 @@ import re
 
 from perchctl.mission.findings import latency_text, turn_text
 from perchctl.report.edges import timings_of
-from perchctl.report.markup import Markup, pairs, table, tag
+from perchctl.report.markup import Markup, pairs, table, tag, text
 from perchctl.report.plot import battery_plot, flight_plots, histogram
 from perchctl.report.sight import Seen, part_of
 from perchctl.report.story import PAPERS
@@ -175,24 +175,25 @@ def pictures(told: Told) -> Markup | None:
     if not told.log.records:
         return None
     if told.pictures is None:
-        why = told.picture_problem or "no recording was made beside this log"
-        return tag("p", f"There are no pictures: {why}.")
+        return tag("p", "There are no pictures: no recording was made beside this log.")
+    lost = [tag("p", f"{told.picture_problem}.", class_="note")] if told.picture_problem else []
     if not told.pictures:
-        return tag("p", "The recording holds no picture of a decision.")
-    return tag(
+        return text(lost or [tag("p", "The recording holds no picture of a decision.")])
+    shown = tag(
         "div",
         [
             tag(
                 "figure",
                 [
-                    tag("img", src=shown.address, alt=shown.decision.caption, loading="lazy"),
-                    tag("figcaption", shown.decision.caption),
+                    tag("img", src=shown.address, alt=shown.decision.caption),
+                    tag("figcaption", _prose(shown.decision.caption)[:-1]),
                 ],
             )
             for shown in told.pictures
         ],
         class_="pictures",
     )
+    return text([*lost, shown])
 
 
 def plots(told: Told) -> Markup | None:
@@ -247,6 +248,8 @@ def link(told: Told) -> Markup | None:
     facts = [
         ("turns of the loop", f"{health.turns_hz:.1f} /s"),
         ("of them with new telemetry", f"{health.fresh_hz:.1f} /s"),
+        ("samples of telemetry", f"{health.samples_hz:.1f} /s" if math.isfinite(health.samples_hz)
+         else "the log does not hold them"),
         ("telemetry's age", f"{milliseconds(health.age_s)}, 99 % below "
          f"{milliseconds(health.age_most_s)}, at most {milliseconds(health.age_worst_s)}"),
         ("older than 100 ms", _stretches(health.old)),

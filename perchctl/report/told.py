@@ -23,7 +23,8 @@ UNFINISHED = "unfinished"
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """One flight. `pictures` is None where no recording was made."""
+    """One flight. `pictures` is None where no recording was made; `picture_problem` says why some
+    could not be read."""
 
     track: Track
     summary: FlightSummary
@@ -71,15 +72,15 @@ class Told:
         return sum(stays) if stays else math.nan
 
 
-def tell(log: FlightLog, recorded: Recorded | None = None, problem: str = "") -> Told:
-    """Works it all out. `recorded`: the pictures beside the log; `problem`: why there are none
-    though a recording was made."""
+def tell(log: FlightLog, recorded: Recorded | None = None) -> Told:
+    """Works it all out. `recorded`: the pictures beside the log, None where there are none."""
     track = Track(log)
     sight, link, outside = sight_of(track), link_of(track), outside_of(track)
     energy = energy_of(log)
     shown: tuple[Shown, ...] | None = None
+    problem = ""
     if recorded is not None:
-        shown = shown_of(decisions_of(track), recorded)
+        shown, problem = shown_of(decisions_of(track), recorded)
     return Told(
         track,
         summary_of(log),

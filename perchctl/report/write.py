@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from perchctl.errors import PerchError
 from perchctl.files import write_files
-from perchctl.log.read import FlightLog, read_log
+from perchctl.log.read import read_log
+from perchctl.log.recording import pictures_of, recording_of
 from perchctl.report.page import page_of
-from perchctl.report.pictures import pictures_of, recording_of
 from perchctl.report.told import Told, tell
 
 SUFFIXES = (".html", ".htm")
@@ -18,7 +17,7 @@ SESSION_NAME = "session.html"
 
 def report_path_of(log_path: Path) -> Path:
     """Where a flight's report stands: beside its log, by its name."""
-    return log_path.with_suffix(".html")
+    return recording_of(log_path).with_suffix(SUFFIXES[0])
 
 
 def session_path_of(log_paths: Sequence[Path]) -> Path:
@@ -32,18 +31,10 @@ def told_of(log_path: Path) -> Told:
 
     Raises NotFound and InvalidValue for the log, as `read_log`.
     """
-    log = read_log(log_path)
-    return _told(log)
-
-
-def _told(log: FlightLog) -> Told:
-    recording = recording_of(log)
-    if recording is None:
+    log, recording = read_log(log_path), recording_of(log_path)
+    if not recording.is_file():
         return tell(log)
-    try:
-        return tell(log, pictures_of(recording))
-    except PerchError as error:
-        return tell(log, problem=f"the recording beside this log cannot be read ({error})")
+    return tell(log, lambda numbers: pictures_of(recording, exact=False, numbers=numbers))
 
 
 def write_report(log_paths: Sequence[Path], output: Path) -> tuple[Told, ...]:
