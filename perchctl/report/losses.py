@@ -67,7 +67,7 @@ def _loss(
 ) -> Loss | None:
     if end_s - start_s < LEAST_S:
         return None
-    phase = _phase_at(track, start_s)
+    phase = _phase_at(track, start_s + LEAST_S / 2)  # the last sight may be just before it
     left = next(
         (s for s in track.steps if s.start_s > start_s and s.phase not in SEEN_IN | {"SEARCH"}),
         None,
