@@ -198,7 +198,7 @@ def _settling(track: Track) -> Iterator[Advice]:
     if standoff_m is None or settle_z_m is None or settle_xy_m is None:
         return
     near = (track.log.column("ez_m") <= standoff_m + settle_z_m) & np.array(
-        [r.get("phase") == "ASCEND" for r in track.log.records]
+        [r.get("phase") == "ASCEND" for r in track.log.records], dtype=bool
     )
     spent_s = float(np.diff(track.t_s, append=track.end_s)[near].sum())
     if spent_s < WAITED_S:

@@ -60,7 +60,7 @@ def link_of(track: Track) -> LinkHealth:
     sampled = np.round(t_s - age, 4)
     fresh = np.count_nonzero(np.diff(sampled[np.isfinite(sampled)]) > 0)
     kinds = [str(r.get("cmd")) for r in track.log.records if r.get("cmd")]
-    flying = np.array([r.get("cmd") in ("position", "thrust") for r in track.log.records])
+    flying = np.array([r.get("cmd") in ("position", "thrust") for r in track.log.records], bool)
     between = np.diff(t_s)[flying[1:] & flying[:-1]] if t_s.size > 1 else np.empty(0)
     return LinkHealth(
         turns_hz=(t_s.size - 1) / spent if t_s.size > 1 else math.nan,

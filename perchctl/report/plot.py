@@ -100,6 +100,7 @@ def histogram(timings: Mapping[str, Array]) -> Markup | None:
     ax.set_xticks(ticks, [f"{ms:g}" for ms in ticks])
     ax.set_xticks([], minor=True)
     ax.set_yscale("log")
+    ax.yaxis.set_major_formatter("{x:g}")
     ax.set_xlabel("time [ms]")
     with matplotlib.rc_context(STYLE):
         ax.figure.legend(*ax.get_legend_handles_labels(), loc="upper right", ncols=5)

@@ -16,6 +16,7 @@ from perchctl.report.words import count, length
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 HELD_LEAST_S = 0.1
+BACKED_OFF_M = 0.01
 FLYING = frozenset(phase.value for phase in FLYING_PHASES)
 PAPERS = tuple(phase.value for phase in SEVEN)
 
@@ -128,7 +129,8 @@ def _recover(track: Track, step: Step) -> str:
     down_m = float(heights[0] - np.nanmin(heights)) if np.isfinite(heights).any() else 0.0
     attempts = track.at(step.start_s, "attempts")
     nth = f" (failed attempt {attempts:.0f})" if attempts >= 1 else ""
-    return f"{_upper(step.reason)}: backed off {length(down_m)}{nth}"
+    away = f"backed off {length(down_m)}" if down_m >= BACKED_OFF_M else "it stayed where it was"
+    return f"{_upper(step.reason)}: {away}{nth}"
 
 
 def _landing(track: Track, step: Step) -> str:

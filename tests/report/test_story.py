@@ -67,8 +67,7 @@ def test_a_loss_says_what_the_vehicle_did_then() -> None:
         blank_frames(record)
         if 5.2 <= flown_s(record) < 6.0:
             record |= {"phase": "RECOVER", "reason": "target lost in ascent"}
-            record["z_m"] -= 0.1 + 0.25 * (flown_s(record) - 5.2)  # on its way it climbs
-            record["z_m"] += 0.1 if flown_s(record) < 5.21 else 0.0
+            record["z_m"] = 1.3 - min(0.1, 0.2 * (flown_s(record) - 5.2))
         if flown_s(record) >= 6.0 and record["phase"] == "ALIGN":
             record |= {"phase": "ESTIMATE", "reason": "steady again, trying once more"}
 
