@@ -47,13 +47,13 @@ def advice_of(
     """In the order in which to heed it."""
     found = [
         *_latency_and_mounting(track),
+        *_computer(track),  # what it delays looks like a video that fails
         *_print(track, sight),
         *_light(track, sight),
         *_video(track, sight),
         *_gains(track),
         *_settling(track),
         *_link(track, link),
-        *_computer(track),
         *_battery(track, energy),
         *_outside(outside),
     ]

@@ -128,6 +128,7 @@ CASES: tuple[tuple[Callable[[dict[str, Any]], None], str, str], ...] = (
     (no_picture, "video", "once no picture came for more than 0.3 s, at most 1.0 s"),
     (small_print, "print", "the large marker seems 6 % farther away than the small one"),
     (unseen, "light", "their median blur was 0."),
+    (blurred, "light", "of them were blurred by more than 2.5 px"),
 )
 
 
