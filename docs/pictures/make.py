@@ -56,11 +56,13 @@ from perchctl.plot import (  # noqa: E402
     save_png,
 )
 from perchctl.profile import Profile, load_profile  # noqa: E402
+from perchctl.report.write import write_report  # noqa: E402
 from perchctl.sim.draw import draw_scenario  # noqa: E402
 from perchctl.sim.renderer import Renderer  # noqa: E402
 from perchctl.vision.types import Frame, PipelineState  # noqa: E402
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+PAGE_PX, REPORT_PX = "1100,560", "1200,1250"
 NEAR_WIDTH_M = 0.2
 """Of the side view where the vehicle is at the ceiling."""
 
@@ -249,6 +251,20 @@ def page(flown: Flight, file: Path) -> None:
         feeder.join()
 
 
+def report(flown: Flight, file: Path) -> None:
+    """The head of the report of the flight, in a browser without a window."""
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        print(f"{file.name}: skipped, none of {', '.join(BROWSERS)} is installed")
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        told = Path(folder) / "report.html"
+        write_report([flown.log.path], told)
+        _photograph(browser, told.as_uri(), file, REPORT_PX)
+    whole = np.asarray(cv2.imread(str(file)), np.uint8)
+    _write(file, np.asarray(cv2.resize(whole, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)))
+
+
 PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "target.png": target,
     "flight.png": flight,
@@ -256,6 +272,7 @@ PICTURES: dict[str, Callable[[Flight, Path], None]] = {
     "panel.svg": terminal,
     "calibration.png": calibration,
     "page.png": page,
+    "report.png": report,
 }
 
 
@@ -350,7 +367,7 @@ def _page_state(status: FlightStatus) -> dict[str, Any]:
     }
 
 
-def _photograph(browser: str, url: str, file: Path) -> None:
+def _photograph(browser: str, url: str, file: Path, size_px: str = PAGE_PX) -> None:
     with tempfile.TemporaryDirectory() as profile:
         subprocess.run(
             [
@@ -360,7 +377,7 @@ def _photograph(browser: str, url: str, file: Path) -> None:
                 "--disable-gpu",
                 "--hide-scrollbars",
                 f"--user-data-dir={profile}",
-                "--window-size=1100,560",
+                f"--window-size={size_px}",
                 "--timeout=4000",
                 f"--screenshot={file.resolve()}",
                 url,
@@ -382,7 +399,8 @@ def _write(file: Path, picture: NDArray[np.uint8]) -> None:
 
 
 def fly(profile: str, seed: int, folder: Path) -> FlightLog:
-    _perchctl("simulate", "-p", profile, "--only", str(seed), "--log-dir", str(folder))
+    where = ("--log-dir", str(folder), "--record")
+    _perchctl("simulate", "-p", profile, "--only", str(seed), *where)
     return read_log(folder / f"flight_seed{seed}.jsonl")
 
 

@@ -5,7 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from perchctl.commands.output import print_record, say
 from perchctl.errors import UsageError
+from perchctl.files import check_output, same_file
+from perchctl.report.page import counted
+from perchctl.report.told import Told
+from perchctl.report.write import SUFFIXES, report_path_of, session_path_of, write_report
 
 
 @dataclass(frozen=True)
@@ -19,5 +24,35 @@ class ReportRequest:
 
 
 def run(request: ReportRequest) -> int:
-    """Errors: UsageError, as it is not there yet."""
-    raise UsageError("perchctl log report is not part of this version")
+    """Errors: NotFound and InvalidValue (a log, the place of the page), UsageError."""
+    files = request.files
+    output = request.output or (report_path_of(files[0]) if len(files) == 1 else None)
+    output = output or session_path_of(files)
+    if any(same_file(output, path) for path in files):
+        raise UsageError(f"{output} is one of the logs; write the page to another file")
+    check_output(output, SUFFIXES, request.force, "a page for a browser")
+    flights = write_report(files, output)
+    if request.as_json:
+        print_record(_record(output, flights))
+    else:
+        print(output)
+        say(counted(flights) if len(flights) > 1 else f"one flight: {flights[0].outcome}")
+    return 0
+
+
+def _record(output: Path, flights: tuple[Told, ...]) -> dict[str, object]:
+    return {
+        "report": str(output),
+        "bytes": output.stat().st_size,
+        "flights": [
+            {
+                "log": str(told.log.path),
+                "outcome": told.outcome,
+                "miss_m": told.summary.miss_m,
+                "used_mah": round(told.energy.used_mah, 1),
+                "pictures": None if told.pictures is None else len(told.pictures),
+                "advice": [f"{a.about}: {a.text} ({a.evidence})" for a in told.advice],
+            }
+            for told in flights
+        ],
+    }

@@ -32,7 +32,7 @@ def frames_of(log: FlightLog) -> Frames:
     """The frames of a flight; what is a gap, the median period says."""
     taken = [record for record in log.records if record.get("frame_t_s") is not None]
     times_s = np.array([record["frame_t_s"] for record in taken], dtype=np.float64) - log.start_s
-    seen = np.array([_shows_target(record) for record in taken], dtype=bool)
+    seen = np.array([shows_target(record) for record in taken], dtype=bool)
     if not taken:
         return Frames(times_s, times_s, np.empty((0, 2)))
     # The flight's end, as old as frames are when they are measured, may end a gap, too.
@@ -42,7 +42,8 @@ def frames_of(log: FlightLog) -> Frames:
     return Frames(times_s[seen], times_s[~seen], gaps_s)
 
 
-def _shows_target(record: dict[str, Any]) -> bool:
+def shows_target(record: dict[str, Any]) -> bool:
+    """Whether the frame of a tick held the target, as the planner's estimate took it."""
     found = any(record.get(f"{source}x_m") is not None for source in "jls")
     return found and record.get("measured") is not False
 

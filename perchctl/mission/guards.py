@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from perchctl.mission import budget
 from perchctl.mission.conditions import SATURATED, press_thrust
 from perchctl.mission.context import Context
 from perchctl.mission.hold import unplaced
@@ -46,6 +47,22 @@ def searched_out(c: Context) -> bool:
 
 def attempts_used(c: Context) -> bool:
     return c.state.attempts >= c.profile.planner.attempts
+
+
+def is_aligned(c: Context) -> bool:
+    return c.held(Condition.ALIGNED) >= c.profile.planner.align.dwell_s
+
+
+def has_recovered(c: Context) -> bool:
+    dwell_s = c.profile.planner.recover.dwell_s
+    steady = c.held(Condition.STEADY) >= dwell_s and c.in_phase_s >= dwell_s
+    return steady and c.state.contact_z_m is None
+
+
+def too_little_left(c: Context) -> bool:
+    """An attempt would begin, or begin anew, and the battery has not enough for it."""
+    begins = is_aligned(c) if c.state.phase is Phase.ALIGN else has_recovered(c)
+    return begins and not attempts_used(c) and budget.short_of_charge(c)
 
 
 def is_blocked(c: Context) -> bool:

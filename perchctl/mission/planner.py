@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from perchctl.mission import budget
 from perchctl.mission.actions import act
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hovers
 from perchctl.mission.context import PUT_RIGHT_S, Context
@@ -88,7 +89,8 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
     felt_mps = felt_climb_mps(Context(state, obs, profile))
-    state = replace(state, last=obs.telemetry, felt_mps=felt_mps)
+    state = replace(state, last=obs.telemetry, felt_mps=felt_mps, energy=budget.watched(context))
+    state = replace(state, battery=budget.outlook(Context(state, obs, profile)))
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
 

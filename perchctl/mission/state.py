@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
+from perchctl.mission.energy import EnergyState
 from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
 from perchctl.vision.types import TargetEstimate
@@ -145,6 +146,15 @@ class Observation:
     position_problem: str | None = None
 
 
+@dataclass(frozen=True)
+class BatteryOutlook:
+    """For how long it can hover, and for how many more attempts, each with a landing, that is
+    enough; None where it is not known, or no target was seen yet."""
+
+    left_s: float | None = None
+    attempts: int | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class PlannerState:
     """The planner's whole memory; `since` holds the time at which each named
@@ -186,6 +196,8 @@ class PlannerState:
     astray: bool = False  # positions from outside lead elsewhere: they prove nothing any more
     stale_s: float | None = None  # when there was no position from outside last
     last: Telemetry | None = None  # of the turn before
+    energy: EnergyState = field(default_factory=EnergyState)  # fitted to the battery
+    battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
     felt_mps: float = 0.0  # how fast it climbs, by its accelerometer
     felt_alone: bool = False  # astray, and its vertical speed with it
     heading_lost: bool = False  # position control would lead away from its setpoint

@@ -5,6 +5,7 @@ The diagram and the table of docs/architecture.md are drawn from `TABLE`.
 
 from __future__ import annotations
 
+from perchctl.mission.budget import why_short
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import (
     attempts_used,
@@ -12,7 +13,9 @@ from perchctl.mission.guards import (
     hangs_in_landing,
     hangs_stopped,
     hangs_where_it_did,
+    has_recovered,
     has_slipped,
+    is_aligned,
     is_astray,
     is_blocked,
     is_watched,
@@ -20,6 +23,7 @@ from perchctl.mission.guards import (
     mounted_wrong,
     searched_out,
     settling_too_long,
+    too_little_left,
     too_weak,
     unsure,
     why_astray,
@@ -143,8 +147,7 @@ TABLE: tuple[Row, ...] = (
         lambda c: f"height {c.height_m:.2f} m is above the limit", S.LAND, O.SAFETY,
     ),
     Row(
-        "fence", BEFORE_CONTACT, fence_broken, P.LANDING,
-        "outside the fence", S.LAND, O.SAFETY,
+        "fence", BEFORE_CONTACT, fence_broken, P.LANDING, "outside the fence", S.LAND, O.SAFETY,
     ),
     Row(
         "camera-gone", BY_CAMERA,
@@ -215,8 +218,7 @@ TABLE: tuple[Row, ...] = (
         "target seen",
     ),
     Row(
-        "searched-out", _only(P.SEARCH), searched_out, P.LANDING,
-        why_not_found,
+        "searched-out", _only(P.SEARCH), searched_out, P.LANDING, why_not_found,
         S.LAND, O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
@@ -242,9 +244,11 @@ TABLE: tuple[Row, ...] = (
         "alignment took too long", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "aligned", _only(P.ALIGN),
-        lambda c: c.held(C.ALIGNED) >= c.profile.planner.align.dwell_s, P.ASCEND,
-        "aligned in position and heading",
+        "too-little-left", _only(P.ALIGN, P.RECOVER), too_little_left, P.LANDING, why_short,
+        S.LAND, O.SAFETY,
+    ),
+    Row(
+        "aligned", _only(P.ALIGN), is_aligned, P.ASCEND, "aligned in position and heading",
     ),
     # --- phase 5: ascend -----------------------------------------------------
     Row(
@@ -294,8 +298,7 @@ TABLE: tuple[Row, ...] = (
         "hanging still with the motors off", outcome=O.PERCHED,
     ),
     Row(
-        "fell-unseen", _only(P.COMPLETE), is_watched, P.LANDING,
-        why_fell_unseen, S.LAND, O.SAFETY,
+        "fell-unseen", _only(P.COMPLETE), is_watched, P.LANDING, why_fell_unseen, S.LAND, O.SAFETY,
     ),
     # --- the failed attempt --------------------------------------------------
     Row(
@@ -304,11 +307,8 @@ TABLE: tuple[Row, ...] = (
         "all perching attempts are used up", S.LAND, O.ATTEMPTS_USED_UP,
     ),
     Row(
-        "recovered", _only(P.RECOVER),
-        lambda c: c.state.contact_z_m is None
-        and c.held(C.STEADY) >= c.profile.planner.recover.dwell_s
-        and c.in_phase_s >= c.profile.planner.recover.dwell_s,
-        P.ESTIMATE, "steady again, trying once more",
+        "recovered", _only(P.RECOVER), has_recovered, P.ESTIMATE,
+        "steady again, trying once more",
     ),
     Row(
         "recover-timeout", _only(P.RECOVER),

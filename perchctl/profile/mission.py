@@ -209,6 +209,12 @@ class SafetyConfig(Section):
     battery_debounce_s: float = Field(
         1.5, ge=0, le=30, description="below `min_load_v` before it lands"
     )
+    energy_gate: bool = Field(
+        True, description="no attempt begins that the battery has not enough for: it lands"
+    )
+    energy_reserve_s: float = Field(
+        4.0, ge=0, le=120, description="of hovering, left after an attempt and a landing"
+    )
     battery_stale_s: float = Field(
         90.0, gt=0, le=600, description="grace for a reading that stands still"
     )

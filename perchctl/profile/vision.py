@@ -130,6 +130,9 @@ class VehicleConfig(Section):
     gear_body_m: BodyVector3 = Field(
         (0.0, 0.0, 0.03), description="tip of the magnet gear in body axes: forward, left, up"
     )
+    battery_mah: float = Field(
+        250.0, ge=50, le=5000, description="charge of the full battery, as printed on it"
+    )
 
 
 class MarkerConfig(Section):

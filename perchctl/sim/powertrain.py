@@ -9,15 +9,16 @@
   `MOTOR_COAST_S` is the value with which the fall after a lone notify, the landing, the
   take-offs and the attitude steps of that page come out nearest to what was measured,
   all at once.
-- A 250 mAh cell: 4.4 A at full thrust, and what that does to its voltage. Current and sag
-  are proportional to thrust: the voltages beside the duty cycles of that page lie on one
-  line within 0.06 V, 0.63 V from no thrust to full.
+- The cell (`perchctl.sim.cell`) gives 4.4 A at full thrust. Current and sag are proportional
+  to thrust: the voltages beside the duty cycles of that page lie on one line within 0.06 V,
+  0.63 V from no thrust to full.
 """
 
 from __future__ import annotations
 
 import math
 
+from perchctl.sim.cell import RESISTANCE_OHM, Cell, CellKind
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 from perchctl.sim.thrust_curve import (
     C0,
@@ -33,20 +34,16 @@ from perchctl.sim.thrust_curve import (
 MOTOR_LAG_S = 0.05
 MOTOR_COAST_S = 0.12
 MOTOR_CURRENT_A = 1.1
-CELL_RESISTANCE_OHM = 0.143
-CELL_CHARGE_C = 900.0
-CELL_SLOPE_V = 0.8  # resting voltage lost over the whole charge
 _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
 
 Forces = tuple[float, float, float, float]
 
 
 class Powertrain:
-    """`forces_n` M1..M4; `rest_v` the cell's resting voltage, `battery_v` under load."""
+    """`forces_n` M1..M4; `battery_v` the cell's voltage under their load."""
 
-    def __init__(self, rest_v: float, resistance_ohm: float | None = None) -> None:
-        self._resistance_ohm = CELL_RESISTANCE_OHM if resistance_ohm is None else resistance_ohm
-        self.rest_v = rest_v
+    def __init__(self, rest_v: float, kind: CellKind | None = None) -> None:
+        self.cell = Cell(rest_v, kind or CellKind())
         self.battery_v = rest_v
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
         self.strength: Forces | None = None  # what is left of each motor's thrust; None: all
@@ -76,9 +73,7 @@ class Powertrain:
             s1, s2, s3, s4 = self.strength
             f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
         self.forces_n = forces = (f1, f2, f3, f4)
-        current_a = _AMPERES_PER_N * (f1 + f2 + f3 + f4)
-        self.rest_v -= current_a * CONTROL_PERIOD_S / CELL_CHARGE_C * CELL_SLOPE_V
-        self.battery_v = self.rest_v - self._resistance_ohm * current_a
+        self.battery_v = self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
         return forces
 
 
@@ -87,5 +82,5 @@ def most_thrust_n(rest_v: float) -> float:
     battery_v = rest_v
     for _ in range(30):
         forces_n = 4.0 * thrust_n(battery_v)
-        battery_v += 0.5 * (rest_v - CELL_RESISTANCE_OHM * _AMPERES_PER_N * forces_n - battery_v)
+        battery_v += 0.5 * (rest_v - RESISTANCE_OHM * _AMPERES_PER_N * forces_n - battery_v)
     return forces_n

@@ -58,6 +58,9 @@ class Scenario:
         motor_strength: what is left of each motor's thrust, M1..M4.
         propeller_shake_g: what each propeller at full shakes the accelerometer by, rms.
         cell_resistance_ohm: of the battery; None means a good one.
+        cell_slow_ohm: more of it, that an old or cold cell shows within seconds.
+        cell_charge: what an old cell still holds, as a share of a new one's.
+        cell_knee: the share of its charge below which its voltage falls steeply.
         rssi_dbm: of the radio, at the vehicle.
         parameters: the firmware's, where they differ from its release at boot.
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
@@ -104,6 +107,9 @@ class Scenario:
     motor_strength: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     propeller_shake_g: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05)
     cell_resistance_ohm: float | None = None
+    cell_slow_ohm: float = 0.0
+    cell_charge: float = 1.0
+    cell_knee: float = 0.1
     rssi_dbm: float = -40.0
     parameters: dict[str, float] = field(default_factory=dict)
     no_target: bool = False

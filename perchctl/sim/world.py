@@ -5,8 +5,8 @@ origin on the floor under the start. One `World.step` is one `CONTROL_PERIOD_S`.
 
 Assumptions of the model, each with its source:
 
-- Motors and battery: `perchctl.sim.powertrain`; the curve between a motor's voltage and
-  its thrust: `perchctl.sim.thrust_curve`.
+- Motors: `perchctl.sim.powertrain`; their battery: `perchctl.sim.cell`; the curve between a
+  motor's voltage and its thrust: `perchctl.sim.thrust_curve`.
 - Drag is linear in the airspeed. Of a Crazyflie's four rotors 9.2e-7 N/(m/s) level and
   10.3e-7 vertically a rad/s of their summed speed have been identified (Foerster, ETH
   Zurich, 2015); lifting 42 g they turn at 7600 rad/s together (2.9e-8 N/(rad/s)^2
@@ -29,6 +29,7 @@ import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_quaternion, rotation_from_rpy
 from perchctl.sim.body import build_model
+from perchctl.sim.cell import RESISTANCE_OHM, CellKind
 from perchctl.sim.magnet import MAGNET_RANGE_M, Magnet
 from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
@@ -79,7 +80,7 @@ class World:
         # Farther than this below the ceiling the gear cannot touch it.
         self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._steps = 0
-        self.powertrain = Powertrain(scenario.battery_rest_v, scenario.cell_resistance_ohm)
+        self.powertrain = Powertrain(scenario.battery_rest_v, _cell_of(scenario))
         if min(scenario.motor_strength) < 1.0:
             self.powertrain.strength = scenario.motor_strength
         self._wind_mps = (0.0, 0.0, 0.0)
@@ -107,11 +108,11 @@ class World:
 
     @property
     def battery_rest_v(self) -> float:
-        return self.powertrain.rest_v
+        return self.powertrain.cell.rest_v
 
     @battery_rest_v.setter
     def battery_rest_v(self, rest_v: float) -> None:
-        self.powertrain.rest_v = rest_v
+        self.powertrain.cell.rest_v = rest_v
 
     def step(self, pwm: tuple[float, float, float, float]) -> None:
         """Advance by `CONTROL_PERIOD_S` under four duty cycles 0..65535."""
@@ -257,3 +258,13 @@ class World:
                 mujoco.mj_contactForce(self._model, self._data, i, wrench)
                 ceiling_n += float(wrench[0])
         return ceiling_n, floor
+
+
+def _cell_of(scenario: Scenario) -> CellKind:
+    ohm = scenario.cell_resistance_ohm
+    return CellKind(
+        RESISTANCE_OHM if ohm is None else ohm,
+        scenario.cell_slow_ohm,
+        scenario.cell_charge,
+        scenario.cell_knee,
+    )

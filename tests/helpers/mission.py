@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.mission import planner
+from perchctl.mission.energy import EnergyState
 from perchctl.mission.state import Observation, Phase, PlannerState, Severity
 from perchctl.mission.watch import Event, EventKind
 from perchctl.profile import Profile
@@ -24,6 +25,14 @@ READY = AUTO_ARM | CAN_FLY | ARMED
 AIRBORNE = READY | FLYING
 HOVER_THRUST = 56000.0
 CEILING_M = 2.2
+FINE_BATTERY = EnergyState(
+    ground_v=4.1,
+    rest_v=4.08,
+    load=HOVER_THRUST / 65535,
+    mean_load=HOVER_THRUST / 65535,
+    loaded_s=5.0,
+)
+"""After some seconds of flight: enough for every attempt."""
 PROFILE = Profile()
 HANG_Z_M = CEILING_M - PROFILE.vehicle.gear_body_m[2]
 """Height of the body that hangs with its gear at the target."""
@@ -109,5 +118,6 @@ def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
         entry_m=(0.0, 0.0, z_m),
         target_m=np.array([0.0, 0.0, CEILING_M]),
         hover_thrust=HOVER_THRUST,
+        energy=FINE_BATTERY,
         contact_z_m=CEILING_M - 0.03 if phase is Phase.COMPLETE else None,
     )

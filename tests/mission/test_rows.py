@@ -38,6 +38,7 @@ from perchctl.vehicle import (
 from tests.helpers.mission import (
     AIRBORNE,
     CEILING_M,
+    FINE_BATTERY,
     HOVER_THRUST,
     PROFILE,
     READY,
@@ -177,7 +178,7 @@ CASES: dict[str, Case] = {
     "estimate-unsure": Case(
         P.ALIGN, P.LANDING, flown(position_variance_m2=0.08), 1.2, O.SAFETY
     ),
-    "battery-low": Case(P.ALIGN, P.LANDING, flown(battery_v=2.8), 1.8, O.SAFETY),
+    "battery-low": Case(P.ASCEND, P.LANDING, flown(battery_v=2.8), 1.8, O.SAFETY),
     "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
@@ -221,6 +222,10 @@ CASES: dict[str, Case] = {
     "estimated": Case(P.ESTIMATE, P.ALIGN, seen(), 0.6),
     "align-lost": Case(P.ALIGN, P.SEARCH, unseen()),
     "align-timeout": Case(P.ALIGN, P.RECOVER, aside(0.2), state={"entered_s": -20.0}),
+    "too-little-left": Case(
+        P.ALIGN, P.LANDING, flown(battery_v=3.24), 1.0, O.SAFETY,
+        state={"energy": replace(FINE_BATTERY, rest_v=3.77)},
+    ),
     "aligned": Case(P.ALIGN, P.ASCEND, seen(), 0.6),
     "ascend-lost": Case(P.ASCEND, P.RECOVER, unseen()),
     "outside-cone": Case(P.ASCEND, P.ALIGN, aside(0.4)),

@@ -125,7 +125,7 @@ def test_hover_command_of_42_g_is_the_measured_one() -> None:
     assert command == pytest.approx(56200, abs=100)
 
 
-@pytest.mark.parametrize(("rest_v", "share"), [(4.2, 1.0), (3.8, 1.0), (3.5, 0.89)])
+@pytest.mark.parametrize(("rest_v", "share"), [(4.2, 1.0), (3.8, 1.0), (3.5, 0.88)])
 def test_full_thrust_is_the_same_until_the_battery_cannot_give_it(
     rest_v: float, share: float
 ) -> None:
@@ -143,7 +143,7 @@ def test_battery_sags_under_load_discharges_and_recovers() -> None:
     assert 3.4 < world.battery_v < 3.75
     run(world, 30.0, (56000.0,) * 4)
     run(world, 1.0)
-    assert 3.85 < world.battery_v < 3.95
+    assert 3.9 < world.battery_v < 3.98
 
 
 @pytest.mark.parametrize(

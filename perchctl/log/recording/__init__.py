@@ -6,7 +6,7 @@ are loaded with the first call: most flights of a campaign are not recorded.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,19 +17,22 @@ if TYPE_CHECKING:
     from perchctl.log.recording.pictures import Picture
 
 
-def pictures_of(path: Path | str, *, exact: bool = True) -> Iterator[Picture]:
+def pictures_of(
+    path: Path | str, *, exact: bool = True, numbers: Container[int] | None = None
+) -> Iterator[Picture]:
     """The pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it lies
     beside; of one that was cut off, those that are whole.
 
     Args:
         exact: every picture must be the flight's to the bit.
+        numbers: only the frames of these, the others are not decoded; None is all.
 
     Errors, with the first picture: NotFound without a recording; InvalidValue where it is none,
     and where this computer's decoder makes other pixels of a JPEG than the flight's did.
     """
     from perchctl.log.recording.pictures import pictures_in
 
-    return pictures_in(recording_of(path), exact)
+    return pictures_in(recording_of(path), exact, numbers)
 
 
 def export_mcap(log_path: Path | str, out_path: Path | str, overwrite: bool = False) -> Exported:

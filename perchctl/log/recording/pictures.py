@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,19 +27,22 @@ class Picture(NamedTuple):
     image: NDArray[np.uint8]
 
 
-def pictures_in(path: Path, exact: bool) -> Iterator[Picture]:
+def pictures_in(
+    path: Path, exact: bool, numbers: Container[int] | None = None
+) -> Iterator[Picture]:
     """As `perchctl.log.recording.pictures_of`, of the recording itself."""
     data: Walked | None = None
     for each in walk(path, (IMAGE, FRAME)):
         if each.topic == IMAGE:
             data = each
         elif data is not None and data.sequence == each.sequence:
-            yield _picture(path, data, each, exact)
+            frame = json.loads(each.data)
+            if numbers is None or frame["number"] in numbers:
+                yield _picture(path, data, frame, exact)
             data = None
 
 
-def _picture(path: Path, data: Walked, told: Walked, exact: bool) -> Picture:
-    frame = json.loads(told.data)
+def _picture(path: Path, data: Walked, frame: dict[str, Any], exact: bool) -> Picture:
     pixels = np.frombuffer(CompressedImage.FromString(data.data).data, np.uint8)
     image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
     if image is None:

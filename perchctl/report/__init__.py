@@ -1,0 +1,1 @@
+"""A flight, or a session of them, told afterwards on one page that needs nothing else."""
