@@ -18,6 +18,7 @@ from perchctl.mission.energy import (
     left_s,
     loaded_v,
     updated,
+    used_mah,
 )
 from perchctl.mission.state import BatteryOutlook, Phase
 from perchctl.profile import Profile
@@ -53,17 +54,18 @@ def watched(c: Context) -> EnergyState:
 
 def outlook(c: Context) -> BatteryOutlook:
     """What is left, and for how many attempts that is enough; None where it is not known."""
-    energy = c.state.energy
+    energy, battery_mah = c.state.energy, c.profile.vehicle.battery_mah
+    used = used_mah(energy, battery_mah)
     seconds = None
     if energy.unknown_s <= UNKNOWN_S:
-        seconds = left_s(energy, floor_of(c.profile), c.profile.vehicle.battery_mah, _hover_load(c))
+        seconds = left_s(energy, floor_of(c.profile), battery_mah, _hover_load(c))
     if seconds is None or c.target_m is None:
-        return BatteryOutlook(seconds, None)
+        return BatteryOutlook(seconds, None, used, energy.rest_v)
     needs = needs_of(c)
     spare_s = seconds - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
     attempts = 0 if spare_s < 0.0 else 1 + math.floor(spare_s / needs.again_s)
     left = c.profile.planner.attempts - c.state.attempts
-    return BatteryOutlook(seconds, max(0, min(attempts, left)))
+    return BatteryOutlook(seconds, max(0, min(attempts, left)), used, energy.rest_v)
 
 
 def floor_of(profile: Profile) -> Floor:

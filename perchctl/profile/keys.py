@@ -22,6 +22,7 @@ UNITS = {
     "hz": "Hz",
     "kg": "kg",
     "m": "m",
+    "mah": "mAh",
     "m2": "m^2",
     "mps": "m/s",
     "mps2": "m/s^2",
