@@ -245,7 +245,7 @@ def page(flown: Flight, file: Path) -> None:
             number += 1
             live.show(number, picture)
 
-    live.tell(lambda: _page_state(status))
+    live.tell(lambda: _page_state(status), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:

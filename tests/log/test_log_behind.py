@@ -135,7 +135,7 @@ def test_a_full_disk_is_in_the_exit_code_of_a_good_flight(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return real(fd, data)
 
-    def session(options: FlyOptions, watchers: tuple[Any, ...], port: int | None) -> SessionResult:
+    def session(options: FlyOptions, watchers: tuple[Any, ...], *rest: object) -> SessionResult:
         for record in list(synthetic.ticks())[:5]:
             watchers[0].writer.write(record)
         return SessionResult(FlightReport(Phase.PERCHED, outcome, "hanging still", 1, 9.0, False))
