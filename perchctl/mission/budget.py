@@ -85,7 +85,7 @@ def needs_of(c: Context) -> Needs:
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
     touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
     aligned_s = 0.0
-    if c.state.phase is not Phase.ALIGN:
+    if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
         aligned_s = BACK_OFF_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_S
     again_m = planner.recover.descend_m + planner.ascend.standoff_m
     return Needs(
@@ -96,8 +96,10 @@ def needs_of(c: Context) -> Needs:
 
 
 def short_of_charge(c: Context) -> bool:
-    """The attempt that would begin now has not enough, or it is not known whether it has."""
-    return c.profile.safety.energy_gate and not c.state.battery.attempts
+    """The attempt that would begin now has not enough, or it is not known whether it has. Where
+    no target is remembered none begins: first there is a search, and then it is asked again."""
+    asked = c.profile.safety.energy_gate and c.target_m is not None
+    return asked and not c.state.battery.attempts
 
 
 def why_short(c: Context) -> str:

@@ -250,3 +250,14 @@ def test_the_firmware_s_word_is_heard() -> None:
     link = PROFILE.link.model_copy(update={"parameters": {"pm.lowVoltage": 3.4}})
     assert floor_of(PROFILE) == Floor(3.2, 3.0)
     assert floor_of(PROFILE.model_copy(update={"link": link})) == Floor(3.4, 3.0)
+
+
+def test_who_has_no_target_goes_on_searching() -> None:
+    """Pressed against a lamp in its search, say: no attempt is at hand that could be refused."""
+    state = replace(state_in(Phase.RECOVER), energy=FINE_BATTERY, target_m=None)
+    for i in range(1, 100):
+        t_s = 10.0 + PERIOD_S * i
+        state, _ = planner.step(state, observation(t_s, target=None), PROFILE)
+        if state.phase is not Phase.RECOVER:
+            break
+    assert state.row == "recovered"
