@@ -77,11 +77,9 @@ def floor_of(profile: Profile) -> Floor:
 
 
 def needs_of(c: Context) -> Needs:
-    """By the target's height, or the highest search where none was seen yet."""
+    """By the height of the target, which was seen."""
     planner = c.profile.planner
     up_m = max(0.0, c.contact_goal_z_m - c.obs.telemetry.position_m[2])
-    if not math.isfinite(up_m):
-        up_m = planner.search.max_height_m
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
     touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
     aligned_s = 0.0
