@@ -44,8 +44,8 @@ class Job:
 
 @dataclass(frozen=True)
 class Flown:
-    """`lost` in an ascent by `battery-low`; `refused` at which attempt, 0: never; `margin_v`
-    the lowest voltage of a whole second in an ascent or a press."""
+    """`lost` in an ascent by `battery-low`; `refused` at which attempt, 0: never; `lowest_v` in
+    an ascent or a press."""
 
     job: Job
     end: str

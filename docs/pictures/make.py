@@ -44,6 +44,7 @@ from perchctl.flight.session import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
 from perchctl.log.plot import plot_flight  # noqa: E402
 from perchctl.log.read import FlightLog, read_log  # noqa: E402
+from perchctl.mission.state import BatteryOutlook  # noqa: E402
 from perchctl.pipeline import make_pipeline, step  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
@@ -144,6 +145,12 @@ class Flight:
             loop_late_s=r["late_s"],
             attempts=r["attempts"],
             reason=r["reason"],
+            battery=BatteryOutlook(
+                r["battery_left_s"],
+                r["battery_attempts"],
+                r["battery_used_mah"],
+                r["battery_rest_v"],
+            ),
         )
 
 
@@ -240,7 +247,7 @@ def page(flown: Flight, file: Path) -> None:
             number += 1
             live.show(number, picture)
 
-    live.tell(lambda: _page_state(status))
+    live.tell(lambda: _page_state(status), live=False)
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:

@@ -18,6 +18,7 @@ from perchctl.commands.output import print_record, say, tell
 from perchctl.commands.page import page_port
 from perchctl.commands.positioning import positioned
 from perchctl.display.page.flight import FlightPage, flight_page
+from perchctl.display.page.told import card_of, failed_card
 from perchctl.display.panel import make_reporter
 from perchctl.display.watch import DisplayWatcher
 from perchctl.errors import (
@@ -141,11 +142,16 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
         merges = f"; merges with {weights_text(options)}"
         log.event(Event(time.monotonic(), EventKind.NOTE, merges.removeprefix("; ")))
     say(f"connecting to {options.uri}{merges}")
-    with unheeded():  # once it has landed nothing is left to stop, but much to tell
+    switch, page = OperatorSwitch(), None
+    # Once it has landed nothing is left to stop, but much to tell.
+    with unheeded(), contextlib.ExitStack() as stack:
         try:
-            result = _session(options, log, DisplayWatcher(reporter), port)
+            page = stack.enter_context(live_page(options, port, switch))
+            result = _session(options, log, DisplayWatcher(reporter), switch, page)
         except BaseException as error:
             log.abandon(str(error) or type(error).__name__)
+            if page is not None:
+                page.end(failed_card(error, log.path if log.path.exists() else None))
             raise
         finally:
             reporter.close()
@@ -153,6 +159,8 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
         summary = log.close(result.report, result.miss_m if perched else None)
         assert summary is not None
         tell(summary_text(summary, log.path))
+        if page is not None:
+            page.end(card_of(summary, log.path))
     code = exit_code(result.report.outcome, summary)
     plot = drawn(lambda: plot_of(log.path, options.profile))
     if plot is not None:
@@ -183,16 +191,19 @@ def exit_code(outcome: Outcome, summary: FlightSummary) -> int:
 
 
 def _session(
-    options: FlyOptions, log: LogWatcher, display: Watcher, port: int | None
+    options: FlyOptions,
+    log: LogWatcher,
+    display: Watcher,
+    switch: OperatorSwitch,
+    page: FlightPage | None,
 ) -> SessionResult:
-    """The session with the signals on its switch, and with the live page where there is a port."""
-    switch = OperatorSwitch()
+    """The session with the signals on its switch, and with the live page where there is one."""
     watchers: tuple[Watcher, ...] = (log, display)
     watched = log.watched
-    with signals_to_operator(switch, say), live_page(options, port, switch) as page:
-        if page is not None:
-            watchers = (*watchers, page)
-            watched = lambda source: page.watched(log.watched(source))  # noqa: E731
+    if page is not None:
+        watchers = (*watchers, page)
+        watched = lambda source: page.watched(log.watched(source))  # noqa: E731
+    with signals_to_operator(switch, say):
         return fly_session(options, watchers, switch, watched, log.remarks)
 
 

@@ -146,7 +146,17 @@ def _limit_lines(profile: Profile) -> list[str]:
         f"fence        {safety.fence_radius_m:g} m around the place of take-off",
         f"height       at most {safety.max_height_m:g} m above the ground",
         f"battery      at least {safety.min_rest_v:g} V at rest, {safety.min_load_v:g} V in flight",
+        f"{'':{_COLUMN}}{_gate_text(profile)}",
     ]
+
+
+def _gate_text(profile: Profile) -> str:
+    if not profile.safety.energy_gate:
+        return "attempts begin whatever it has left"
+    return (
+        f"{profile.vehicle.battery_mah:g} mAh; no attempt without enough for its landing and "
+        f"{profile.safety.energy_reserve_s:g} s"
+    )
 
 
 def _doubts(rows_found: list[dict[str, str]]) -> list[str]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from perchctl.mission.state import BatteryOutlook
 from perchctl.mission.watch import Event, EventKind, Outside
+from perchctl.vehicle import NO_BATTERY_READING_V
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,7 @@ class FlightStatus:
         link_age_s, camera_age_s: since the newest telemetry and the last good frame.
         loop_late_s: how late this tick began.
         attempts: failed perching attempts so far.
+        battery: what it is enough for; None outside a flight's phases.
         reason: why the phase was entered; `hold`: why the vehicle is held, or empty.
         outside: how it goes with positions from outside; None where decks measure them.
     """
@@ -42,6 +45,7 @@ class FlightStatus:
     reason: str
     hold: str = ""
     outside: Outside | None = None
+    battery: BatteryOutlook | None = None
 
 
 def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
@@ -61,11 +65,29 @@ def status_rows(status: FlightStatus) -> list[tuple[str, str]]:
         ("phase", f"{status.phase}  {status.in_phase_s:.1f} s"),
         ("error", error),
         ("markers", f"{status.stage}   attempts {status.attempts}"),
-        ("height", f"{status.height_m:.2f} m   battery {status.battery_v:.2f} V"),
+        ("height", f"{status.height_m:.2f} m   battery {battery_text(status)}"),
         ("ages", ages),
         *([] if status.outside is None else [("outside", _outside_text(status.outside))]),
         ("held" if status.hold else "reason", status.hold or status.reason),
     ]
+
+
+def battery_text(status: FlightStatus) -> str:
+    """Its voltage under load, and what it is enough for."""
+    if not status.battery_v >= NO_BATTERY_READING_V:
+        return "unknown"
+    text, battery = f"{status.battery_v:.2f} V", status.battery
+    if battery is None or battery.left_s is None:
+        return text
+    if battery.attempts is None:
+        return f"{text}, {_whole(battery.left_s)} left"
+    if battery.attempts == 0:
+        return f"{text}, not enough for an attempt"
+    return f"{text}, enough for {battery.attempts} attempt{'s' if battery.attempts > 1 else ''}"
+
+
+def _whole(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
 
 
 def _outside_text(outside: Outside) -> str:

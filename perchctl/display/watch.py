@@ -6,6 +6,7 @@ import math
 
 from perchctl.display.panel import Reporter
 from perchctl.display.status import FlightStatus
+from perchctl.mission.table import BEFORE_CONTACT
 from perchctl.mission.watch import Event, Tick
 
 
@@ -52,4 +53,5 @@ def status_of(tick: Tick) -> FlightStatus:
         reason=state.reason,
         hold=state.hold,
         outside=tick.outside,
+        battery=state.battery if state.phase in BEFORE_CONTACT else None,
     )

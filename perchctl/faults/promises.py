@@ -77,7 +77,7 @@ PROMISES = (
     ),
     Promise(
         "battery low under load for 1.5 s, its reading frozen",
-        "no new attempt, landing; a reading that stands still lands after 90 s",
+        "no new attempt, landing; without a reading no attempt begins, and it lands after 90 s",
         ("battery-low", "battery-sags", "battery-reading-frozen", "battery-block-dead"),
     ),
     Promise(

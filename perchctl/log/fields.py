@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from perchctl.mission.state import BatteryOutlook
 from perchctl.mission.watch import Event, Outside
 from perchctl.vehicle import (
     Command,
@@ -50,6 +51,10 @@ FIELDS: dict[str, str] = {
     "thrust": "commanded by the vehicle's controller, 0..65535",
     "battery_v": "under the load of the moment",
     "battery_state": "pm.state; 3 is low power",
+    "battery_rest_v": "what it would have at rest, by the energy model",
+    "battery_used_mah": "by the count of the thrust, in a battery as assumed",
+    "battery_left_s": "of hovering, until it would land for it; by the energy model",
+    "battery_attempts": "for so many more attempts it is enough, with a landing",
     "supervisor": "supervisor bits",
     "var_m2": "largest of the estimator's position variances",
     "tel_age_s": "age of the telemetry sample",
@@ -174,6 +179,7 @@ def tick_record(
     consistency: Consistency | None = None,
     delay_used_s: float = 0.0,
     outside: Outside | None = None,
+    battery: BatteryOutlook | None = None,
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
 ) -> dict[str, Any]:
@@ -202,6 +208,7 @@ def tick_record(
         **_consistency_values(consistency),
         **_xyz("true_", true_position_m),
         **_outside_values(outside),
+        **_battery_values(battery),
         **_telemetry_values(telemetry),
         **_output_values(output),
         **_target_values(target),
@@ -236,6 +243,10 @@ def _outside_values(outside: Outside | None) -> dict[str, Any]:
         if place.quaternion is not None:
             values |= {f"pos_q{c}": q for c, q in zip("wxyz", place.quaternion, strict=True)}
     return values
+
+
+def _battery_values(battery: BatteryOutlook | None) -> dict[str, Any]:
+    return {} if battery is None else {f"battery_{k}": v for k, v in vars(battery).items()}
 
 
 def _xyz(prefix: str, vector: Any, unit: str = "m") -> dict[str, Any]:

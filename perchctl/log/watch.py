@@ -191,6 +191,7 @@ def flight_record(
         consistency=tick.consistency,
         delay_used_s=tick.delay_used_s,
         outside=tick.outside,
+        battery=tick.state.battery,
         true_position_m=true_position_m,
         true_miss_m=true_miss_m,
     )

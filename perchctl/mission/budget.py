@@ -18,6 +18,7 @@ from perchctl.mission.energy import (
     left_s,
     loaded_v,
     updated,
+    used_mah,
 )
 from perchctl.mission.state import BatteryOutlook, Phase
 from perchctl.profile import Profile
@@ -53,17 +54,18 @@ def watched(c: Context) -> EnergyState:
 
 def outlook(c: Context) -> BatteryOutlook:
     """What is left, and for how many attempts that is enough; None where it is not known."""
-    energy = c.state.energy
+    energy, battery_mah = c.state.energy, c.profile.vehicle.battery_mah
+    used = used_mah(energy, battery_mah)
     seconds = None
     if energy.unknown_s <= UNKNOWN_S:
-        seconds = left_s(energy, floor_of(c.profile), c.profile.vehicle.battery_mah, _hover_load(c))
+        seconds = left_s(energy, floor_of(c.profile), battery_mah, _hover_load(c))
     if seconds is None or c.target_m is None:
-        return BatteryOutlook(seconds, None)
+        return BatteryOutlook(seconds, None, used, energy.rest_v)
     needs = needs_of(c)
     spare_s = seconds - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
     attempts = 0 if spare_s < 0.0 else 1 + math.floor(spare_s / needs.again_s)
     left = c.profile.planner.attempts - c.state.attempts
-    return BatteryOutlook(seconds, max(0, min(attempts, left)))
+    return BatteryOutlook(seconds, max(0, min(attempts, left)), used, energy.rest_v)
 
 
 def floor_of(profile: Profile) -> Floor:
@@ -75,15 +77,13 @@ def floor_of(profile: Profile) -> Floor:
 
 
 def needs_of(c: Context) -> Needs:
-    """By the target's height, or the highest search where none was seen yet."""
+    """By the height of the target, which was seen."""
     planner = c.profile.planner
     up_m = max(0.0, c.contact_goal_z_m - c.obs.telemetry.position_m[2])
-    if not math.isfinite(up_m):
-        up_m = planner.search.max_height_m
     touch_s = SETTLING_S + planner.ascend.settle_dwell_s + TOUCHING_S
     touch_s += planner.ascend.standoff_m / planner.perch.climb_mps + planner.perch.contact_dwell_s
     aligned_s = 0.0
-    if c.state.phase is not Phase.ALIGN:
+    if c.state.phase not in (Phase.ALIGN, Phase.ASCEND, Phase.PERCH):
         aligned_s = BACK_OFF_S if c.state.phase is Phase.RECOVER else 2.0 * BACK_OFF_S
     again_m = planner.recover.descend_m + planner.ascend.standoff_m
     return Needs(
@@ -94,8 +94,10 @@ def needs_of(c: Context) -> Needs:
 
 
 def short_of_charge(c: Context) -> bool:
-    """The attempt that would begin now has not enough, or it is not known whether it has."""
-    return c.profile.safety.energy_gate and not c.state.battery.attempts
+    """The attempt that would begin now has not enough, or it is not known whether it has. Where
+    no target is remembered none begins: first there is a search, and then it is asked again."""
+    asked = c.profile.safety.energy_gate and c.target_m is not None
+    return asked and not c.state.battery.attempts
 
 
 def why_short(c: Context) -> str:

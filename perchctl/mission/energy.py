@@ -37,10 +37,12 @@ LOW_POWER_V = 3.2
 USUAL_SAG_V, SAG_WITHIN_V = 0.63, 0.3
 USUAL_HUNGER, HUNGER_WITHIN = 1.1, 0.3
 LEAST_HUNGER, MOST_HUNGER, LEAST_SAG_V = 1.0, 3.0, 0.2
-READING_V, FADES_S = 0.03, 40.0
+READING_V, FADES_S = 0.02, 40.0
 """What a second of readings is off, and for how long it counts."""
 SMOOTH_S, LAG_S = 1.0, 0.3
 """Of the present resting voltage; and by how much a reading comes after its thrust."""
+STEADY_LOAD = 0.06
+"""A thrust that is not farther from where it was belongs to the reading of the moment."""
 LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0
 """From so much of the full thrust on, and after so many seconds of it, there is an estimate."""
 
@@ -105,8 +107,10 @@ def updated(
     if not battery_v >= NO_BATTERY_READING_V:
         return _counted(state, dt_s, battery_mah)
     state = replace(state, unknown_s=0.0)
-    if state.load < LEAST_LOAD and not state.loaded_s:
-        return replace(state, ground_v=battery_v, rest_v=battery_v) if load == 0.0 else state
+    if load == 0.0 and not state.loaded_s:
+        return replace(state, ground_v=battery_v, rest_v=battery_v)
+    if abs(load - state.load) > STEADY_LOAD:
+        return state  # a reading that comes after its thrust belongs to another one
     if state.ground_v is None:
         state = replace(state, ground_v=battery_v + USUAL_SAG_V * state.load)
     if state.load >= LEAST_LOAD:

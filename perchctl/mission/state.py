@@ -148,11 +148,20 @@ class Observation:
 
 @dataclass(frozen=True)
 class BatteryOutlook:
-    """For how long it can hover, and for how many more attempts, each with a landing, that is
-    enough; None where it is not known, or no target was seen yet."""
+    """What the battery is enough for, by the energy model.
+
+    Attributes:
+        left_s: hovering, until `battery-low` would land it; None where that is not known.
+        attempts: for so many more there is enough, with the landing after the last; None before
+            a target was seen, too.
+        used_mah: by the count of the thrust.
+        rest_v: what it would have at rest; None where that is not known.
+    """
 
     left_s: float | None = None
     attempts: int | None = None
+    used_mah: float = 0.0
+    rest_v: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

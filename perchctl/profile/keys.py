@@ -22,6 +22,7 @@ UNITS = {
     "hz": "Hz",
     "kg": "kg",
     "m": "m",
+    "mah": "mAh",
     "m2": "m^2",
     "mb": "MB",
     "mps": "m/s",

@@ -21,7 +21,7 @@ from perchctl.log.read import read_log
 from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission.planner import start
-from perchctl.mission.state import Observation, Phase
+from perchctl.mission.state import BatteryOutlook, Observation, Phase
 from perchctl.mission.watch import Tick
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
@@ -280,3 +280,25 @@ def test_the_truth_of_a_simulation_is_logged(tmp_path: Path) -> None:
     log.close()
     record = read_log(log.path).records[0]
     assert [record[f"true_{k}_m"] for k in ("x", "y", "z", "miss")] == [1.0, 2.0, 3.0, 0.25]
+
+
+@pytest.mark.parametrize(
+    ("volts", "battery", "text"),
+    [
+        (3.71, BatteryOutlook(60.0, 2), "3.71 V, enough for 2 attempts"),
+        (3.71, BatteryOutlook(40.0, 1), "3.71 V, enough for 1 attempt"),
+        (3.3, BatteryOutlook(10.0, 0), "3.30 V, not enough for an attempt"),
+        (3.71, BatteryOutlook(60.0), "3.71 V, 60 s left"),
+        (3.71, BatteryOutlook(150.0), "3.71 V, 2 min left"),
+        (3.71, BatteryOutlook(), "3.71 V"),
+        (3.71, None, "3.71 V"),
+        (0.0, BatteryOutlook(), "unknown"),
+        (math.nan, BatteryOutlook(), "unknown"),
+    ],
+)
+def test_what_the_battery_is_enough_for(
+    volts: float, battery: BatteryOutlook | None, text: str
+) -> None:
+    rows = dict(status_rows(replace(STATUS, battery_v=volts, battery=battery)))
+    assert rows["height"] == f"0.82 m   battery {text}"
+    assert len(rows["height"]) < 70

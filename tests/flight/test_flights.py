@@ -260,6 +260,20 @@ def test_a_nearly_empty_battery_lands() -> None:
     assert "PERCH" not in flown.way
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("gate", [True, False])
+def test_a_battery_for_a_flight_and_not_for_an_attempt(gate: bool) -> None:
+    """It would just do here: the gate does not bet on it, and lands with the figures."""
+    changes = {"safety.min_rest_v": 3.0, "safety.energy_gate": gate}
+    flown = fly_short(changes, battery_rest_v=3.775)
+    if gate:
+        assert is_landed(flown, Outcome.SAFETY), flown
+        assert " s left at 3." in flown.report.reason
+        assert flown.way[-3:] == ["ALIGN", "LANDING", "LANDED"]
+    else:
+        assert flown.way[-1] == "PERCHED"
+
+
 def _turned(deg: float) -> dict[str, Any]:
     """A scenario whose camera is turned so far from what the profile says."""
     drawn = draw_scenario(load_profile(SHORT), SEED)

@@ -21,6 +21,7 @@ from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.jsonl import to_plain
 from perchctl.log.read import read_log
 from perchctl.log.write import FlightLogWriter, log_path
+from perchctl.mission.state import BatteryOutlook
 from perchctl.mission.watch import Outside
 from perchctl.vehicle import (
     EmergencyStop,
@@ -167,6 +168,7 @@ def test_every_field_is_filled_by_something() -> None:
                 99.0,
                 ExternalPosition((1.0, 2.0, 0.5), (1.0, 0.0, 0.0, 0.0)),
             ),
+            battery=BatteryOutlook(60.0, 3, 12.5, 3.9),
             true_position_m=(0.0, 0.0, 1.0),
             true_miss_m=0.01,
         )

@@ -10,10 +10,11 @@ from functools import partial
 from perchctl.camera.source import FrameSource, WatchedSource
 from perchctl.display.page.live import LivePage, State
 from perchctl.display.page.sketch import Sketch
+from perchctl.display.page.told import Card, answered
 from perchctl.display.status import status_rows
 from perchctl.display.watch import status_of
 from perchctl.mission.planner import is_over
-from perchctl.mission.watch import Event, Tick
+from perchctl.mission.watch import Event, EventKind, Tick
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput
 
 AXES_OF_SIDE = 0.5
@@ -32,7 +33,10 @@ class FlightPage:
         self._axis_m = AXES_OF_SIDE * large_side_m
         self._frame: Frame | None = None
         self._flying = False
-        page.tell(lambda: {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]})
+        self._events: list[Event] = []
+        self._pressed_s: float | None = None
+        waiting = {"phase": "WAITING", "rows": [["reason", "vehicle and camera"]]}
+        page.tell(lambda: waiting, live=False)
 
     @property
     def problem(self) -> str | None:
@@ -49,12 +53,23 @@ class FlightPage:
             if frame is not None:
                 self._frame = None
                 self.page.show(frame.index, sketch_of(frame, tick.output, self._axis_m))
-            self.page.tell(partial(flight_state, tick))
+            if self._pressed_s is None and self.page.stop_requested:
+                self._pressed_s = tick.t_s
+            did = answered(self._events, self._pressed_s)
+            self.page.tell(partial(flight_state, tick, did), live=not is_over(tick.state))
         except Exception as error:
             self.page.remember(error)
 
     def event(self, event: Event) -> None:
-        return None
+        self._events.append(event)
+
+    def end(self, card: Card) -> None:
+        """The flight is over, and this is how: the last that the page shows. After an error in
+        flight, with what the rescue said."""
+        last = self._events[-1] if self._events else None
+        if last is not None and last.kind is EventKind.NOTE and not card["good"]:
+            card = card | {"rows": [["flight", last.reason], *card["rows"]]}
+        self.page.end(card)
 
     def _seen(self, frame: Frame) -> None:
         self._frame = frame
@@ -76,9 +91,9 @@ def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Ske
     )
 
 
-def flight_state(tick: Tick) -> State:
-    """The tick for the page: phase, battery, the rows of the terminal's panel, and whether the
-    flight is over."""
+def flight_state(tick: Tick, stop_did: str = "") -> State:
+    """The tick for the page: phase, battery, the rows of the terminal's panel, whether the flight
+    is over, and what it did for STOP."""
     status = status_of(tick)
     volts = status.battery_v
     return {
@@ -88,6 +103,7 @@ def flight_state(tick: Tick) -> State:
         "rows": [list(row) for row in status_rows(status)],
         "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
         "over": is_over(tick.state),
+        "stop_did": stop_did,
     }
 
 

@@ -23,6 +23,8 @@ from perchctl.vision.types import CameraModel
 
 JPEG_QUALITY = 80
 WAIT_S = 0.5
+READS_S, LAST_READ_S = 2.5, 2.0
+"""A reader that asked so recently is waited for so long at the end, until it has the last state."""
 _RATE_FRAMES = 30  # over which the frame rate is taken
 _RATE_STALE_S = 1.0
 
@@ -66,6 +68,10 @@ class LivePage:
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._jpegs: dict[bool, tuple[int, bytes]] = {}
         self._describe: Callable[[], State] = dict
+        self._told_s: float | None = None  # None: nothing is due
+        self._read_s: float | None = None
+        self._card: State | None = None
+        self._card_read = False
         try:
             self._server = PageServer(self, port)
         except (OSError, OverflowError) as error:
@@ -94,16 +100,32 @@ class LivePage:
             self._number += 1
             self._changed.notify_all()
 
-    def tell(self, describe: Callable[[], State]) -> None:
-        """The newest numbers; formatted only when a reader polls."""
+    def tell(self, describe: Callable[[], State], *, live: bool = True) -> None:
+        """The newest numbers; formatted only when a reader polls. While they are `live`, others
+        are due at once, and the page says when they stay away."""
         self._describe = describe
+        self._told_s = self._clock() if live else None
+
+    def end(self, card: State) -> None:
+        """How it ended: what it shows now stays, with this card. Waits, bounded, until a reader
+        that is there has it."""
+        with self._changed:
+            self._card, self._told_s = card, None
+            read_s = self._read_s
+            if read_s is not None and self._clock() - read_s < READS_S:
+                self._changed.wait_for(lambda: self._card_read or self.closed, LAST_READ_S)
+
+    @property
+    def stop_requested(self) -> bool:
+        return self._stop_requested
 
     # --- for the server's threads --------------------------------------------
 
     def state(self) -> State:
         """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
-        0..1; note, phase, battery, over), and title, rate_hz, stop (``none``, ``ready``,
-        ``requested``, ``over``)."""
+        0..1; note, phase, battery, over, stop_did), and title, rate_hz, stop (``none``, ``ready``,
+        ``requested``, ``over``), age_s of these numbers (None where no others are due), card
+        (`end`'s, or None)."""
         try:
             described = self._describe()
         except Exception as error:
@@ -111,13 +133,24 @@ class LivePage:
             described = {}
         if self._on_stop is None:
             stop = "none"
-        elif described.get("over"):
+        elif described.get("over") or self._card is not None:
             stop = "over"
         else:
             stop = "requested" if self._stop_requested else "ready"
         fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
         fixed["flat"] = self._is_there(-1, flat=True)  # there is a picture without distortion
+        told_s, card = self._told_s, self._card
+        fixed["age_s"] = None if told_s is None else round(max(0.0, self._clock() - told_s), 2)
+        fixed["card"] = card
+        self._read_s = self._clock()
         return described | fixed | {"page_problem": self.problem}
+
+    def was_read(self, state: State) -> None:
+        """That state has reached a reader."""
+        if state.get("card") is not None:
+            with self._changed:
+                self._card_read = True
+                self._changed.notify_all()
 
     def rate_hz(self) -> float:
         """Frames a second, 0 once none has come for a second."""

@@ -44,6 +44,8 @@ class Content(Protocol):
 
     def state(self) -> dict[str, Any]: ...
 
+    def was_read(self, state: dict[str, Any]) -> None: ...
+
     def jpeg_after(self, number: int, flat: bool = False) -> tuple[int, bytes] | None: ...
 
     def pause(self, seconds: float) -> bool: ...
@@ -87,8 +89,9 @@ class _Handler(BaseHTTPRequestHandler):
             case "/":
                 self._send_page()
             case "/state":
-                state = json.dumps(self.server.page.state())
-                self._send(200, "application/json", state.encode())
+                state = self.server.page.state()
+                self._send(200, "application/json", json.dumps(state).encode())
+                self.server.page.was_read(state)
             case "/stream" | "/flat":
                 self._send_stream(flat=wanted == "/flat")
             case _:

@@ -1,0 +1,263 @@
+"""What a battery has left, against batteries whose end is known; and the gate that asks for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.mission import planner
+from perchctl.mission.budget import floor_of, needs_of, outlook, watched
+from perchctl.mission.context import Context
+from perchctl.mission.energy import (
+    CURVE,
+    EnergyState,
+    Floor,
+    charge_at,
+    fitted,
+    left_s,
+    loaded_v,
+    resting_v,
+    updated,
+    used_mah,
+)
+from perchctl.mission.state import Outcome, Phase, PlannerState
+from perchctl.profile import Profile, load_profile
+from perchctl.sim.cell import Cell, CellKind
+from perchctl.sim.scenario import CONTROL_PERIOD_S
+from perchctl.vehicle import FULL_THRUST
+from tests.helpers.mission import (
+    FINE_BATTERY,
+    HOVER_THRUST,
+    PROFILE,
+    observation,
+    state_in,
+    telemetry,
+)
+
+PERIOD_S, MAH = 0.02, 250.0
+FLOOR = Floor(3.2, 3.0)
+HOVER = HOVER_THRUST / FULL_THRUST
+ATTEMPT_S, LANDING_S = 12.0, 10.0
+
+
+@dataclass(frozen=True)
+class Moment:
+    t_s: float
+    energy: EnergyState
+    under_load_v: float
+
+
+def hovering(rest_v: float, kind: CellKind, most_s: float = 120.0) -> Iterator[Moment]:
+    """On the ground for 1 s, then hovering, with a press of a second every 8 s."""
+    cell, energy, reading_v = Cell(rest_v, kind), EnergyState(), rest_v
+    for i in range(round(most_s / PERIOD_S)):
+        t_s = PERIOD_S * i
+        load = 0.0 if t_s < 1.0 else 1.0 if t_s % 8.0 > 7.0 else HOVER
+        for _ in range(round(PERIOD_S / CONTROL_PERIOD_S)):
+            cell.step(4.4 * load)
+        reading_v += 0.1 * (cell.battery_v - reading_v)  # the firmware's, low-passed
+        energy = updated(energy, PERIOD_S, reading_v, load * FULL_THRUST, MAH)
+        yield Moment(
+            t_s, energy, cell.rest_v - (cell.rest_v - cell.battery_v) / (load or 1) * HOVER
+        )
+
+
+WEAK = {
+    "low": (3.87, CellKind()),
+    "early knee": (3.9, CellKind(knee=0.14)),
+    "high resistance": (4.1, CellKind(resistance_ohm=0.19, slow_ohm=0.02)),
+    "old": (4.0, CellKind(resistance_ohm=0.165, charge=0.5, slow_ohm=0.02)),
+}
+
+
+@pytest.mark.parametrize("name", WEAK)
+def test_what_is_left_is_not_more_than_there_is(name: str) -> None:
+    """From a few seconds on, where it decides."""
+    moments = list(hovering(*WEAK[name]))
+    end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < FLOOR.hover_v)
+    assert 20.0 < end_s < 110.0
+    for moment in moments[:: round(1.0 / PERIOD_S)]:
+        ahead_s = end_s - moment.t_s
+        if moment.t_s < 6.0 or ahead_s <= 0.0:
+            continue
+        told_s = left_s(moment.energy, FLOOR, MAH, HOVER)
+        assert told_s is not None
+        if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
+            assert told_s < ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
+        if ahead_s > 70.0:  # and one that is safe three times over is
+            assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
+
+
+@pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
+def test_the_sag_is_found_within_seconds(ohm: float) -> None:
+    last = list(hovering(4.1, CellKind(resistance_ohm=ohm), 5.0))[-1]
+    assert fitted(last.energy).sag_v == pytest.approx(4.4 * ohm, rel=0.05)
+    assert loaded_v(last.energy, HOVER) == pytest.approx(last.under_load_v, abs=0.02)
+
+
+def test_a_hungry_battery_is_found_out_while_it_flies() -> None:
+    tame, hungry = (
+        fitted(list(hovering(4.1, CellKind(charge=charge), 30.0))[-1].energy).hunger
+        for charge in (1.0, 0.5)
+    )
+    assert 1.0 <= tame < 1.15
+    assert 1.3 < hungry < 2.3
+
+
+def test_the_count_of_the_thrust() -> None:
+    energy = EnergyState()
+    for _ in range(500):
+        energy = updated(energy, PERIOD_S, 3.7, FULL_THRUST, MAH)
+    assert used_mah(energy, MAH) == pytest.approx(4.4 / 3.6 * 10.0)
+
+
+@pytest.mark.parametrize("reading_v", [0.0, 0.3, math.nan])
+def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
+    energy = EnergyState()
+    for i in range(500):
+        energy = updated(energy, PERIOD_S, reading_v, HOVER_THRUST * (i > 50), MAH)
+    assert left_s(energy, FLOOR, MAH) is None
+    assert energy.unknown_s == pytest.approx(10.0)
+
+
+def test_a_moment_without_readings_is_counted_on() -> None:
+    moments = list(hovering(4.0, CellKind(), 12.0))
+    before = moments[-1].energy
+    blind = before
+    for _ in range(200):
+        blind = updated(blind, PERIOD_S, math.nan, HOVER_THRUST, MAH)
+    known_s, counted_s = (left_s(each, FLOOR, MAH, HOVER) for each in (before, blind))
+    assert known_s is not None
+    assert counted_s == pytest.approx(known_s - 4.0, abs=0.5)
+
+
+def test_readings_that_begin_under_load_are_taken_as_usual_ones() -> None:
+    """As after a reading that came late: the sag is not known, and what is usual counts."""
+    energy = EnergyState()
+    for _ in range(200):
+        energy = updated(energy, PERIOD_S, 3.5, HOVER_THRUST, MAH)
+    assert energy.rest_v == pytest.approx(3.5 + 0.63 * HOVER, abs=0.05)
+
+
+@given(st.floats(3.0, 4.2))
+def test_charge_and_voltage_are_each_other_s(volts: float) -> None:
+    assert resting_v(charge_at(volts)) == pytest.approx(volts, abs=1e-6)
+
+
+def test_the_curve_rises() -> None:
+    assert list(CURVE) == sorted(CURVE)
+    assert [v for _, v in CURVE] == sorted(v for _, v in CURVE)
+
+
+@settings(max_examples=60)
+@given(st.lists(st.tuples(st.floats(-1.0, 6.0), st.floats(0.0, 70000.0)), max_size=60))
+def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
+    energy = FINE_BATTERY
+    for volts, thrust in readings:
+        energy = updated(energy, PERIOD_S, volts, thrust, MAH)
+    seconds = left_s(energy, FLOOR, MAH)
+    assert seconds is not None
+    assert 0.0 <= seconds < 1e5
+
+
+# --- the gate ------------------------------------------------------------------------------
+
+
+def at_gate(phase: Phase, rest_v: float, **changes: object) -> Context:
+    """Aligned, or steady again, with a battery of that resting voltage."""
+    energy = replace(FINE_BATTERY, ground_v=rest_v + 0.02, rest_v=rest_v)
+    state = replace(state_in(phase), energy=energy, **changes)  # type: ignore[arg-type]
+    c = Context(state, observation(20.0), PROFILE)
+    return Context(replace(state, battery=outlook(c)), c.obs, PROFILE)
+
+
+def test_needs_follow_the_way() -> None:
+    align, recover = needs_of(at_gate(Phase.ALIGN, 4.0)), needs_of(at_gate(Phase.RECOVER, 4.0))
+    assert recover.attempt_s > align.attempt_s
+    high = Context(state_in(Phase.ALIGN), observation(20.0, 0.2), PROFILE)
+    assert needs_of(high).attempt_s > align.attempt_s
+    assert needs_of(high).landing_s == pytest.approx(align.landing_s)
+
+
+def test_fewer_and_fewer_attempts_are_left() -> None:
+    told = [at_gate(Phase.ALIGN, 0.002 * i).state.battery.attempts for i in range(1850, 2050)]
+    assert all(attempts is not None for attempts in told)
+    assert told == sorted(told)  # type: ignore[type-var]
+    assert told[0] == 0
+    assert told[-1] == PROFILE.planner.attempts
+
+
+def flown(
+    phase: Phase, energy: EnergyState, seconds: float, profile: Profile = PROFILE, **tel: object
+) -> PlannerState:
+    state = replace(state_in(phase), energy=energy)
+    for i in range(1, round(seconds / PERIOD_S)):
+        t_s = 10.0 + PERIOD_S * i
+        sample = telemetry(t_s, **tel)  # type: ignore[arg-type]
+        state, _ = planner.step(state, observation(t_s, telemetry=sample), profile)
+        if state.phase is not phase:
+            break
+    return state
+
+
+NEAR_ITS_END = replace(FINE_BATTERY, ground_v=3.79, rest_v=3.77)
+
+
+@pytest.mark.parametrize("phase", [Phase.ALIGN, Phase.RECOVER])
+def test_no_attempt_begins_on_a_battery_near_its_end(phase: Phase) -> None:
+    state = flown(phase, NEAR_ITS_END, 2.0, battery_v=3.24)
+    assert state.phase is Phase.LANDING
+    assert state.row == "too-little-left"
+    assert state.outcome is Outcome.SAFETY
+    assert " s left at 3.2" in state.reason
+    assert flown(phase, FINE_BATTERY, 2.0).phase in (Phase.ASCEND, Phase.ESTIMATE)
+
+
+@pytest.mark.parametrize("phase", [Phase.ASCEND, Phase.PERCH])
+def test_what_was_begun_is_flown(phase: Phase) -> None:
+    assert flown(phase, NEAR_ITS_END, 1.0, battery_v=3.24).row != "too-little-left"
+
+
+def test_the_gate_can_be_taken_away() -> None:
+    safety = PROFILE.safety.model_copy(update={"energy_gate": False})
+    open_ = PROFILE.model_copy(update={"safety": safety})
+    assert flown(Phase.ALIGN, NEAR_ITS_END, 2.0, open_, battery_v=3.24).row == "aligned"
+    assert not load_profile("paper").safety.energy_gate
+
+
+def test_no_attempt_begins_without_a_reading() -> None:
+    state = flown(Phase.ALIGN, EnergyState(), 2.0, battery_v=0.0)
+    assert state.row == "too-little-left"
+    assert "not known (no reading)" in state.reason
+
+
+def test_a_reading_that_stands_still_is_none() -> None:
+    state = state_in(Phase.ALIGN)
+    for age_s, known in ((0.5, True), (4.0, True), (9.0, False)):
+        later = observation(state.t_s + 4.0, battery_age_s=age_s)
+        state = replace(state, energy=watched(Context(state, later, PROFILE)), t_s=later.t_s)
+        c = Context(state, later, PROFILE)
+        assert (outlook(c).left_s is not None) is known
+
+
+def test_the_firmware_s_word_is_heard() -> None:
+    """It reports low power below `pm.lowVoltage`, and the vehicle is landed for it."""
+    link = PROFILE.link.model_copy(update={"parameters": {"pm.lowVoltage": 3.4}})
+    assert floor_of(PROFILE) == Floor(3.2, 3.0)
+    assert floor_of(PROFILE.model_copy(update={"link": link})) == Floor(3.4, 3.0)
+
+
+def test_who_has_no_target_goes_on_searching() -> None:
+    """Pressed against a lamp in its search, say: no attempt is at hand that could be refused."""
+    state = replace(state_in(Phase.RECOVER), energy=FINE_BATTERY, target_m=None)
+    for i in range(1, 100):
+        t_s = 10.0 + PERIOD_S * i
+        state, _ = planner.step(state, observation(t_s, target=None), PROFILE)
+        if state.phase is not Phase.RECOVER:
+            break
+    assert state.row == "recovered"
