@@ -187,7 +187,7 @@ def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> R
 
 
 def _compared(uri: str, profile: Profile) -> list[Row]:
-    return compared.rows(profile.positioning, wall_date(), simulated=uri.startswith("sim://"))
+    return compared.rows(profile.positioning, uri, wall_date(), simulated=uri.startswith("sim://"))
 
 
 def _vehicle(
@@ -215,7 +215,7 @@ def _with_a_hand(
         lifted = _lifted(probe, room, profile, wanted)
         yield lifted
         rows = _compared(uri, profile)
-        yield from [compared.kept(lifted, profile.positioning, wall_date())] if rows else []
+        yield from [compared.kept(lifted, profile.positioning, uri, wall_date())] if rows else []
     else:
         yield lift.unasked()
         yield from _compared(uri, profile)

@@ -10,6 +10,7 @@ from perchctl.errors import SafetyAbort, no_motion_capture
 from perchctl.flight.clock import Clock, wall_date
 from perchctl.flight.preflight import refuse_strange
 from perchctl.link.cflib_link import CflibLink
+from perchctl.link.claim import vehicle_of
 from perchctl.link.outside import check_parameters
 from perchctl.positioning.capture import check_reachable, open_capture
 from perchctl.positioning.compared import newest, objection
@@ -35,12 +36,13 @@ def check_positioning(profile: Profile, *, simulated: bool) -> None:
         raise no_motion_capture()
 
 
-def check_compared(config: PositioningConfig, *, simulated: bool) -> None:
-    """Raises SafetyAbort for a capture that no hand has compared of late: that its axes are
-    swapped does not show at rest. The simulator's own room is right as it is built."""
+def check_compared(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
+    """Raises SafetyAbort for a capture that no hand has compared of late with this vehicle:
+    that its axes are swapped does not show at rest. The simulator's own room is right as it is
+    built."""
     if config.by != "mocap" or simulated:
         return
-    objected = objection(newest(config), wall_date())
+    objected = objection(newest(config, vehicle_of(uri)), wall_date())
     if objected is not None:
         raise SafetyAbort(": ".join(objected))
 

@@ -55,7 +55,7 @@ def test_what_the_hand_finds_is_what_fly_refuses(
 
     turn = axes_matrix(axes)
     lifted = recorded(world=turn, body=turn.T, config=config)
-    row = compared.kept(lifted, config, wall_date())
+    row = compared.kept(lifted, config, NOWHERE, wall_date())
     code, said = fly()
     if words is None:
         assert (lifted.verdict, row.verdict) == (Verdict.PASS, Verdict.PASS)
