@@ -1,8 +1,8 @@
 """From a hand to a refusal: the comparison names what is swapped, the record says so, and `fly`
 refuses with that name.
 
-The samples are recorded ones: a simulated vehicle that is put somewhere has no gyroscope that
-measures it, so its attitude does not follow a hand in real time.
+The samples are recorded ones; over the link and the capture's server a vehicle is lifted in
+`test_lift`.
 """
 
 from __future__ import annotations
