@@ -22,7 +22,7 @@ class NewestSlot:
 
     def put(self, image: Grey, t_s: float, t_arrival_s: float) -> None:
         """Times of exposure and of arrival."""
-        self._repeats, again = repeated(self._repeats, image, self._by_noise)
+        self._repeats, again = repeated(self._repeats, image, t_arrival_s, self._by_noise)
         if not again:
             self._frame = Frame(self.count, t_s, image, t_arrival_s)
             self.count += 1
