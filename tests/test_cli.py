@@ -8,7 +8,6 @@ import re
 import socket
 import subprocess
 import sys
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -23,15 +22,12 @@ from perchctl import __version__
 from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
 from perchctl.cli.app import reported
-from perchctl.errors import EXIT_CODES, InvalidValue, ProfileNote
+from perchctl.errors import EXIT_CODES
 from perchctl.flight.session import PLAIN_SEED
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.handle import SimProcess
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SHORT
-from tests.helpers.recording import write_pictures
-from tests.helpers.weights_data import known
-from tests.helpers.weights_data import write as write_session
 
 HEAVY = ("cv2", "numpy", "cflib", "matplotlib", "mujoco", "pydantic", "filterpy", "scipy")
 NOWHERE = "udp://127.0.0.1:9"
@@ -298,75 +294,6 @@ def grounded() -> Iterator[SimProcess]:
         assert sim.truth()["position_m"][2] < 0.05
 
 
-WRITING = [
-    ["calibrate", "images:.", "-o", "OUT.yaml"],
-    ["calibrate", "--convert", str(ROOT / "calib/example_640x480.yaml"), "-o", "OUT.yaml"],
-    ["calibrate", "images:.", "--mask", "OUT.png"],
-    ["make-target", "-o", "OUT.pdf"],
-    ["make-target", "--board", "chessboard:9x6:20mm", "-o", "OUT.pdf"],
-    ["make-target", "--camera", "example_640x480.yaml", "--plot", "OUT.png"],
-    ["make-target", "--measured-large", "150", "-o", "OUT.yaml"],
-    ["track", "images:.", "--csv", "OUT.csv"],
-    ["track", "images:.", "--overlay", "OUT.mp4"],
-    ["fit-weights", "session.csv", "-o", "OUT.yaml"],
-    ["fit-weights", "session.csv", "--plot", "OUT.png"],
-]
-"""Each way to write a file, which is refused before there is anything to work on."""
-
-
-@pytest.mark.parametrize("words", WRITING, ids=lambda words: f"{words[0]} {words[-2]}")
-def test_one_rule_for_what_is_there_already(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    name = words[-1].replace("OUT", "mine")
-    words = [*words[:-1], name]
-    Path(name).write_text("mine")
-    said = run(*words)
-    assert said.code == InvalidValue.exit_code
-    assert said.complaint == f"{name} exists already; add --force to replace it, or name another"
-    assert Path(name).read_text() == "mine"
-    assert "exists already" not in run(*words, "--force").stderr
-    inside = [*words[:-1], f"{name}/inside/{name}"]
-    Path(name).write_text("mine")
-    assert "is a file, not a folder" in run(*inside).complaint
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["calibrate", "--convert", str(ROOT / "calib/example_640x480.yaml"), "-o", "OUT.yaml"],
-        ["make-target", "--board", "chessboard:9x6:20mm", "-o", "OUT.pdf"],
-        ["make-target", "--measured-large", "150", "-o", "OUT.yaml"],
-        ["track", "images:pictures", "--stills", "--csv", "OUT.csv"],
-        ["fit-weights", "session.csv", "--plot", "OUT.png"],
-    ],
-    ids=lambda words: f"{words[0]} {words[-2]}",
-)
-def test_one_rule_for_folders(
-    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    if words[0] == "fit-weights":
-        write_session(known(positions=4, per=20), Path("session.csv"))
-    if words[0] == "track":
-        write_pictures(Path("pictures"))
-    place = Path(words[-1].replace("OUT", "made/new/out"))
-    said = run(*words[:-1], str(place))
-    assert said.code == 0, said.stderr
-    assert [path.name for path in place.parent.iterdir()] == [place.name]
-
-
-@pytest.mark.parametrize("name", ["d3.png", "camera", "camera.txt"])
-def test_a_calibration_is_not_named_like_its_report(name: str, tmp_path: Path) -> None:
-    said = run("calibrate", "images:.", "-o", str(tmp_path / name), "--force")
-    assert said.code == InvalidValue.exit_code
-    assert "must end in .yaml or .yml" in said.complaint
-    assert "report goes beside it as .png" in said.complaint
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_calibration_of_another_size(tmp_path: Path) -> None:
     source = pictures(tmp_path / "p", (320, 240))
     said = run("fly", "-p", SHORT, "--source", source)
@@ -421,95 +348,7 @@ def test_ctrl_c_before_the_flight_is_130(capsys: pytest.CaptureFixture[str]) -> 
 # --- Notes on the profile -----------------------------------------------------------------------
 
 
-def test_a_note_on_the_profile_is_one_sentence_once(capsys: pytest.CaptureFixture[str]) -> None:
-    """Other warnings are left to those who show them: here to pytest, else to Python."""
-
-    def warn() -> None:
-        with reported():
-            for key in ("a", "b", "a"):
-                warnings.warn(f"mine.yaml: {key} has another name", ProfileNote, stacklevel=1)
-            warnings.warn("something else", DeprecationWarning, stacklevel=1)
-
-    with pytest.warns(DeprecationWarning, match="something else") as others:
-        warn()
-    assert len(others) == 1
-    assert capsys.readouterr().err == (
-        "perchctl: mine.yaml: a has another name\nperchctl: mine.yaml: b has another name\n"
-    )
-    with pytest.raises(ProfileNote):
-        warnings.warn("an error again behind it", ProfileNote, stacklevel=1)
-
-
-def test_a_note_stands_before_the_sentence_of_a_failure(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def load(name: str) -> None:
-        warnings.warn(f"{name}: camera.old is camera.new by now", ProfileNote, stacklevel=1)
-        raise InvalidValue(f"{name}: no good")
-
-    monkeypatch.setattr("perchctl.commands.fly.load_profile", load)
-    said = run("fly", "-p", "mine.yaml", "--dry-run")
-    assert said.code == 30
-    assert said.stderr.splitlines() == [
-        "perchctl: mine.yaml: camera.old is camera.new by now",
-        "perchctl: mine.yaml: no good",
-    ]
-
-
 # --- Options that would not be heeded -------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("--only 3 -n 5", ["--only 3", "-n 5 does not apply", "leave it out"]),
-        ("--only 3 --seed 7", ["--seed 7 does not apply"]),
-        ("--only 3 --jobs 2 --seed 0", ["--seed 0 and --jobs 2 do not apply", "leave them out"]),
-        ("--only 3 --faults all --heat-map m.png", ["--heat-map m.png does not apply"]),
-        ("--faults list --log-dir x", ["flies nothing", "--log-dir x does not apply"]),
-        ("--heat-map m.png", ["--faults"]),
-    ],
-)
-def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str]) -> None:
-    said = run("simulate", *arguments.split())
-    assert said.code == 2
-    for word in words:
-        assert word in said.complaint
-    assert list(Path().iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("pictures --view", ["pictures is no live camera", "--view does not apply"]),
-        ("pictures --check c.yaml -o d.yaml", ["--check", "--output does not apply"]),
-        ("pictures --check c.yaml --model fisheye", ["--check", "--model does not apply"]),
-        ("--convert c.yaml -o d.yaml --model fisheye", ["--convert", "--model does not apply"]),
-        ("--convert c.yaml -o d.yaml --view", ["--convert", "--view does not apply"]),
-    ],
-)
-def test_calibrate_refuses_what_it_would_not_heed(arguments: str, words: list[str]) -> None:
-    Path("pictures").mkdir()
-    said = run("calibrate", *arguments.split())
-    assert said.code == 2
-    for word in words:
-        assert word in said.complaint
-
-
-def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:
-    at = ("--uri", "usb://0", "--source", "camera:0", "--dry-run")
-    assert "--seed 7" in run("fly", "--seed", "7", *at).complaint
-    assert run("fly", *at).stderr == ""
-
-
-@pytest.mark.parametrize("where", ["afile", "afile/logs"])
-@pytest.mark.parametrize("command", ["simulate --only 1", "simulate", "fly"])
-def test_a_file_in_the_place_of_the_logs_is_named_with_what_to_do(command: str, where: str) -> None:
-    Path("afile").touch()
-    said = run(*command.split(), "--log-dir", where)
-    assert said.code == 30
-    assert where in said.complaint
-    assert "name another folder with --log-dir" in said.complaint
 
 
 @pytest.mark.long

@@ -116,7 +116,9 @@ def open_source(
         return _started(pipeline, timeout_s, tell)
     if (stream := _stream(spec, scheme, rest, latency_s, clock)) is not None:
         try:
-            return _started(stream, timeout_s, tell)
+            started = _started(stream, timeout_s, tell)
+            _tell_unasked(spec, config, tell)
+            return started
         except TimedOut as error:
             if stream.not_found:
                 raise NotFound(str(error)) from None
@@ -138,9 +140,15 @@ def _stream(
     kinds = {"http": MjpegSource, "https": MjpegSource, "rtsp": RtspSource}
     if scheme not in kinds or not rest.strip("/"):
         return None
+    port: int | str | None = None
     try:
-        host = urlsplit(spec).hostname if rest.startswith("//") else None
-        _ = urlsplit(spec).port
+        parts = urlsplit(spec)
+        host = parts.hostname if rest.startswith("//") else None
+        try:
+            port = parts.port
+        except ValueError:
+            port = parts.netloc.rpartition(":")[2]
+            host = None if "@" in spec else host  # part of a password, it may be
     except ValueError:
         host = None
     if not host:
@@ -148,7 +156,27 @@ def _stream(
             f"camera source {without_password(spec)!r} lacks a host that can be read, as in "
             f"{scheme}://192.168.1.20/stream; in a name or password @ is %40, : is %3A, / is %2F"
         )
+    if port == 0 or isinstance(port, str):
+        raise InvalidValue(
+            f"camera source {without_password(spec)!r} has port {port}; allowed are 1 to 65535, "
+            f"as in {scheme}://{host}:{_USUAL_PORT[scheme]}/stream, or none for the usual one"
+        )
     return kinds[scheme](spec, latency_s, clock)
+
+
+_USUAL_PORT = {"http": 80, "https": 443, "rtsp": 554}
+
+
+def _tell_unasked(spec: str, config: CameraConfig | None, tell: Callable[[str], None]) -> None:
+    """What the profile asks of a driver, and no network camera has."""
+    keys = {} if config is None else {"format": config.format, "controls": config.controls}
+    given = [f"camera.{key}" for key, value in keys.items() if value]
+    if given:
+        verb = "is" if len(given) == 1 else "are"
+        tell(
+            f"{' and '.join(given)} {verb} not used with {without_password(spec)}: only camera: "
+            f"sources have a driver to ask; set that in the camera itself"
+        )
 
 
 def _started(source: LiveSource, timeout_s: float, tell: Callable[[str], None]) -> FrameSource:

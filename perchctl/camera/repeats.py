@@ -10,6 +10,10 @@ far below the noise that each has along its columns. A picture at rest on a roug
 look so, too, as can one that wobbles where it turns back, and one of which a codec has left
 nothing but the outlines: it only counts in a stream that shows both kinds by turns, the
 repetitions all equally alike and nothing between the two, and no more than four times in a row.
+A wobble whose period is a whole number of pictures does all of that. What it cannot do is turn
+back so often: a repetition counts only where there are more of them a second than any vehicle's
+wobble has turns, as of 25 or 30 in 60 or 25 in 50. Slower ones, as of 25 in 30, count as new
+pictures, late by one place: that costs less than a picture that is thrown away.
 So nothing but equal bytes can starve a flight of its pictures. Only a camera of this computer has
 a converter before it: pictures that come over a network repeat by their bytes or not at all.
 """
@@ -17,7 +21,7 @@ a converter before it: pictures that come over a network repeat by their bytes o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, pairwise
 
 import cv2
 import numpy as np
@@ -31,6 +35,8 @@ _WINDOW = 24
 _ALIKE, _UNLIKE = 0.6, 0.8
 _SPREAD = 1.5  # among repetitions: the converter's noise is the same in each
 _LEAST_OF_EACH = 4
+WOBBLE_HZ = 10.0
+"""No vehicle swings faster by as much as a picture shows; it turns back twice a period."""
 _CALM = 0.7  # of the pixels: what moved, and edges, are no noise
 _LEAST_NOISE = 1.0
 _STEP = 8
@@ -39,16 +45,20 @@ _STEP = 8
 @dataclass(frozen=True, eq=False)
 class RepeatState:
     """`last`: the newest picture that was new. `ratios`: how unlike the newest few were to the
-    one before, in units of their own noise; None where there was no noise to tell by."""
+    one before, in units of their own noise; None where there was no noise to tell by. `times_s`:
+    of their arrival."""
 
     last: Grey | None = None
     ratios: tuple[float | None, ...] = ()
+    times_s: tuple[float, ...] = ()
     again: int = 0
 
 
-def repeated(state: RepeatState, image: Grey, by_noise: bool = True) -> tuple[RepeatState, bool]:
-    """Whether the picture is the one before once more. Grey, (h, w). `by_noise`: also where a
-    converter has put its own noise on it; else by equal bytes alone."""
+def repeated(
+    state: RepeatState, image: Grey, t_s: float, by_noise: bool = True
+) -> tuple[RepeatState, bool]:
+    """Whether the picture is the one before once more. Grey, (h, w); `t_s`: when it arrived.
+    `by_noise`: also where a converter has put its own noise on it; else by equal bytes alone."""
     last = state.last
     if last is None or last.shape != image.shape:
         return RepeatState(image), False
@@ -57,10 +67,20 @@ def repeated(state: RepeatState, image: Grey, by_noise: bool = True) -> tuple[Re
     if not by_noise:
         return RepeatState(image), False
     ratios = (*state.ratios[1 - _WINDOW :], _unlike(last, image))
+    times_s = (*state.times_s[1 - _WINDOW :], t_s)
     again = state.again + 1
-    if _alike(ratios[-1]) and again <= MOST_AGAIN and _by_turns(ratios):
-        return RepeatState(last, ratios, again), True
-    return RepeatState(image, ratios), False
+    proven = _by_turns(ratios) and _alike_hz(ratios, times_s) > 2.0 * WOBBLE_HZ
+    if _alike(ratios[-1]) and again <= MOST_AGAIN and proven:
+        return RepeatState(last, ratios, times_s, again), True
+    return RepeatState(image, ratios, times_s), False
+
+
+def _alike_hz(ratios: tuple[float | None, ...], times_s: tuple[float, ...]) -> float:
+    """How many a second. What came in a heap, behind a computer that was busy, was not taken in
+    one: the slower of both, the usual step between two and the mean one, is the stream's."""
+    steps_s = sorted(b - a for a, b in pairwise(times_s))
+    step_s = max(steps_s[len(steps_s) // 2], (times_s[-1] - times_s[0]) / len(steps_s), 1e-6)
+    return sum(map(_alike, ratios)) / len(ratios) / step_s
 
 
 def _alike(ratio: float | None) -> bool:

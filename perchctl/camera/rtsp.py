@@ -6,8 +6,10 @@ PyAV's open and read both end in time, and say why they failed; OpenCV's FFmpeg 
 from __future__ import annotations
 
 import math
+import socket
 from collections import deque
 from typing import Any
+from urllib.parse import urlsplit
 
 from perchctl.camera.credentials import without_password
 from perchctl.camera.source import Clock
@@ -92,7 +94,7 @@ class RtspSource(StreamSource):
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
-            return _reason(error)
+            return unresolved(self._url) or _reason(error)
 
     def _read(self, stream: Any) -> str:
         """One connection until it ends; why it ended. Errors: those of PyAV."""
@@ -121,6 +123,18 @@ class RtspSource(StreamSource):
                     waited_s=waiting.of(frame.time, self._clock()),
                 )
         return "the stream ended"
+
+
+def unresolved(url: str) -> str:
+    """Why the host's name is none, which FFmpeg calls an input/output error; else nothing. May
+    take as long as the system's own asking."""
+    host = urlsplit(url).hostname or ""
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError) as error:  # the latter: a name that can be none
+        why = getattr(error, "strerror", None) or "it is no host's name"
+        return f"the host name {host!r} cannot be resolved ({why}): correct it, or give the address"
+    return ""
 
 
 def _gone(errors: Any) -> tuple[type[Exception], ...]:

@@ -24,7 +24,7 @@ class NewestSlot:
         self, image: Grey, t_s: float, t_arrival_s: float, encoded: bytes | None = None
     ) -> None:
         """Times of exposure and of arrival; `encoded` as `Frame` has it."""
-        self._repeats, again = repeated(self._repeats, image, self._by_noise)
+        self._repeats, again = repeated(self._repeats, image, t_arrival_s, self._by_noise)
         if not again:
             self._frame = Frame(self.count, t_s, image, t_arrival_s, encoded=encoded)
             self.count += 1

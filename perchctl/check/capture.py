@@ -87,8 +87,6 @@ def listen(
 def refused(why: str, config: PositioningConfig) -> list[Row]:
     """It could not be opened."""
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
-    if "cannot be loaded" in why:
-        advice = "it has to be installed anew; the motion capture was not asked"
     return [
         failed("capture", why, advice),
         *(skipped(name, f"no {label(config)}") for name in NAMES[1:]),

@@ -5,21 +5,23 @@ from __future__ import annotations
 from datetime import datetime
 
 from perchctl.check.row import Row, Verdict, failed, passed, warned
-from perchctl.positioning.compared import Compared, Unreadable, keep, newest, objection, told
+from perchctl.link.claim import vehicle_of
+from perchctl.positioning.compared import Compared, Known, keep, newest, objection, told
 from perchctl.profile.positioning import PositioningConfig
 
 NAME = "compared"
 
 
-def kept(lifted: Row, config: PositioningConfig, now: datetime) -> Row:
+def kept(lifted: Row, config: PositioningConfig, uri: str, now: datetime) -> Row:
     """Write down what the hand found, and the row of it. A lift that told nothing is none."""
+    vehicle = vehicle_of(uri)
     if lifted.verdict is Verdict.SKIPPED:
-        return row(newest(config), now)
+        return row(newest(config, vehicle), now)
     record = Compared(now, lifted.verdict is Verdict.PASS, lifted.found)
-    why = keep(config, record)
+    why = keep(config, vehicle, record)
     if why is None:
         return row(record, now)
-    standing = newest(config)
+    standing = newest(config, vehicle)
     if not record.passed and objection(standing, now) is None:
         return failed(
             NAME, f"what was found could not be written, and fly goes by an older pass: {why}",
@@ -28,7 +30,7 @@ def kept(lifted: Row, config: PositioningConfig, now: datetime) -> Row:
     return warned(NAME, f"not written, so fly does not know of it: {why}", "then once more")
 
 
-def row(record: Compared | Unreadable | None, now: datetime) -> Row:
+def row(record: Known, now: datetime) -> Row:
     objected = objection(record, now)
     if objected is None:
         assert isinstance(record, Compared)
@@ -37,8 +39,8 @@ def row(record: Compared | Unreadable | None, now: datetime) -> Row:
     return warned(NAME, f"{found}; fly refuses", advice)
 
 
-def rows(config: PositioningConfig, now: datetime, *, simulated: bool) -> list[Row]:
+def rows(config: PositioningConfig, uri: str, now: datetime, *, simulated: bool) -> list[Row]:
     """None with decks, nor for the simulator's own vehicle, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []
-    return [row(newest(config), now)]
+    return [row(newest(config, vehicle_of(uri)), now)]

@@ -29,7 +29,7 @@ from perchctl.check import (
 from perchctl.check.lift import WITHIN_S as LIFT_S
 from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
 from perchctl.check.row import Row, failed, passed, skipped
-from perchctl.errors import ConnectionFailed, PerchError
+from perchctl.errors import ConnectionFailed, PerchError, UsageError
 from perchctl.flight.clock import WallClock, wall_date
 from perchctl.flight.positions import at_hand
 from perchctl.flight.session import FlyOptions, check_options, simulated_vehicle
@@ -72,7 +72,7 @@ class Wanted:
 
 def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
     """Rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
-    profile's files), UsageError."""
+    profile's files), UsageError (a library that is missing, or does not load)."""
     check_options(options)
     profile = options.profile
     calibrated = camera_of(profile.camera)
@@ -148,6 +148,8 @@ def _opened_capture(config: PositioningConfig, wanted: Wanted, stack: contextlib
     wanted.tell(f"connecting to {label(config)}")
     try:
         opened = wanted.open_capture(config)
+    except UsageError:
+        raise  # a library that does not load is the computer's fault, here as in `fly`
     except PerchError as error:
         return str(error)
     stack.callback(opened.close)
@@ -187,7 +189,7 @@ def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> R
 
 
 def _compared(uri: str, profile: Profile) -> list[Row]:
-    return compared.rows(profile.positioning, wall_date(), simulated=uri.startswith("sim://"))
+    return compared.rows(profile.positioning, uri, wall_date(), simulated=uri.startswith("sim://"))
 
 
 def _vehicle(
@@ -215,7 +217,7 @@ def _with_a_hand(
         lifted = _lifted(probe, room, profile, wanted)
         yield lifted
         rows = _compared(uri, profile)
-        yield from [compared.kept(lifted, profile.positioning, wall_date())] if rows else []
+        yield from [compared.kept(lifted, profile.positioning, uri, wall_date())] if rows else []
     else:
         yield lift.unasked()
         yield from _compared(uri, profile)

@@ -8,23 +8,22 @@ from typing import Any
 
 from perchctl.camera.computer import Camera, cameras
 from perchctl.camera.v4l2 import Control
-from perchctl.commands.output import say
 from perchctl.errors import NotFound
 
 NONE = "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
 
 
 def list_cameras(as_json: bool, known: Sequence[Camera] | None = None) -> int:
-    """Print them; the exit code is that of `NotFound` where there are none. Nothing is set, and
-    no picture taken. `known` takes the place of this computer's."""
+    """Print them; returns the exit code. Nothing is set, and no picture taken. `known` takes the
+    place of this computer's. Errors: NotFound where there are none."""
     known = cameras(asked=True) if known is None else known
+    if not known:
+        raise NotFound(NONE)
     if as_json:
         print(json.dumps([camera_record(camera) for camera in known]))
-    elif known:
+    else:
         print("\n".join(line for camera in known for line in camera_lines(camera)))
-    if not known:
-        say(NONE)
-    return 0 if known else NotFound.exit_code
+    return 0
 
 
 def camera_record(camera: Camera) -> dict[str, Any]:

@@ -88,7 +88,7 @@ def run(request: FlyRequest) -> int:
         return 0
     for warning in quick.warnings(options):
         say(f"check: {warning}")
-    check_compared(options.profile.positioning, simulated=options.simulated)
+    check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
     if not (request.yes or options.simulated):
         ask_before_arming(options.uri)
     return fly(options, request.as_json, page_port(request.view, request.view_port))

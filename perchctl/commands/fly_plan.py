@@ -106,7 +106,9 @@ def _compared_lines(options: FlyOptions) -> list[str]:
 
 
 def _compared(options: FlyOptions) -> list[Row]:
-    return compared.rows(options.profile.positioning, wall_date(), simulated=options.simulated)
+    return compared.rows(
+        options.profile.positioning, options.uri, wall_date(), simulated=options.simulated
+    )
 
 
 def _place_lines(profile: Profile) -> list[str]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
+from perchctl.flight.outside import AtRest
 from perchctl.flight.preflight import (
     refuse,
     refuse_strange,
@@ -109,7 +110,7 @@ def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
 
 def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
     refuse_unmeasured(parts.link, parts.profile, positions=parts.positions is not None)
-    started_s = parts.clock.now()
+    started_s, at_rest = parts.clock.now(), AtRest()
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
@@ -118,7 +119,7 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
         newest = senses.history.newest
         refuse(newest, parts.profile)
         outside = None if parts.positions is None else parts.positions(now_s)
-        refuse_strange(outside, newest, parts.profile)
+        refuse_strange(outside, newest, parts.profile, at_rest)
         turns.waiting(senses, now_s, outside)
         waiting = still_waiting_for(
             newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,

@@ -34,6 +34,8 @@ UPRIGHT_DEG = 20.0
 """What attitude and capture may differ by: the attitude of a rigid body is defined by eye."""
 AXIS_DEG = 30.0
 """Within it of an axis, up is that axis."""
+WANDERED_M = 0.1
+"""Far beyond a capture's noise."""
 AGREE_M, AGREE_DEG = 0.1, 15.0
 """Estimate and capture, once positions are fused and the heading was set by them."""
 
@@ -44,6 +46,24 @@ def strange(place: ExternalPosition, telemetry: Telemetry, profile: Profile) -> 
         in_millimetres(place, profile)
         or with_another_up(place, telemetry)
         or off_the_ground(place, profile)
+        or unreachable(place, profile)
+    )
+
+
+def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """Where the target is told to be, no flight from there comes: another vehicle's body stands
+    there, perhaps, which looks right in all else."""
+    target, (x, y, _) = profile.target, place.position_m
+    if target.expected_xy_m is None:
+        return None
+    away_m = math.dist((x, y), target.expected_xy_m)
+    if not away_m > profile.safety.fence_radius_m + target.expected_within_m:
+        return None
+    return Problem(
+        f"the motion capture has the vehicle at x {x:.2f}, y {y:.2f} m, {away_m:.1f} m from where "
+        f"its target is expected, and the fence is {profile.safety.fence_radius_m:g} m",
+        f"is the rigid body {profile.positioning.body!r} another vehicle's? correct "
+        f"positioning.body, or target.expected_xy_m",
     )
 
 
@@ -117,6 +137,29 @@ def off_the_ground(place: ExternalPosition, profile: Profile) -> Problem | None:
         f"{perhaps}, another rigid body or zero: perchctl check --lift tells; "
         f"safety.ground_z_m is the height that it has where it stands",
     )
+
+
+class AtRest:
+    """A body that goes about in the capture while the vehicle stands still is another's."""
+
+    def __init__(self) -> None:
+        self._from: ExternalPosition | None = None
+
+    def strange(self, place: ExternalPosition | None, profile: Profile) -> Problem | None:
+        """Asked in each turn; `place` None while the vehicle does not stand still, or nothing
+        fresh tells where it is: then it begins anew."""
+        self._from = None if place is None else self._from or place
+        if place is None or self._from is None:
+            return None
+        way_m = math.dist(self._from.position_m, place.position_m)
+        if not way_m > WANDERED_M:
+            return None
+        body = profile.positioning.body
+        return Problem(
+            f"the rigid body {body!r} has moved by {way_m:.2f} m in the motion capture, and the "
+            f"vehicle stands still",
+            "it is another body's: correct positioning.body; if somebody carried it, put it down",
+        )
 
 
 def missing(status: FeedStatus, profile: Profile) -> Problem | None:

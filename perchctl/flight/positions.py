@@ -8,8 +8,10 @@ from importlib.util import find_spec
 
 from perchctl.errors import SafetyAbort, no_motion_capture
 from perchctl.flight.clock import Clock, wall_date
+from perchctl.flight.outside import AtRest
 from perchctl.flight.preflight import refuse_strange
 from perchctl.link.cflib_link import CflibLink
+from perchctl.link.claim import vehicle_of
 from perchctl.link.outside import check_parameters
 from perchctl.positioning.capture import check_reachable, open_capture
 from perchctl.positioning.compared import newest, objection
@@ -35,12 +37,13 @@ def check_positioning(profile: Profile, *, simulated: bool) -> None:
         raise no_motion_capture()
 
 
-def check_compared(config: PositioningConfig, *, simulated: bool) -> None:
-    """Raises SafetyAbort for a capture that no hand has compared of late: that its axes are
-    swapped does not show at rest. The simulator's own room is right as it is built."""
+def check_compared(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
+    """Raises SafetyAbort for a capture that no hand has compared of late with this vehicle:
+    that its axes are swapped does not show at rest. The simulator's own room is right as it is
+    built."""
     if config.by != "mocap" or simulated:
         return
-    objected = objection(newest(config), wall_date())
+    objected = objection(newest(config, vehicle_of(uri)), wall_date())
     if objected is not None:
         raise SafetyAbort(": ".join(objected))
 
@@ -91,8 +94,8 @@ def started_feed(
 def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:
     """Before an estimate is set to them, and before their scatter or their place is taken for
     something else. What is late is left to those who wait for it."""
-    end_s, newest = clock.now() + STRANGE_S, None
+    end_s, newest, at_rest = clock.now() + STRANGE_S, None, AtRest()
     while (now_s := clock.now()) < end_s:
         newest = next(reversed(link.telemetry()), newest)
-        refuse_strange(feed.status(now_s), newest, profile)
+        refuse_strange(feed.status(now_s), newest, profile, at_rest)
         clock.wait_until(now_s + 0.02)

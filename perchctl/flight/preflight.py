@@ -15,7 +15,7 @@ from perchctl.flight.criteria import (
     unsettled,
     within_reach,
 )
-from perchctl.flight.outside import apart, missing, strange
+from perchctl.flight.outside import AtRest, apart, missing, strange
 from perchctl.link.protocol import Link
 from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
@@ -41,16 +41,23 @@ def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
 
 
 def refuse_strange(
-    status: FeedStatus | None, telemetry: Telemetry | None, profile: Profile
+    status: FeedStatus | None,
+    telemetry: Telemetry | None,
+    profile: Profile,
+    at_rest: AtRest | None = None,
 ) -> None:
-    """Raises SafetyAbort for positions in another unit, or of another world. Held askew or moved
-    it is not judged: capture and attitude are not of one moment."""
-    if status is None or status.problem is not None or status.measured is None:
-        return  # what was sent last may have been elsewhere
-    if telemetry is None:
-        return
-    if tilted(telemetry, profile) is None and moving(telemetry) is None:
-        _refuse(strange(status.measured, telemetry, profile))
+    """Raises SafetyAbort for positions in another unit, or of another world or body. Held askew or
+    moved it is not judged: capture and attitude are not of one moment. `at_rest`: what has been
+    seen in the turns before."""
+    place = None
+    # What was sent last before a problem may have been elsewhere.
+    if status is not None and status.problem is None and telemetry is not None:
+        stands = tilted(telemetry, profile) is None and moving(telemetry) is None
+        place = status.measured if stands else None
+    if place is not None and telemetry is not None:
+        _refuse(strange(place, telemetry, profile))
+    if at_rest is not None:
+        _refuse(at_rest.strange(place, profile))
 
 
 def still_waiting_for(

@@ -100,7 +100,7 @@ def fly_session(
     to look at its frames on their way. `remarks`: as `FlightParts` has them.
     """
     check_options(options)
-    check_compared(options.profile.positioning, simulated=options.simulated)
+    check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
     profile, clock, switch = options.profile, WallClock(), switch or OperatorSwitch()
     camera = camera_of(profile.camera)
     pipeline = make_pipeline(profile, camera)

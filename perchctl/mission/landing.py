@@ -36,6 +36,8 @@ PLANNED_MPS, SETTLING_S = 0.35, 1.8
 """The quintic's largest speed, and time added for its begin: it starts at rest, while the
 vehicle comes sinking, and what the vehicle then catches up with must be slow."""
 MOST_DRIFT_M = 1.0
+BLIND_DRIFT_MPS = 0.08
+"""Of a height that no position from outside corrects: the most that 40 simulated landings had."""
 UNKNOWN_M = 1.0
 """The height to come down from where none is known."""
 PEELED_M = 0.1
@@ -44,24 +46,35 @@ PEEL_BELOW_M, PEEL_BLIND_S = 0.35, 4.0
 DROPPING_MPS = -0.35
 OVERDUE = 0.5
 """Of the landing's time: what is up there by then is left to its own landing."""
-FALLING_G = 0.5
+FALLING_G, FALLEN_MPS = 0.5, 1.0
+"""A landing that ends 5 cm above the floor drops it no faster, and is over."""
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 
 
 def own_landing(
-    landing: LandingConfig, ground_z_m: float, flown_s: float, newest: Telemetry | None
+    landing: LandingConfig,
+    ground_z_m: float,
+    flown_s: float,
+    newest: Telemetry | None,
+    blind_s: float = 0.0,
 ) -> Land:
     """The order for the vehicle's own landing, which follows a quintic from rest to rest.
 
     It aims below the ground, and the lower the longer the estimate has had to drift: the
     motors stop at the trajectory's end, and over a floor that lies lower they would drop it.
+    It never aims above where the estimate has the vehicle, which may be far below the ground by
+    now: that would be a climb. `blind_s`: for how long no position from outside has come; until
+    the floor none will, so it aims deeper in the same time, which is faster.
     """
-    below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
-    aim_m = ground_z_m - below_m
     z_m = math.nan if newest is None else newest.position_m[2]
-    height_m = max(0.0, z_m - aim_m) if math.isfinite(z_m) else UNKNOWN_M
-    return Land(aim_m, SETTLING_S + _PEAK_OF_MEAN * height_m / PLANNED_MPS)
+    below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
+    known = math.isfinite(z_m)
+    aim_m = (min(ground_z_m, z_m) if known else ground_z_m) - below_m
+    lasts_s = SETTLING_S + _PEAK_OF_MEAN * (z_m - aim_m if known else UNKNOWN_M) / PLANNED_MPS
+    if blind_s > 0.0:
+        aim_m -= min(MOST_DRIFT_M, BLIND_DRIFT_MPS * (blind_s + lasts_s))
+    return Land(aim_m, lasts_s)
 
 
 def landing(c: Context) -> Acted:
@@ -171,7 +184,10 @@ def _by_setpoints(c: Context) -> Acted:
 def _by_itself(c: Context) -> Acted:
     """The vehicle's own landing, given again while it shows no effect."""
     landing_config, state = c.profile.planner.landing, c.state
-    carried = c.obs.telemetry.acc_z_g > FALLING_G
+    tel = c.obs.telemetry
+    # Where it has been given often enough, a short fall is its end, and not that it was lost.
+    given = state.orders >= LEAST_ORDERS
+    carried = tel.acc_z_g > FALLING_G or (given and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.proves and c.obs.telemetry.thrust < 1 and carried and (state.orders or not c.flying):
         return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0
@@ -179,6 +195,7 @@ def _by_itself(c: Context) -> Acted:
     seen = state.orders >= LEAST_ORDERS and c.proves and c.high_level_active
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.obs.t_s - state.started_s
-        order = own_landing(landing_config, ground_z, flown_s, c.obs.telemetry)
+        blind_s = 0.0 if c.placed else c.obs.position_age_s
+        order = own_landing(landing_config, ground_z, flown_s, tel, blind_s)
         return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()

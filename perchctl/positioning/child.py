@@ -78,17 +78,19 @@ def serve_parent() -> None:
         channel.send(Connected())
         threading.Thread(target=_end_with, args=(channel,), daemon=True).start()
         _pass_on(client, channel, setup.partial)
-    except OSError:
-        return  # the parent is gone
     except _LoadingFailed as error:
         with contextlib.suppress(OSError):
             channel.send(NotLoaded(str(error)))
     except Exception as error:  # whatever the library raises
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # the parent may be gone, and have caused it
             channel.send(Failed(str(error) or type(error).__name__))
 
 
 class _LoadingFailed(Exception):
+    pass
+
+
+class _Unresolved(Exception):
     pass
 
 
@@ -114,10 +116,18 @@ def _bounded(setup: CaptureSetup) -> Iterator[None]:
 
 
 def _by_address(setup: CaptureSetup) -> dict[str, str]:
-    """OptiTrack's reader knows addresses only."""
+    """OptiTrack's reader knows addresses only. Errors: _Unresolved."""
     if setup.kind != "optitrack":
         return setup.options
-    return setup.options | {"hostname": socket.gethostbyname(setup.options["hostname"])}
+    host = setup.options["hostname"]
+    try:
+        return setup.options | {"hostname": socket.gethostbyname(host)}
+    except (OSError, UnicodeError) as error:  # the latter: a name that can be none
+        why = getattr(error, "strerror", None) or "it is no host's name"
+        raise _Unresolved(
+            f"the host name {host!r} cannot be resolved ({why}): correct positioning.host, or give "
+            f"the address, as in 192.168.1.2"
+        ) from None
 
 
 def _pass_on(client: Any, channel: Channel, partial: bool) -> None:

@@ -2,15 +2,16 @@
 
 Axes that are swapped do not show on a vehicle at rest that stands as it stood when its body was
 defined: all numbers look right. Only a hand that lifts and turns it tells. So each comparison is
-written down, for exactly the set-up that it is true of, and a flight asks for one that passed, at
-most `VALID_S` old. What cannot be read, or is of another time than the past, is unknown, and no
-comparison.
+written down, for exactly the vehicle and set-up that it is true of, and a flight asks for one that
+passed, at most `VALID_S` old. What cannot be read, or is of another time than the past, is unknown,
+and no comparison.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import json
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
@@ -25,13 +26,17 @@ VALID_S = 24 * 3600.0
 AHEAD_S = 60.0
 """A computer's clock is set by so much, now and then."""
 MOST_BYTES, MOST_FOUND = 65536, 300
+MOST_OTHERS = 200
+"""Records that are looked through for other vehicles."""
 AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 
 
 @dataclass(frozen=True)
 class SetUp:
-    """What a comparison is true of: another capture, body or turn of its axes is another one."""
+    """What a comparison is true of: another vehicle, capture, body or turn of its axes is another
+    one. `vehicle`: as `perchctl.link.claim.vehicle_of` has it."""
 
+    vehicle: str
     system: str
     host: str
     body: str
@@ -56,19 +61,37 @@ class Unreadable:
     why: str
 
 
-def set_up_of(config: PositioningConfig) -> SetUp:
+@dataclass(frozen=True)
+class OfOthers:
+    """Records there are of this very capture and body, and of other vehicles only."""
+
+    vehicle: str
+    others: tuple[str, ...]
+
+
+Known = Compared | OfOthers | Unreadable | None
+"""None: it was never compared."""
+
+
+def set_up_of(config: PositioningConfig, vehicle: str) -> SetUp:
     rpy, place = (tuple(map(float, v)) for v in (config.body_rpy_deg, config.body_position_m))
-    return SetUp(config.system, config.host, config.body, rpy, place)
+    return SetUp(vehicle, config.system, config.host, config.body, rpy, place)
 
 
 # --- Judging: pure -----------------------------------------------------------------------
 
 
-def objection(record: Compared | Unreadable | None, now: datetime) -> tuple[str, str] | None:
+def objection(record: Known, now: datetime) -> tuple[str, str] | None:
     """Why no flight may rely on it: what was found, and what to do. None where it passed, and not
     long ago. `now` has a time zone, in which dates are told."""
     if record is None:
         return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
+    if isinstance(record, OfOthers):
+        found = (
+            f"the motion capture was compared with another vehicle ({', '.join(record.others)}), "
+            f"and never with this one ({record.vehicle})"
+        )
+        return found, f"{AGAIN}, once"
     if isinstance(record, Unreadable):
         found = f"whether the motion capture was compared is not known: {record.path} {record.why}"
         return found, f"remove that file, then {AGAIN}"
@@ -145,10 +168,24 @@ def path_of(set_up: SetUp) -> Path:
     return user_state_folder() / "compared" / f"{name}.json"
 
 
-def newest(config: PositioningConfig) -> Compared | Unreadable | None:
-    """What is known of this set-up; None where it was never compared."""
-    set_up = set_up_of(config)
+def newest(config: PositioningConfig, vehicle: str) -> Known:
+    """What is known of this vehicle in this set-up."""
+    set_up = set_up_of(config, vehicle)
     path = path_of(set_up)
+    data = _read(path)
+    if data is None:
+        others = _others(set_up)
+        return OfOthers(vehicle, others) if others else None
+    if isinstance(data, Unreadable):
+        return data
+    try:
+        return decoded(data, set_up)
+    except ValueError as error:
+        return Unreadable(path, str(error))
+
+
+def _read(path: Path) -> bytes | Unreadable | None:
+    """None where there is no file."""
     try:
         if not path.exists():
             return None
@@ -160,19 +197,32 @@ def newest(config: PositioningConfig) -> Compared | Unreadable | None:
         return None
     except OSError as error:
         return Unreadable(path, f"cannot be read ({error.strerror or error})")
-    if len(data) > MOST_BYTES:
-        return Unreadable(path, "is damaged")
-    try:
-        return decoded(data, set_up)
-    except ValueError as error:
-        return Unreadable(path, str(error))
+    return Unreadable(path, "is damaged") if len(data) > MOST_BYTES else data
 
 
-def keep(config: PositioningConfig, record: Compared) -> str | None:
-    """Write it down; what was there of this set-up is gone. None, or why it could not be written:
-    one that passed must not stand, then, where the newest did not, and is taken away if it can
-    be."""
-    set_up = set_up_of(config)
+def _others(set_up: SetUp) -> tuple[str, ...]:
+    """The other vehicles of which there is a record in this set-up; only for a sentence."""
+    wanted = json.loads(json.dumps(asdict(set_up)))
+    found = set()
+    for path in itertools.islice(sorted(path_of(set_up).parent.glob("*.json")), MOST_OTHERS):
+        data = _read(path)
+        if not isinstance(data, bytes):
+            continue
+        try:
+            of = json.loads(data)["set_up"]
+            vehicle = of["vehicle"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
+        if isinstance(vehicle, str) and of == wanted | {"vehicle": vehicle}:
+            found.add(_one_line(vehicle))
+    return tuple(sorted(found - {set_up.vehicle}))
+
+
+def keep(config: PositioningConfig, vehicle: str, record: Compared) -> str | None:
+    """Write it down; what was there of this vehicle in this set-up is gone. None, or why it could
+    not be written: one that passed must not stand, then, where the newest did not, and is taken
+    away if it can be."""
+    set_up = set_up_of(config, vehicle)
     path = path_of(set_up)
     try:
         write_files({path: encoded(set_up, record)})

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -11,6 +13,9 @@ from pydantic import Field, field_validator, model_validator
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile.base import BodyVector3, Section, Vector3
 from perchctl.profile.dictionaries import check_marker_id, is_one_pattern
+from perchctl.profile.plain_yaml import clipped
+
+_FORMAT = "^[A-Z0-9]{3,4}$"
 
 
 class Mounting(Section):
@@ -97,7 +102,7 @@ class CameraConfig(Section):
 
     format: str | None = Field(
         None,
-        pattern=r"^[A-Z0-9]{3,4}$",
+        pattern=_FORMAT,
         description="asked of `camera:` sources: `MJPG`, `YUYV`, ...; none: the driver's own",
     )
     rate_hz: float | None = Field(
@@ -119,6 +124,38 @@ class CameraConfig(Section):
             f"found {latency_s!r}; allowed are 0 to {MOST_LATENCY_S:g} (seconds), or the word "
             f"measured, to have each flight measure it"
         )
+
+    @field_validator("format", mode="before")
+    @classmethod
+    def _a_format(cls, name: Any) -> Any:
+        if name is None or (isinstance(name, str) and re.fullmatch(_FORMAT, name)):
+            return name
+        raise ValueError(
+            f"found {clipped(repr(name))}; allowed is a format's name of three or four capitals or "
+            f"digits, as in MJPG or YUYV; perchctl check --cameras lists what each camera has"
+        )
+
+    @field_validator("controls", mode="before")
+    @classmethod
+    def _names_with_values(cls, controls: Any) -> Any:
+        """One sentence for whatever stands there; which names and values there are only the
+        driver knows."""
+        needed = (
+            "needed are names with a whole number or a menu's text each, as in controls: "
+            "{gain: 20}; "
+            "perchctl check --cameras lists them"
+        )
+        if not isinstance(controls, Mapping):
+            raise ValueError(f"found {clipped(repr(controls))}; {needed}")
+        for name, value in controls.items():
+            whole = isinstance(value, str) or (
+                isinstance(value, (int, float)) and float(value).is_integer()
+            )
+            if not isinstance(name, str) or isinstance(value, bool) or not whole:
+                found = f"{clipped(str(name))}: {clipped(repr(value))}"
+                hint = "; write 1 for on and 0 for off" if isinstance(value, bool) else ""
+                raise ValueError(f"found {found}; {needed}{hint}")
+        return controls
 
     @property
     def start_latency_s(self) -> float:

@@ -22,13 +22,21 @@ Assumptions of the model, each with its source:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from perchctl.geometry import GRAVITY_MPS2, Array, rotation_from_quaternion, rotation_from_rpy
+from perchctl.geometry import (
+    GRAVITY_MPS2,
+    Array,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
 from perchctl.sim.body import build_model
+from perchctl.sim.carried import Stop, Way
 from perchctl.sim.cell import RESISTANCE_OHM, CellKind
 from perchctl.sim.magnet import MAGNET_RANGE_M, Magnet
 from perchctl.sim.powertrain import Powertrain
@@ -86,6 +94,7 @@ class World:
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
         self._held = False
+        self._carried: tuple[float, Way] | None = None
         self.magnet = Magnet(scenario)
         self.external_force_n: tuple[float, float, float] = (0.0, 0.0, 0.0)
         mujoco.mj_forward(self._model, self._data)
@@ -119,7 +128,7 @@ class World:
         self._steps += 1
         f1, f2, f3, f4 = self.powertrain.step(pwm)
         if self._held:
-            self._set_specific_force(0.0, 0.0, 0.0)
+            self._follow_hand()
             return
         if self._steps % _WIND_EVERY == 1:
             self._wind_mps = self._wind.at(self.t_s)
@@ -211,22 +220,48 @@ class World:
     ) -> None:
         """Put the vehicle somewhere, not turning; `hold` pins it there until `let_go`.
 
-        No gyroscope measures it (see `perchctl.sim.firmware.estimator`).
+        No gyroscope measures it (see `perchctl.sim.firmware.estimator`); it does what `carry` does.
         """
-        R = rotation_from_rpy(*rpy_rad)
+        self._held, self._carried = hold, None
+        self._place(position_m, rotation_from_rpy(*rpy_rad), velocity_mps, (0.0, 0.0, 0.0))
+
+    def carry(self, stops: Sequence[Stop]) -> None:
+        """A hand takes it from where it is through all stops, and holds it at the last until
+        `let_go`. Its sensors feel all of it. Errors: InvalidValue."""
+        roll, pitch, yaw = rpy_from_rotation(rotation_from_quaternion(self.quaternion))
+        start = Stop(0.0, (self.x_m, self.y_m, self.z_m), (roll, pitch, yaw))
+        self._carried = (self.t_s, Way(start, stops))
+        self._held = True
+
+    def let_go(self) -> None:
+        """End what `set_pose(..., hold=True)` or `carry` began."""
+        self._held, self._carried = False, None
+
+    def _follow_hand(self) -> None:
+        if self._carried is None:
+            self._set_specific_force(0.0, 0.0, 0.0)
+            return
+        began_s, way = self._carried
+        now = way.at(self.t_s - began_s)
+        self._place(now.position_m, now.R, now.velocity_mps, now.rates_radps)
+        ax, ay, az = now.acceleration_mps2.tolist()
+        self._set_specific_force(ax, ay, az)
+
+    def _place(
+        self,
+        position_m: Sequence[float] | Array,
+        R: Array,
+        velocity_mps: Sequence[float] | Array,
+        rates_radps: Sequence[float] | Array,
+    ) -> None:
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
         self._data.qpos[:3] = position_m
         self._data.qpos[3:] = quaternion
         self._data.qvel[:3] = velocity_mps
-        self._data.qvel[3:] = 0.0
-        self._held = hold
+        self._data.qvel[3:] = rates_radps
         mujoco.mj_forward(self._model, self._data)
         self._read()
-
-    def let_go(self) -> None:
-        """End what `set_pose(..., hold=True)` began."""
-        self._held = False
 
     def _read(self) -> None:
         self.x_m, self.y_m, self.z_m, w, x, y, z = self._data.qpos.tolist()

@@ -11,6 +11,11 @@ lock never did, or, if it is as far away as the target was, after `REACQUIRE_S` 
 target was not seen, though its place is in the picture; and to any that was seen more often than
 a lock that is hardly begun. A lock that nothing has confirmed for `FORGET_S` is forgotten.
 
+One pose a picture is judged. While something is seen where the lock is, be it a lone marker of
+the size that is expected, the search (`perchctl.vision.markers.search.choose`) hands on that, and
+no whole target beside it: with or without `detector.window`. So a lock on a lone look-alike goes
+over to a whole target once the look-alike is out of sight, and not before.
+
 Where the state estimate jumps, the target seems to jump in the world, but not in the picture:
 a pose that goes on from the last one relative to the vehicle, though not in the world, is the
 target's, too.

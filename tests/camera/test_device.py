@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import pytest
+from typer.testing import CliRunner
 
 from perchctl.camera.computer import camera_number, cameras
 from perchctl.camera.controls import set_controls
@@ -24,6 +25,8 @@ from perchctl.camera.v4l2 import (
     open_driver,
     value_of,
 )
+from perchctl.cli import app
+from perchctl.commands import check_cameras
 from perchctl.commands.check_cameras import camera_lines, list_cameras
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
@@ -115,13 +118,18 @@ def test_one_that_may_not_be_opened_has_its_name_from_the_system(dev: Callable[.
     assert "Permission denied" in "\n".join(camera_lines(camera))
 
 
-def test_no_camera_at_all(dev: Callable[..., Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_camera_at_all(dev: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(NotFound, match="this computer has no camera"):
         camera_number("USB", Opener({}), dev(), dev)  # type: ignore[arg-type]
-    assert list_cameras(True, ()) == NotFound.exit_code
-    said = capsys.readouterr()
-    assert json.loads(said.out) == []
-    assert "has no camera" in said.err
+    with pytest.raises(NotFound, match="this computer has no camera"):
+        list_cameras(False, ())
+    monkeypatch.setattr(check_cameras, "cameras", lambda asked: [])
+    done = CliRunner().invoke(app, ["check", "--cameras", "--json"])
+    assert done.exit_code == NotFound.exit_code
+    said = json.loads(done.stdout)  # an object, as of every failure
+    assert said["exit_code"] == NotFound.exit_code
+    assert "has no camera" in said["error"]
+    assert "has no camera" in done.stderr
 
 
 def test_a_driver_that_is_not_there_is_an_os_error() -> None:

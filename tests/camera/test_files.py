@@ -264,6 +264,15 @@ def test_a_url_without_a_host_is_refused_and_its_password_not_shown(url: str) ->
     assert "sec" not in str(e.value)
 
 
+@pytest.mark.parametrize(("url", "found"), [
+    ("rtsp://lab:99999/a", "99999"), ("rtsp://lab:0/a", "0"), ("http://lab:abc/a", "abc"),
+    ("rtsp://lab:-1/a", "-1"),
+])  # fmt: skip
+def test_a_port_that_is_none_is_named(url: str, found: str) -> None:
+    with pytest.raises(InvalidValue, match=rf"has port {found}; allowed are 1 to 65535, as in"):
+        open_source(url, 0.0, None, clock)
+
+
 def test_gst_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("perchctl.camera.gst.has_gstreamer", lambda: False)
     with pytest.raises(InvalidValue, match=r"^gst: needs an OpenCV .* GStreamer.*rtsp://"):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from perchctl.camera.open import open_source
-from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting
+from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting, unresolved
 from perchctl.camera.source import LiveSource
 from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
 from perchctl.errors import NotFound, TimedOut
+from perchctl.profile import CameraConfig
 from tests.camera.test_live import WAIT_S, Clock, level, next_frame, wait_for
 from tests.helpers.rtsp import RtspServer, Step
 
@@ -21,14 +24,6 @@ def server() -> Iterator[RtspServer]:
     server = RtspServer()
     yield server
     server.close()
-
-
-@pytest.fixture
-def opened() -> Iterator[list[LiveSource]]:
-    sources: list[LiveSource] = []
-    yield sources
-    for source in sources:
-        source.close()
 
 
 def started(server: RtspServer, opened: list[LiveSource], who: str = "") -> RtspSource:
@@ -120,6 +115,40 @@ def test_nobody_listens(server: RtspServer) -> None:
     server.close()
     with pytest.raises(TimedOut, match=r"gave no picture in 5 attempts: connection refused"):
         open_source(server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S)
+
+
+def test_a_host_that_is_not_known_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """FFmpeg has an input/output error of it."""
+    with pytest.raises(TimedOut, match=r"the host name 'a\.\.b' cannot be resolved") as caught:
+        open_source("rtsp://me:secret@a..b/x", 0.0, None, Clock(), timeout_s=WAIT_S)
+    assert "secret" not in str(caught.value)
+
+    def unknown(*_: object) -> None:
+        raise socket.gaierror(-2, "Name or service not known")
+
+    assert unresolved("rtsp://127.0.0.1/x") == ""
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    told = unresolved("rtsp://me:secret@lab:554/x")
+    assert told.startswith("the host name 'lab' cannot be resolved (Name or service not known):")
+
+
+def test_what_only_a_driver_can_do_is_said_of_a_stream(server: RtspServer) -> None:
+    never = threading.Event()
+    wishes: list[tuple[dict[str, Any], str | None]] = [
+        ({}, None),
+        ({"format": "MJPG"}, "camera.format is not used with rtsp://127.0.0.1"),
+        ({"controls": {"gain": 1}, "format": "MJPG"}, "camera.format and camera.controls are not"),
+    ]
+    for asked, words in wishes:
+        server.scripts.put([*seconds(5, 60, 100), never])
+        told: list[str] = []
+        source = open_source(
+            server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S,
+            config=CameraConfig(**asked), tell=told.append,
+        )  # fmt: skip
+        source.close()
+        assert [words in sentence for sentence in told] == ([] if words is None else [True])
+        assert "secret" not in "".join(told)
 
 
 def test_closing_does_not_wait_for_a_stalled_stream(server: RtspServer) -> None:

@@ -1,8 +1,8 @@
 """From a hand to a refusal: the comparison names what is swapped, the record says so, and `fly`
 refuses with that name.
 
-The samples are recorded ones: a simulated vehicle that is put somewhere has no gyroscope that
-measures it, so its attitude does not follow a hand in real time.
+The samples are recorded ones; over the link and the capture's server a vehicle is lifted in
+`test_lift`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def test_what_the_hand_finds_is_what_fly_refuses(
 
     turn = axes_matrix(axes)
     lifted = recorded(world=turn, body=turn.T, config=config)
-    row = compared.kept(lifted, config, wall_date())
+    row = compared.kept(lifted, config, NOWHERE, wall_date())
     code, said = fly()
     if words is None:
         assert (lifted.verdict, row.verdict) == (Verdict.PASS, Verdict.PASS)

@@ -17,14 +17,34 @@ from perchctl.check import camera, health, session
 from perchctl.check.row import Row, Verdict
 from perchctl.check.session import Wanted, check
 from perchctl.commands.check import exit_code
+from perchctl.errors import UsageError, broken_motion_capture
 from perchctl.link.scan import Answering, address_of, scan
 from perchctl.profile import Profile
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.scenario import Scenario
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
+from tests.helpers.flights import short_profile
 from tests.helpers.relay import Relay
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
+
+
+# --- A motion capture whose library does not load -----------------------------------------
+
+
+def test_a_library_that_does_not_load_ends_the_check_as_it_ends_a_flight() -> None:
+    """It is the computer that lacks something: exit 2 with what to type, and no failed row."""
+    pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
+
+    def broken(config: PositioningConfig) -> Any:
+        raise broken_motion_capture("libvrpn.so.7: cannot open")
+
+    profile = short_profile({"positioning.by": "mocap", "positioning.host": "lab"})
+    wanted = Wanted(**QUICK, open_capture=broken)
+    with pytest.raises(UsageError, match="cannot be loaded: libvrpn") as refused:
+        next(check(options(NOWHERE, profile=profile), wanted))
+    assert refused.value.exit_code == 2
 
 
 # --- What goes out ----------------------------------------------------------------------

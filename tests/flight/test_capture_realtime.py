@@ -37,6 +37,9 @@ LATE_S = 0.25
 MOCAP = {"positioning.by": "mocap"}
 ASIDE = CaptureSettings(origin_m=(0.7, -0.5, 0.0))
 PHASE = "ALIGN"
+BLIND_ASIDE_M = 0.6
+"""Of 20 seeds in lockstep at most 0.22 m on the way down, begun within 0.1 m of the start; twice
+that, since positions on a busy computer are late, and the last ones set the speed."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,7 @@ def test_hidden_for_good_it_lands_and_says_why(tmp_path: Path) -> None:
     assert "does not see the rigid body 'crazyflie'" in it.stderr
     assert truth["floor_contact"]
     assert truth["motors"] == (0, 0, 0, 0)
-    assert math.hypot(*truth["position_m"][:2]) < 1.5  # blind on the way down
+    assert math.hypot(*truth["position_m"][:2]) < BLIND_ASIDE_M
 
 
 @pytest.mark.parametrize(

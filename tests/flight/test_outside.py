@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import unmeasured
-from perchctl.flight.outside import apart, strange, with_another_up
+from perchctl.flight.outside import AtRest, apart, strange, with_another_up
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission.state import Operator, Outcome
 from perchctl.positioning.feed import FeedStatus
@@ -60,6 +60,30 @@ def test_a_place_that_is_none_is_named(place: ExternalPosition, words: str | Non
     assert problem is not None
     assert re.search(words, problem.sentence)
     assert problem.advice
+
+
+def test_a_body_that_stands_out_of_the_target_s_reach_is_another_vehicle_s() -> None:
+    """Two vehicles in one room: the other one stands level, on the ground, two metres aside."""
+    own = MOCAP.target.model_copy(update={"expected_xy_m": (0.3, 0.0), "expected_within_m": 0.3})
+    profile = MOCAP.model_copy(update={"target": own})
+    assert strange(at(0.2, -0.5, 0.012), REST, profile) is None
+    assert strange(at(3.0, -0.5, 0.012), REST, MOCAP) is None, "nobody has said where it hangs"
+    problem = strange(at(3.0, -0.5, 0.012), REST, profile)
+    assert problem is not None
+    assert "2.7 m from where its target is expected" in problem.found
+    assert "another vehicle's" in problem.advice
+
+
+def test_a_body_that_goes_about_while_the_vehicle_stands_is_another_s() -> None:
+    def told(places: list[Any]) -> list[bool]:
+        at_rest = AtRest()
+        return [at_rest.strange(place, MOCAP) is not None for place in places]
+
+    walks = [at(0.02 * k, 0.0, 0.012) for k in range(8)]
+    assert told(walks) == [False] * 6 + [True] * 2
+    assert not any(told([at(0.004 * (k % 2), 0.0, 0.012) for k in range(100)])), "noise"
+    # What was carried there, or is not known for a while, begins anew.
+    assert not any(told([*walks[:4], None, *walks[4:]]))
 
 
 @given(st.sampled_from(TURNS), st.floats(-3.1, 3.1), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))

@@ -34,6 +34,8 @@ from perchctl.profile.positioning import PositioningConfig
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.scenario import Scenario
+from perchctl.vehicle import ExternalPosition, Telemetry
+from tests.helpers.mission import READY, telemetry
 
 CONFIG = PositioningConfig(by="mocap", body="crazyflie", connect_timeout_s=10.0)
 NO_DECK = Scenario(extra={"external_position": 1.0})
@@ -47,6 +49,41 @@ def until(true: Callable[[], Any], limit_s: float = 20.0) -> Any:
         assert time.monotonic() < end_s, "waited in vain"
         time.sleep(0.01)
     return value
+
+
+class Standing:
+    """Feed, link and clock in one, of a vehicle that stands while its body goes about."""
+
+    def __init__(self, speed_mps: float) -> None:
+        self.speed_mps, self.t_s = speed_mps, 100.0
+
+    def now(self) -> float:
+        return self.t_s
+
+    def wait_until(self, t_s: float) -> None:
+        self.t_s = t_s
+
+    def status(self, now_s: float) -> FeedStatus:
+        at = ExternalPosition((self.speed_mps * (now_s - 100.0), 0.0, 0.012), (1.0, 0.0, 0.0, 0.0))
+        return FeedStatus(0.01, None, 1, at, 100.0, at)
+
+    def telemetry(self) -> list[Telemetry]:
+        return [telemetry(self.t_s, 0.0, thrust=0.0, supervisor=READY)]
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 0.5])
+def test_a_body_that_moves_while_the_vehicle_stands_is_refused_before_it_is_used(
+    speed_mps: float,
+) -> None:
+    it: Any = Standing(speed_mps)
+    refused = contextlib.nullcontext()
+    if speed_mps:
+        refused = pytest.raises(
+            SafetyAbort, match=r"moved by 0\.1\d m in the motion capture, and th"
+        )
+    with refused:
+        positions._refuse_strange(it, it, it, load_profile("sim"))
+    assert (it.t_s - 100.0 > 0.4) is (speed_mps == 0.0)
 
 
 @pytest.fixture

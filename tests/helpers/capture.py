@@ -9,6 +9,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from perchctl.geometry import Array
+from perchctl.link.claim import vehicle_of
 from perchctl.positioning.compared import Compared, keep
 from perchctl.profile.positioning import PositioningConfig
 
@@ -37,8 +38,13 @@ def named_up(turn: Array) -> str:
 
 
 def compared(
-    config: PositioningConfig, *, ago_s: float = 0.0, passed: bool = True, found: str = "it turns"
+    config: PositioningConfig,
+    uri: str,
+    *,
+    ago_s: float = 0.0,
+    passed: bool = True,
+    found: str = "it turns",
 ) -> None:
     """As if `perchctl check --lift` had found that, so long ago."""
     at = datetime.now(UTC) - timedelta(seconds=ago_s)
-    assert keep(config, Compared(at, passed, found)) is None
+    assert keep(config, vehicle_of(uri), Compared(at, passed, found)) is None

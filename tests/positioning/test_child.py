@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 
@@ -28,6 +28,51 @@ def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.M
     assert ended.wait(5.0)
     thread.join()
     own.close()
+
+
+class Parent:
+    """Gives the setup, and takes what is said."""
+
+    def __init__(self, setup: child.CaptureSetup, gone: bool = False) -> None:
+        self.setup, self.gone, self.said = setup, gone, list[Any]()
+
+    def receive(self, timeout_s: float) -> child.CaptureSetup:
+        return self.setup
+
+    def send(self, message: Any) -> None:
+        if self.gone:
+            raise BrokenPipeError
+        self.said.append(message)
+
+
+@pytest.mark.parametrize(("host", "raised", "words"), [
+    ("lab", socket.gaierror(-2, "Name or service not known"),
+     "the host name 'lab' cannot be resolved (Name or service not known): correct"),
+    ("a..b", UnicodeError("label empty or too long"), "'a..b' cannot be resolved (it is no host"),
+])  # fmt: skip
+def test_a_host_that_cannot_be_resolved_is_named(
+    host: str, raised: Exception, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def resolve(name: str) -> str:
+        raise raised
+
+    parent = Parent(child.CaptureSetup("optitrack", {"hostname": host}))
+    monkeypatch.setattr(child, "connect_back", lambda: parent)
+    monkeypatch.setattr(child, "_loaded", lambda: None)
+    monkeypatch.setattr(child.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(child.socket, "gethostbyname", resolve)
+    child.serve_parent()
+    (said,) = parent.said
+    assert isinstance(said, child.Failed)
+    assert words in said.text
+
+
+def test_a_parent_that_is_gone_is_left_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    parent = Parent(child.CaptureSetup("vicon", {"hostname": "lab"}), gone=True)
+    monkeypatch.setattr(child, "connect_back", lambda: parent)
+    monkeypatch.setattr(child, "_loaded", lambda: lambda kind, options: None)
+    monkeypatch.setattr(child.signal, "signal", lambda *_: None)
+    child.serve_parent()
 
 
 class Clock:

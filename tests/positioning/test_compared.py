@@ -24,6 +24,8 @@ from tests.helpers.capture import compared as was_compared
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
 NOW = datetime(2026, 11, 22, 15, 0, tzinfo=timezone(timedelta(hours=2)))
+URI, OTHER_URI = "udp://127.0.0.1:1", "udp://127.0.0.1:2"
+VEHICLE, OTHER = "udp/127.0.0.1:1", "udp/127.0.0.1:2"
 SWAPPED = "swapped axes: up is y in the motion capture"
 DAY_S = 24 * 3600.0
 OTHERS: list[dict[str, Any]] = [
@@ -76,7 +78,7 @@ def test_each_objection_says_what_is_and_what_to_do(
 
 @given(st.text(), st.booleans(), st.datetimes(datetime(2001, 1, 1), datetime(2900, 1, 1)))
 def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None:
-    set_up = compared.set_up_of(CONFIG)
+    set_up = compared.set_up_of(CONFIG, VEHICLE)
     record = Compared(at.replace(tzinfo=UTC), passes, found)
     back = decoded(encoded(set_up, record), set_up)
     assert (back.at, back.passed) == (record.at, passes)
@@ -93,28 +95,55 @@ def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None
 ).map(lambda value: json.dumps(value).encode())))  # fmt: skip
 def test_what_is_no_record_is_told_as_such(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is damaged|is of another set-up"):
-        decoded(data, compared.set_up_of(CONFIG))
+        decoded(data, compared.set_up_of(CONFIG, VEHICLE))
 
 
 @pytest.mark.parametrize("change", OTHERS)
 def test_another_set_up_was_never_compared(change: dict[str, Any], folder: Path) -> None:
-    was_compared(CONFIG)
+    was_compared(CONFIG, URI)
     other = CONFIG.model_copy(update=change)
-    assert compared.newest(other) is None
+    assert compared.newest(other, VEHICLE) is None
     # Nor by a file that was copied to its place.
-    (mine, theirs) = (compared.path_of(compared.set_up_of(c)) for c in (CONFIG, other))
+    (mine, theirs) = (compared.path_of(compared.set_up_of(c, VEHICLE)) for c in (CONFIG, other))
     theirs.write_bytes(mine.read_bytes())
-    assert isinstance(compared.newest(other), Unreadable)
+    assert isinstance(compared.newest(other, VEHICLE), Unreadable)
+
+
+def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
+    """Two vehicles with the same body's name by turns."""
+    was_compared(CONFIG, OTHER_URI)
+    with pytest.raises(SafetyAbort) as refused:
+        positions.check_compared(CONFIG, URI, simulated=False)
+    said = str(refused.value)
+    assert f"compared with another vehicle ({OTHER}), and never with this one ({VEHICLE})" in said
+    assert "run perchctl check --lift" in said
+    positions.check_compared(CONFIG, OTHER_URI, simulated=False)
+    # Nor by a file that was copied to its place; what is damaged beside it is no vehicle.
+    (mine, theirs) = (compared.path_of(compared.set_up_of(CONFIG, v)) for v in (VEHICLE, OTHER))
+    mine.write_bytes(theirs.read_bytes())
+    assert isinstance(compared.newest(CONFIG, VEHICLE), Unreadable)
+    mine.unlink()
+    theirs.write_bytes(b"{")
+    assert compared.newest(CONFIG, VEHICLE) is None
+    was_compared(CONFIG.model_copy(update={"host": "lab2"}), OTHER_URI)
+    assert compared.newest(CONFIG, VEHICLE) is None
+
+
+def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:
+    was_compared(CONFIG, "radio://0/80/2M/E7E7E7E701")
+    positions.check_compared(CONFIG, "radio://1/80/2M/e7e7e7e701", simulated=False)
+    with pytest.raises(SafetyAbort, match="another vehicle"):
+        positions.check_compared(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
 
 
 def test_what_says_nothing_of_the_axes_is_no_other_set_up() -> None:
-    was_compared(CONFIG)
+    was_compared(CONFIG, URI)
     same = CONFIG.model_copy(update={"rate_hz": 50.0, "send": "pose", "hold_s": 0.2})
-    assert isinstance(compared.newest(same), Compared)
+    assert isinstance(compared.newest(same, VEHICLE), Compared)
 
 
 def spoil(how: str) -> None:
-    path = compared.path_of(compared.set_up_of(CONFIG))
+    path = compared.path_of(compared.set_up_of(CONFIG, VEHICLE))
     if how == "folder":
         path.unlink()
         path.mkdir()
@@ -129,11 +158,11 @@ def spoil(how: str) -> None:
 
 @pytest.mark.parametrize("how", ["empty", "cut", "huge", "no zone", "deep", "folder", "of old"])
 def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
-    was_compared(CONFIG)
-    positions.check_compared(CONFIG, simulated=False)
+    was_compared(CONFIG, URI)
+    positions.check_compared(CONFIG, URI, simulated=False)
     spoil(how)
     with pytest.raises(SafetyAbort, match=r"is not known: .*remove that file") as refused:
-        positions.check_compared(CONFIG, simulated=False)
+        positions.check_compared(CONFIG, URI, simulated=False)
     assert "\n" not in str(refused.value)
 
 
@@ -144,31 +173,31 @@ def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
     failed("lifted", SWAPPED, ""), warned("lifted", "about too few axes to tell all", ""),
 ])  # fmt: skip
 def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
-    was_compared(CONFIG)
-    row = check_compared.kept(lifted, CONFIG, positions.wall_date())
+    was_compared(CONFIG, URI)
+    row = check_compared.kept(lifted, CONFIG, URI, positions.wall_date())
     assert row.verdict is Verdict.WARN
     with pytest.raises(SafetyAbort, match=lifted.found):
-        positions.check_compared(CONFIG, simulated=False)
-    again = check_compared.kept(passed("lifted", "fine"), CONFIG, positions.wall_date())
+        positions.check_compared(CONFIG, URI, simulated=False)
+    again = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, positions.wall_date())
     assert again.verdict is Verdict.PASS
-    positions.check_compared(CONFIG, simulated=False)
+    positions.check_compared(CONFIG, URI, simulated=False)
 
 
 def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
-    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, positions.wall_date())
+    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, positions.wall_date())
     assert "was never compared" in row.found
-    was_compared(CONFIG)
-    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, positions.wall_date())
+    was_compared(CONFIG, URI)
+    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, positions.wall_date())
     assert row.verdict is Verdict.PASS
 
 
 def test_a_record_that_cannot_be_written_warns(folder: Path) -> None:
     folder.write_text("in the way", encoding="utf-8")
-    row = check_compared.kept(passed("lifted", "fine"), CONFIG, positions.wall_date())
+    row = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, positions.wall_date())
     assert row.verdict is Verdict.WARN
     assert "not written" in row.found
     with pytest.raises(SafetyAbort):
-        positions.check_compared(CONFIG, simulated=False)
+        positions.check_compared(CONFIG, URI, simulated=False)
 
 
 @pytest.mark.parametrize("removable", [True, False])
@@ -178,23 +207,23 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    was_compared(CONFIG)
+    was_compared(CONFIG, URI)
     monkeypatch.setattr(compared, "write_files", full)
     if not removable:
         monkeypatch.setattr(Path, "unlink", full)
-    row = check_compared.kept(failed("lifted", SWAPPED, ""), CONFIG, positions.wall_date())
+    row = check_compared.kept(failed("lifted", SWAPPED, ""), CONFIG, URI, positions.wall_date())
     assert row.verdict is (Verdict.WARN if removable else Verdict.FAIL)
     assert "No space left" in row.found
     if removable:
         with pytest.raises(SafetyAbort, match="never compared"):
-            positions.check_compared(CONFIG, simulated=False)
+            positions.check_compared(CONFIG, URI, simulated=False)
 
 
 def test_decks_and_the_simulator_s_own_room_ask_for_none() -> None:
     deck = CONFIG.model_copy(update={"by": "deck"})
     for config, simulated in ((deck, False), (CONFIG, True)):
-        positions.check_compared(config, simulated=simulated)
-        assert check_compared.rows(config, NOW, simulated=simulated) == []
+        positions.check_compared(config, URI, simulated=simulated)
+        assert check_compared.rows(config, URI, NOW, simulated=simulated) == []
 
 
 # --- `fly` -------------------------------------------------------------------------------
@@ -208,7 +237,7 @@ positioning: {by: mocap, system: vicon, host: lab, body: cf2}
 def fly(tmp_path: Path, *words: str) -> Result:
     profile = tmp_path / "lab.yaml"
     profile.write_text(LAB, encoding="utf-8")
-    where = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x")
+    where = ("-u", URI, "--source", "http://127.0.0.1:1/x")
     logs = ("--log-dir", str(tmp_path / "logs"))
     done = CliRunner().invoke(app, ["fly", "-p", str(profile), *where, *logs, *words])
     assert "Traceback" not in done.output
@@ -224,7 +253,7 @@ def test_fly_refuses_before_it_asks_connects_or_logs(
     record: dict[str, Any] | None, words: str, tmp_path: Path
 ) -> None:
     if record is not None:
-        was_compared(CONFIG, **record)
+        was_compared(CONFIG, URI, **record)
     for sure in ((), ("--yes",)):
         done = fly(tmp_path, *sure)
         assert done.exit_code == 52, done.output
@@ -239,7 +268,7 @@ def test_fly_refuses_before_it_asks_connects_or_logs(
 
 
 def test_fly_goes_on_where_it_was_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    was_compared(CONFIG, ago_s=3600.0)
+    was_compared(CONFIG, URI, ago_s=3600.0)
     plan = " ".join(fly(tmp_path, "--dry-run").stdout.split())
     assert "compared by hand on" in plan
     assert "fly refuses" not in plan

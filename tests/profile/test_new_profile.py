@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import shlex
 import tempfile
@@ -21,6 +22,7 @@ from perchctl.cli import app
 from perchctl.commands.new_profile import NewProfileRequest, run
 from perchctl.commands.new_profile_answers import QUESTIONS, WRITTEN
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
+from perchctl.files import mode_of
 from perchctl.profile import find_calibration, load_profile
 from perchctl.profile.keys import keys
 from perchctl.profile.picture import EDGES, edges_beside, edges_of
@@ -237,6 +239,16 @@ def test_nobody_to_ask_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Monke
     ) as caught:
         run(NewProfileRequest(tmp_path / "m.yaml", given))
     assert "--uri" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o002, 0o664), (0o077, 0o600)])
+def test_who_may_read_it_is_up_to_the_umask(umask: int, mode: int, tmp_path: Path) -> None:
+    before = os.umask(umask)
+    try:
+        run(NewProfileRequest(tmp_path / "mine.yaml", defaults=True))
+    finally:
+        os.umask(before)
+    assert mode_of(tmp_path / "mine.yaml") == mode
 
 
 def test_a_file_that_exists_is_kept_without_force(tmp_path: Path) -> None:

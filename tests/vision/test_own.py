@@ -205,6 +205,19 @@ def test_a_whole_target_elsewhere_does_not_stand_in_for_the_own_one() -> None:
     assert near["small"] is small[0]
 
 
+def test_a_lone_look_alike_goes_before_a_whole_target_until_it_is_out_of_sight() -> None:
+    """As the gate says of it: with the whole picture searched both are seen, and one is told."""
+    whole = {"large": [box(400, 200, 60)], "small": [box(400, 200, 10)]}
+    lone = {"large": box(104, 98, 60)}
+    both = {"large": [box(100, 100, 60), *whole["large"]], "small": whole["small"]}
+    assert list(choose(both, lone, 1 / 6)) == ["large"]
+    assert choose(both, lone, 1 / 6)["large"] is both["large"][0]
+    assert choose(whole, lone, 1 / 6) == {"large": whole["large"][0], "small": whole["small"][0]}
+    # Not a look-alike of another size: that goes on from nothing.
+    other = {"large": [box(100, 100, 20), *whole["large"]], "small": whole["small"]}
+    assert choose(other, lone, 1 / 6)["large"] is whole["large"][0]
+
+
 def test_nothing_is_between_two_targets() -> None:
     """A frame's two fields, of which each shows another one."""
     fields = [

@@ -12,6 +12,7 @@ import math
 import subprocess
 import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, get_args
@@ -29,6 +30,7 @@ from perchctl.children import (
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
+from perchctl.sim.carried import Stop
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.control import LINGER_S, START_TIMEOUT_S, HostSetup, Pace
 from perchctl.sim.scenario import Scenario
@@ -158,6 +160,10 @@ class SimProcess:
         self._ask(
             "set_pose", position_m=position_m, rpy_rad=rpy_rad, velocity_mps=velocity_mps, hold=hold
         )
+
+    def carry(self, stops: Sequence[Stop]) -> None:
+        """A hand takes it through all stops, and holds it at the last until `let_go`."""
+        self._ask("carry", stops=tuple(stops))
 
     def let_go(self) -> None:
         self._ask("let_go")

@@ -52,6 +52,7 @@ class Runner:
             "advance": self._advance,
             "truth": host.truth,
             "set_pose": self._set_pose,
+            "carry": lambda stops: host.vehicle.world.carry(stops),
             "let_go": lambda: host.vehicle.world.let_go(),
             "silence": lambda duration_s: host.endpoint.silence(host.elapsed_s, duration_s),
             "reboot": host.server.reboot,

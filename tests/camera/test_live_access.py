@@ -1,0 +1,147 @@
+"""Motion-JPEG behind certificates, redirects, names and passwords."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from perchctl.camera.mjpeg import MjpegSource
+from perchctl.camera.open import open_source
+from perchctl.camera.source import LiveSource
+from perchctl.errors import NotFound
+from tests.camera.test_live import Server, jpeg, part, stream
+from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    server = Server()
+    yield server
+    server.close()
+
+
+def test_a_certificate_that_nobody_vouches_for(
+    server: Server, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pem = Path(__file__).parents[1] / "helpers" / "loopback.pem"  # for 127.0.0.1 and 100 years
+    server.encrypt(pem)
+    url = server.url.replace("http://", "https://me:secret@")
+    with pytest.raises(NotFound, match=r"is not trusted \(self.signed.*SSL_CERT_FILE") as caught:
+        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    assert "secret" not in str(caught.value)
+    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = MjpegSource(url, 0.0, Clock())
+    opened.append(source)
+    assert level(next_frame(source)) == 60
+
+
+def test_it_follows_a_redirect(server: Server, opened: list[LiveSource]) -> None:
+    server.redirect_first = "/elsewhere.mjpg?x=1"
+    server.scripts.put([])
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    assert level(next_frame(stream(server, Clock(), opened))) == 60
+    assert server.paths == ["/stream.mjpg", "/elsewhere.mjpg?x=1"]
+
+
+def test_user_and_password_of_the_url_are_sent(server: Server, opened: list[LiveSource]) -> None:
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    url = server.url.replace("http://", "http://me:p%40ss@")
+    server.challenges = ['Basic realm="camera"']
+    source = MjpegSource(url, 0.0, Clock())
+    opened.append(source)
+    next_frame(source)
+    assert server.authorization == [None, "Basic bWU6cEBzcw=="], "once it is asked for"
+    assert "p%40ss" not in source.describe()
+
+
+DIGEST = ['Basic realm="camera"', 'Digest realm="camera", nonce="n1", qop="auth,auth-int"']
+
+
+def test_digest_is_preferred_and_kept_for_the_next_connection(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    server.challenges = DIGEST
+    server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(100)), threading.Event()])
+    url = server.url.replace("http://", "http://me:secret@")
+    source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
+    opened.append(source)
+    wait_for(lambda: len(server.authorization) == 3)
+    assert server.authorization[0] is None
+    kept = [str(each) for each in server.authorization[1:]]
+    assert all(each.startswith('Digest username="me", realm="camera"') for each in kept)
+    assert [each[-len("nc=00000001") :] for each in kept] == ["nc=00000001", "nc=00000002"]
+    assert all("secret" not in each for each in kept)
+
+
+def test_a_nonce_that_is_too_old_is_changed(server: Server, opened: list[LiveSource]) -> None:
+    server.challenges = DIGEST
+    server.scripts.put([part(jpeg(60))])
+    server.scripts.put([part(jpeg(100)), threading.Event()])
+    source = MjpegSource(
+        server.url.replace("http://", "http://me:secret@"), 0.0, Clock(), reconnect_wait_s=0.05
+    )
+    opened.append(source)
+    wait_for(lambda: len(server.authorization) == 2)
+    server.challenges = ['Digest realm="camera", nonce="n2", stale=true, qop="auth"']
+    server.nonce = "n2"
+    wait_for(lambda: source._count == 2)
+    assert 'nonce="n2"' in str(server.authorization[-1])
+
+
+def test_a_camera_that_forbids_the_nameless_without_asking_gets_the_name(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    server.refusal = 403
+    server.scripts.put([part(jpeg(60)), threading.Event()])
+    source = MjpegSource(server.url.replace("http://", "http://me:p%40ss@"), 0.0, Clock())
+    opened.append(source)
+    assert level(next_frame(source)) == 60
+    assert server.authorization == [None, "Basic bWU6cEBzcw=="]
+
+
+@pytest.mark.parametrize("who", ["", "me:wrong@"])
+def test_one_that_forbids_it_for_good_is_told_at_once(server: Server, who: str) -> None:
+    server.status = 403
+    with pytest.raises(NotFound, match="403"):
+        open_source(
+            server.url.replace("http://", f"http://{who}"), 0.0, None, Clock(), timeout_s=WAIT_S
+        )
+    assert len(server.authorization) == (2 if who else 1)
+
+
+@pytest.mark.parametrize(("challenges", "who", "sentence"), [
+    (DIGEST, "", "it wants a name and a password, as in http://NAME:PASSWORD@HOST/PATH"),
+    (DIGEST, "me:wrong@", "check the name and the password in the URL"),
+    (["Negotiate"], "me:secret@", "asks for no basic or digest authentication"),
+])  # fmt: skip
+def test_who_may_not_see_it_is_told_at_once(
+    server: Server, challenges: list[str], who: str, sentence: str
+) -> None:
+    server.challenges, server.nonce = challenges, "none of mine"
+    url = server.url.replace("http://", f"http://{who}")
+    with pytest.raises(NotFound, match=f"401.*{sentence}") as caught:
+        open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+    assert "wrong" not in str(caught.value)
+    assert len(server.authorization) <= 3
+
+
+def test_name_and_password_do_not_go_to_another_host(
+    server: Server, opened: list[LiveSource]
+) -> None:
+    other = Server()
+    try:
+        other.challenges = ['Basic realm="camera"']
+        server.redirect_first = other.url
+        url = server.url.replace("http://", "http://me:secret@")
+        source = MjpegSource(url, 0.0, Clock(), reconnect_wait_s=0.0)
+        opened.append(source)
+        wait_for(lambda: source.problem(100.0) is not None)
+        assert other.authorization == [None]
+        assert "401" in str(source.problem(100.0))
+    finally:
+        other.close()

@@ -1,0 +1,143 @@
+"""`check --lift` whole: a simulated vehicle is carried and turned by a hand, cflib listens to it,
+and the library that reads a lab's system to its motion capture."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
+
+from perchctl.check import compared, hand
+from perchctl.check.row import Row, Verdict
+from perchctl.check.session import Wanted, check
+from perchctl.errors import SafetyAbort
+from perchctl.flight.positions import check_compared
+from perchctl.profile import Profile
+from perchctl.sim.capture.settings import (
+    MILLIMETRES,
+    SWAPPED_XY,
+    Y_UP,
+    CaptureFault,
+    CaptureSettings,
+)
+from perchctl.sim.carried import Stop, lifted_and_turned
+from perchctl.sim.draw import draw_scenario
+from perchctl.sim.process.handle import SimProcess
+from tests.helpers.checks import QUICK, options, wait_for
+from tests.helpers.flights import short_profile
+
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("elsewhere")]
+
+HOME = (0.0, 0.0, 0.012)
+TRIES, MOST_BEHIND_S = 3, 0.1
+UNTIL_BACK_S, WHOLE_S = 25.0, 8.0
+"""It ends by itself once all was seen; where that never comes, the first seconds tell as well."""
+
+
+@pytest.fixture(scope="module")
+def sim() -> Iterator[SimProcess]:
+    """A vehicle without a deck in a room with a motion capture, in which nobody films."""
+    profile = short_profile({"positioning.by": "mocap"})
+    settings = CaptureSettings(origin_m=(0.7, -0.5, 0.0), heading_rad=0.6)
+    with SimProcess.start(draw_scenario(profile, 3), capture=settings) as started:
+        yield started
+
+
+@dataclass(frozen=True)
+class Lab:
+    """What somebody would have in front of them."""
+
+    sim: SimProcess
+    profile: Profile
+
+    def lift(self, within_s: float) -> dict[str, Row]:
+        """Each row by its name. A vehicle whose time stood still meanwhile, as on a computer that
+        is busy, has told nothing: once more, then."""
+        for _ in range(TRIES):
+            began_s, began_t_s = time.monotonic(), self.sim.truth()["t_s"]
+            rows = self._lifted(within_s)
+            lasted_s = time.monotonic() - began_s
+            if lasted_s - (self.sim.truth()["t_s"] - began_t_s) < MOST_BEHIND_S:
+                return rows
+        pytest.skip("this computer is too busy for a vehicle in real time")
+
+    def _lifted(self, within_s: float) -> dict[str, Row]:
+        """The hand takes it when the command says so."""
+
+        def tell(text: str) -> None:
+            if hand.HOW in text:
+                self.sim.carry(lifted_and_turned(HOME))
+
+        self._put_down()
+        quick = Wanted(**QUICK)
+        wanted = replace(quick, lift=True, lift_s=within_s, listen_s=0.5, capture_s=0.5, tell=tell)
+        found = check(options(self.sim.uri, profile=self.profile), wanted)
+        return {row.name: row for row in found}
+
+    def _put_down(self) -> None:
+        """By a hand, too: what is put somewhere else no gyroscope follows."""
+        self.sim.carry([Stop(0.5, HOME)])
+        end_s = time.monotonic() + 20.0
+        while math.dist(self.sim.truth()["position_m"], HOME) > 1e-3:
+            assert time.monotonic() < end_s
+            time.sleep(0.02)
+        wait_for(self.sim, 0.5)
+
+    def may_fly(self) -> None:
+        """Raises SafetyAbort."""
+        check_compared(self.profile.positioning, self.sim.uri, simulated=False)
+
+
+def lab(sim: SimProcess, **changes: Any) -> Lab:
+    assert sim.capture is not None
+    system, host = sim.capture
+    at = {"by": "mocap", "system": system, "host": host} | changes
+    return Lab(sim, short_profile({f"positioning.{key}": value for key, value in at.items()}))
+
+
+@pytest.fixture(autouse=True)
+def no_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+
+def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProcess) -> None:
+    it = lab(sim)
+    with pytest.raises(SafetyAbort, match="never compared"):
+        it.may_fly()
+    rows = it.lift(UNTIL_BACK_S)
+    lifted = rows[hand.NAME]
+    assert lifted.verdict is Verdict.PASS, lifted
+    assert "turns as the vehicle does" in lifted.found
+    assert rows["body place"].verdict is Verdict.PASS
+    assert rows[compared.NAME].verdict is Verdict.PASS
+    it.may_fly()
+
+
+@pytest.mark.parametrize(("fault", "body", "within_s", "words"), [
+    (CaptureFault(axes=Y_UP), "crazyflie", UNTIL_BACK_S, "swapped axes: up is y"),
+    (CaptureFault(axes=SWAPPED_XY), "crazyflie", UNTIL_BACK_S, "axes are turned by 90 deg"),
+    (CaptureFault(scale=MILLIMETRES), "crazyflie", WHOLE_S, "these look like millimetres"),
+    (None, "wand", WHOLE_S, "the vehicle moves, and the rigid body 'wand' stands still"),
+])  # fmt: skip
+def test_what_is_set_up_wrong_is_named_and_not_flown_by(
+    sim: SimProcess, fault: CaptureFault | None, body: str, within_s: float, words: str
+) -> None:
+    it = lab(sim, body=body)
+    if fault is not None:
+        sim.capture_fault(fault)
+    try:
+        rows = it.lift(within_s)
+    finally:
+        sim.capture_fault(None)
+    assert rows[hand.NAME].verdict is Verdict.FAIL, rows[hand.NAME]
+    assert words in rows[hand.NAME].found
+    with pytest.raises(SafetyAbort, match="found by check --lift on"):
+        it.may_fly()

@@ -1,0 +1,158 @@
+"""A capture in another world: what goes astray by it comes down level, by thrust alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from perchctl.mission import planner
+from perchctl.mission.state import Phase
+from perchctl.vehicle import RawThrust, StopMotors
+from tests.helpers.mission import (
+    AIRBORNE,
+    HOVER_THRUST,
+    PROFILE,
+    READY,
+    observation,
+    state_in,
+    target_at,
+    telemetry,
+)
+from tests.mission.test_positions import BEGIN_S, MOCAP, TURN_S, times
+
+
+@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.015, -0.015])
+@pytest.mark.parametrize("hover", [42000.0, 55000.0])
+def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
+    hover: float, felt_too_much_g: float
+) -> None:
+    """A world with its y up: the vehicle rises, its position slides, its height and its vertical
+    speed stand. It is let down by what its accelerometer feels, one with an offset too."""
+    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
+    z_m, up_mps, thrust, highest_m = 0.0, 0.0, 1.15 * hover, 0.0
+    for t_s in times(5.0):
+        acc_g = thrust / hover
+        up_mps += 9.81 * (acc_g - 1.0) * TURN_S
+        z_m += up_mps * TURN_S
+        highest_m = max(highest_m, z_m)
+        tel = telemetry(
+            t_s, position_m=(0.0, z_m, 0.0), velocity_mps=(0.0, up_mps, 0.0), thrust=thrust,
+            acc_z_g=acc_g + felt_too_much_g,
+        )  # fmt: skip
+        obs = observation(t_s, telemetry=tel, target=target_at(t_s, body_m=tel.position_m))
+        state, command = planner.step(state, obs, MOCAP)
+        if isinstance(command, RawThrust):
+            thrust = float(command.thrust)
+        if z_m <= 0.0:
+            break
+    assert (state.phase, state.row) == (Phase.LANDING, "position-astray")
+    assert "perchctl check --lift" in state.reason
+    assert z_m <= 0.0
+    assert -0.9 < up_mps < 0.0
+    assert highest_m < 0.3
+
+
+def test_what_is_astray_and_unfelt_for_a_moment_keeps_the_speed_that_it_had() -> None:
+    """A gap in telemetry tells nothing: neither that it stands still nor the estimate's speed."""
+    state = replace(
+        state_in(Phase.LANDING), astray=True, heading_lost=True, row="position-astray",
+        felt_mps=-0.4, last=telemetry(10.0),
+    )  # fmt: skip
+    tel = telemetry(10.3, velocity_mps=(0.0, 0.0, 0.8))
+    after, _ = planner.step(state, observation(10.3, telemetry=tel), MOCAP)
+    assert after.felt_mps == -0.4
+    again, _ = planner.step(
+        after, observation(10.32, telemetry=telemetry(10.32, acc_z_g=1.1)), MOCAP
+    )
+    assert -0.4 < again.felt_mps < -0.38
+
+
+def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
+    """On the floor, by a height that says 0.6 m: the motors are stopped all the same, in time."""
+    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
+    thrust = 60000.0
+    for t_s in times(14.0):
+        down = t_s > BEGIN_S + 2.0
+        body_m = (0.0, 0.2, 0.6 if down else 0.0)
+        tel = telemetry(
+            t_s, position_m=body_m, thrust=thrust, supervisor=READY if thrust == 0 else AIRBORNE
+        )
+        obs = observation(t_s, telemetry=tel, target=None)
+        state, command = planner.step(state, obs, MOCAP)
+        if isinstance(command, RawThrust):
+            thrust = float(command.thrust)
+        elif isinstance(command, StopMotors):
+            thrust = 0.0
+        if planner.is_over(state):
+            break
+    assert state.phase is Phase.LANDED
+
+
+@pytest.mark.parametrize("profile", [PROFILE, MOCAP])
+def test_only_positions_from_outside_go_astray(profile: Any) -> None:
+    tel = telemetry(10.02, position_m=(0.2, 0.0, 0.02))
+    state, _ = planner.step(
+        state_in(Phase.APPROACH, z_m=0.2), observation(10.02, telemetry=tel), profile
+    )
+    assert (state.phase is Phase.LANDING) is (profile is MOCAP)
+
+
+@pytest.mark.parametrize(("phase", "z_m", "aside_m", "lands"), [
+    (Phase.APPROACH, 0.02, 0.08, False), (Phase.APPROACH, 0.2, 0.2, False),
+    (Phase.APPROACH, 0.2, 0.3, True), (Phase.ALIGN, 1.0, 0.6, False), (Phase.ALIGN, 1.0, 0.9, True),
+    (Phase.SEARCH, 0.5, 0.15, False), (Phase.SEARCH, 0.5, 0.3, True),
+    (Phase.ESTIMATE, 0.5, 0.3, True),
+    (Phase.LANDING, 1.0, 0.3, False), (Phase.LANDING, 1.0, 0.5, True),
+])  # fmt: skip
+def test_a_draught_is_not_another_world(
+    phase: Phase, z_m: float, aside_m: float, lands: bool
+) -> None:
+    tel = telemetry(10.02, position_m=(aside_m, 0.0, z_m))
+    obs = observation(10.02, telemetry=tel)
+    state, _ = planner.step(state_in(phase, z_m=z_m), obs, MOCAP)
+    assert (state.row == "position-astray") is lands
+
+
+def test_what_has_touched_the_ceiling_is_left_to_its_landing() -> None:
+    """The magnet may hold it aside of its setpoint: that is no other world."""
+    begin = replace(state_in(Phase.LANDING, z_m=1.0), contact_z_m=1.0)
+    obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 1.0)))
+    state, _ = planner.step(begin, obs, MOCAP)
+    assert state.row != "position-astray"
+
+
+def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
+    begin = replace(state_in(Phase.LANDING, z_m=0.5), reason="camera.mount", row="mounting")
+    obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 0.5)))
+    state, command = planner.step(begin, obs, MOCAP)
+    assert isinstance(command, RawThrust)
+    assert state.astray
+    assert "swapped axes" in state.reason
+
+
+@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.02, -0.02])
+@pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
+def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: float) -> None:
+    """Axes swapped in the plane alone: the estimate's vertical speed is its own, and corrects
+    what an accelerometer's offset would sum up to on the longer way."""
+    state = state_in(Phase.ALIGN, z_m=height_m)
+    z_m, up_mps, thrust = height_m, 0.0, state.hover_thrust
+    for t_s in times(9.0):
+        acc_g = thrust / HOVER_THRUST
+        up_mps += 9.81 * (acc_g - 1.0) * TURN_S
+        z_m += up_mps * TURN_S
+        aside_m = 2.0 * (t_s - BEGIN_S)
+        tel = telemetry(
+            t_s, position_m=(aside_m, 0.0, z_m), velocity_mps=(2.0, 0.0, up_mps), thrust=thrust,
+            acc_z_g=acc_g + felt_too_much_g,
+        )  # fmt: skip
+        state, command = planner.step(state, observation(t_s, telemetry=tel, target=None), MOCAP)
+        if isinstance(command, RawThrust):
+            thrust = float(command.thrust)
+        if z_m <= 0.0:
+            break
+    assert state.row == "position-astray"
+    assert z_m <= 0.0
+    assert -1.0 < up_mps < 0.0

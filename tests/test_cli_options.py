@@ -1,0 +1,102 @@
+"""Options that would not be heeded are refused, and notes on the profile are told once."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.cli.app import reported
+from perchctl.errors import InvalidValue, ProfileNote
+from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
+
+
+def test_a_note_on_the_profile_is_one_sentence_once(capsys: pytest.CaptureFixture[str]) -> None:
+    """Other warnings are left to those who show them: here to pytest, else to Python."""
+
+    def warn() -> None:
+        with reported():
+            for key in ("a", "b", "a"):
+                warnings.warn(f"mine.yaml: {key} has another name", ProfileNote, stacklevel=1)
+            warnings.warn("something else", DeprecationWarning, stacklevel=1)
+
+    with pytest.warns(DeprecationWarning, match="something else") as others:
+        warn()
+    assert len(others) == 1
+    assert capsys.readouterr().err == (
+        "perchctl: mine.yaml: a has another name\nperchctl: mine.yaml: b has another name\n"
+    )
+    with pytest.raises(ProfileNote):
+        warnings.warn("an error again behind it", ProfileNote, stacklevel=1)
+
+
+def test_a_note_stands_before_the_sentence_of_a_failure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def load(name: str) -> None:
+        warnings.warn(f"{name}: camera.old is camera.new by now", ProfileNote, stacklevel=1)
+        raise InvalidValue(f"{name}: no good")
+
+    monkeypatch.setattr("perchctl.commands.fly.load_profile", load)
+    said = run("fly", "-p", "mine.yaml", "--dry-run")
+    assert said.code == 30
+    assert said.stderr.splitlines() == [
+        "perchctl: mine.yaml: camera.old is camera.new by now",
+        "perchctl: mine.yaml: no good",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("--only 3 -n 5", ["--only 3", "-n 5 does not apply", "leave it out"]),
+        ("--only 3 --seed 7", ["--seed 7 does not apply"]),
+        ("--only 3 --jobs 2 --seed 0", ["--seed 0 and --jobs 2 do not apply", "leave them out"]),
+        ("--only 3 --faults all --heat-map m.png", ["--heat-map m.png does not apply"]),
+        ("--faults list --log-dir x", ["flies nothing", "--log-dir x does not apply"]),
+        ("--heat-map m.png", ["--faults"]),
+    ],
+)
+def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str]) -> None:
+    said = run("simulate", *arguments.split())
+    assert said.code == 2
+    for word in words:
+        assert word in said.complaint
+    assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("pictures --view", ["pictures is no live camera", "--view does not apply"]),
+        ("pictures --check c.yaml -o d.yaml", ["--check", "--output does not apply"]),
+        ("pictures --check c.yaml --model fisheye", ["--check", "--model does not apply"]),
+        ("--convert c.yaml -o d.yaml --model fisheye", ["--convert", "--model does not apply"]),
+        ("--convert c.yaml -o d.yaml --view", ["--convert", "--view does not apply"]),
+    ],
+)
+def test_calibrate_refuses_what_it_would_not_heed(arguments: str, words: list[str]) -> None:
+    Path("pictures").mkdir()
+    said = run("calibrate", *arguments.split())
+    assert said.code == 2
+    for word in words:
+        assert word in said.complaint
+
+
+def test_a_seed_for_a_real_vehicle_is_said_to_change_nothing() -> None:
+    at = ("--uri", "usb://0", "--source", "camera:0", "--dry-run")
+    assert "--seed 7" in run("fly", "--seed", "7", *at).complaint
+    assert run("fly", *at).stderr == ""
+
+
+@pytest.mark.parametrize("where", ["afile", "afile/logs"])
+@pytest.mark.parametrize("command", ["simulate --only 1", "simulate", "fly"])
+def test_a_file_in_the_place_of_the_logs_is_named_with_what_to_do(command: str, where: str) -> None:
+    Path("afile").touch()
+    said = run(*command.split(), "--log-dir", where)
+    assert said.code == 30
+    assert where in said.complaint
+    assert "name another folder with --log-dir" in said.complaint
