@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -81,6 +82,7 @@ def tell(log: FlightLog, recorded: Recorded | None = None) -> Told:
     problem = ""
     if recorded is not None:
         shown, problem = shown_of(decisions_of(track), recorded)
+        problem = problem.replace(f"{log.path.parent}{os.sep}", "")
     return Told(
         track,
         summary_of(log),
