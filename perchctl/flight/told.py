@@ -24,8 +24,7 @@ def events_of(
         events.append(Event(obs.t_s, EventKind.PHASE, start.reason, start.phase))
         if obs.telemetry.battery_v < NO_BATTERY_READING_V:
             grace_s = profile.safety.battery_stale_s
-            gate = "no attempt begins, " if profile.safety.energy_gate else ""
-            text = f"no battery reading: {gate}landing after {grace_s:.0f} s at most"
+            text = f"no battery reading: landing after {grace_s:.0f} s at most"
             events.append(Event(obs.t_s, EventKind.NOTE, text, start.phase))
         before = start
     if state.phase is not before.phase:

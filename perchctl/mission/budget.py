@@ -53,19 +53,33 @@ def watched(c: Context) -> EnergyState:
 
 
 def outlook(c: Context) -> BatteryOutlook:
-    """What is left, and for how many attempts that is enough; None where it is not known."""
+    """What is left, None where it is not known, and for how many attempts that is enough. What
+    is not known counts as what was left by the last reading, less what has been used since, and as
+    no more than the grace that a vehicle without a reading has (fault 7)."""
     energy, battery_mah = c.state.energy, c.profile.vehicle.battery_mah
     used = used_mah(energy, battery_mah)
-    seconds = None
-    if energy.unknown_s <= UNKNOWN_S:
-        seconds = left_s(energy, floor_of(c.profile), battery_mah, _hover_load(c))
-    if seconds is None or c.target_m is None:
+    counted_s = left_s(energy, floor_of(c.profile), battery_mah, _hover_load(c))
+    seconds = None if _is_unknown(c) else counted_s
+    if c.target_m is None:
         return BatteryOutlook(seconds, None, used, energy.rest_v)
     needs = needs_of(c)
-    spare_s = seconds - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
+    if seconds is None:
+        enough_s = grace_s(c) if counted_s is None else min(counted_s, grace_s(c))
+    else:
+        enough_s = seconds
+    spare_s = enough_s - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
     attempts = 0 if spare_s < 0.0 else 1 + math.floor(spare_s / needs.again_s)
     left = c.profile.planner.attempts - c.state.attempts
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used, energy.rest_v)
+
+
+def grace_s(c: Context) -> float:
+    """What `battery-unknown` leaves of its time to one whose reading tells nothing."""
+    return c.profile.safety.battery_stale_s - max(c.state.energy.unknown_s, c.obs.battery_age_s)
+
+
+def _is_unknown(c: Context) -> bool:
+    return c.state.energy.unknown_s > UNKNOWN_S
 
 
 def floor_of(profile: Profile) -> Floor:
@@ -94,8 +108,8 @@ def needs_of(c: Context) -> Needs:
 
 
 def short_of_charge(c: Context) -> bool:
-    """The attempt that would begin now has not enough, or it is not known whether it has. Where
-    no target is remembered none begins: first there is a search, and then it is asked again."""
+    """The attempt that would begin now has not enough. Where no target is remembered none
+    begins: first there is a search, and then it is asked again."""
     asked = c.profile.safety.energy_gate and c.target_m is not None
     return asked and not c.state.battery.attempts
 
@@ -103,21 +117,17 @@ def short_of_charge(c: Context) -> bool:
 def why_short(c: Context) -> str:
     """With the figures."""
     energy, seconds = c.state.energy, c.state.battery.left_s
-    if seconds is None:
-        cause = "no reading"
-        if energy.loaded_s and energy.unknown_s > UNKNOWN_S:
-            cause = f"its reading stands still for {energy.unknown_s:.0f} s"
-        return (
-            f"what the battery has left is not known ({cause}), so no attempt begins "
-            f"(safety.energy_gate)"
+    needs, volts = needs_of(c), loaded_v(energy, _hover_load(c))
+    if seconds is None or volts is None:
+        has = (
+            f"what the battery has left is not known, and of the time that it may fly without a "
+            f"reading (safety.battery_stale_s) {max(0.0, grace_s(c)):.0f} s are left"
         )
-    needs = needs_of(c)
-    volts = loaded_v(energy, _hover_load(c))
-    assert volts is not None
+    else:
+        has = f"the battery has {max(0.0, seconds):.0f} s left at {volts:.2f} V under load"
     return (
-        f"the battery has {max(0.0, seconds):.0f} s left at {volts:.2f} V under load; an attempt "
-        f"takes {needs.attempt_s:.0f} s, the landing {needs.landing_s:.0f} s, the reserve is "
-        f"{c.profile.safety.energy_reserve_s:g} s"
+        f"{has}; an attempt takes {needs.attempt_s:.0f} s, the landing {needs.landing_s:.0f} s, "
+        f"the reserve is {c.profile.safety.energy_reserve_s:g} s"
     )
 
 

@@ -230,10 +230,20 @@ def test_the_gate_can_be_taken_away() -> None:
     assert not load_profile("paper").safety.energy_gate
 
 
-def test_no_attempt_begins_without_a_reading() -> None:
-    state = flown(Phase.ALIGN, EnergyState(), 2.0, battery_v=0.0)
+def test_without_a_reading_attempts_end_within_the_grace() -> None:
+    """Fault 7: a vehicle that tells nothing of its battery is landed after
+    `safety.battery_stale_s`, and not in the middle of an ascent."""
+    grace_s = PROFILE.safety.battery_stale_s
+    assert flown(Phase.ALIGN, EnergyState(unknown_s=8.0), 2.0, battery_v=0.0).row == "aligned"
+    state = flown(Phase.ALIGN, EnergyState(unknown_s=grace_s - 10.0), 2.0, battery_v=0.0)
     assert state.row == "too-little-left"
-    assert "not known (no reading)" in state.reason
+    assert "not known" in state.reason
+    assert state.battery.left_s is None
+
+
+def test_what_was_little_is_no_more_without_a_reading() -> None:
+    lost = replace(NEAR_ITS_END, unknown_s=8.0)
+    assert flown(Phase.ALIGN, lost, 2.0, battery_v=0.0).row == "too-little-left"
 
 
 def test_a_reading_that_stands_still_is_none() -> None:
