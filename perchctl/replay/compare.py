@@ -29,22 +29,20 @@ class Difference:
 
 def first_differing(name: str, one: Any, other: Any) -> tuple[str, Any, Any] | None:
     """The field's whole name, and both values in their exact form; None where nothing differs."""
-    if dataclasses.is_dataclass(one) and type(one) is type(other):
-        parts = [
-            (f"{name}.{f.name}", getattr(one, f.name), getattr(other, f.name))
-            for f in dataclasses.fields(one)
-        ]
-        if parts or same(one, other):
-            return _first_of(parts)
-    elif isinstance(one, dict) and isinstance(other, dict):
-        keys = [*one, *(key for key in other if key not in one)]
-        return _first_of([(f"{name}.{_key(k)}", one.get(k), other.get(k)) for k in keys])
-    elif _is_row(one) and _is_row(other) and len(one) == len(other):
-        pairs = zip(one, other, strict=True)
-        return _first_of([(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(pairs)])
     if same(one, other):
         return None
-    return name, _shown(one), _shown(other)
+    parts: list[tuple[str, Any, Any]] = []
+    if dataclasses.is_dataclass(one) and type(one) is type(other):
+        names = [f.name for f in dataclasses.fields(one)]
+        parts = [(f"{name}.{n}", getattr(one, n), getattr(other, n)) for n in names]
+    elif isinstance(one, dict) and isinstance(other, dict):
+        keys = [*one, *(key for key in other if key not in one)]
+        parts = [(f"{name}.{_key(k)}", one.get(k), other.get(k)) for k in keys]
+    elif _is_row(one) and _is_row(other) and len(one) == len(other):
+        pairs = zip(one, other, strict=True)
+        parts = [(f"{name}[{k}]", a, b) for k, (a, b) in enumerate(pairs)]
+    within = next((d for part in parts if (d := first_differing(*part)) is not None), None)
+    return within or (name, _shown(one), _shown(other))
 
 
 def same(one: Any, other: Any) -> bool:
@@ -52,10 +50,6 @@ def same(one: Any, other: Any) -> bool:
     if dataclasses.is_dataclass(one) and type(one) is not type(other):
         return False
     return json.dumps(to_exact(one)) == json.dumps(to_exact(other))
-
-
-def _first_of(parts: list[tuple[str, Any, Any]]) -> tuple[str, Any, Any] | None:
-    return next((d for part in parts if (d := first_differing(*part)) is not None), None)
 
 
 def _is_row(value: Any) -> bool:

@@ -44,7 +44,7 @@ def flown(folder: Path, rig: Rig) -> tuple[FlightLog, list[Picture]]:
     rig.operator = lambda: pressed[0]
 
     def press(tick: Tick) -> None:
-        if tick.t_s > 1.0 and tick.state.phase is Phase.APPROACH:
+        if tick.t_s > 0.3 and tick.state.phase is Phase.APPROACH:
             pressed[0] = Operator.LAND
 
     rig.watcher.on_tick = press
@@ -60,6 +60,11 @@ def flown(folder: Path, rig: Rig) -> tuple[FlightLog, list[Picture]]:
 def seen_again(log: FlightLog, pictures: list[Picture]) -> Replay:
     """By the pipeline of the rig: its camera is smaller than the profile's."""
     return replay(log, pictures, pipeline=Rig().setup)
+
+
+def begun(log: FlightLog) -> FlightLog:
+    """Of a flight that was killed soon."""
+    return replace(log, turn_records=log.turn_records[:50])
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +102,7 @@ def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> None:
-    log, pictures = flight
+    log, pictures = begun(flight[0]), flight[1]
     index, t_s, image = pictures[20]
     other = image.copy()
     other[3, 4] ^= 1
@@ -109,18 +114,18 @@ def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> 
 
 def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> None:
     """From there on the pipeline would remember another flight; what came before counts."""
-    log, pictures = flight
+    log, pictures = begun(flight[0]), flight[1]
     for rest in ([*pictures[:20], *pictures[21:]], pictures[:20]):
         found = seen_again(log, rest)
         assert found.seen is not None
         assert f"frame {pictures[20][0]} was not recorded" in found.seen.ended
         assert 0 < len(found.seen.turns) < len(log.turns)
         assert not found.seen.differences
-        assert found.ticks == len(log.records)  # the planner needs no picture
+        assert len(found.decided) > len(found.seen.turns)  # the planner needs no picture
 
 
 def test_a_pose_that_differs_is_named(flight: tuple[FlightLog, list[Picture]]) -> None:
-    log, pictures = flight
+    log, pictures = begun(flight[0]), flight[1]
     turns = list(log.turns)
     at = next(k for k, turn in enumerate(turns) if turn.role == "flown") + 10
     obs = turns[at].observation
