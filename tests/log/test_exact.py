@@ -43,7 +43,7 @@ def there_and_back(kind: Any, value: Any) -> Any:
 def bits(value: Any) -> Any:
     """Of everything in it; what a comparison of floats would overlook as well."""
     if isinstance(value, np.ndarray):
-        return (value.dtype.str, value.shape, value.tobytes())
+        return (value.dtype.str, value.shape, [bits(v) for v in value.ravel().tolist()])
     if isinstance(value, float):
         return "nan" if math.isnan(value) else np.float64(value).tobytes()
     if isinstance(value, dict):
