@@ -140,7 +140,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_session(known(positions=4, per=20), folder / "session.csv")
     (folder / "camchain.yaml").write_text(CAMCHAIN, encoding="utf-8")
     packed = ROOT / "tests" / "data" / "flights" / "searched-out.jsonl.gz"
-    (folder / "flight.jsonl").write_bytes(gzip.decompress(packed.read_bytes()))
+    (folder / "last.jsonl").write_bytes(gzip.decompress(packed.read_bytes()))
     (folder / "quick.yaml").write_text(QUICK, encoding="utf-8")
     for name in ("my_vehicle", "left", "right"):
         shutil.copyfile(ROOT / "profiles" / "crazyflie.yaml", folder / f"{name}.yaml")

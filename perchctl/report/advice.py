@@ -28,7 +28,7 @@ UNSEEN_SHARE, LEAST_UNSEEN, BLURRED_PX = 0.1, 10, 2.5
 IN_VIEW = 0.5
 """Aside by less than half of the height: a camera that looks up has the target in view."""
 GAP_S = 0.3
-SPARE_V, WORN_SAG_V, WORN_HUNGER = 0.15, 0.95, 1.8
+SPARE_V, WORN_SAG_V, WORN_HUNGER, LEAST_USED = 0.15, 0.95, 1.8, 0.15
 APART_M = 0.05
 
 
@@ -251,7 +251,8 @@ def _battery(track: Track, energy: EnergyStory) -> Iterator[Advice]:
             f"it came down to {energy.lowest_v:.2f} V, and at {least_v:.2f} V a flight is ended",
         )
     fit = energy.fit
-    if fit is not None and (fit.sag_v > WORN_SAG_V or fit.hunger > WORN_HUNGER):
+    told = energy.used_mah > LEAST_USED * energy.battery_mah  # or how fast it empties is a guess
+    if fit is not None and (fit.sag_v > WORN_SAG_V or (told and fit.hunger > WORN_HUNGER)):
         yield Advice(
             "battery",
             "take another battery: this one is worn, or its contacts are",

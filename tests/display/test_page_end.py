@@ -21,6 +21,7 @@ from perchctl.errors import Interrupted
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.session import FlyOptions, SessionResult
 from perchctl.log.summary import FlightSummary
+from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase, PlannerState
 from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
 from perchctl.profile import load_profile
@@ -250,9 +251,13 @@ def test_the_page_of_a_flight_ends_with_its_card(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last_state: dict[str, Any]
 ) -> None:
     def session(
-        options: FlyOptions, watchers: tuple[Watcher, ...], switch: OperatorSwitch, page: FlightPage
+        options: FlyOptions,
+        log: LogWatcher,
+        display: Watcher,
+        switch: OperatorSwitch,
+        page: FlightPage,
     ) -> SessionResult:
-        for watcher in (*watchers, page):
+        for watcher in (log, display, page):
             watcher.event(BEGUN[0])
             watcher.tick(tick(START_S))
         report = FlightReport(

@@ -24,10 +24,11 @@ pytest.importorskip("motioncapture", reason="motion capture needs the extra [moc
 
 from perchctl.calibration.files import load_calibration
 from perchctl.log.read import read_log
-from perchctl.profile import find_calibration
+from perchctl.profile import find_calibration, load_profile
 from perchctl.sim.capture.settings import MILLIMETRES, Y_UP, CaptureFault, CaptureSettings
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.process.handle import SimProcess
+from tests.helpers.capture import compared
 from tests.helpers.flights import ROOT, SEED, SHORT, short_profile
 
 pytestmark = pytest.mark.campaign
@@ -100,6 +101,7 @@ def room(folder: Path, capture: CaptureSettings) -> Any:
         lab = folder / "lab.yaml"
         positioning = f"positioning: {{by: mocap, system: {system}, host: '{host}'}}\n"
         lab.write_text(Path(SHORT).read_text(encoding="utf-8") + positioning, encoding="utf-8")
+        compared(load_profile(lab).positioning, sim.uri)
         words = ("-p", str(lab), "--uri", sim.uri, "--source", sim.stream_url)
         yield sim, words
 

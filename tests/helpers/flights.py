@@ -13,6 +13,7 @@ import cv2
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.log.watch import LogWatcher, Truth
 from perchctl.mission.state import Operator, Phase
+from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event, FlightReport
 from perchctl.profile import Profile, load_profile
 from perchctl.sim.draw import draw_capture, draw_scenario
@@ -50,12 +51,16 @@ class _Heights(LogWatcher):
 
     def __init__(self) -> None:
         self.truth: Callable[[], Truth] | None = None
+        self._recorder = None
         self.z_m = self.farthest_m = 0.0
 
     def tick(self, tick: Tick) -> None:
         assert self.truth is not None
         x_m, y_m, self.z_m = self.truth()[0]
         self.farthest_m = max(self.farthest_m, math.hypot(x_m, y_m))
+
+    def turn(self, turn: Turn) -> None:
+        return None
 
     def event(self, event: Event) -> None:
         return None
