@@ -101,7 +101,7 @@ def room(folder: Path, capture: CaptureSettings) -> Any:
         lab = folder / "lab.yaml"
         positioning = f"positioning: {{by: mocap, system: {system}, host: '{host}'}}\n"
         lab.write_text(Path(SHORT).read_text(encoding="utf-8") + positioning, encoding="utf-8")
-        compared(load_profile(lab).positioning, sim.uri)
+        compared(load_profile(str(lab)).positioning, sim.uri)
         words = ("-p", str(lab), "--uri", sim.uri, "--source", sim.stream_url)
         yield sim, words
 

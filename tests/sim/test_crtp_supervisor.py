@@ -101,6 +101,7 @@ def test_disarm_in_flight_cuts_without_locking(pilot: Pilot) -> None:
     assert pilot.info == READY
 
 
+@pytest.mark.long
 def test_rearms_after_30_s_on_the_ground(pilot: Pilot) -> None:
     """Row "After 30 s armed on the ground it disarms and re-arms (can-fly 0 for 120 ms)"."""
     pilot.advance(32.0)

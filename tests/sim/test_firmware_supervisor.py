@@ -114,6 +114,7 @@ def test_nothing_locks_later_when_nothing_is_sent_after_a_disarm_in_flight(
     assert rig.world.z_m > 0.3
 
 
+@pytest.mark.long
 def test_rearms_after_30_s_on_the_ground() -> None:
     rig = make_rig(booted=False)
     rig.run_until(lambda: rig.info == READY, 1.0)

@@ -149,6 +149,7 @@ def test_a_large_turn_is_measured_too(deg: float, setup: PoseSetup) -> None:
     assert found.turn_sigma_rad[2] < math.radians(7.0)
 
 
+@pytest.mark.long
 def test_what_is_claimed_is_what_is_so(setup: PoseSetup) -> None:
     """Many flights, all errors at once: squared errors over claimed variances."""
     ratios = []

@@ -300,7 +300,9 @@ def ghosts(setup: Pipeline, scene: Pass) -> list[tuple[float, float]]:
     return found
 
 
-@pytest.mark.parametrize("below_m", [0.15, 0.3, 0.5])
+@pytest.mark.parametrize(
+    "below_m", [0.3, *(pytest.param(z_m, marks=pytest.mark.long) for z_m in (0.15, 0.5))]
+)
 def test_blended_fields_are_named_and_not_trusted(build: Build, below_m: float) -> None:
     speed = 0.75 * below_m  # 6 px between the fields
     scene = Pass(below_m, (speed, 0.2 * speed, 0.0), camera_fields="top", camera_blended=True)
@@ -311,7 +313,9 @@ def test_blended_fields_are_named_and_not_trusted(build: Build, below_m: float) 
 
 
 @pytest.mark.parametrize("exposure_s", [0.0, 0.008, 0.02])
-@pytest.mark.parametrize("below_m", [0.1, 0.3, 0.5, 1.2])
+@pytest.mark.parametrize(
+    "below_m", [0.3, *(pytest.param(z_m, marks=pytest.mark.long) for z_m in (0.1, 0.5, 1.2))]
+)
 def test_motion_and_its_blur_are_not_blended_fields(
     build: Build, below_m: float, exposure_s: float
 ) -> None:

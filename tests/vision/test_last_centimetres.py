@@ -40,7 +40,14 @@ def errors_m(rows: list[tuple[float, PipelineOutput]], along: str) -> Array:
     return np.array([next(iter(o.poses.values())).e_m - (*SIDEWAYS[along], z) for z, o in rows])
 
 
-@pytest.mark.parametrize("along", ["width", "height", "under"])
+@pytest.mark.parametrize(
+    "along",
+    [
+        "height",
+        pytest.param("width", marks=pytest.mark.long),
+        pytest.param("under", marks=pytest.mark.long),
+    ],
+)
 def test_an_ascent_is_measured_to_the_end(build: Any, along: str) -> None:
     rows = ascent(build, along, with_attitude=along != "under")
     assert all(o.target is not None and o.target.measured for _, o in rows)
