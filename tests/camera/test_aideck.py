@@ -279,10 +279,13 @@ def approach(form: Callable[[Picture], bytes]) -> list[bytes]:
 def test_track_through_it(form: str, deck: AiDeck) -> None:
     forms = {"raw": raw, "jpeg": jpeg, "colour": lambda image: jpeg(bayer(image))}
     frames = approach(forms[form])
-    deck.scripts.put([step for f in frames for step in (console(), f, Pause(0.12))])
-    said = run("track", deck.url, "--json", "--calibration", "example_aideck_324x244.yaml")
-    lines = [json.loads(line) for line in said.stdout.splitlines()]
-    assert len(lines) >= 4, "slow computers skip some"
+    for pause_s in (0.12, 0.5, 2.0):  # a computer that is busy skips some: slower, then
+        deck.scripts.put([step for f in frames for step in (console(), f, Pause(pause_s))])
+        said = run("track", deck.url, "--json", "--calibration", "example_aideck_324x244.yaml")
+        lines = [json.loads(line) for line in said.stdout.splitlines()]
+        if len(lines) >= 4:
+            break
+    assert len(lines) >= 4
     seen = [line["target"]["tvec_m"] for line in lines if line["stage"] != "none"]
     assert len(seen) >= len(lines) - 1
     for x_m, y_m, z_m in seen:
