@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import hmac
+import multiprocessing
+import os
 import pickle
 import secrets
 import socket
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -127,6 +130,20 @@ def connect_back() -> Channel:
     connection = socket.create_connection(("127.0.0.1", int(port)), timeout=10.0)
     connection.sendall(token.encode())
     return Channel(connection)
+
+
+def end_with_parent() -> None:
+    """In a process of `multiprocessing`: end as soon as its parent is gone, killed or not; work
+    that nobody waits for would go on. It is here since this module loads at once: asked for by
+    one that loads the whole program, a process of a busy computer would first do that."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 def end(child: subprocess.Popen[bytes], timeout_s: float) -> None:

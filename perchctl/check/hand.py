@@ -36,8 +36,9 @@ LEAST_STEP_RAD, MOST_STEP_RAD = math.radians(12.0), math.radians(120.0)
 """Turns between two moments: smaller ones are noise, larger ones have no certain axis."""
 MOVED_RAD, MOVED_M, MOVED_G = math.radians(12.0), 0.06, 0.05
 STILL_RAD, STILL_M = math.radians(4.0), 0.03
-TURNED_ENOUGH = 0.3
-"""Second of the three spreads of the turns' axes over the first: below it all are about one."""
+MANY_SHARE = 0.9
+"""All turns are about one axis where so many of them leave it by less than `LEAST_STEP_RAD`. A
+spread over all of them would say so of who turns far and tilts little, or lets it stand long."""
 UPRIGHT_DEG, BODY_WARN_DEG, BODY_FAIL_DEG = 25.0, 5.0, 15.0
 LIFTED_M = 0.12
 REACH_M = 5.0
@@ -225,9 +226,10 @@ def _rotation_between(before: Array, after: Array) -> tuple[Array, bool, Array]:
     and the axis that they have most of."""
     u, _, vt = np.linalg.svd(after.T @ before)
     sign = np.sign(np.linalg.det(u @ vt))
-    square, axes = np.linalg.eigh(before.T @ before)  # the largest comes last
-    many = bool(square[1] > TURNED_ENOUGH**2 * square[2])
-    return u @ np.diag([1.0, 1.0, sign]) @ vt, many, axes[:, 2]
+    axis = np.linalg.eigh(before.T @ before)[1][:, 2]  # the largest comes last
+    aside_rad = np.linalg.norm(before - np.outer(before @ axis, axis), axis=1)
+    many = bool(np.quantile(aside_rad, MANY_SHARE) > LEAST_STEP_RAD)
+    return u @ np.diag([1.0, 1.0, sign]) @ vt, many, axis
 
 
 def _rise(moved: Moved, up: Array | None) -> Array | None:

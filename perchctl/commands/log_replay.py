@@ -74,5 +74,5 @@ def _profile(request: ReplayRequest, log: FlightLog) -> Profile | None:
 
 def _pictures(request: ReplayRequest, log: Path) -> Iterator[Picture] | None:
     """Those of the recording that lies beside the log; None without one."""
-    recording = recording_of(log.with_suffix("") if log.suffix == ".gz" else log)
+    recording = recording_of(log)
     return pictures_of(recording) if request.pictures and recording.is_file() else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
@@ -22,6 +21,7 @@ from typing import TypeVar
 
 import cv2
 
+from perchctl.children import end_with_parent
 from perchctl.errors import PerchError
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.flight.results import FlightEnd, FlightResult
@@ -173,7 +173,7 @@ def job_processes(jobs: int) -> Iterator[Executor]:
     they are ended where they are; and they end where this one is killed."""
     context = multiprocessing.get_context("spawn")
     with uninterrupted():
-        executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=_end_with_parent)
+        executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=end_with_parent)
     try:
         yield executor
     except BaseException:
@@ -182,15 +182,3 @@ def job_processes(jobs: int) -> Iterator[Executor]:
         executor.shutdown(cancel_futures=True)
         raise
     executor.shutdown()
-
-
-def _end_with_parent() -> None:
-    """Flights that nobody waits for would go on to the last seed."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, name="parent", daemon=True).start()

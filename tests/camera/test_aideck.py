@@ -279,10 +279,13 @@ def approach(form: Callable[[Picture], bytes]) -> list[bytes]:
 def test_track_through_it(form: str, deck: AiDeck) -> None:
     forms = {"raw": raw, "jpeg": jpeg, "colour": lambda image: jpeg(bayer(image))}
     frames = approach(forms[form])
-    deck.scripts.put([step for f in frames for step in (console(), f, Pause(0.12))])
-    said = run("track", deck.url, "--json", "--calibration", "example_aideck_324x244.yaml")
-    lines = [json.loads(line) for line in said.stdout.splitlines()]
-    assert len(lines) >= 4, "slow computers skip some"
+    for pause_s in (0.12, 0.5, 2.0):  # a computer that is busy skips some: slower, then
+        deck.scripts.put([step for f in frames for step in (console(), f, Pause(pause_s))])
+        said = run("track", deck.url, "--json", "--calibration", "example_aideck_324x244.yaml")
+        lines = [json.loads(line) for line in said.stdout.splitlines()]
+        if len(lines) >= 4:
+            break
+    assert len(lines) >= 4
     seen = [line["target"]["tvec_m"] for line in lines if line["stage"] != "none"]
     assert len(seen) >= len(lines) - 1
     for x_m, y_m, z_m in seen:
@@ -290,19 +293,28 @@ def test_track_through_it(form: str, deck: AiDeck) -> None:
         assert min(abs(z_m / at_m - 1.0) for at_m in RANGES_M) < 0.01
 
 
-@pytest.mark.long
-def test_calibrate_through_it(deck: AiDeck, tmp_path: Path) -> None:
+def views(pause_s: float) -> list[bytes | threading.Event | Pause]:
+    """Of a board, each held still; the same picture to the bit would be no new one."""
     rng = np.random.default_rng(5)
     renderer = BoardRenderer(CAMERA, CHARUCO)
     script: list[bytes | threading.Event | Pause] = []
     for pose in draw_poses(rng, CAMERA, CHARUCO, 16):
         image = renderer.render(pose, rng)
-        for _ in range(3):  # held still; the same picture to the bit would be no new one
+        for _ in range(3):
             noise = rng.integers(0, 2, image.shape, dtype=np.uint8)
-            script += [raw(np.maximum(image, noise) - noise), Pause(0.2)]
-    deck.scripts.put(script)  # and then it is gone, which ends the capture
-    output = tmp_path / "mine.yaml"
-    said = run("calibrate", deck.url, "--board", CHARUCO.notation(), "-o", str(output))
+            script += [raw(np.maximum(image, noise) - noise), Pause(pause_s)]
+    return script
+
+
+@pytest.mark.long
+def test_calibrate_through_it(deck: AiDeck, tmp_path: Path) -> None:
+    for pause_s in (0.2, 1.0):  # a computer that is busy sees too few: slower, then
+        deck.scripts.put(views(pause_s))  # and then it is gone, which ends the capture
+        output = tmp_path / f"{pause_s}" / "mine.yaml"
+        output.parent.mkdir()
+        said = run("calibrate", deck.url, "--board", CHARUCO.notation(), "-o", str(output))
+        if said.code == 0:
+            break
     assert said.code == 0, said.stderr
     found = load_calibration(output)
     assert found.size_px == (324, 244)

@@ -17,6 +17,7 @@ from perchctl.geometry import Array, rot_z, rotation_from_rpy
 from perchctl.positioning.judge import Placed
 from perchctl.positioning.types import BodyPose
 from perchctl.profile.positioning import PositioningConfig
+from perchctl.sim.carried import Stop, Way, lifted_and_turned
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up
 from tests.helpers.mission import telemetry
@@ -192,6 +193,40 @@ def test_a_lift_or_a_turn_alone_finds_another_axis_up(own: tuple[float, float, f
     assert row.verdict is Verdict.FAIL
     assert "swapped axes" in row.found
     assert "y" in row.found
+
+
+@given(tilt_deg=st.floats(20.0, 40.0), before_s=st.floats(0.2, 5.0), after_s=st.floats(0.2, 20.0))
+@settings(max_examples=20, deadline=None)
+def test_what_is_asked_for_is_enough_however_long_it_stands(
+    tilt_deg: float, before_s: float, after_s: float
+) -> None:
+    """The very motion, as the simulated hand makes it, tilted more or less."""
+    home = (0.0, 0.0, 0.012)
+    share = math.radians(tilt_deg) / math.radians(30.0)
+    way = Way(Stop(1.0, home), [
+        replace(stop, rpy_rad=(share * stop.rpy_rad[0], share * stop.rpy_rad[1], stop.rpy_rad[2]))
+        for stop in lifted_and_turned(home)
+    ])  # fmt: skip
+    moments = [way.at(float(t_s)) for t_s in np.arange(-before_s, 7.5 + after_s, hand.EVERY_S)]
+    R = np.array([moment.R for moment in moments])
+    moved = hand.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
+    assert hand.is_enough(moved)
+    assert hand.row(moved, CONFIG).verdict is Verdict.PASS
+
+
+@given(wobble_deg=st.floats(0.0, 5.0), stands_s=st.floats(0.2, 20.0))
+@settings(max_examples=20, deadline=None)
+def test_a_hand_that_wobbles_has_tilted_nothing(wobble_deg: float, stands_s: float) -> None:
+    up, wobble, turn = (0.0, 0.0, 0.3), math.radians(wobble_deg), math.radians(90.0)
+    way = Way(Stop(1.0, (0.0, 0.0, 0.0)), [
+        Stop(1.0, up), Stop(0.8, up, (wobble, -wobble, turn / 2.0)),
+        Stop(0.8, up, (-wobble, wobble, turn)), Stop(1.5, up), Stop(1.0, (0.0, 0.0, 0.0)),
+    ])  # fmt: skip
+    moments = [way.at(float(t_s)) for t_s in np.arange(-0.5, 5.1 + stands_s, hand.EVERY_S)]
+    R = np.array([moment.R for moment in moments])
+    moved = hand.Moved(R, R, np.array([moment.position_m for moment in moments]), 0.2)
+    assert not hand.is_enough(moved)
+    assert "too few axes" in hand.row(moved, CONFIG).found
 
 
 def test_without_moments_of_both_nothing_is_said() -> None:

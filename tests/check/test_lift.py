@@ -4,6 +4,7 @@ and the library that reads a lab's system to its motion capture."""
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -37,7 +38,8 @@ from tests.helpers.flights import short_profile
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("elsewhere")]
 
 HOME = (0.0, 0.0, 0.012)
-TRIES, MOST_BEHIND_S = 3, 0.1
+TRIES, SLOW_S, STARVED_S = 4, 0.1, 1.0
+"""A vehicle that lost up to the last of these is still told right; beyond, it may not answer."""
 UNTIL_BACK_S, WHOLE_S = 25.0, 8.0
 """It ends by itself once all was seen; where that never comes, the first seconds tell as well."""
 
@@ -58,16 +60,21 @@ class Lab:
     sim: SimProcess
     profile: Profile
 
-    def lift(self, within_s: float) -> dict[str, Row]:
-        """Each row by its name. A vehicle whose time stood still meanwhile, as on a computer that
-        is busy, has told nothing: once more, then."""
+    def lift(self, within_s: float, expected: Verdict) -> dict[str, Row]:
+        """Each row by its name. Where it is not as expected, and the vehicle's time stood still
+        meanwhile, as on a computer that is busy, it has told nothing: once more, then."""
+        least_s = math.inf
         for _ in range(TRIES):
             began_s, began_t_s = time.monotonic(), self.sim.truth()["t_s"]
             rows = self._lifted(within_s)
             lasted_s = time.monotonic() - began_s
-            if lasted_s - (self.sim.truth()["t_s"] - began_t_s) < MOST_BEHIND_S:
+            behind_s = lasted_s - (self.sim.truth()["t_s"] - began_t_s)
+            least_s = min(least_s, behind_s)
+            if rows[hand.NAME].verdict is expected or behind_s < SLOW_S:
                 return rows
-        pytest.skip("this computer is too busy for a vehicle in real time")
+        if least_s > STARVED_S:
+            pytest.skip(f"no real time on this computer: {least_s:.1f} s lost at each try")
+        return rows
 
     def _lifted(self, within_s: float) -> dict[str, Row]:
         """The hand takes it when the command says so."""
@@ -112,7 +119,7 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
     it = lab(sim)
     with pytest.raises(SafetyAbort, match="never compared"):
         it.may_fly()
-    rows = it.lift(UNTIL_BACK_S)
+    rows = it.lift(UNTIL_BACK_S, Verdict.PASS)
     lifted = rows[hand.NAME]
     assert lifted.verdict is Verdict.PASS, lifted
     assert "turns as the vehicle does" in lifted.found
@@ -123,7 +130,7 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
 
 @pytest.mark.parametrize(("fault", "body", "within_s", "words"), [
     (CaptureFault(axes=Y_UP), "crazyflie", UNTIL_BACK_S, "swapped axes: up is y"),
-    (CaptureFault(axes=SWAPPED_XY), "crazyflie", UNTIL_BACK_S, "axes are turned by 90 deg"),
+    (CaptureFault(axes=SWAPPED_XY), "crazyflie", UNTIL_BACK_S, "axes are turned by (89|9.) deg"),
     (CaptureFault(scale=MILLIMETRES), "crazyflie", WHOLE_S, "these look like millimetres"),
     (None, "wand", WHOLE_S, "the vehicle moves, and the rigid body 'wand' stands still"),
 ])  # fmt: skip
@@ -134,10 +141,10 @@ def test_what_is_set_up_wrong_is_named_and_not_flown_by(
     if fault is not None:
         sim.capture_fault(fault)
     try:
-        rows = it.lift(within_s)
+        rows = it.lift(within_s, Verdict.FAIL)
     finally:
         sim.capture_fault(None)
     assert rows[hand.NAME].verdict is Verdict.FAIL, rows[hand.NAME]
-    assert words in rows[hand.NAME].found
+    assert re.search(words, rows[hand.NAME].found)
     with pytest.raises(SafetyAbort, match="found by check --lift on"):
         it.may_fly()

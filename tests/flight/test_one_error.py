@@ -16,14 +16,14 @@ from perchctl.display.watch import status_of
 from perchctl.flight import senses
 from perchctl.flight.lockstep import fly_lockstep
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.log.watch import LogWatcher, Truth, flight_record
+from perchctl.log.watch import Truth, flight_record
 from perchctl.mission import planner
 from perchctl.mission.context import Context
 from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, Tick
+from perchctl.mission.watch import Tick
 from perchctl.sim.draw import draw_scenario
 from perchctl.vision import strategies
-from tests.helpers.flights import SEED, short_profile
+from tests.helpers.flights import SEED, NoLog, short_profile
 
 pytestmark = pytest.mark.long
 
@@ -31,19 +31,16 @@ PROFILE = short_profile()
 SCENARIO = draw_scenario(PROFILE, SEED)
 
 
-@dataclass
-class Looker(LogWatcher):
-    """Takes the log's place: the ticks, and where the vehicle truly was."""
+class Looker(NoLog):
+    """The ticks, and where the vehicle truly was."""
 
-    truth: Any = None
-    ticks: list[tuple[Tick, Truth]] = field(default_factory=list)
-    problem: str | None = None  # type: ignore[assignment]
+    def __init__(self) -> None:
+        super().__init__()
+        self.ticks: list[tuple[Tick, Truth]] = []
 
     def tick(self, tick: Tick) -> None:
+        assert self.truth is not None
         self.ticks.append((tick, self.truth()))
-
-    def event(self, event: Event) -> None:
-        return None
 
 
 @dataclass

@@ -20,6 +20,7 @@ from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.scenario import Scenario
 
 WAIT_S = 10.0
+CONNECTED_S = 60.0  # all tables, where a busy machine gives it a tenth of a core
 LOG_PERIOD_S = 0.010
 AIRBORNE_S = 2.0  # after a take-off: enough where only the supervisor is tested
 CHUNK_S = 0.4  # so few packets fit into cflib's receive buffer
@@ -53,7 +54,7 @@ class Client:
         )
         self.cf.console.receivedChar.add_callback(self._take_text)
 
-    def connect(self, wait_s: float = WAIT_S) -> bool:
+    def connect(self, wait_s: float = CONNECTED_S) -> bool:
         self.cf.open_link(self.uri)
         return self._connected.wait(wait_s) and self._complete.wait(wait_s)
 

@@ -13,7 +13,6 @@ import cv2
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.log.watch import LogWatcher, Truth
 from perchctl.mission.state import Operator, Phase
-from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event, FlightReport
 from perchctl.profile import Profile, load_profile
 from perchctl.sim.draw import draw_capture, draw_scenario
@@ -21,6 +20,8 @@ from perchctl.sim.draw import draw_capture, draw_scenario
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from perchctl.camera.source import FrameSource
+    from perchctl.mission.turn import Turn
     from perchctl.mission.watch import Tick
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,18 +47,22 @@ class Flown:
         return [event.phase.value for event in self.report.history if event.phase]
 
 
-class _Heights(LogWatcher):
-    """Takes the log's place, and keeps the true height only."""
+class NoLog(LogWatcher):
+    """Takes a log's place, and writes none."""
+
+    problem: str | None = None  # type: ignore[assignment]
 
     def __init__(self) -> None:
         self.truth: Callable[[], Truth] | None = None
-        self._recorder = None
-        self.z_m = self.farthest_m = 0.0
+
+    def watched(self, source: FrameSource) -> FrameSource:
+        return source
+
+    def remarks(self) -> list[str]:
+        return []
 
     def tick(self, tick: Tick) -> None:
-        assert self.truth is not None
-        x_m, y_m, self.z_m = self.truth()[0]
-        self.farthest_m = max(self.farthest_m, math.hypot(x_m, y_m))
+        return None
 
     def turn(self, turn: Turn) -> None:
         return None
@@ -65,9 +70,18 @@ class _Heights(LogWatcher):
     def event(self, event: Event) -> None:
         return None
 
-    @property
-    def problem(self) -> str | None:
-        return None
+
+class _Heights(NoLog):
+    """Keeps where the vehicle truly was."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.z_m = self.farthest_m = 0.0
+
+    def tick(self, tick: Tick) -> None:
+        assert self.truth is not None
+        (x_m, y_m, self.z_m), _ = self.truth()
+        self.farthest_m = max(self.farthest_m, math.hypot(x_m, y_m))
 
 
 def short_profile(changes: Mapping[str, Any] | None = None, base: str = SHORT) -> Profile:
