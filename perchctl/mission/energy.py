@@ -83,10 +83,12 @@ class BatteryFit:
 
 @dataclass(frozen=True)
 class Floor:
-    """Where the battery ends a flight: under a long load, and under the short one of a press."""
+    """Where the battery ends a flight: under a long load, and under the one of a press, which
+    takes `press_load` of the full thrust."""
 
     hover_v: float
     press_v: float
+    press_load: float = 1.0
 
 
 def updated(
@@ -145,7 +147,8 @@ def left_s(
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
     fit = fitted(state)
-    end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v)
+    press_load = max(load, floor.press_load)
+    end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v * press_load)
     share = charge_at(state.rest_v) - charge_at(end_v)
     return max(0.0, share) / (fit.hunger * load * _per_s(battery_mah))
 

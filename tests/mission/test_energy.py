@@ -40,7 +40,7 @@ from tests.helpers.mission import (
 )
 
 PERIOD_S, MAH = 0.02, 250.0
-FLOOR = Floor(3.2, 3.0)
+FLOOR = floor_of(PROFILE)
 HOVER = HOVER_THRUST / FULL_THRUST
 ATTEMPT_S, LANDING_S = 12.0, 10.0
 
@@ -52,18 +52,20 @@ class Moment:
     under_load_v: float
 
 
-def hovering(rest_v: float, kind: CellKind, most_s: float = 120.0) -> Iterator[Moment]:
+def hovering(
+    rest_v: float, kind: CellKind, most_s: float = 120.0, hover: float = HOVER
+) -> Iterator[Moment]:
     """On the ground for 1 s, then hovering, with a press of a second every 8 s."""
     cell, energy, reading_v = Cell(rest_v, kind), EnergyState(), rest_v
     for i in range(round(most_s / PERIOD_S)):
         t_s = PERIOD_S * i
-        load = 0.0 if t_s < 1.0 else 1.0 if t_s % 8.0 > 7.0 else HOVER
+        load = 0.0 if t_s < 1.0 else 1.0 if t_s % 8.0 > 7.0 else hover
         for _ in range(round(PERIOD_S / CONTROL_PERIOD_S)):
             cell.step(4.4 * load)
         reading_v += 0.1 * (cell.battery_v - reading_v)  # the firmware's, low-passed
         energy = updated(energy, PERIOD_S, reading_v, load * FULL_THRUST, MAH)
         yield Moment(
-            t_s, energy, cell.rest_v - (cell.rest_v - cell.battery_v) / (load or 1) * HOVER
+            t_s, energy, cell.rest_v - (cell.rest_v - cell.battery_v) / (load or 1) * hover
         )
 
 
@@ -91,6 +93,16 @@ def test_what_is_left_is_not_more_than_there_is(name: str) -> None:
             assert told_s < ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
         if ahead_s > 70.0:  # and one that is safe three times over is
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
+
+
+def test_a_light_vehicle_s_battery_is_not_asked_for_a_long_press() -> None:
+    """It sags deep under full thrust, for a second; hovering takes half of that."""
+    cell = CellKind(resistance_ohm=0.9 / 4.4)
+    moments = list(hovering(3.95, cell, 130.0, hover=0.5))
+    assert min(m.under_load_v for m in moments) > FLOOR.hover_v
+    told_s = left_s(moments[round(8.0 / PERIOD_S)].energy, FLOOR, MAH, 0.5)
+    assert told_s is not None
+    assert told_s > 60.0
 
 
 @pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
@@ -258,8 +270,17 @@ def test_a_reading_that_stands_still_is_none() -> None:
 def test_the_firmware_s_word_is_heard() -> None:
     """It reports low power below `pm.lowVoltage`, and the vehicle is landed for it."""
     link = PROFILE.link.model_copy(update={"parameters": {"pm.lowVoltage": 3.4}})
-    assert floor_of(PROFILE) == Floor(3.2, 3.0)
-    assert floor_of(PROFILE.model_copy(update={"link": link})) == Floor(3.4, 3.0)
+    assert floor_of(PROFILE) == Floor(3.2, 2.7)
+    assert floor_of(PROFILE.model_copy(update={"link": link})) == Floor(3.4, 2.7)
+
+
+def test_a_press_counts_by_what_it_takes_and_how_long_it_lasts() -> None:
+    perch = PROFILE.planner.perch.model_copy(update={"contact_dwell_s": 1.0})
+    planned = PROFILE.planner.model_copy(update={"perch": perch})
+    assert floor_of(PROFILE.model_copy(update={"planner": planned})) == Floor(3.2, 3.0)
+    perch = PROFILE.planner.perch.model_copy(update={"mode": "raw", "thrust": 52428})
+    planned = PROFILE.planner.model_copy(update={"perch": perch})
+    assert floor_of(PROFILE.model_copy(update={"planner": planned})) == Floor(3.2, 2.7, 0.8)
 
 
 def test_who_has_no_target_goes_on_searching() -> None:
