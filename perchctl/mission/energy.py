@@ -22,7 +22,7 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
-from perchctl.vehicle import FULL_THRUST, NO_BATTERY_READING_V
+from perchctl.vehicle import FULL_THRUST, is_battery_reading
 
 CURVE: tuple[tuple[float, float], ...] = (
     (0.0, 3.0), (0.02, 3.4), (0.05, 3.64), (0.1, 3.76), (0.2, 3.82), (0.3, 3.86), (0.4, 3.885),
@@ -96,7 +96,7 @@ def updated(
 ) -> EnergyState:
     """The state after `dt_s` under a commanded thrust 0..65535.
 
-    A `battery_v` below `NO_BATTERY_READING_V`, or none (NaN), is no reading."""
+    A `battery_v` that no cell can have, or none (NaN), is no reading."""
     load = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
         state,
@@ -106,7 +106,7 @@ def updated(
     if load >= LEAST_LOAD:
         known = dt_s / 3.0 if state.mean_load else 1.0
         state = replace(state, mean_load=_towards(state.mean_load, load, known))
-    if not battery_v >= NO_BATTERY_READING_V:
+    if not is_battery_reading(battery_v):
         return _counted(state, dt_s, battery_mah)
     state = replace(state, unknown_s=0.0)
     if load == 0.0 and not state.loaded_s:

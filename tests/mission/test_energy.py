@@ -167,7 +167,15 @@ def test_the_curve_rises() -> None:
 
 
 @settings(max_examples=60)
-@given(st.lists(st.tuples(st.floats(-1.0, 6.0), st.floats(0.0, 70000.0)), max_size=60))
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(-1.0, 6.0) | st.sampled_from([math.inf, -math.inf, math.nan, 65.0, 1e6]),
+            st.floats(0.0, 70000.0),
+        ),
+        max_size=60,
+    )
+)
 def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
@@ -175,6 +183,15 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     seconds = left_s(energy, FLOOR, MAH)
     assert seconds is not None
     assert 0.0 <= seconds < 1e5
+
+
+@pytest.mark.parametrize("reading_v", [math.inf, -math.inf, math.nan, 5.1, 65.0, 1e6])
+@pytest.mark.parametrize("thrust", [0.0, HOVER_THRUST])
+def test_what_no_cell_can_have_is_no_reading(reading_v: float, thrust: float) -> None:
+    before = FINE_BATTERY if thrust else EnergyState()
+    assert updated(before, PERIOD_S, reading_v, thrust, MAH) == updated(
+        before, PERIOD_S, math.nan, thrust, MAH
+    )
 
 
 # --- the gate ------------------------------------------------------------------------------
