@@ -48,6 +48,8 @@ OVERDUE = 0.5
 """Of the landing's time: what is up there by then is left to its own landing."""
 FALLING_G, FALLEN_MPS = 0.5, 1.0
 """A landing that ends 5 cm above the floor drops it no faster, and is over."""
+FALLEN_BELOW_M = 0.4
+"""By an estimate that is placed, such an end is not higher up: that is a cut in the air."""
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 
@@ -185,9 +187,10 @@ def _by_itself(c: Context) -> Acted:
     """The vehicle's own landing, given again while it shows no effect."""
     landing_config, state = c.profile.planner.landing, c.state
     tel = c.obs.telemetry
-    # Where it has been given often enough, a short fall is its end, and not that it was lost.
-    given = state.orders >= LEAST_ORDERS
-    carried = tel.acc_z_g > FALLING_G or (given and tel.velocity_mps[2] > -FALLEN_MPS)
+    # Where it has been given often enough, a short fall is its end, and not that it was lost:
+    # near the floor, or where nothing tells how near that is.
+    ends = state.orders >= LEAST_ORDERS and not (c.placed and c.height_m >= FALLEN_BELOW_M)
+    carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.proves and c.obs.telemetry.thrust < 1 and carried and (state.orders or not c.flying):
         return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0
