@@ -71,8 +71,10 @@ def outlook(c: Context) -> BatteryOutlook:
     else:
         enough_s = seconds
     spare_s = enough_s - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
-    attempts = 0 if spare_s < 0.0 else 1 + math.floor(spare_s / needs.again_s)
     left = c.profile.planner.attempts - c.state.attempts
+    attempts = 0  # also where the figures are no numbers
+    if spare_s >= 0.0:
+        attempts = 1 + math.floor(min(spare_s / needs.again_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used, energy.rest_v)
 
 

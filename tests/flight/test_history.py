@@ -78,7 +78,15 @@ def battery_age_s(*readings_v: float) -> float:
 
 @pytest.mark.parametrize(
     "readings_v",
-    [(0.0,), (math.nan,), (0.01, 0.02, 0.0), (math.inf, -math.inf), (65.0, 65.1), (3.8, 0.0), (3.8,)],
+    [
+        (0.0,),
+        (math.nan,),
+        (0.01, 0.02, 0.0),
+        (math.inf, -math.inf),
+        (65.0, 65.1),
+        (3.8, 0.0),
+        (3.8,),
+    ],
     ids=["absent", "none", "jitters", "endless", "too large", "comes and goes", "stands still"],
 )
 def test_a_battery_that_tells_nothing_new_ages(readings_v: tuple[float, ...]) -> None:

@@ -15,8 +15,7 @@ from perchctl.flight import loop, senses
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
-from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEEL_BLIND_S
-from perchctl.mission.landing import own_landing
+from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEEL_BLIND_S, own_landing
 from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
