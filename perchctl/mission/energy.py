@@ -43,6 +43,8 @@ SMOOTH_S, LAG_S = 1.0, 0.3
 """Of the present resting voltage; and by how much a reading comes after its thrust."""
 STEADY_LOAD = 0.06
 """A thrust that is not farther from where it was belongs to the reading of the moment."""
+COUNTED_SHARE = 0.05
+"""Down to so much of the charge the count tells what is spent; below, the voltage alone."""
 LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0
 """From so much of the full thrust on, and after so many seconds of it, there is an estimate."""
 
@@ -193,7 +195,11 @@ def _summed(
 ) -> tuple[float, float, float, float, float]:
     """With one reading more, as deviations from what is usual."""
     assert state.ground_v is not None
-    spent_v = state.ground_v - resting_v(charge_at(state.ground_v) - state.used)
+    # A larger battery than assumed goes on where the count has come to the curve's steep end:
+    # counted on, a sag would be made up for it. A voltage above the curve is nothing spent.
+    begun = charge_at(state.ground_v)
+    counted = max(min(begun, COUNTED_SHARE), begun - state.used)
+    spent_v = resting_v(begun) - resting_v(counted)
     off_v = state.ground_v - battery_v - USUAL_SAG_V * state.load - USUAL_HUNGER * spent_v
     weight, keep = dt_s / READING_V**2, math.exp(-dt_s / FADES_S)
     a, b, c, p, q = (keep * each for each in state.fit)

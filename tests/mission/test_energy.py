@@ -77,22 +77,46 @@ WEAK = {
 }
 
 
-@pytest.mark.parametrize("name", WEAK)
-def test_what_is_left_is_not_more_than_there_is(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "hover"),
+    [*((name, HOVER) for name in WEAK), ("low", 0.5), ("low", 0.7), ("old", 0.5), ("old", 0.7)],
+)
+def test_what_is_left_is_not_more_than_there_is(name: str, hover: float) -> None:
     """From a few seconds on, where it decides."""
-    moments = list(hovering(*WEAK[name]))
+    moments = list(hovering(*WEAK[name], most_s=130.0, hover=hover))
     end_s = next(m.t_s for m in moments if m.t_s > 1.0 and m.under_load_v < FLOOR.hover_v)
-    assert 20.0 < end_s < 110.0
+    assert 20.0 < end_s < 125.0
     for moment in moments[:: round(1.0 / PERIOD_S)]:
         ahead_s = end_s - moment.t_s
         if moment.t_s < 6.0 or ahead_s <= 0.0:
             continue
-        told_s = left_s(moment.energy, FLOOR, MAH, HOVER)
+        told_s = left_s(moment.energy, FLOOR, MAH, hover)
         assert told_s is not None
         if ahead_s < ATTEMPT_S:  # an attempt that is lost in its ascent is not begun
             assert told_s < ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
         if ahead_s > 70.0:  # and one that is safe three times over is
             assert told_s > ATTEMPT_S + LANDING_S + PROFILE.safety.energy_reserve_s
+
+
+@pytest.mark.long
+def test_a_battery_larger_than_assumed_is_not_thought_fuller_near_its_end() -> None:
+    """The count of the thrust has come to the end of the charge long before it has."""
+    moments = []
+    for moment in hovering(3.95, CellKind(charge=1.6), 300.0, hover=0.7):
+        moments.append(moment)
+        if moment.t_s > 1.0 and moment.under_load_v < FLOOR.hover_v:
+            break
+    assert moments[-1].energy.used > charge_at(3.95)
+    for ahead_s in (60.0, 40.0, 20.0):
+        told_s = left_s(moments[-round(ahead_s / PERIOD_S)].energy, FLOOR, MAH, 0.7)
+        assert told_s is not None
+        assert 0.7 * ahead_s < told_s < 1.5 * ahead_s
+
+
+def test_a_voltage_above_the_curve_is_nothing_spent() -> None:
+    begun = EnergyState(ground_v=4.35, load=HOVER)
+    energy = updated(begun, PERIOD_S, 4.35 - 0.63 * HOVER, HOVER_THRUST, MAH)
+    assert energy.fit[2] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_a_light_vehicle_s_battery_is_not_asked_for_a_long_press() -> None:
@@ -219,6 +243,14 @@ def test_fewer_and_fewer_attempts_are_left() -> None:
     assert told == sorted(told)  # type: ignore[type-var]
     assert told[0] == 0
     assert told[-1] == PROFILE.planner.attempts
+
+
+@pytest.mark.parametrize(("reserve_s", "share"), [(math.nan, 0), (math.inf, 0), (-math.inf, 1)])
+def test_figures_that_are_no_numbers_end_no_flight(reserve_s: float, share: int) -> None:
+    safety = PROFILE.safety.model_copy(update={"energy_reserve_s": reserve_s})
+    profile = PROFILE.model_copy(update={"safety": safety})
+    c = Context(state_in(Phase.ALIGN), observation(20.0), profile)
+    assert outlook(c).attempts == share * PROFILE.planner.attempts
 
 
 def flown(
