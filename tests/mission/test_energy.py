@@ -122,7 +122,7 @@ def test_a_voltage_above_the_curve_is_nothing_spent() -> None:
 def test_a_light_vehicle_s_battery_is_not_asked_for_a_long_press() -> None:
     """It sags deep under full thrust, for a second; hovering takes half of that."""
     cell = CellKind(resistance_ohm=0.9 / 4.4)
-    moments = list(hovering(3.95, cell, 130.0, hover=0.5))
+    moments = list(hovering(3.95, cell, 70.0, hover=0.5))
     assert min(m.under_load_v for m in moments) > FLOOR.hover_v
     told_s = left_s(moments[round(8.0 / PERIOD_S)].energy, FLOOR, MAH, 0.5)
     assert told_s is not None
