@@ -12,6 +12,8 @@ LOW_POWER = 3  # pm.state
 FULL_THRUST = 65535
 NO_BATTERY_READING_V = 1.0
 """Below this nothing is measured: the battery is unknown, not empty (fault 7)."""
+MOST_CELL_V = 5.0
+"""No single cell has more: above this nothing is measured either."""
 
 
 @dataclass(frozen=True)
@@ -115,3 +117,8 @@ class EmergencyStop:
 
 
 Command = Idle | PositionSetpoint | RawThrust | StopMotors | Land | EmergencyStop
+
+
+def is_battery_reading(volts: float) -> bool:
+    """Whether a cell can have that voltage; NaN is none."""
+    return NO_BATTERY_READING_V <= volts <= MOST_CELL_V

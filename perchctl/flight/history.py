@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import SafetyConfig
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import Telemetry, is_battery_reading
 from perchctl.vision.types import Attitude
 
 KEEP_S = 2.0
@@ -19,12 +19,17 @@ FASTEST_TURN_RADPS, FASTEST_MPS2 = 7.0, 20.0
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it."""
+    """Telemetry of the last `KEEP_S`, oldest first, and what was found in it.
+
+    `battery_changed_s`: when the last reading differed from the one before, `battery_v`; without
+    any reading, when the first sample came: an absent one ages like one that stands still.
+    """
 
     samples: tuple[Telemetry, ...] = ()
     jumped: bool = False
     turned_rad: float = 0.0
     battery_changed_s: float | None = None
+    battery_v: float | None = None
 
     @property
     def newest(self) -> Telemetry | None:
@@ -38,21 +43,24 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
     Samples with NaN or out of order are left out (fault 35).
     """
     samples = list(history.samples)
-    jumped, turned_rad, changed = False, 0.0, history.battery_changed_s
+    jumped, turned_rad = False, 0.0
+    changed_s, battery_v = history.battery_changed_s, history.battery_v
     for sample in new:
         if not is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
             continue
         if samples:
             jumped = jumped or _is_jump(samples, sample, safety)
             turned_rad = max(turned_rad, _turned_rad(samples[-1], sample))
-        if changed is None or sample.battery_v != samples[-1].battery_v:
-            changed = sample.t_s
+        if changed_s is None:
+            changed_s = sample.t_s
+        if is_battery_reading(sample.battery_v) and sample.battery_v != battery_v:
+            changed_s, battery_v = sample.t_s, sample.battery_v
         samples.append(sample)
     if samples:
         oldest = samples[-1].t_s - KEEP_S
         first = bisect.bisect_left(samples, oldest, key=_time_s)
         samples = samples[first:]
-    return History(tuple(samples), jumped, turned_rad, changed)
+    return History(tuple(samples), jumped, turned_rad, changed_s, battery_v)
 
 
 def attitude_at(history: History, t_s: float) -> Attitude | None:

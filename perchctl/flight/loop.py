@@ -93,6 +93,7 @@ def fly(parts: FlightParts) -> FlightReport:
             senses.ground_z_m,
             flown_s=parts.clock.now() - started_s,
             held_m=watchdog.held_m,
+            blind_s=watchdog.blind_s(parts.clock.now()),
         )
         _tell_rescue(parts, error, safe)
         raise
@@ -167,7 +168,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         turns.lap()
         watchdog.turn(
             now_s, max(due_s, now_s) + period_s, state, command, obs.telemetry,
-            placed=Context(state, obs, parts.profile).placed,
+            placed=Context(state, obs, parts.profile).placed, position_age_s=obs.position_age_s,
         )  # fmt: skip
         events = events_of(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:

@@ -35,12 +35,14 @@ def rescue(
     ground_z_m: float = 0.0,
     flown_s: float = 0.0,
     held_m: float | None = None,
+    blind_s: float = 0.0,
 ) -> bool:
     """Order a landing and wait for it, bounded; whether the motors were seen off at the end.
     The landing needs no further packet once it is under way.
 
     `known` is the newest telemetry the loop has taken in, `ground_z_m` the height of the
-    ground in the estimate, `flown_s` for how long it has flown. What the ceiling held at
+    ground in the estimate, `flown_s` for how long it has flown, `blind_s` for how long without the
+    positions from outside that it needs. What the ceiling held at
     `held_m` is first peeled off: its own landing would run by the clock, and end up there. On
     the ground it is looked at again for `LOOK_S`: a take-off just begun does not show at once.
     """
@@ -66,7 +68,8 @@ def rescue(
             seen = under_way and orders >= LEAST_ORDERS
             due = orders == 0 or (not seen and now_s - ordered_s > REPEAT_ORDER_S)
             if due and orders < MAX_ORDERS:
-                link.send(own_landing(landing, ground_z_m, flown_s, newest))
+                gone_s = blind_s + now_s - start_s if blind_s > 0.0 else 0.0
+                link.send(own_landing(landing, ground_z_m, flown_s, newest, gone_s))
                 ordered_s, orders = now_s, orders + 1
         elif now_s - off_since_s >= LOOK_S:
             return True

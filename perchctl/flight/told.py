@@ -11,7 +11,7 @@ from perchctl.mission.hold import unplaced
 from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
 from perchctl.mission.watch import Event, EventKind, FlightReport
 from perchctl.profile import Profile
-from perchctl.vehicle import LOCKED, NO_BATTERY_READING_V
+from perchctl.vehicle import LOCKED, is_battery_reading
 
 
 def events_of(
@@ -22,7 +22,7 @@ def events_of(
     if before is None:
         start = planner.start(obs)
         events.append(Event(obs.t_s, EventKind.PHASE, start.reason, start.phase))
-        if obs.telemetry.battery_v < NO_BATTERY_READING_V:
+        if not is_battery_reading(obs.telemetry.battery_v):
             grace_s = profile.safety.battery_stale_s
             text = f"no battery reading: landing after {grace_s:.0f} s at most"
             events.append(Event(obs.t_s, EventKind.NOTE, text, start.phase))

@@ -74,6 +74,7 @@ class Turn:
         due_s: when the next turn is due; the loop measures its lateness from there.
         held_m: height of the body where the ceiling holds it, None away from the ceiling.
         placed: whether the estimate's height and speed prove anything (`Context.placed`).
+        position_age_s: of the newest position from outside; 0 where none is awaited.
     """
 
     t_s: float
@@ -86,6 +87,7 @@ class Turn:
     stopped: bool
     by_itself: bool
     placed: bool = True
+    position_age_s: float = 0.0
 
 
 class Watchdog:
@@ -123,6 +125,7 @@ class Watchdog:
         newest: Telemetry,
         *,
         placed: bool = True,
+        position_age_s: float = 0.0,
     ) -> None:
         """A turn of the loop is done, its command on its way."""
         if isinstance(command, (PositionSetpoint, RawThrust)):
@@ -143,6 +146,7 @@ class Watchdog:
             state.stopped_s is not None,
             state.phase is Phase.LANDING and state.orders > 0,
             placed,
+            position_age_s,
         )
 
     def rescuing(self) -> None:
@@ -157,6 +161,14 @@ class Watchdog:
     def held_m(self) -> float | None:
         """Height of the body where the ceiling holds it, as of the last turn."""
         return None if self._turn is None else self._turn.held_m
+
+    def blind_s(self, now_s: float) -> float:
+        """For how long no position from outside has come, by what the last turn knew; 0 where it
+        had one: `own_landing`."""
+        turn = self._turn
+        if turn is None or turn.placed:
+            return 0.0
+        return turn.position_age_s + now_s - turn.t_s
 
     # --- the link's side ---------------------------------------------------------------
 
@@ -248,7 +260,8 @@ class Watchdog:
             return None
         self._ordered_s, self._orders = now_s, self._orders + 1
         flown_s = now_s - turn.started_s
-        return own_landing(self._landing, turn.ground_z_m, flown_s, known or turn.telemetry)
+        newest, blind_s = known or turn.telemetry, self.blind_s(now_s)
+        return own_landing(self._landing, turn.ground_z_m, flown_s, newest, blind_s)
 
     def _let_go(self, now_s: float, known: Telemetry) -> Command | None:
         """The magnet holds on the least thrust of position mode: the whole weight is put on it

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from perchctl.mission.conditions import press_thrust
 from perchctl.mission.context import Context
 from perchctl.mission.energy import (
     LOW_POWER_V,
@@ -31,6 +32,8 @@ UNKNOWN_S = 5.0
 SETTLING_S, TOUCHING_S, LANDING_S = 3.0, 1.0, 3.0
 """Under the target, from the press to its proof, and of the vehicle's own landing: as measured
 in simulated flights."""
+PRESS_DIP_V = 0.3
+"""By so much a press that is over before `battery-low` fires may go below `safety.min_load_v`."""
 BACK_OFF_S = 3.0
 """From a failed attempt until it is steady, has the target, and is aligned again."""
 
@@ -68,8 +71,10 @@ def outlook(c: Context) -> BatteryOutlook:
     else:
         enough_s = seconds
     spare_s = enough_s - c.profile.safety.energy_reserve_s - needs.landing_s - needs.attempt_s
-    attempts = 0 if spare_s < 0.0 else 1 + math.floor(spare_s / needs.again_s)
     left = c.profile.planner.attempts - c.state.attempts
+    attempts = 0  # also where the figures are no numbers
+    if spare_s >= 0.0:
+        attempts = 1 + math.floor(min(spare_s / needs.again_s, max(0, left)))
     return BatteryOutlook(seconds, max(0, min(attempts, left)), used, energy.rest_v)
 
 
@@ -84,10 +89,13 @@ def _is_unknown(c: Context) -> bool:
 
 def floor_of(profile: Profile) -> Floor:
     """Where `battery-low` fires: by the firmware's word under a long load, by the profile's
-    under any."""
+    under one that outlasts `safety.battery_debounce_s`. A press seldom does."""
     safety = profile.safety
     low_v = float(profile.link.parameters.get("pm.lowVoltage", LOW_POWER_V))
-    return Floor(max(low_v, safety.min_load_v), safety.min_load_v)
+    press_s = TOUCHING_S + profile.planner.perch.contact_dwell_s
+    dip_v = 0.0 if press_s > safety.battery_debounce_s else PRESS_DIP_V
+    press_load = press_thrust(profile) / FULL_THRUST
+    return Floor(max(low_v, safety.min_load_v), safety.min_load_v - dip_v, press_load)
 
 
 def needs_of(c: Context) -> Needs:

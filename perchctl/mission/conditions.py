@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from perchctl.mission.context import Context
 from perchctl.mission.state import Condition, Phase
+from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST
 
 DESCENDED_M, HELD_WITHIN_M = 0.1, 0.1
@@ -75,16 +76,16 @@ def _contact(c: Context) -> bool:
     )
 
 
-def press_thrust(c: Context) -> float:
+def press_thrust(profile: Profile) -> float:
     """The most that a press can have."""
-    perch = c.profile.planner.perch
+    perch = profile.planner.perch
     return float(perch.thrust) if perch.mode == "raw" else FULL_THRUST
 
 
 def contact_thrust(c: Context) -> float:
     """What proves a contact: more than hovering takes, as far as there is more."""
     wanted = c.profile.planner.perch.contact_thrust_ratio * c.state.hover_thrust
-    return min(wanted, PROVABLE * press_thrust(c))
+    return min(wanted, PROVABLE * press_thrust(c.profile))
 
 
 def hovers(c: Context) -> bool:

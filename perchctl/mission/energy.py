@@ -22,7 +22,7 @@ import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 
-from perchctl.vehicle import FULL_THRUST, NO_BATTERY_READING_V
+from perchctl.vehicle import FULL_THRUST, is_battery_reading
 
 CURVE: tuple[tuple[float, float], ...] = (
     (0.0, 3.0), (0.02, 3.4), (0.05, 3.64), (0.1, 3.76), (0.2, 3.82), (0.3, 3.86), (0.4, 3.885),
@@ -43,6 +43,8 @@ SMOOTH_S, LAG_S = 1.0, 0.3
 """Of the present resting voltage; and by how much a reading comes after its thrust."""
 STEADY_LOAD = 0.06
 """A thrust that is not farther from where it was belongs to the reading of the moment."""
+COUNTED_SHARE = 0.05
+"""Down to so much of the charge the count tells what is spent; below, the voltage alone."""
 LEAST_LOAD, LEAST_LOADED_S = 0.2, 1.0
 """From so much of the full thrust on, and after so many seconds of it, there is an estimate."""
 
@@ -83,10 +85,12 @@ class BatteryFit:
 
 @dataclass(frozen=True)
 class Floor:
-    """Where the battery ends a flight: under a long load, and under the short one of a press."""
+    """Where the battery ends a flight: under a long load, and under the one of a press, which
+    takes `press_load` of the full thrust."""
 
     hover_v: float
     press_v: float
+    press_load: float = 1.0
 
 
 def updated(
@@ -94,7 +98,7 @@ def updated(
 ) -> EnergyState:
     """The state after `dt_s` under a commanded thrust 0..65535.
 
-    A `battery_v` below `NO_BATTERY_READING_V`, or none (NaN), is no reading."""
+    A `battery_v` that no cell can have, or none (NaN), is no reading."""
     load = max(0.0, min(1.0, thrust / FULL_THRUST))
     state = replace(
         state,
@@ -104,7 +108,7 @@ def updated(
     if load >= LEAST_LOAD:
         known = dt_s / 3.0 if state.mean_load else 1.0
         state = replace(state, mean_load=_towards(state.mean_load, load, known))
-    if not battery_v >= NO_BATTERY_READING_V:
+    if not is_battery_reading(battery_v):
         return _counted(state, dt_s, battery_mah)
     state = replace(state, unknown_s=0.0)
     if load == 0.0 and not state.loaded_s:
@@ -145,7 +149,8 @@ def left_s(
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
     fit = fitted(state)
-    end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v)
+    press_load = max(load, floor.press_load)
+    end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v * press_load)
     share = charge_at(state.rest_v) - charge_at(end_v)
     return max(0.0, share) / (fit.hunger * load * _per_s(battery_mah))
 
@@ -190,7 +195,11 @@ def _summed(
 ) -> tuple[float, float, float, float, float]:
     """With one reading more, as deviations from what is usual."""
     assert state.ground_v is not None
-    spent_v = state.ground_v - resting_v(charge_at(state.ground_v) - state.used)
+    # A larger battery than assumed goes on where the count has come to the curve's steep end:
+    # counted on, a sag would be made up for it. A voltage above the curve is nothing spent.
+    begun = charge_at(state.ground_v)
+    counted = max(min(begun, COUNTED_SHARE), begun - state.used)
+    spent_v = resting_v(begun) - resting_v(counted)
     off_v = state.ground_v - battery_v - USUAL_SAG_V * state.load - USUAL_HUNGER * spent_v
     weight, keep = dt_s / READING_V**2, math.exp(-dt_s / FADES_S)
     a, b, c, p, q = (keep * each for each in state.fit)

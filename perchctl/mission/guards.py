@@ -74,7 +74,7 @@ def too_weak(c: Context) -> bool:
     if c.held(Condition.SATURATED) >= WEAK_S:
         return True
     near = c.state.phase is Phase.ASCEND and c.held(Condition.NEAR_STANDOFF) >= 0.0
-    return near and c.state.hover_thrust > SATURATED * press_thrust(c)
+    return near and c.state.hover_thrust > SATURATED * press_thrust(c.profile)
 
 
 def is_astray(c: Context) -> bool:

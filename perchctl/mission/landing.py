@@ -38,6 +38,8 @@ vehicle comes sinking, and what the vehicle then catches up with must be slow.""
 MOST_DRIFT_M = 1.0
 BLIND_DRIFT_MPS = 0.08
 """Of a height that no position from outside corrects: the most that 40 simulated landings had."""
+MOST_BELOW_M = 3.0
+"""An estimate that is farther below the ground is no height, and no order aims along with it."""
 UNKNOWN_M = 1.0
 """The height to come down from where none is known."""
 PEELED_M = 0.1
@@ -48,6 +50,8 @@ OVERDUE = 0.5
 """Of the landing's time: what is up there by then is left to its own landing."""
 FALLING_G, FALLEN_MPS = 0.5, 1.0
 """A landing that ends 5 cm above the floor drops it no faster, and is over."""
+FALLEN_BELOW_M = 0.4
+"""By an estimate that is placed, such an end is not higher up: that is a cut in the air."""
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 
@@ -64,14 +68,17 @@ def own_landing(
     It aims below the ground, and the lower the longer the estimate has had to drift: the
     motors stop at the trajectory's end, and over a floor that lies lower they would drop it.
     It never aims above where the estimate has the vehicle, which may be far below the ground by
-    now: that would be a climb. `blind_s`: for how long no position from outside has come; until
+    now: that would be a climb; beyond `MOST_BELOW_M` it is no height, and it aims slowly at
+    that. `blind_s`: for how long no position from outside has come; until
     the floor none will, so it aims deeper in the same time, which is faster.
     """
     z_m = math.nan if newest is None else newest.position_m[2]
     below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
     known = math.isfinite(z_m)
-    aim_m = (min(ground_z_m, z_m) if known else ground_z_m) - below_m
-    lasts_s = SETTLING_S + _PEAK_OF_MEAN * (z_m - aim_m if known else UNKNOWN_M) / PLANNED_MPS
+    lowest_m = ground_z_m - MOST_BELOW_M
+    aim_m = (max(lowest_m, min(ground_z_m, z_m)) if known else ground_z_m) - below_m
+    way_m = UNKNOWN_M if not known else (z_m if z_m >= lowest_m else ground_z_m) - aim_m
+    lasts_s = SETTLING_S + _PEAK_OF_MEAN * way_m / PLANNED_MPS
     if blind_s > 0.0:
         aim_m -= min(MOST_DRIFT_M, BLIND_DRIFT_MPS * (blind_s + lasts_s))
     return Land(aim_m, lasts_s)
@@ -185,9 +192,10 @@ def _by_itself(c: Context) -> Acted:
     """The vehicle's own landing, given again while it shows no effect."""
     landing_config, state = c.profile.planner.landing, c.state
     tel = c.obs.telemetry
-    # Where it has been given often enough, a short fall is its end, and not that it was lost.
-    given = state.orders >= LEAST_ORDERS
-    carried = tel.acc_z_g > FALLING_G or (given and tel.velocity_mps[2] > -FALLEN_MPS)
+    # Where it has been given often enough, a short fall is its end, and not that it was lost:
+    # near the floor, or where nothing tells how near that is.
+    ends = state.orders >= LEAST_ORDERS and not (c.placed and c.height_m >= FALLEN_BELOW_M)
+    carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
     if c.proves and c.obs.telemetry.thrust < 1 and carried and (state.orders or not c.flying):
         return state, Idle()  # on the floor: another order would spin the motors up again
     ground_z = state.ground_m[2] if state.ground_m else 0.0

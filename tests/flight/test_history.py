@@ -12,10 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.flight.history import History, extended
+from perchctl.flight.told import events_of
+from perchctl.mission import planner
 from perchctl.mission.state import Outcome
 from perchctl.vehicle import Telemetry
 from tests.flight.test_loop import PROFILE, Rig, Vehicle
-from tests.helpers.mission import telemetry
+from tests.helpers.mission import observation, telemetry
 
 SAFETY = PROFILE.safety
 
@@ -62,6 +64,46 @@ def test_a_step_of_the_estimate_is_a_jump(changes: dict[str, Any]) -> None:
 )
 def test_a_small_step_is_none(changes: dict[str, Any]) -> None:
     assert not step(**changes)
+
+
+def battery_age_s(*readings_v: float) -> float:
+    """After 10 s in which they came in turn, ten a second."""
+    history = History()
+    for i in range(101):
+        sample = telemetry(0.1 * i, battery_v=readings_v[i % len(readings_v)])
+        history = extended(history, [sample], SAFETY)
+    assert history.battery_changed_s is not None
+    return 10.0 - history.battery_changed_s
+
+
+@pytest.mark.parametrize(
+    "readings_v",
+    [
+        (0.0,),
+        (math.nan,),
+        (0.01, 0.02, 0.0),
+        (math.inf, -math.inf),
+        (65.0, 65.1),
+        (3.8, 0.0),
+        (3.8,),
+    ],
+    ids=["absent", "none", "jitters", "endless", "too large", "comes and goes", "stands still"],
+)
+def test_a_battery_that_tells_nothing_new_ages(readings_v: tuple[float, ...]) -> None:
+    """Fault 7: it is landed after the grace, whatever fills the field of the reading."""
+    assert battery_age_s(*readings_v) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("readings_v", [(3.8, 3.81), (3.8, 0.0, 3.81, math.nan)])
+def test_a_battery_that_changes_is_read(readings_v: tuple[float, ...]) -> None:
+    assert battery_age_s(*readings_v) < 0.5
+
+
+@pytest.mark.parametrize(("battery_v", "told"), [(math.nan, True), (0.0, True), (3.8, False)])
+def test_a_flight_without_a_battery_reading_says_so(battery_v: float, told: bool) -> None:
+    obs = observation(1.0, telemetry=telemetry(1.0, battery_v=battery_v))
+    events = events_of(None, planner.start(obs), obs, PROFILE)
+    assert any("no battery reading" in event.reason for event in events) is told
 
 
 def test_the_heading_wraps() -> None:

@@ -15,7 +15,7 @@ from perchctl.flight import loop, senses
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
-from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEEL_BLIND_S
+from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, PEEL_BLIND_S, own_landing
 from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
@@ -396,6 +396,17 @@ def test_a_rescue_lands_on_the_ground_that_it_started_from() -> None:
         aims.append(orders(rig)[0].height_m - ground_z_m)
     assert aims == pytest.approx([aims[0]] * 3)
     assert -1.0 < aims[0] <= 0.0
+
+
+def test_a_rescue_without_positions_from_outside_aims_as_the_planner_does() -> None:
+    aims = []
+    for blind_s in (0.0, 2.0):
+        rig = Rig()
+        rig.rescue(telemetry(0.0, 1.5), blind_s=blind_s)
+        aims.append(orders(rig)[0])
+    expected = own_landing(PROFILE.planner.landing, 0.0, 0.0, telemetry(0.0, 1.5), 2.0)
+    assert aims[1] == expected
+    assert aims[1].height_m < aims[0].height_m - 0.2
 
 
 def test_a_rescue_steers_by_no_number_that_is_none() -> None:

@@ -14,7 +14,7 @@ from perchctl.flight.watchdog import (
     REPEAT_AFTER_S,
     Watchdog,
 )
-from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
+from perchctl.mission.landing import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S, own_landing
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, STILL_THRUST, STOPS
 from perchctl.mission.state import Operator, Phase, PlannerState
 from perchctl.profile import Profile
@@ -367,3 +367,18 @@ def test_an_estimate_that_slides_does_not_free_a_vehicle_from_the_ceiling() -> N
     assert isinstance(rig.after(late_s, thrust=60000.0), PositionSetpoint)
     rig.dog.turn(T_S, T_S + PERIOD_S, state, HOVER, telemetry(T_S, CEILING_M), placed=True)
     assert isinstance(rig.after(late_s, thrust=60000.0), Land)
+
+
+@pytest.mark.parametrize("placed", [True, False])
+def test_a_silent_loop_s_landing_knows_for_how_long_it_is_blind(placed: bool) -> None:
+    """As the planner's: its age goes on while the loop hangs."""
+    rig, late_s = Rig(), LAND_S + 0.1
+    rig.dog.turn(
+        T_S, T_S + PERIOD_S, IN_AIR, HOVER, telemetry(T_S), placed=placed, position_age_s=0.7
+    )
+    blind_s = rig.dog.blind_s(T_S + late_s)
+    assert blind_s == pytest.approx(0.0 if placed else 0.7 + late_s)
+    newest = telemetry(T_S + late_s - 0.02, rig.z_m)
+    flown_s = T_S + late_s - IN_AIR.started_s
+    order = own_landing(PROFILE.planner.landing, 0.0, flown_s, newest, blind_s)
+    assert rig.poll(late_s, newest) == order

@@ -221,6 +221,18 @@ def test_a_landing_that_ends_a_hand_above_the_floor_is_over(mps: float, again: b
     assert isinstance(ticked(state, 10.0, drops)[1], Land) is again
 
 
+@pytest.mark.parametrize(
+    ("z_m", "age_s", "again"), [(1.5, 0.0, True), (0.3, 0.0, False), (1.5, 2.0, False)]
+)
+def test_a_cut_in_the_air_is_answered_at_once(z_m: float, age_s: float, again: bool) -> None:
+    """Ordered three times, and the motors stop far above the floor: that is no landing's end,
+    unless no position tells how far above."""
+    state = replace(state_in(Phase.LANDING, z_m=1.8), orders=3, ordered_s=5.0)
+    cut = telemetry(10.0, z_m, thrust=0.0, acc_z_g=0.02, velocity_mps=(0.0, 0.0, -0.3))
+    _, command = ticked(state, 10.02, replace(cut, t_s=10.02), position_age_s=age_s)
+    assert isinstance(command, Land) is again
+
+
 @pytest.mark.parametrize("z_m", [-2.0, -0.3, 0.0, 0.3, 2.0])
 @pytest.mark.parametrize("blind_s", [0.0, 0.7, 1e3, math.inf])
 def test_no_landing_of_its_own_goes_up(z_m: float, blind_s: float) -> None:
@@ -230,6 +242,17 @@ def test_no_landing_of_its_own_goes_up(z_m: float, blind_s: float) -> None:
     assert order.height_m <= min(0.0, z_m) - config.undershoot_m
     assert order.height_m >= min(0.0, z_m) - config.undershoot_m - 2.0 * MOST_DRIFT_M
     assert 1.0 < order.duration_s < 20.0
+
+
+@pytest.mark.parametrize("ground_z_m", [0.0, 0.75])
+@pytest.mark.parametrize("z_m", [-4.0, -100.0, -1e30])
+def test_a_height_that_cannot_be_is_not_followed_down(ground_z_m: float, z_m: float) -> None:
+    """One wild sample, and the vehicle would dive from where it really is."""
+    config = PROFILE.planner.landing
+    order = own_landing(config, ground_z_m, 0.0, telemetry(1.0, z_m))
+    way_m = ground_z_m + 1.0 - order.height_m  # from a metre up
+    assert way_m == pytest.approx(1.0 + 3.0 + config.undershoot_m)
+    assert 15 / 8 * way_m / order.duration_s < 0.5
 
 
 def test_a_blind_landing_aims_below_what_its_height_drifts_by() -> None:
