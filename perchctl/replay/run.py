@@ -83,7 +83,9 @@ def replay(
     seen = None
     if pictures is not None:
         pipeline = pipeline or pipeline_of(log, used, changed)
-        seen = _seen(log, turns, used, pictures, pipeline)
+        # A source takes the latency off the time at which a picture came.
+        later_s = flown.camera.start_latency_s - used.camera.start_latency_s
+        seen = _seen(log, turns, used, pictures, pipeline, later_s)
     observations: dict[int, Observation | None] = {}
     if seen is not None and changed:
         observations = {each.turn.number: each.observation for each in seen.turns}
@@ -139,12 +141,13 @@ def _seen(
     profile: Profile,
     pictures: Iterable[Picture],
     pipeline: Pipeline,
+    later_s: float,
 ) -> Seen:
     found: list[Sensed] = []
     ended = ""
     with one_thread():
         try:
-            for each in sense(turns, profile, pipeline, pictures):
+            for each in sense(turns, profile, pipeline, pictures, later_s):
                 found.append(each)
         except PictureMissing as missing:
             ended = f"{missing}: what came after it cannot be seen again"

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from perchctl.flight import senses
 from perchctl.flight.loop import fly
 from perchctl.log.read import FlightLog, read_log
 from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter, make_header
 from perchctl.mission.state import Operator, Phase
 from perchctl.mission.watch import Tick
+from perchctl.pipeline import FieldState, Pipeline
+from perchctl.profile.changed import changed
 from perchctl.replay.run import Replay, replay
 from perchctl.replay.sense import Picture
 from perchctl.vision.types import Frame
-from tests.flight.test_loop import PROFILE, Rig, SleepyClock, Vehicle
+from tests.flight.test_loop import PROFILE, Camera, Rig, SleepyClock, Vehicle
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 
 
@@ -101,6 +105,40 @@ def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not found.seen.ended
 
 
+def test_a_source_that_ends_does_so_again(tmp_path: Path) -> None:
+    """By its own name, which the planner was shown."""
+    log, pictures = flown(tmp_path, Rig(camera=Camera(frames=40)))
+    observed = [turn.observation for turn in log.turns if turn.observation is not None]
+    assert observed[-1].camera_problem == "the scripted camera has ended"
+    found = seen_again(log, pictures)
+    assert found.seen is not None
+    assert found.seen.first is None, found.seen.first
+    assert found.same
+
+
+def test_with_another_latency_the_pictures_are_of_another_time(
+    flight: tuple[FlightLog, list[Picture]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are still found, by the recorded time."""
+    log, given_s = begun(flight[0]), []
+    inside = senses.pictures
+
+    def looked_at(state: FieldState, frame: Frame, pipeline: Pipeline) -> Any:
+        given_s.append(frame.t_s)
+        return inside(state, frame, pipeline)
+
+    monkeypatch.setattr(senses, "pictures", looked_at)
+    seen_again(log, flight[1])
+    as_flown_s = given_s.copy()
+    given_s.clear()
+    latency_s = PROFILE.camera.start_latency_s + 0.02
+    found = replay(log, flight[1], changed(PROFILE, [f"camera.latency_s={latency_s}"]), Rig().setup)
+    assert found.seen is not None
+    assert not found.seen.ended
+    assert given_s == pytest.approx([t_s - 0.02 for t_s in as_flown_s])
+    assert given_s
+
+
 def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> None:
     log, pictures = begun(flight[0]), flight[1]
     index, t_s, image = pictures[20]
@@ -131,9 +169,9 @@ def test_a_pose_that_differs_is_named(flight: tuple[FlightLog, list[Picture]]) -
     obs = turns[at].observation
     assert obs is not None
     turns[at] = replace(turns[at], observation=replace(obs, camera_age_s=obs.camera_age_s + 1e-15))
-    changed = replace(log)
-    changed.__dict__["turns"] = turns
-    found = seen_again(changed, pictures)
+    other = replace(log)
+    other.__dict__["turns"] = turns
+    found = seen_again(other, pictures)
     assert found.seen is not None
     assert found.seen.first is not None
     assert (found.seen.first.tick, found.seen.first.field) == (10, "camera_age_s")
