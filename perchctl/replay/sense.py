@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight.senses import ENDED, SENSED, Senses
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken, Turn
@@ -28,6 +29,14 @@ Picture = tuple[int, float, NDArray[np.uint8]]
 
 class PictureMissing(Exception):
     """The replay of pictures ends here; the message says why."""
+
+
+class PictureAnother(PictureMissing):
+    """It is there, and not the one that was flown by."""
+
+
+class PicturesUnreadable(PictureMissing):
+    """What should hold them is damaged, or is no recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +57,7 @@ class _Given:
     ) -> None:
         self.size_px: tuple[int, int] | None = size_px
         self._later_s = later_s
-        self._pictures = iter(pictures)
+        self._pictures = _readable(pictures)
         self._name = "the recording"
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
         self._taken = Taken()
@@ -115,7 +124,7 @@ class _Given:
         for index, t_s, image in self._pictures:
             if (index, t_s) == (seen.index, seen.t_s):
                 if seen.checksum not in (None, zlib.crc32(image.tobytes())):
-                    raise PictureMissing(f"the picture of frame {seen.index} is another one")
+                    raise PictureAnother(f"the picture of frame {seen.index} is another one")
                 return image
             if index > seen.index:
                 break
@@ -133,8 +142,8 @@ def sense(
     """Each turn, in order, from the first before take-off on. `later_s` is added to the time at
     which a live source's pictures were taken.
 
-    Raises PictureMissing where a frame was taken whose picture is not there: from then on the
-    pipeline would remember another flight.
+    Raises PictureMissing where a frame was taken whose picture is not there, is another one or
+    cannot be read: from then on the pipeline would remember another flight.
     """
     given = _Given(pictures, pipeline.camera.size_px, later_s)
     senses = Senses(given, given, pipeline, profile)
@@ -145,6 +154,14 @@ def sense(
             if turn.t_s != turn.began_s:
                 senses.present(turn.began_s, turn.t_s)
             yield Sensed(turn, senses.poses, _observed(turn, senses))
+
+
+def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
+    """A recording that cannot be read costs the planner's replay nothing."""
+    try:
+        yield from pictures
+    except (InvalidValue, NotFound) as error:
+        raise PicturesUnreadable(str(error)) from error
 
 
 def _observed(turn: Turn, senses: Senses) -> Observation | None:

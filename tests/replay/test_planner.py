@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from perchctl.profile.changed import changed
 from perchctl.replay.compare import first_differing, same
 from perchctl.replay.run import changed_keys, replay
 from perchctl.replay.told import replay_lines, replay_record
-from perchctl.replay.whatif import CAUTION, gates_of
+from perchctl.replay.whatif import CAUTION, Gate, gates_of
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.commands import run
 from tests.replay.test_corpus import FOLDER, corpus
@@ -124,6 +125,8 @@ def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
     assert found.same
     assert found.ticks < 200
     assert any("is not in the log" in note for note in found.notes)
+    assert "is not in the log" in replay_record(found, [], [])["gap"]
+    assert any("up to where the log has lost" in line for line in replay_lines(found, [], []))
 
 
 def test_a_log_of_before_has_no_turns(tmp_path: Path) -> None:
@@ -221,6 +224,34 @@ def test_what_acts_on_pictures_only_is_said() -> None:
         n.startswith("kalman.n_max: what it would change in the pictures") for n in found.notes
     )
     assert any(n.startswith("link.loop_hz: a replay has nothing") for n in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("setting", "why"),
+    [
+        ("safety.jump_m=0.9", "takes the flight's pictures"),
+        ("safety.camera_hold_s=0.2", "takes the flight's pictures"),
+        ("safety.max_frame_age_s=0.3", "takes the flight's pictures"),
+        ("positioning.rate_hz=50", "positions that reach the vehicle"),
+    ],
+)
+def test_what_was_not_looked_at_is_said(setting: str, why: str) -> None:
+    log = corpus("stopped")
+    found = replay(log, None, changed(profile_of(log.header), [setting]))
+    key = setting.partition("=")[0]
+    assert any(note.startswith(f"{key}: ") and why in note for note in found.notes)
+    same = "no command would have been another, by the observations as they were recorded"
+    assert any(same in line for line in replay_lines(found, [], []))
+
+
+@pytest.mark.parametrize(
+    ("times_s", "text"),
+    [((1.0,), "at 1.00 s as"), ((1.0, 2.0), "once more as"), ((1.0, 2.0, 3.0), "2 times more as")],
+)
+def test_gates_are_counted_in_words(times_s: tuple[float, ...], text: str) -> None:
+    found = replay(corpus("stopped"))
+    changed_too = replace(found, changed=("x",))
+    assert any(text in s for s in replay_lines(changed_too, [Gate("g", times_s, ())], []))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import senses
 from perchctl.flight.loop import fly
 from perchctl.log.read import FlightLog, read_log
@@ -20,6 +22,7 @@ from perchctl.pipeline import FieldState, Pipeline
 from perchctl.profile.changed import changed
 from perchctl.replay.run import Replay, replay
 from perchctl.replay.sense import Picture
+from perchctl.replay.told import replay_lines, replay_record
 from perchctl.vision.types import Frame
 from tests.flight.test_loop import PROFILE, Camera, Rig, SleepyClock, Vehicle
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
@@ -148,6 +151,46 @@ def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> 
     assert found.seen is not None
     assert f"the picture of frame {index} is another one" in found.seen.ended
     assert not found.seen.differences
+    assert not found.same
+
+
+def test_where_no_picture_is_left_nothing_is_the_same(
+    flight: tuple[FlightLog, list[Picture]],
+) -> None:
+    log = begun(flight[0])
+    found = seen_again(log, [])
+    assert found.first is None
+    assert not found.same
+    record, lines = replay_record(found, [], []), replay_lines(found, [], [])
+    assert (record["pictures"]["frames"], record["gap"]) == (0, None)
+    assert record["pictures"]["frames_flown"] > 20
+    assert "was not recorded" in record["pictures"]["ended"]
+    assert f"pictures:  seen up to frame 0 of {record['pictures']['frames_flown']}" in lines
+    assert not any("to the bit" in line for line in lines)
+
+
+def damaged(pictures: list[Picture], error: Exception) -> Iterator[Picture]:
+    yield from pictures
+    raise error
+
+
+@pytest.mark.parametrize("error", [InvalidValue("it is none"), NotFound("it is gone")])
+def test_a_recording_that_cannot_be_read_costs_the_planner_nothing(
+    flight: tuple[FlightLog, list[Picture]], error: Exception
+) -> None:
+    log = begun(flight[0])
+    found = replay(log, damaged([], error), pipeline=Rig().setup)
+    assert found.same
+    assert found.ticks > 20
+    assert any(str(error) in note for note in found.notes)
+    part = replay(log, damaged(flight[1][:10], error), pipeline=Rig().setup)
+    assert part.seen is not None
+    assert part.seen.frames > 5
+    assert part.same
+    other = changed(PROFILE, ["kalman.n_max=3"])
+    what_if = replay(log, damaged([], error), other, Rig().setup)
+    assert what_if.ticks == found.ticks
+    assert any(note.startswith("kalman.n_max: ") for note in what_if.notes)
 
 
 def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> None:
@@ -158,6 +201,9 @@ def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> N
         assert found.seen is not None
         assert f"frame {pictures[20][0]} was not recorded" in found.seen.ended
         assert 0 < len(found.seen.turns) < len(log.turns)
+        assert found.same  # what was compared
+        line = replay_lines(found, [], [])[-1]
+        assert f"up to frame {found.seen.frames} of {found.seen.frames_flown}, all with" in line
         assert not found.seen.differences
         assert len(found.decided) > len(found.seen.turns)  # the planner needs no picture
 
