@@ -94,6 +94,8 @@ def fly(parts: FlightParts) -> FlightReport:
             flown_s=parts.clock.now() - started_s,
             held_m=watchdog.held_m,
         )
+        with contextlib.suppress(Exception):  # the log may be what failed
+            turns.failed(senses)
         _tell_rescue(parts, error, safe)
         raise
 
@@ -153,6 +155,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         outside = None if parts.positions is None else parts.positions(now_s)
         obs = _observe(parts, senses, now_s, late_s, outside)
         turns.lap()
+        turns.observed(obs)
         before = state
         new, command = planner.step(before or planner.start(obs), obs, parts.profile)
         turns.lap()

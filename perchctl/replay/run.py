@@ -62,7 +62,8 @@ class Seen:
 class Replay:
     """Attributes:
     decided: each turn of the planner, decided again.
-    ticks: how many were flown; `differences`, how many of all were decided otherwise.
+    ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
+        may be of one that was not sent.
     seen: None without pictures.
     changed: the keys in which the profile is another than the flown one's.
     observations_anew: the planner was given what another profile sees in the pictures.
@@ -84,7 +85,7 @@ class Replay:
 
     @property
     def same(self) -> bool:
-        return not self.differences and (self.seen is None or self.seen.same)
+        return self.first is None and (self.seen is None or self.seen.same)
 
 
 def replay(
@@ -123,7 +124,7 @@ def replay(
         profile=used,
         decided=decided,
         ticks=sum(each.turn.role == "flown" for each in decided),
-        differences=sum(each.differs for each in decided),
+        differences=sum(each.differs for each in decided if each.turn.role == "flown"),
         first=first_of(decided, log.t0_s),
         seen=seen,
         changed=changed,
@@ -131,6 +132,18 @@ def replay(
         gap=whole.gap,
         notes=tuple(_notes(log, whole.gap, seen, changed)),
     )
+
+
+def check_readable(log: FlightLog) -> None:
+    """Decode all that a replay takes from the log. Errors: InvalidValue, and those of a value that
+    no flight writes."""
+    whole_turns(log)
+    profile_of(log.header)
+    camera = camera_in(log.header)
+    if camera is not None:
+        mask_in(log.header, camera)
+    if log.t0_s != log.t0_s:
+        raise ValueError("t0_s is no time")
 
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:

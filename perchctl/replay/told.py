@@ -80,6 +80,10 @@ def _planner_lines(replay: Replay) -> list[str]:
         if replay.gap:
             same += ", up to where the log has lost a turn"
         return [f"planner:   {ticks}, {same}"]
+    if not replay.differences:
+        what = "would only be" if what_if else "is only"
+        lead = f"planner:   {ticks}, what was not sent {what} decided otherwise"
+        return [lead, f"first:     {difference_text(replay.first, what_if)}"]
     would = "would be decided otherwise" if what_if else "are decided otherwise"
     return [
         f"planner:   {ticks}, {replay.differences} {would}",
@@ -123,9 +127,7 @@ def _gate_line(gate: Gate) -> str:
 def _times(times_s: Sequence[float]) -> str:
     if not times_s:
         return "never"
-    more = {1: "", 2: " and once more"}.get(
-        len(times_s), f" and {len(times_s) - 1} times more"
-    )
+    more = {1: "", 2: " and once more"}.get(len(times_s), f" and {len(times_s) - 1} times more")
     return f"at {times_s[0]:.2f} s{more}"
 
 

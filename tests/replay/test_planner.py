@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 
 import perchctl
+from perchctl.commands import log_plot, log_replay
+from perchctl.commands.log_replay import ReplayRequest
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
 from perchctl.log.exact import to_exact
 from perchctl.log.jsonl import line_of
@@ -116,6 +118,30 @@ def test_a_packed_log_that_is_cut_is_read_as_far_as_it_goes(tmp_path: Path) -> N
     log = read_log(path)
     assert log.truncated
     assert replay(log).same
+
+
+def test_a_packed_log_may_be_of_several_parts(tmp_path: Path) -> None:
+    lines, path = lines_of(), tmp_path / "parts.jsonl.gz"
+    parts = [b"".join(lines[:200]), b"".join(lines[200:])]
+    path.write_bytes(b"".join(gzip.compress(part) for part in parts))
+    log = read_log(path)
+    assert not log.truncated
+    assert len(log.turns) == len(corpus("perched").turns)
+
+
+def test_a_turn_that_was_not_sent_is_no_tick_of_either_count() -> None:
+    log = replace(corpus("stopped"))
+    turns = list(log.turns)
+    at = len(turns) - 20
+    turn = replace(turns[at], role="redone", attempts=9)
+    rest = [replace(t, number=t.number + 1) for t in turns[at:]]
+    log.__dict__["turns"] = [*turns[:at], turn, *rest]
+    found = replay(log)
+    assert found.first is not None
+    assert found.first.field == "attempts"
+    assert (found.ticks, found.differences) == (replay(corpus("stopped")).ticks, 0)
+    assert not found.same
+    assert any("what was not sent" in line for line in replay_lines(found, [], []))
 
 
 def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
@@ -316,6 +342,30 @@ def test_both_are_drawn(tmp_path: Path) -> None:
     again = run(*words, "-o", str(picture))
     assert again.code == 30
     assert "--force" in again.complaint
+
+
+def test_a_fault_of_the_planner_is_not_the_file_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: Any) -> Any:
+        raise ValueError("by the test")
+
+    path = log_of(tmp_path, lines_of()[:120])
+    monkeypatch.setattr("perchctl.mission.planner.step", fails)
+    with pytest.raises(ValueError, match="by the test"):
+        log_replay.run(ReplayRequest(path))
+    monkeypatch.setattr("perchctl.log.plot.plot_flight", fails)
+    with pytest.raises(ValueError, match="by the test"):
+        log_plot.run(log_plot.PlotRequest(path))
+
+
+def test_a_damaged_turn_is_the_file_s(tmp_path: Path) -> None:
+    lines = lines_of()[:120]
+    at = next(k for k, line in enumerate(lines) if b'"role":"flown"' in line)
+    lines[at] = altered(lines[at], attempts="many")
+    said = run("log", "replay", str(log_of(tmp_path, lines)))
+    assert said.code == 30
+    assert "cannot be read" in said.complaint
 
 
 def test_the_command_compares_with_another_profile(tmp_path: Path) -> None:
