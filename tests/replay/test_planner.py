@@ -323,6 +323,16 @@ def test_the_command_says_so_and_leaves_with_0(tmp_path: Path) -> None:
     assert record["ticks"] > 50
 
 
+def test_a_broken_recording_beside_the_log_is_a_note(tmp_path: Path) -> None:
+    path = log_of(tmp_path, lines_of()[:150])
+    path.with_suffix(".mcap").write_bytes(b"no recording")
+    said = run("log", "replay", str(path))
+    assert said.code == 0
+    assert "all with the same commands" in said.stdout
+    assert "pictures:  seen up to frame 0 of" in said.stdout
+    assert "f.mcap" in said.stderr
+
+
 def test_the_command_leaves_with_its_own_code_where_something_differs(tmp_path: Path) -> None:
     path = log_of(tmp_path, lines_of())
     said = run("log", "replay", str(path), "--set", "planner.ascend.settle_dwell_s=0.6")
