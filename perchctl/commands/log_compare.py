@@ -34,10 +34,10 @@ def run(request: CompareRequest) -> int:
     with opened(request.one) as one, opened(request.other) as other:
         found = compared(one, other)
         record, text = comparison_record(found), comparison_text(found)
-        if picture is not None:
-            from perchctl.log.compare.plot import plot_comparison
+    if picture is not None:
+        from perchctl.log.compare.plot import plot_comparison
 
-            plot_comparison(one, other, picture)
+        plot_comparison(one, other, picture)
     if request.as_json:
         print_record(record | {"plot": None if picture is None else str(picture)})
         return 0

@@ -40,7 +40,8 @@ def log_folder(profile: str | None, log_dir: Path | None) -> Path:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[FlightLog]:
-    """The log; a value in it that is of no flight is an error of the file.
+    """The log; within, a value in it that is of no flight is an error of the file: read and decode
+    within, and decide and draw after it, where a fault is the program's.
 
     Errors: NotFound, InvalidValue.
     """

@@ -32,15 +32,14 @@ def run(request: PlotRequest) -> int:
     picture = request.output or beside(path, ".png")
     with opened(path) as log:
         check_output(picture, FORMATS, request.force, DRAWN_IN)
-        from perchctl.log.plot import plot_flight
+        outcome = summary_of(log).outcome
+    from perchctl.log.plot import plot_flight
 
-        plot_flight(log, picture)
-        if request.as_json:
-            print_record(
-                {"log": str(path), "plot": str(picture), "outcome": summary_of(log).outcome}
-            )
-        else:
-            print(f"plot:      {picture}")
+    plot_flight(log, picture)
+    if request.as_json:
+        print_record({"log": str(path), "plot": str(picture), "outcome": outcome})
+    else:
+        print(f"plot:      {picture}")
     return 0
 
 

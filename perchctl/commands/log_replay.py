@@ -15,7 +15,7 @@ from perchctl.log.recording import pictures_of, recording_of
 from perchctl.log.setup import profile_of
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.changed import changed
-from perchctl.replay.run import replay
+from perchctl.replay.run import check_readable, replay
 from perchctl.replay.sense import Picture
 from perchctl.replay.told import replay_lines, replay_record
 from perchctl.replay.whatif import changes_of, gates_of
@@ -44,23 +44,24 @@ def run(request: ReplayRequest) -> int:
         check_output(request.output, FORMATS, request.force, "what plots are drawn in")
     with opened(path) as log:
         wanted = _profile(request, log)
-        found = replay(log, _pictures(request, path), wanted)
-        if wanted is not None and not found.changed:
-            say("nothing was changed: that is what was flown")
-        gates = gates_of(found) if found.changed else []
-        changes = changes_of(found) if found.changed else []
-        if request.output is not None:
-            from perchctl.replay.plot import plot_replay
+        check_readable(log)
+    found = replay(log, _pictures(request, path), wanted)
+    if wanted is not None and not found.changed:
+        say("nothing was changed: that is what was flown")
+    gates = gates_of(found) if found.changed else []
+    changes = changes_of(found) if found.changed else []
+    if request.output is not None:
+        from perchctl.replay.plot import plot_replay
 
-            plot_replay(found, request.output)
-        if request.as_json:
-            print_record(replay_record(found, gates, changes))
-        else:
-            for note in found.notes:
-                say(note)
-            print("\n".join(replay_lines(found, gates, changes)))
-            if request.output is not None:
-                print(f"plot:      {request.output}")
+        plot_replay(found, request.output)
+    if request.as_json:
+        print_record(replay_record(found, gates, changes))
+    else:
+        for note in found.notes:
+            say(note)
+        print("\n".join(replay_lines(found, gates, changes)))
+        if request.output is not None:
+            print(f"plot:      {request.output}")
     return 0 if found.same else ReplayDiffers.exit_code
 
 

@@ -95,6 +95,8 @@ def fly(parts: FlightParts) -> FlightReport:
             held_m=watchdog.held_m,
             blind_s=watchdog.blind_s(parts.clock.now()),
         )
+        with contextlib.suppress(Exception):  # the log may be what failed
+            turns.failed(senses)
         _tell_rescue(parts, error, safe)
         raise
 
@@ -154,6 +156,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         outside = None if parts.positions is None else parts.positions(now_s)
         obs = _observe(parts, senses, now_s, late_s, outside)
         turns.lap()
+        turns.observed(obs)
         before = state
         new, command = planner.step(before or planner.start(obs), obs, parts.profile)
         turns.lap()

@@ -24,6 +24,7 @@ from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineSta
 
 MIRRORED_FRAMES = 5
 REMARK_PICTURES = 3
+ENDED = " has ended"
 SENSED = (
     "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
     "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused",
@@ -85,7 +86,7 @@ class Senses:
             frame = replace(frame, t_s=frame.t_s - used_s)
         if frame is None:
             if problem is None and self.source.finished:
-                problem = f"{self.source.describe()} has ended"
+                problem = f"{self.source.describe()}{ENDED}"
             if problem is not None:
                 self.camera_problem = problem
             return

@@ -12,6 +12,9 @@ from perchctl.mission.watch import TurnWatcher, Watcher
 from perchctl.positioning.feed import FeedStatus
 from perchctl.vehicle import Command
 
+UNDECIDED: TurnRole = "redone"
+"""The role of a turn on which the planner raised: not sent either, and without a command."""
+
 
 class Turns:
     """Counts them. In lockstep there are no timings: the same seed gives the same turns."""
@@ -22,6 +25,7 @@ class Turns:
         self._count = 0
         self._began_s = 0.0
         self._laps_s = [0.0]
+        self._undecided: Observation | None = None
 
     def begin(self, now_s: float) -> None:
         self._began_s, self._laps_s = now_s, [now_s]
@@ -40,6 +44,22 @@ class Turns:
 
     def redone(self, senses: Senses, obs: Observation, new: PlannerState, command: Command) -> None:
         self._tell(self._turn("redone", senses, obs, new, command, None))
+
+    def observed(self, obs: Observation) -> None:
+        """What is about to be decided on."""
+        self._undecided = obs
+
+    def failed(self, senses: Senses) -> None:
+        """The flight broke off. Where the planner was at work, tell what it was shown: by that its
+        fault can be found again."""
+        obs, self._undecided = self._undecided, None
+        if obs is not None:
+            self._tell(
+                Turn(
+                    self._counted(), UNDECIDED, self._began_s, obs.t_s, senses.taken, senses.poses,
+                    observation=obs,
+                )
+            )  # fmt: skip
 
     def flown(
         self,
@@ -60,6 +80,7 @@ class Turns:
         command: Command,
         outside: Outside | None,
     ) -> Turn:
+        self._undecided = None
         return Turn(
             number=self._counted(),
             role=role,
@@ -78,9 +99,11 @@ class Turns:
         )
 
     def _timing(self) -> TurnTiming | None:
-        if self._clock is None or len(self._laps_s) < 4:
+        if self._clock is None:
             return None
-        began_s, seen_s, decided_s, sent_s = self._laps_s[:4]
+        # Of a turn that was not sent, or not decided, that part took no time.
+        laps_s = [*self._laps_s, *[self._laps_s[-1]] * 3]
+        began_s, seen_s, decided_s, sent_s = laps_s[:4]
         return TurnTiming(
             seen_s - began_s, decided_s - seen_s, sent_s - decided_s, self._clock.now() - began_s
         )

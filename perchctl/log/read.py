@@ -169,10 +169,13 @@ def _lines(path: Path) -> list[bytes]:
 
 def _unpacked(data: bytes) -> bytes:
     """As far as it goes: the end of one that is cut is lost."""
-    unpacker, found = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS), b""
+    members: list[bytes] = []
     with contextlib.suppress(zlib.error):
-        found = unpacker.decompress(data)
-    return found
+        while data.startswith(_GZIP):  # `cat` and some packers put several in one file
+            unpacker = zlib.decompressobj(wbits=16 + zlib.MAX_WBITS)
+            members.append(unpacker.decompress(data))
+            data = unpacker.unused_data
+    return b"".join(members)
 
 
 def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:

@@ -38,8 +38,10 @@ class Decided:
 
     @cached_property
     def difference(self) -> tuple[str, Any, Any] | None:
-        """The first field in which it does."""
+        """The first field in which it does; a turn on which the planner raised has none."""
         turn, state = self.turn, self.state
+        if turn.command is None:
+            return None
         return next(
             (
                 found

@@ -17,7 +17,15 @@ from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.replay.compare import Difference, first_differing, same
 from perchctl.replay.decide import Decided, decide, first_of, whole_turns
-from perchctl.replay.sense import Picture, PictureMissing, Sensed, one_thread, sense
+from perchctl.replay.sense import (
+    Picture,
+    PictureAnother,
+    PictureMissing,
+    PicturesUnreadable,
+    Sensed,
+    one_thread,
+    sense,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,25 +34,40 @@ class Seen:
 
     Attributes:
         turns: each, seen again, up to where a picture is missing.
-        frames: pictures that were looked at.
+        frames: pictures that were looked at, of `frames_flown`.
         differences: turns of which a pose, or what the planner sees, differs.
         ended: why it ends before the flight does, or empty.
+        another: it ends at a picture that is not the flown one.
+        unreadable: it ends where the recording cannot be read.
     """
 
     turns: Sequence[Sensed]
     frames: int
     differences: int
     first: Difference | None
+    frames_flown: int = 0
     ended: str = ""
+    another: bool = False
+    unreadable: bool = False
+
+    @property
+    def same(self) -> bool:
+        """Of pictures none of which was looked at that is not known; of those that cannot be
+        read, nothing is."""
+        unseen = bool(self.ended) and not self.frames and not self.unreadable
+        return not (self.differences or self.another or unseen)
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
     """Attributes:
     decided: each turn of the planner, decided again.
-    ticks: how many were flown; `differences`, how many of all were decided otherwise.
+    ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
+        may be of one that was not sent.
     seen: None without pictures.
     changed: the keys in which the profile is another than the flown one's.
+    observations_anew: the planner was given what another profile sees in the pictures.
+    gap: which turn is the first that the log has lost, or empty.
     notes: what limits the replay, in sentences.
     """
 
@@ -56,11 +79,13 @@ class Replay:
     first: Difference | None
     seen: Seen | None = None
     changed: tuple[str, ...] = ()
+    observations_anew: bool = False
+    gap: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def same(self) -> bool:
-        return not self.differences and (self.seen is None or not self.seen.differences)
+        return self.first is None and (self.seen is None or self.seen.same)
 
 
 def replay(
@@ -83,9 +108,12 @@ def replay(
     seen = None
     if pictures is not None:
         pipeline = pipeline or pipeline_of(log, used, changed)
-        seen = _seen(log, turns, used, pictures, pipeline)
+        # A source takes the latency off the time at which a picture came.
+        later_s = flown.camera.start_latency_s - used.camera.start_latency_s
+        seen = _seen(log, turns, used, pictures, pipeline, later_s)
     observations: dict[int, Observation | None] = {}
-    if seen is not None and changed:
+    unseen = seen is not None and seen.unreadable and not seen.frames
+    if seen is not None and changed and not unseen:
         observations = {each.turn.number: each.observation for each in seen.turns}
         turns = turns[: len(seen.turns)]
     decided = list(
@@ -96,12 +124,26 @@ def replay(
         profile=used,
         decided=decided,
         ticks=sum(each.turn.role == "flown" for each in decided),
-        differences=sum(each.differs for each in decided),
+        differences=sum(each.differs for each in decided if each.turn.role == "flown"),
         first=first_of(decided, log.t0_s),
         seen=seen,
         changed=changed,
+        observations_anew=bool(observations),
+        gap=whole.gap,
         notes=tuple(_notes(log, whole.gap, seen, changed)),
     )
+
+
+def check_readable(log: FlightLog) -> None:
+    """Decode all that a replay takes from the log. Errors: InvalidValue, and those of a value that
+    no flight writes."""
+    whole_turns(log)
+    profile_of(log.header)
+    camera = camera_in(log.header)
+    if camera is not None:
+        mask_in(log.header, camera)
+    if log.t0_s != log.t0_s:
+        raise ValueError("t0_s is no time")
 
 
 def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
@@ -139,23 +181,36 @@ def _seen(
     profile: Profile,
     pictures: Iterable[Picture],
     pipeline: Pipeline,
+    later_s: float,
 ) -> Seen:
     found: list[Sensed] = []
-    ended = ""
+    missing: PictureMissing | None = None
     with one_thread():
         try:
-            for each in sense(turns, profile, pipeline, pictures):
+            for each in sense(turns, profile, pipeline, pictures, later_s):
                 found.append(each)
-        except PictureMissing as missing:
-            ended = f"{missing}: what came after it cannot be seen again"
+        except PictureMissing as error:
+            missing = error
     start = next((t.number for t in turns if t.role != "waiting"), len(turns))
     differing = [(each, d) for each in found if (d := _unlike(each)) is not None]
     first = None
     if differing:
         each, difference = differing[0]
         first = Difference(_tick_of(each.turn, turns, start), each.turn.t_s - log.t0_s, *difference)
-    frames = sum(each.turn.taken.frame is not None and each.turn.taken.look for each in found)
-    return Seen(found, frames, len(differing), first, ended)
+    return Seen(
+        found,
+        _frames_of(each.turn for each in found),
+        len(differing),
+        first,
+        frames_flown=_frames_of(turns),
+        ended=f"{missing}: what came after it cannot be seen again" if missing else "",
+        another=isinstance(missing, PictureAnother),
+        unreadable=isinstance(missing, PicturesUnreadable),
+    )
+
+
+def _frames_of(turns: Iterable[Turn]) -> int:
+    return sum(turn.taken.frame is not None and turn.taken.look for turn in turns)
 
 
 def _tick_of(turn: Turn, turns: Sequence[Turn], start: int) -> int:
@@ -178,6 +233,9 @@ def _unlike(sensed: Sensed) -> tuple[str, object, object] | None:
 
 
 _ON_PICTURES = ("camera", "detector", "pose", "kalman", "merge", "target", "vehicle")
+_ON_SENSES = ("safety.jump_", "safety.camera_hold_s", "safety.max_frame_age_s")
+"""What the senses make of telemetry and pictures by them stands in the observations already."""
+_ON_FEED = ("positioning",)
 _ON_NEITHER = ("link", "simulation", "log")
 
 
@@ -198,11 +256,24 @@ def _notes(log: FlightLog, gap: str, seen: Seen | None, changed: Sequence[str]) 
     if seen is not None and seen.ended:
         yield seen.ended
     sections = {key: key.split(".")[0] for key in changed}
-    blind = [key for key, section in sections.items() if section in _ON_PICTURES]
-    if blind and seen is None:
+    if seen is None or (seen.unreadable and not seen.frames):
+        blind = [key for key, section in sections.items() if section in _ON_PICTURES]
+        if blind:
+            yield (
+                f"{', '.join(blind)}: what it would change in the pictures cannot be shown, as "
+                f"there are none to look at"
+            )
+        unsensed = [key for key in changed if key.startswith(_ON_SENSES)]
+        if unsensed:
+            yield (
+                f"{', '.join(unsensed)}: what it would change in what the planner is shown was "
+                f"not looked at, which takes the flight's pictures"
+            )
+    fed = [key for key, section in sections.items() if section in _ON_FEED]
+    if fed:
         yield (
-            f"{', '.join(blind)}: what it would change in the pictures cannot be shown, as they "
-            f"were not recorded"
+            f"{', '.join(fed)}: what it would change in the positions that reach the vehicle was "
+            f"not looked at, only what the planner makes of their age"
         )
     idle = [key for key, section in sections.items() if section in _ON_NEITHER]
     if idle:

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.flight.senses import SENSED, Senses
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.flight.senses import ENDED, SENSED, Senses
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken, Turn
 from perchctl.pipeline import Pipeline
@@ -30,6 +31,14 @@ class PictureMissing(Exception):
     """The replay of pictures ends here; the message says why."""
 
 
+class PictureAnother(PictureMissing):
+    """It is there, and not the one that was flown by."""
+
+
+class PicturesUnreadable(PictureMissing):
+    """What should hold them is damaged, or is no recording."""
+
+
 @dataclass(frozen=True, eq=False)
 class Sensed:
     """One turn, seen again: `observation` with what the replay sees in the place of what was
@@ -43,15 +52,23 @@ class Sensed:
 class _Given:
     """The recorded edges of one turn after another, as the senses ask for them."""
 
-    def __init__(self, pictures: Iterable[Picture], size_px: tuple[int, int]) -> None:
+    def __init__(
+        self, pictures: Iterable[Picture], size_px: tuple[int, int], later_s: float
+    ) -> None:
         self.size_px: tuple[int, int] | None = size_px
-        self._pictures = iter(pictures)
+        self._later_s = later_s
+        self._pictures = _readable(pictures)
+        self._name = "the recording"
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
         self._taken = Taken()
         self._samples: list[tuple[Telemetry, ...]] = []
 
-    def turn(self, taken: Taken) -> None:
+    def turn(self, turn: Turn) -> None:
+        taken, obs = turn.taken, turn.observation
         self._taken, self._samples = taken, [taken.samples, taken.late]
+        told = None if obs is None else obs.camera_problem
+        if taken.ended and told is not None and told.endswith(ENDED):
+            self._name = told.removesuffix(ENDED)  # no other record has the flown source's
 
     # As a link.
 
@@ -73,13 +90,14 @@ class _Given:
         if seen is None:
             return None
         image = self._picture_of(seen)
-        return Frame(seen.index, seen.t_s, image, seen.t_arrival_s, seen.fields, seen.repeated)
+        t_s = seen.t_s + self._later_s if self._taken.live else seen.t_s
+        return Frame(seen.index, t_s, image, seen.t_arrival_s, seen.fields, seen.repeated)
 
     def problem(self, now_s: float) -> str | None:
         return self._taken.problem
 
     def describe(self) -> str:
-        return "the recording"
+        return self._name
 
     def close(self) -> None:
         return None
@@ -106,7 +124,7 @@ class _Given:
         for index, t_s, image in self._pictures:
             if (index, t_s) == (seen.index, seen.t_s):
                 if seen.checksum not in (None, zlib.crc32(image.tobytes())):
-                    raise PictureMissing(f"the picture of frame {seen.index} is another one")
+                    raise PictureAnother(f"the picture of frame {seen.index} is another one")
                 return image
             if index > seen.index:
                 break
@@ -115,22 +133,35 @@ class _Given:
 
 
 def sense(
-    turns: Iterable[Turn], profile: Profile, pipeline: Pipeline, pictures: Iterable[Picture]
+    turns: Iterable[Turn],
+    profile: Profile,
+    pipeline: Pipeline,
+    pictures: Iterable[Picture],
+    later_s: float = 0.0,
 ) -> Iterator[Sensed]:
-    """Each turn, in order, from the first before take-off on.
+    """Each turn, in order, from the first before take-off on. `later_s` is added to the time at
+    which a live source's pictures were taken.
 
-    Raises PictureMissing where a frame was taken whose picture is not there: from then on the
-    pipeline would remember another flight.
+    Raises PictureMissing where a frame was taken whose picture is not there, is another one or
+    cannot be read: from then on the pipeline would remember another flight.
     """
-    given = _Given(pictures, pipeline.camera.size_px)
+    given = _Given(pictures, pipeline.camera.size_px, later_s)
     senses = Senses(given, given, pipeline, profile)
     with one_thread():
         for turn in turns:
-            given.turn(turn.taken)
+            given.turn(turn)
             senses.take_in(turn.began_s, look=turn.taken.look)
             if turn.t_s != turn.began_s:
                 senses.present(turn.began_s, turn.t_s)
             yield Sensed(turn, senses.poses, _observed(turn, senses))
+
+
+def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
+    """A recording that cannot be read costs the planner's replay nothing."""
+    try:
+        yield from pictures
+    except (InvalidValue, NotFound) as error:
+        raise PicturesUnreadable(str(error)) from error
 
 
 def _observed(turn: Turn, senses: Senses) -> Observation | None:

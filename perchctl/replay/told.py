@@ -27,10 +27,13 @@ def replay_record(
         "ticks": replay.ticks,
         "differences": replay.differences,
         "first_difference": _difference_record(replay.first),
+        "gap": replay.gap or None,
         "pictures": None
         if seen is None
         else {
             "frames": seen.frames,
+            "frames_flown": seen.frames_flown,
+            "ended": seen.ended or None,
             "differences": seen.differences,
             "first_difference": _difference_record(seen.first),
         },
@@ -69,8 +72,18 @@ def _what_if_head(replay: Replay) -> list[str]:
 def _planner_lines(replay: Replay) -> list[str]:
     what_if, ticks = bool(replay.changed), f"{replay.ticks} turns"
     if replay.first is None:
-        same = "no command would have been another" if what_if else "all with the same commands"
+        same = "all with the same commands"
+        if what_if:
+            same = "no command would have been another"
+            if not replay.observations_anew:
+                same += ", by the observations as they were recorded"
+        if replay.gap:
+            same += ", up to where the log has lost a turn"
         return [f"planner:   {ticks}, {same}"]
+    if not replay.differences:
+        what = "would only be" if what_if else "is only"
+        lead = f"planner:   {ticks}, what was not sent {what} decided otherwise"
+        return [lead, f"first:     {difference_text(replay.first, what_if)}"]
     would = "would be decided otherwise" if what_if else "are decided otherwise"
     return [
         f"planner:   {ticks}, {replay.differences} {would}",
@@ -82,10 +95,14 @@ def _picture_lines(replay: Replay) -> list[str]:
     seen = replay.seen
     if seen is None:
         return []
+    frames = f"{seen.frames} frames"
+    if seen.ended:
+        frames = f"seen up to frame {seen.frames} of {seen.frames_flown}"
     if seen.first is None:
-        return [f"pictures:  {seen.frames} frames, all with the same poses, to the bit"]
+        poses = ", all with the same poses, to the bit" if seen.frames else ""
+        return [f"pictures:  {frames}{poses}"]
     return [
-        f"pictures:  {seen.frames} frames, {seen.differences} turns see something else",
+        f"pictures:  {frames}, {seen.differences} turns see something else",
         f"first:     {difference_text(seen.first, bool(replay.changed))}",
     ]
 
@@ -110,7 +127,7 @@ def _gate_line(gate: Gate) -> str:
 def _times(times_s: Sequence[float]) -> str:
     if not times_s:
         return "never"
-    more = f" and {len(times_s) - 1} times more" if len(times_s) > 1 else ""
+    more = {1: "", 2: " and once more"}.get(len(times_s), f" and {len(times_s) - 1} times more")
     return f"at {times_s[0]:.2f} s{more}"
 
 

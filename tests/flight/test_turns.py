@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import pytest
 
@@ -10,9 +11,13 @@ from perchctl.flight.clock import WallClock
 from perchctl.flight.loop import fly
 from perchctl.flight.senses import SENSED
 from perchctl.flight.turns import Turns
-from perchctl.mission.state import Observation, Operator
+from perchctl.mission import planner
+from perchctl.mission.state import Observation, Operator, PlannerState
 from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Tick, TurnWatcher
+from perchctl.profile import Profile
+from perchctl.replay.decide import decide
+from perchctl.vehicle import Land
 from tests.flight.test_loop import Rig, Vehicle
 from tests.flight.test_loop import Watcher as LooksOn
 from tests.helpers.hangs import hang_in_the_planner
@@ -60,6 +65,45 @@ def test_each_turn_is_told_once_and_in_order(monkeypatch: pytest.MonkeyPatch) ->
     assert redone.command is not None
 
 
+def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the landing; deciding on it again raises again."""
+    step = planner.step
+
+    def fails(state: PlannerState, obs: Observation, profile: Profile) -> Any:
+        if obs.t_s > 0.5:
+            raise ZeroDivisionError("by the test")
+        return step(state, obs, profile)
+
+    monkeypatch.setattr(planner, "step", fails)
+    told, rig = Told(), Rig()
+    with pytest.raises(ZeroDivisionError):
+        fly(replace(rig.parts(), watchers=(told,)))
+    assert rig.link.said(Land)
+    last = told.turns[-1]
+    assert last.observation is not None
+    assert last.observation.t_s > 0.5
+    assert last.command is None
+    flown = [tick.turn for tick in told.ticks if tick.turn is not None]
+    assert last.number == flown[-1].number + 1
+    with pytest.raises(ZeroDivisionError):
+        list(decide([*flown, last], rig.profile))
+    monkeypatch.setattr(planner, "step", step)  # mended
+    assert not any(each.differs for each in decide([*flown, last], rig.profile))
+
+
+def test_where_something_else_fails_no_turn_is_told_twice() -> None:
+    told, rig = Told(), Rig()
+
+    def fails(tick: Tick) -> None:
+        if tick.t_s > 0.5:
+            raise ZeroDivisionError
+
+    told.on_tick = fails
+    with pytest.raises(ZeroDivisionError):
+        fly(replace(rig.parts(), watchers=(told,)))
+    assert {turn.role for turn in told.turns} == {"waiting"}
+
+
 def test_one_that_looks_on_at_ticks_only_is_told_no_others() -> None:
     assert isinstance(Told(), TurnWatcher)
     assert not isinstance(LooksOn(), TurnWatcher)
@@ -85,7 +129,7 @@ def test_all_that_is_taken_in_is_in_the_turns() -> None:
 
 
 def test_in_real_time_its_parts_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([1.01, 1.012, 1.0125, 1.02])
+    times = iter([1.01, 1.012, 1.0125, 1.02, 2.01, 2.312, 2.313])
     clock = WallClock()
     monkeypatch.setattr(clock, "now", lambda: next(times))
     turns = Turns(clock, ())
@@ -96,6 +140,13 @@ def test_in_real_time_its_parts_are_timed(monkeypatch: pytest.MonkeyPatch) -> No
     assert timing is not None
     parts = (timing.pipeline_s, timing.planner_s, timing.send_s, timing.turn_s)
     assert parts == pytest.approx((0.01, 0.002, 0.0005, 0.02))
+    turns.begin(2.0)
+    for _ in range(2):  # decided anew: it was not sent
+        turns.lap()
+    timing = turns._timing()
+    assert timing is not None
+    parts = (timing.pipeline_s, timing.planner_s, timing.send_s, timing.turn_s)
+    assert parts == pytest.approx((0.01, 0.302, 0.0, 0.313))
 
 
 def test_what_the_senses_give_is_of_the_observation() -> None:

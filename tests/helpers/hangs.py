@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-from perchctl.link.mock import ScriptedLink
+from perchctl.link.mock import MockLink, ScriptedLink
 from perchctl.mission import planner
 from perchctl.mission.state import Observation, PlannerState
 from perchctl.vision.types import Frame
 
 
-def hang_in_the_camera(link: ScriptedLink, camera: Any, at_s: float) -> None:
+def hang_in_the_camera(link: ScriptedLink | MockLink, camera: Any, at_s: float) -> None:
     poll, left = camera.poll, [True]
 
     def hang(now_s: float) -> Frame | None:
@@ -25,7 +25,9 @@ def hang_in_the_camera(link: ScriptedLink, camera: Any, at_s: float) -> None:
     camera.poll = hang
 
 
-def hang_in_the_planner(link: ScriptedLink, monkeypatch: pytest.MonkeyPatch, at_s: float) -> None:
+def hang_in_the_planner(
+    link: ScriptedLink | MockLink, monkeypatch: pytest.MonkeyPatch, at_s: float
+) -> None:
     step, left = planner.step, [True]
 
     def hang(state: PlannerState, obs: Observation, *more: Any) -> Any:

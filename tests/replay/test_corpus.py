@@ -42,13 +42,17 @@ def test_the_planner_decides_as_it_did(name: str) -> None:
 
 
 def test_the_corpus_is_worth_its_place() -> None:
-    """Small, with every way in which a flight ends, every phase, and positions from outside."""
+    """Small, with every way in which a flight ends, every phase, positions from outside, a silent
+    link, and turns that hung while they looked or decided."""
     assert sum(path.stat().st_size for path in FOLDER.iterdir()) < MOST_BYTES
     ends = {str((corpus(name).summary or {}).get("outcome")) for name in NAMES}
     assert {"perched", "landed", "aborted"} <= ends
     flown = {turn.phase for name in NAMES for turn in corpus(name).turns if turn.phase}
     assert flown == set(Phase)
     assert any(turn.outside for name in NAMES for turn in corpus(name).turns)
+    assert any(turn.role == "redone" for turn in corpus("hung-within").turns)
+    assert any(turn.taken.late for turn in corpus("hung-within").turns)
+    assert any(turn.row == "telemetry-stale" for turn in corpus("link-silent").turns)
 
 
 def test_each_flight_of_the_corpus_can_be_made_anew() -> None:

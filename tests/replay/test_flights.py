@@ -20,6 +20,8 @@ from tests.helpers.flights import short_profile
 
 EVERY_FAULT = tuple(fault.name for fault in FAULTS)
 PLAIN, FAULTY, RECORDED = range(10, 35), range(100, 125), range(10)
+LEAST_REPLAYED = 13
+"""More than half of the 25 with faults: some of these refuse the flight, or leave no log."""
 
 
 def flown(folder: Path, seed: int, faults: tuple[str, ...] = ()) -> Replay | None:
@@ -82,11 +84,17 @@ def test_seeded_flights_replay(tmp_path: Path, seed: int) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("seed", FAULTY)
-def test_seeded_flights_with_faults_replay(tmp_path: Path, seed: int) -> None:
-    """Each with one of all faults, in a phase and at a moment of its seed's."""
-    found = flown(tmp_path, seed, EVERY_FAULT)
-    assert found is None or found.same, found and found.first
+def test_seeded_flights_with_faults_replay(tmp_path: Path) -> None:
+    """Each with one of all faults, in a phase and at a moment of its seed's. Of most there is
+    something to replay."""
+    replayed = 0
+    for seed in FAULTY:
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        found = flown(folder, seed, EVERY_FAULT)
+        assert found is None or found.same, (seed, found.first)
+        replayed += found is not None and found.ticks > 0
+    assert replayed >= LEAST_REPLAYED
 
 
 @pytest.mark.campaign

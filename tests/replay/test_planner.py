@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gzip
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import perchctl
+from perchctl.commands import log_plot, log_replay
+from perchctl.commands.log_replay import ReplayRequest
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
 from perchctl.log.exact import to_exact
 from perchctl.log.jsonl import line_of
@@ -22,7 +25,7 @@ from perchctl.profile.changed import changed
 from perchctl.replay.compare import first_differing, same
 from perchctl.replay.run import changed_keys, replay
 from perchctl.replay.told import replay_lines, replay_record
-from perchctl.replay.whatif import CAUTION, gates_of
+from perchctl.replay.whatif import CAUTION, Gate, gates_of
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.commands import run
 from tests.replay.test_corpus import FOLDER, corpus
@@ -117,6 +120,30 @@ def test_a_packed_log_that_is_cut_is_read_as_far_as_it_goes(tmp_path: Path) -> N
     assert replay(log).same
 
 
+def test_a_packed_log_may_be_of_several_parts(tmp_path: Path) -> None:
+    lines, path = lines_of(), tmp_path / "parts.jsonl.gz"
+    parts = [b"".join(lines[:200]), b"".join(lines[200:])]
+    path.write_bytes(b"".join(gzip.compress(part) for part in parts))
+    log = read_log(path)
+    assert not log.truncated
+    assert len(log.turns) == len(corpus("perched").turns)
+
+
+def test_a_turn_that_was_not_sent_is_no_tick_of_either_count() -> None:
+    log = replace(corpus("stopped"))
+    turns = list(log.turns)
+    at = len(turns) - 20
+    turn = replace(turns[at], role="redone", attempts=9)
+    rest = [replace(t, number=t.number + 1) for t in turns[at:]]
+    log.__dict__["turns"] = [*turns[:at], turn, *rest]
+    found = replay(log)
+    assert found.first is not None
+    assert found.first.field == "attempts"
+    assert (found.ticks, found.differences) == (replay(corpus("stopped")).ticks, 0)
+    assert not found.same
+    assert any("what was not sent" in line for line in replay_lines(found, [], []))
+
+
 def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
     """What the planner remembered of that turn is not known."""
     lines = lines_of()
@@ -124,6 +151,8 @@ def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
     assert found.same
     assert found.ticks < 200
     assert any("is not in the log" in note for note in found.notes)
+    assert "is not in the log" in replay_record(found, [], [])["gap"]
+    assert any("up to where the log has lost" in line for line in replay_lines(found, [], []))
 
 
 def test_a_log_of_before_has_no_turns(tmp_path: Path) -> None:
@@ -224,6 +253,34 @@ def test_what_acts_on_pictures_only_is_said() -> None:
 
 
 @pytest.mark.parametrize(
+    ("setting", "why"),
+    [
+        ("safety.jump_m=0.9", "takes the flight's pictures"),
+        ("safety.camera_hold_s=0.2", "takes the flight's pictures"),
+        ("safety.max_frame_age_s=0.3", "takes the flight's pictures"),
+        ("positioning.rate_hz=50", "positions that reach the vehicle"),
+    ],
+)
+def test_what_was_not_looked_at_is_said(setting: str, why: str) -> None:
+    log = corpus("stopped")
+    found = replay(log, None, changed(profile_of(log.header), [setting]))
+    key = setting.partition("=")[0]
+    assert any(note.startswith(f"{key}: ") and why in note for note in found.notes)
+    same = "no command would have been another, by the observations as they were recorded"
+    assert any(same in line for line in replay_lines(found, [], []))
+
+
+@pytest.mark.parametrize(
+    ("times_s", "text"),
+    [((1.0,), "at 1.00 s as"), ((1.0, 2.0), "once more as"), ((1.0, 2.0, 3.0), "2 times more as")],
+)
+def test_gates_are_counted_in_words(times_s: tuple[float, ...], text: str) -> None:
+    found = replay(corpus("stopped"))
+    changed_too = replace(found, changed=("x",))
+    assert any(text in s for s in replay_lines(changed_too, [Gate("g", times_s, ())], []))
+
+
+@pytest.mark.parametrize(
     ("setting", "error", "why"),
     [
         ("planner.align.xy_m", UsageError, "must be KEY=VALUE"),
@@ -266,6 +323,16 @@ def test_the_command_says_so_and_leaves_with_0(tmp_path: Path) -> None:
     assert record["ticks"] > 50
 
 
+def test_a_broken_recording_beside_the_log_is_a_note(tmp_path: Path) -> None:
+    path = log_of(tmp_path, lines_of()[:150])
+    path.with_suffix(".mcap").write_bytes(b"no recording")
+    said = run("log", "replay", str(path))
+    assert said.code == 0
+    assert "all with the same commands" in said.stdout
+    assert "pictures:  seen up to frame 0 of" in said.stdout
+    assert "f.mcap" in said.stderr
+
+
 def test_the_command_leaves_with_its_own_code_where_something_differs(tmp_path: Path) -> None:
     path = log_of(tmp_path, lines_of())
     said = run("log", "replay", str(path), "--set", "planner.ascend.settle_dwell_s=0.6")
@@ -285,6 +352,30 @@ def test_both_are_drawn(tmp_path: Path) -> None:
     again = run(*words, "-o", str(picture))
     assert again.code == 30
     assert "--force" in again.complaint
+
+
+def test_a_fault_of_the_planner_is_not_the_file_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: Any) -> Any:
+        raise ValueError("by the test")
+
+    path = log_of(tmp_path, lines_of()[:120])
+    monkeypatch.setattr("perchctl.mission.planner.step", fails)
+    with pytest.raises(ValueError, match="by the test"):
+        log_replay.run(ReplayRequest(path))
+    monkeypatch.setattr("perchctl.log.plot.plot_flight", fails)
+    with pytest.raises(ValueError, match="by the test"):
+        log_plot.run(log_plot.PlotRequest(path))
+
+
+def test_a_damaged_turn_is_the_file_s(tmp_path: Path) -> None:
+    lines = lines_of()[:120]
+    at = next(k for k, line in enumerate(lines) if b'"role":"flown"' in line)
+    lines[at] = altered(lines[at], attempts="many")
+    said = run("log", "replay", str(log_of(tmp_path, lines)))
+    assert said.code == 30
+    assert "cannot be read" in said.complaint
 
 
 def test_the_command_compares_with_another_profile(tmp_path: Path) -> None:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from perchctl.errors import InvalidValue, NotFound
+from perchctl.flight import senses
 from perchctl.flight.loop import fly
 from perchctl.log.read import FlightLog, read_log
 from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter, make_header
 from perchctl.mission.state import Operator, Phase
 from perchctl.mission.watch import Tick
+from perchctl.pipeline import FieldState, Pipeline
+from perchctl.profile.changed import changed
 from perchctl.replay.run import Replay, replay
 from perchctl.replay.sense import Picture
+from perchctl.replay.told import replay_lines, replay_record
 from perchctl.vision.types import Frame
-from tests.flight.test_loop import PROFILE, Rig, SleepyClock, Vehicle
+from tests.flight.test_loop import PROFILE, Camera, Rig, SleepyClock, Vehicle
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 
 
@@ -101,6 +108,40 @@ def test_turns_that_hung_are_replayed(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not found.seen.ended
 
 
+def test_a_source_that_ends_does_so_again(tmp_path: Path) -> None:
+    """By its own name, which the planner was shown."""
+    log, pictures = flown(tmp_path, Rig(camera=Camera(frames=40)))
+    observed = [turn.observation for turn in log.turns if turn.observation is not None]
+    assert observed[-1].camera_problem == "the scripted camera has ended"
+    found = seen_again(log, pictures)
+    assert found.seen is not None
+    assert found.seen.first is None, found.seen.first
+    assert found.same
+
+
+def test_with_another_latency_the_pictures_are_of_another_time(
+    flight: tuple[FlightLog, list[Picture]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are still found, by the recorded time."""
+    log, given_s = begun(flight[0]), []
+    inside = senses.pictures
+
+    def looked_at(state: FieldState, frame: Frame, pipeline: Pipeline) -> Any:
+        given_s.append(frame.t_s)
+        return inside(state, frame, pipeline)
+
+    monkeypatch.setattr(senses, "pictures", looked_at)
+    seen_again(log, flight[1])
+    as_flown_s = given_s.copy()
+    given_s.clear()
+    latency_s = PROFILE.camera.start_latency_s + 0.02
+    found = replay(log, flight[1], changed(PROFILE, [f"camera.latency_s={latency_s}"]), Rig().setup)
+    assert found.seen is not None
+    assert not found.seen.ended
+    assert given_s == pytest.approx([t_s - 0.02 for t_s in as_flown_s])
+    assert given_s
+
+
 def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> None:
     log, pictures = begun(flight[0]), flight[1]
     index, t_s, image = pictures[20]
@@ -110,6 +151,46 @@ def test_another_picture_is_noticed(flight: tuple[FlightLog, list[Picture]]) -> 
     assert found.seen is not None
     assert f"the picture of frame {index} is another one" in found.seen.ended
     assert not found.seen.differences
+    assert not found.same
+
+
+def test_where_no_picture_is_left_nothing_is_the_same(
+    flight: tuple[FlightLog, list[Picture]],
+) -> None:
+    log = begun(flight[0])
+    found = seen_again(log, [])
+    assert found.first is None
+    assert not found.same
+    record, lines = replay_record(found, [], []), replay_lines(found, [], [])
+    assert (record["pictures"]["frames"], record["gap"]) == (0, None)
+    assert record["pictures"]["frames_flown"] > 20
+    assert "was not recorded" in record["pictures"]["ended"]
+    assert f"pictures:  seen up to frame 0 of {record['pictures']['frames_flown']}" in lines
+    assert not any("to the bit" in line for line in lines)
+
+
+def damaged(pictures: list[Picture], error: Exception) -> Iterator[Picture]:
+    yield from pictures
+    raise error
+
+
+@pytest.mark.parametrize("error", [InvalidValue("it is none"), NotFound("it is gone")])
+def test_a_recording_that_cannot_be_read_costs_the_planner_nothing(
+    flight: tuple[FlightLog, list[Picture]], error: Exception
+) -> None:
+    log = begun(flight[0])
+    found = replay(log, damaged([], error), pipeline=Rig().setup)
+    assert found.same
+    assert found.ticks > 20
+    assert any(str(error) in note for note in found.notes)
+    part = replay(log, damaged(flight[1][:10], error), pipeline=Rig().setup)
+    assert part.seen is not None
+    assert part.seen.frames > 5
+    assert part.same
+    other = changed(PROFILE, ["kalman.n_max=3"])
+    what_if = replay(log, damaged([], error), other, Rig().setup)
+    assert what_if.ticks == found.ticks
+    assert any(note.startswith("kalman.n_max: ") for note in what_if.notes)
 
 
 def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> None:
@@ -120,6 +201,9 @@ def test_a_missing_picture_ends_it(flight: tuple[FlightLog, list[Picture]]) -> N
         assert found.seen is not None
         assert f"frame {pictures[20][0]} was not recorded" in found.seen.ended
         assert 0 < len(found.seen.turns) < len(log.turns)
+        assert found.same  # what was compared
+        line = replay_lines(found, [], [])[-1]
+        assert f"up to frame {found.seen.frames} of {found.seen.frames_flown}, all with" in line
         assert not found.seen.differences
         assert len(found.decided) > len(found.seen.turns)  # the planner needs no picture
 
@@ -131,9 +215,9 @@ def test_a_pose_that_differs_is_named(flight: tuple[FlightLog, list[Picture]]) -
     obs = turns[at].observation
     assert obs is not None
     turns[at] = replace(turns[at], observation=replace(obs, camera_age_s=obs.camera_age_s + 1e-15))
-    changed = replace(log)
-    changed.__dict__["turns"] = turns
-    found = seen_again(changed, pictures)
+    other = replace(log)
+    other.__dict__["turns"] = turns
+    found = seen_again(other, pictures)
     assert found.seen is not None
     assert found.seen.first is not None
     assert (found.seen.first.tick, found.seen.first.field) == (10, "camera_age_s")

@@ -22,11 +22,16 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parents[2]))
 
 import cv2  # noqa: E402
+import pytest  # noqa: E402
 
 from perchctl.faults.flight import fly_fault_seed  # noqa: E402
+from perchctl.flight import lockstep  # noqa: E402
 from perchctl.flight.lockstep import fly_lockstep  # noqa: E402
+from perchctl.flight.loop import FlightParts  # noqa: E402
 from perchctl.mission.state import Operator, Phase  # noqa: E402
+from perchctl.mission.watch import FlightReport  # noqa: E402
 from tests.helpers.flights import short_profile  # noqa: E402
+from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner  # noqa: E402
 
 KEPT = (b'{"kind":"header"', b'{"kind":"turn"', b'{"kind":"event"', b'{"kind":"summary"')
 
@@ -43,17 +48,32 @@ def _fault(log: Path, fault: str, seed: int) -> None:
     fly_fault_seed(short_profile(SMALL), seed, (fault,), log)
 
 
+def _hung_within(log: Path) -> None:
+    """Once in the camera, once in the planner: between turns a fault's loop hangs by itself."""
+    real = lockstep.fly
+    with pytest.MonkeyPatch.context() as patch:
+
+        def fly(parts: FlightParts) -> FlightReport:
+            hang_in_the_camera(parts.link, parts.source, at_s=1.5)
+            hang_in_the_planner(parts.link, patch, at_s=3.0)
+            return real(parts)
+
+        patch.setattr(lockstep, "fly", fly)
+        _fly(log, operator_at={Phase.ALIGN: Operator.STOP})
+
+
 FLIGHTS: dict[str, Callable[[Path], None]] = {
     "perched": _fly,
     "searched-out": partial(_fly, changes={"simulation.no_target": True}),
     "slipped": partial(_fly, changes={"simulation.first_contact_fails": 1.0}),
     "stopped": partial(_fly, operator_at={Phase.ALIGN: Operator.STOP}),
-    "link-silent": partial(_fault, fault="link-silent", seed=4),
+    "link-silent": partial(_fault, fault="link-silent", seed=2),
+    "hung-within": _hung_within,
     "hung": partial(_fault, fault="hung", seed=2),
     "external-occluded": partial(_fault, fault="external-occluded", seed=6),
 }
-"""Perched; landed without a target; a contact that fails; cut by the operator; and faults of the
-link, of the loop and of positions from outside."""
+"""Perched; landed without a target; a contact that fails; cut by the operator; hung within two
+turns; and faults of the link, of the loop and of positions from outside."""
 
 
 def made(name: str) -> Path:
