@@ -98,6 +98,16 @@ def test_two_flights_are_compared(logs: Path) -> None:
     assert (told["profile"], told["plot"]) == ({}, None)
 
 
+BAD: dict[str, dict[str, object]] = {
+    "exposure": {"frame_t_s": "x"},
+    "corners": {"large_px": "abcdefgh", "lz_m": 1.0},
+    "pose": {"lz_m": "x", "large_px": [0.0] * 8},
+    "timing": {"kind": "turn", "timing": {"pipeline_s": "q"}},
+    "sample": {"kind": "turn", "taken": {"samples": [{"t_s": "a"}]}},
+}
+"""Records, by what in them no flight writes."""
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
@@ -117,6 +127,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
         (["export", "damaged.jsonl", "--csv"], 30, "battery_v must be a number"),
         (["show", "damaged.jsonl"], 30, "battery_v is not a number"),
         (["show", "odd.jsonl"], 30, "no flight writes"),
+        *((["report", f"bad_{name}.jsonl"], 30, "a value that no flight writes") for name in BAD),
         (["export", "bare.jsonl"], 2, "say in which form"),
         (["export", "bare.jsonl", "-o", "x.txt"], 2, "say in which form"),
         (["export", "--csv", "--mcap", "bare.jsonl"], 2, "one at a time"),
@@ -138,6 +149,11 @@ def test_what_goes_wrong_is_one_sentence(
     good = synthetic.write(Path("damaged.jsonl"), most=1, summary=synthetic.SUMMARY).read_bytes()
     Path("odd.jsonl").write_bytes(good.replace(b'"duration_s":18.6', b'"duration_s":"x"'))
     Path("damaged.jsonl").write_bytes(good.replace(b'"battery_v":3.', b'"battery_v":"a","y":3.'))
+    lines = synthetic.write(Path("whole.jsonl"), summary=synthetic.SUMMARY, most=200).read_bytes()
+    *before, tick, end = lines.splitlines(keepends=True)
+    for name, bad in BAD.items():
+        changed = json.dumps(json.loads(tick) | bad).encode() + b"\n"
+        Path(f"bad_{name}.jsonl").write_bytes(b"".join([*before, tick, changed, end]))
     result = run("log", *words)
     assert result.code == code
     assert said in result.complaint
