@@ -245,7 +245,7 @@ def _notes(log: FlightLog) -> list[dict[str, Any]]:
 
 
 def _after(log: FlightLog, t_s: float) -> float:
-    return round(t_s - log.start_s, 6) + 0.0
+    return round(log.since(t_s), 6) + 0.0
 
 
 def _named(name: str, text: str) -> list[str]:

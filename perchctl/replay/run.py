@@ -97,7 +97,7 @@ def replay(
         decided=decided,
         ticks=sum(each.turn.role == "flown" for each in decided),
         differences=sum(each.differs for each in decided),
-        first=first_of(decided, log.t0_s),
+        first=first_of(decided, log.start_s),
         seen=seen,
         changed=changed,
         notes=tuple(_notes(log, whole.gap, seen, changed)),
@@ -153,7 +153,9 @@ def _seen(
     first = None
     if differing:
         each, difference = differing[0]
-        first = Difference(_tick_of(each.turn, turns, start), each.turn.t_s - log.t0_s, *difference)
+        first = Difference(
+            _tick_of(each.turn, turns, start), each.turn.t_s - log.start_s, *difference
+        )
     frames = sum(each.turn.taken.frame is not None and each.turn.taken.look for each in found)
     return Seen(found, frames, len(differing), first, ended)
 

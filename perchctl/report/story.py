@@ -252,7 +252,7 @@ def _holds(track: Track) -> Iterator[Sentence]:
 def _notes(track: Track) -> Iterator[Sentence]:
     for event in track.log.events:
         if event.get("event") == "note" and event.get("reason"):
-            t_s = float(event["t_s"]) - track.log.start_s
+            t_s = track.log.since(float(event["t_s"]))
             yield Sentence(max(0.0, t_s), _upper(str(event["reason"])))
 
 
