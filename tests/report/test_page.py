@@ -139,6 +139,18 @@ def test_its_sections_say_what_the_flight_was(perched: str) -> None:
 
 
 @words_only
+def test_the_sum_of_the_frames_says_what_it_counts() -> None:
+    """Frames of the other phases are not in it: `log show` counts those, too."""
+
+    def change(record: dict[str, Any]) -> None:
+        if record["phase"] == "APPROACH":
+            record["frame_t_s"] = record["t_s"]
+
+    sight = told(change).sight
+    assert sight.whole.phase == "in these phases"
+    assert sight.whole.frames == sum(seen.frames for seen in sight.phases)
+
+
 def test_a_log_without_a_tick_says_so() -> None:
     log = made(summary=None)
     log.records.clear()
