@@ -13,7 +13,7 @@ from perchctl.log.jsonl import line_of
 from perchctl.log.plot import spans_of
 from perchctl.log.read import read_log
 from perchctl.log.recording import export_mcap
-from perchctl.log.shown import show_record
+from perchctl.log.shown import show_record, show_text
 from perchctl.mission import conditions
 from perchctl.replay.run import replay
 from perchctl.report.track import Track
@@ -63,6 +63,16 @@ def test_all_outputs_of_a_log_have_one_zero(path: Path, monkeypatch: pytest.Monk
         "replay": decided_otherwise.t_s,
     }
     assert said == pytest.approx(dict.fromkeys(said, at_s), abs=2e-6)
+
+
+def test_a_log_of_turns_alone_is_said_to_be_one(tmp_path: Path) -> None:
+    kept = gzip.decompress((FOLDER / "stopped.jsonl.gz").read_bytes()).splitlines(keepends=True)
+    path = tmp_path / "f.jsonl"
+    path.write_bytes(b"".join(line for line in kept if b'"kind":"summary"' not in line))
+    text = " ".join(show_text(read_log(path)).split())
+    assert text.startswith("UNKNOWN: the log ends in ")
+    assert "left out of this log; its" in text
+    assert "perchctl log replay" in text
 
 
 def test_without_ticks_the_first_flown_turn_is_the_zero() -> None:
