@@ -17,6 +17,9 @@ from tests.helpers import log as synthetic
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 
 
+FLIGHTS = Path(__file__).parent / "data" / "flights"
+
+
 @pytest.fixture
 def logs(tmp_path: Path) -> Path:
     """Two flights where `fly` puts them, the killed one newer."""
@@ -68,6 +71,30 @@ def test_the_recording_of_a_flight_is_not_replaced_by_an_export(logs: Path) -> N
     assert said.code == 30
     assert "the flight's own recording" in said.complaint
     assert own.read_bytes() == b"pictures"
+
+
+def test_a_report_is_of_the_newest_and_of_each_log_once(logs: Path) -> None:
+    said = run("log", "report", "-o", "newest.html", "--json")
+    assert said.complaint == "the newest log: perchctl-logs/flight_new.jsonl"
+    (told,) = json.loads(said.stdout)["flights"]
+    assert told["log"] == "perchctl-logs/flight_new.jsonl"
+    old = "perchctl-logs/flight_old.jsonl"
+    said = run("log", "report", old, str(logs / "flight_old.jsonl"), "-o", "old.html", "--json")
+    assert len(json.loads(said.stdout)["flights"]) == 1
+    assert "named twice" in said.complaint
+
+
+def test_programs_are_told_what_an_export_lacks(logs: Path) -> None:
+    said = run("log", "export", "--mcap", "perchctl-logs/flight_old.jsonl", "--json")
+    assert any("without pictures" in note for note in json.loads(said.stdout)["notes"])
+
+
+def test_programs_are_told_where_a_replay_is_drawn(
+    logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("perchctl.replay.plot.plot_replay", lambda _found, _path: None)
+    log = str(FLIGHTS / "stopped.jsonl.gz")
+    assert json.loads(run("log", "replay", log, "--json", "-o", "x.png").stdout)["plot"] == "x.png"
 
 
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -283,7 +283,8 @@ def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) 
     said = run("log", "report", str(log))
     assert (said.code, said.stdout.strip()) == (0, str(report_path_of(log)))
     assert "already" in run("log", "report", str(log)).complaint
-    said = run("log", "report", str(log), str(log), "-o", "both.html", "--json")
+    other = written(tmp_path / "other.jsonl")
+    said = run("log", "report", str(log), str(other), "-o", "both.html", "--json")
     answer = json.loads(said.stdout)
     assert answer["report"] == "both.html"
     assert [flight["outcome"] for flight in answer["flights"]] == ["perched", "perched"]
