@@ -16,7 +16,6 @@ from perchctl.commands import complete
 from tests.helpers import log as synthetic
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 
-
 FLIGHTS = Path(__file__).parent / "data" / "flights"
 
 
