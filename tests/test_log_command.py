@@ -16,6 +16,8 @@ from perchctl.commands import complete
 from tests.helpers import log as synthetic
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 
+FLIGHTS = Path(__file__).parent / "data" / "flights"
+
 
 @pytest.fixture
 def logs(tmp_path: Path) -> Path:
@@ -70,6 +72,30 @@ def test_the_recording_of_a_flight_is_not_replaced_by_an_export(logs: Path) -> N
     assert own.read_bytes() == b"pictures"
 
 
+def test_a_report_is_of_the_newest_and_of_each_log_once(logs: Path) -> None:
+    said = run("log", "report", "-o", "newest.html", "--json")
+    assert said.complaint == "the newest log: perchctl-logs/flight_new.jsonl"
+    (told,) = json.loads(said.stdout)["flights"]
+    assert told["log"] == "perchctl-logs/flight_new.jsonl"
+    old = "perchctl-logs/flight_old.jsonl"
+    said = run("log", "report", old, str(logs / "flight_old.jsonl"), "-o", "old.html", "--json")
+    assert len(json.loads(said.stdout)["flights"]) == 1
+    assert "named twice" in said.complaint
+
+
+def test_programs_are_told_what_an_export_lacks(logs: Path) -> None:
+    said = run("log", "export", "--mcap", "perchctl-logs/flight_old.jsonl", "--json")
+    assert any("without pictures" in note for note in json.loads(said.stdout)["notes"])
+
+
+def test_programs_are_told_where_a_replay_is_drawn(
+    logs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("perchctl.replay.plot.plot_replay", lambda _found, _path: None)
+    log = str(FLIGHTS / "stopped.jsonl.gz")
+    assert json.loads(run("log", "replay", log, "--json", "-o", "x.png").stdout)["plot"] == "x.png"
+
+
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Path] = []
     monkeypatch.setattr("perchctl.log.plot.plot_flight", lambda _log, path: drawn.append(path))
@@ -98,6 +124,16 @@ def test_two_flights_are_compared(logs: Path) -> None:
     assert (told["profile"], told["plot"]) == ({}, None)
 
 
+BAD: dict[str, dict[str, object]] = {
+    "exposure": {"frame_t_s": "x"},
+    "corners": {"large_px": "abcdefgh", "lz_m": 1.0},
+    "pose": {"lz_m": "x", "large_px": [0.0] * 8},
+    "timing": {"kind": "turn", "timing": {"pipeline_s": "q"}},
+    "sample": {"kind": "turn", "taken": {"samples": [{"t_s": "a"}]}},
+}
+"""Records, by what in them no flight writes."""
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
@@ -117,6 +153,7 @@ def test_two_flights_are_compared(logs: Path) -> None:
         (["export", "damaged.jsonl", "--csv"], 30, "battery_v must be a number"),
         (["show", "damaged.jsonl"], 30, "battery_v is not a number"),
         (["show", "odd.jsonl"], 30, "no flight writes"),
+        *((["report", f"bad_{name}.jsonl"], 30, "a value that no flight writes") for name in BAD),
         (["export", "bare.jsonl"], 2, "say in which form"),
         (["export", "bare.jsonl", "-o", "x.txt"], 2, "say in which form"),
         (["export", "--csv", "--mcap", "bare.jsonl"], 2, "one at a time"),
@@ -138,6 +175,11 @@ def test_what_goes_wrong_is_one_sentence(
     good = synthetic.write(Path("damaged.jsonl"), most=1, summary=synthetic.SUMMARY).read_bytes()
     Path("odd.jsonl").write_bytes(good.replace(b'"duration_s":18.6', b'"duration_s":"x"'))
     Path("damaged.jsonl").write_bytes(good.replace(b'"battery_v":3.', b'"battery_v":"a","y":3.'))
+    lines = synthetic.write(Path("whole.jsonl"), summary=synthetic.SUMMARY, most=200).read_bytes()
+    *before, tick, end = lines.splitlines(keepends=True)
+    for name, bad in BAD.items():
+        changed = json.dumps(json.loads(tick) | bad).encode() + b"\n"
+        Path(f"bad_{name}.jsonl").write_bytes(b"".join([*before, tick, changed, end]))
     result = run("log", *words)
     assert result.code == code
     assert said in result.complaint

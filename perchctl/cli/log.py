@@ -31,8 +31,9 @@ for _name, _command in (
 def _top(context: typer.Context) -> None:
     """After a flight: its log shown, drawn, compared, exported, replayed, told.
 
-    Each works on every log: of a flight that was killed, of a simulated one, of an older
-    perchctl. Where FILE is left out it is the newest log.
+    They work on logs of flights that were killed, of simulated ones, of an older perchctl;
+    replay needs whole turns, which logs of versions 1 and 2 do not hold. Where FILE is left out
+    it is the newest log; compare wants two.
     """
     if context.invoked_subcommand is None:
         print(context.get_help())

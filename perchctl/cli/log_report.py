@@ -7,18 +7,30 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, JsonOption, perform, reported
+from perchctl.cli.app import (
+    ForceOption,
+    JsonOption,
+    LogDirOption,
+    LogProfileOption,
+    perform,
+    reported,
+)
 from perchctl.cli.complete import complete_log
 
 
 def report(
-    files: Annotated[list[Path], typer.Argument(help="Flight logs.", autocompletion=complete_log)],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Flight logs; by default the newest.", autocompletion=complete_log),
+    ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="The page: .html.")] = None,
     force: ForceOption = False,
+    profile: LogProfileOption = None,
+    log_dir: LogDirOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write one page that tells the flight, or several, in sentences and plots."""
     with reported(as_json):
         from perchctl.commands.log_report import ReportRequest, run
 
-        perform(run, ReportRequest(tuple(files), output, force, as_json))
+        perform(run, ReportRequest(tuple(files or ()), output, force, profile, log_dir, as_json))

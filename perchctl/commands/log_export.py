@@ -107,4 +107,4 @@ def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
         done = export_mcap(path, place, force)
     for note in done.notes:
         say(note)
-    return {"layout": str(done.layout), "pictures": done.pictures}
+    return {"layout": str(done.layout), "pictures": done.pictures, "notes": list(done.notes)}

@@ -55,7 +55,8 @@ def run(request: ReplayRequest) -> int:
 
         plot_replay(found, request.output)
     if request.as_json:
-        print_record(replay_record(found, gates, changes))
+        plot = None if request.output is None else str(request.output)
+        print_record(replay_record(found, gates, changes) | {"plot": plot})
     else:
         for note in found.notes:
             say(note)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from perchctl.commands.log_file import log_file
 from perchctl.commands.output import print_record, say
 from perchctl.errors import UsageError
 from perchctl.files import check_output, same_file
@@ -17,15 +18,17 @@ from perchctl.report.write import SUFFIXES, report_path_of, session_path_of, wri
 class ReportRequest:
     """The command line as it was given; None is not given."""
 
-    files: tuple[Path, ...]
+    files: tuple[Path, ...] = ()
     output: Path | None = None
     force: bool = False
+    profile: str | None = None
+    log_dir: Path | None = None
     as_json: bool = False
 
 
 def run(request: ReportRequest) -> int:
     """Errors: NotFound and InvalidValue (a log, the place of the page), UsageError."""
-    files = request.files
+    files = _files(request)
     output = request.output or (report_path_of(files[0]) if len(files) == 1 else None)
     output = output or session_path_of(files)
     if any(same_file(output, path) for path in files):
@@ -38,6 +41,19 @@ def run(request: ReportRequest) -> int:
         print(output)
         say(counted(flights) if len(flights) > 1 else f"one flight: {flights[0].outcome}")
     return 0
+
+
+def _files(request: ReportRequest) -> tuple[Path, ...]:
+    """Each log once; without any the newest."""
+    named = request.files or (None,)
+    files: list[Path] = []
+    for name in named:
+        path = log_file(name, request.profile, request.log_dir)
+        if any(path == known or same_file(path, known) for known in files):
+            say(f"{path} is named twice: it is told once")
+            continue
+        files.append(path)
+    return tuple(files)
 
 
 def _record(output: Path, flights: tuple[Told, ...]) -> dict[str, object]:

@@ -31,13 +31,13 @@ class Frames:
 def frames_of(log: FlightLog) -> Frames:
     """The frames of a flight; what is a gap, the median period says."""
     taken = [record for record in log.records if record.get("frame_t_s") is not None]
-    times_s = np.array([record["frame_t_s"] for record in taken], dtype=np.float64) - log.start_s
+    times_s = log.since(np.array([record["frame_t_s"] for record in taken], dtype=np.float64))
     seen = np.array([shows_target(record) for record in taken], dtype=bool)
     if not taken:
         return Frames(times_s, times_s, np.empty((0, 2)))
     # The flight's end, as old as frames are when they are measured, may end a gap, too.
     late_s = float(np.median([record["t_s"] - record["frame_t_s"] for record in taken]))
-    end_s = max(log.records[-1]["t_s"] - late_s - log.start_s, times_s[-1])
+    end_s = max(log.since(log.records[-1]["t_s"]) - late_s, times_s[-1])
     gaps_s = _gaps_s(log, np.append(times_s, end_s))
     return Frames(times_s[seen], times_s[~seen], gaps_s)
 
@@ -54,6 +54,6 @@ def _gaps_s(log: FlightLog, times_s: Array) -> Array:
     gaps_s = gaps_s[between_s > _GAP_PERIODS * np.median(between_s)]
     for span in log.phases:
         if span.phase == _BLIND_PHASE:
-            start_s, end_s = span.start_s - log.start_s, span.end_s - log.start_s
+            start_s, end_s = log.since(span.start_s), log.since(span.end_s)
             gaps_s = gaps_s[(gaps_s[:, 1] <= start_s) | (gaps_s[:, 0] >= end_s)]
     return gaps_s

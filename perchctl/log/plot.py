@@ -56,7 +56,7 @@ def plot_flight(log: FlightLog, path: Path | str) -> None:
         raise InvalidValue(f"{log.path}: the log holds no ticks, there is nothing to plot")
     figure = new_figure(*SIZE_IN)
     *axes, last_ax = figure.subplots(9, 1, height_ratios=(1.7, 1, 1, 1, 1, 0.25, 1.1, 1.1, 2.0))
-    t_s = log.column("t_s") - log.start_s
+    t_s = log.since(log.column("t_s"))
     _plot_errors(axes[0], log, t_s)
     for ax, (name, unit, scale, label) in zip(axes[1:5], (*AXES, YAW), strict=True):
         _plot_raw_and_filtered(ax, log, t_s, f"{name}_{unit}", scale, label)
@@ -117,7 +117,7 @@ def _plot_raw_and_filtered(
     ax: Axes, log: FlightLog, t_s: Array, key: str, scale: float, label: str
 ) -> None:
     # A frame is some 100 ms old when it is measured; the estimate is carried to the present.
-    frame_s = log.column("frame_t_s") - log.start_s
+    frame_s = log.since(log.column("frame_t_s"))
     for source, colour, marker in (("j", GREEN, "s"), ("l", SKY, "o"), ("s", ORANGE, "^")):
         raw = scale * log.column(f"{source}{key}")
         ax.plot(frame_s, raw, linestyle="none", marker=marker, markersize=3, color=colour)
@@ -216,7 +216,7 @@ def _plot_last_seconds(ax: Axes, log: FlightLog, t_s: Array, frames: Frames) -> 
     end_s = float(frames.seen_s[-1]) if frames.seen_s.size else float(t_s[-1])
     shown_s = (end_s - LAST_S, end_s + AFTER_S)
     inside = (t_s >= shown_s[0]) & (t_s <= shown_s[1])
-    frame_s = log.column("frame_t_s") - log.start_s
+    frame_s = log.since(log.column("frame_t_s"))
     lines: list[Line2D] = []
     span_mm = [LEAST_SPAN_MM]
     for name, colour in (("x", BLUE), ("y", ORANGE)):
@@ -249,7 +249,7 @@ def _plot_last_seconds(ax: Axes, log: FlightLog, t_s: Array, frames: Frames) -> 
 
 
 def spans_of(log: FlightLog) -> list[Span]:
-    return [(p.phase, p.start_s - log.start_s, p.end_s - log.start_s) for p in log.phases]
+    return [(p.phase, log.since(p.start_s), log.since(p.end_s)) for p in log.phases]
 
 
 def shade_spans(ax: Axes, spans: Sequence[Span]) -> None:

@@ -7,7 +7,7 @@ import zlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,7 @@ KINDS = ("tick", "turn", "event", "summary")
 READABLE_VERSIONS = (1, 2, SCHEMA_VERSION)
 """1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
 turns."""
+Times = TypeVar("Times", float, Array)
 _GZIP = b"\x1f\x8b"
 _BEGIN_BYTES = 1 << 16
 
@@ -67,13 +68,6 @@ class FlightLog:
         """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
         return [turn_of(record) for record in self.turn_records]
 
-    @property
-    def t0_s(self) -> float:
-        """What every output takes for 0: the loop's clock when the log began; of an older log
-        its first tick."""
-        t0_s = self.header.get("t0_s")
-        return self.start_s if t0_s is None else float(t0_s)
-
     def column(self, key: str) -> Array:
         """A field over the ticks, shape (n,); NaN where it is missing.
 
@@ -87,8 +81,14 @@ class FlightLog:
 
     @property
     def start_s(self) -> float:
-        """Loop time of the first tick (0 without ticks)."""
-        return float(self.records[0]["t_s"]) if self.records else 0.0
+        """The loop's time of the first flown turn, which every output takes for 0; 0 without."""
+        flown = (r for r in self.turn_records if r.get("role") == "flown")
+        first = self.records[0] if self.records else next(flown, None)
+        return 0.0 if first is None else float(first["t_s"])
+
+    def since(self, t_s: Times) -> Times:
+        """Times on the loop's clock, counted from the first flown turn as all outputs do."""
+        return t_s - self.start_s
 
     @cached_property
     def phases(self) -> tuple[PhaseSpan, ...]:

@@ -154,6 +154,12 @@ def _head(log: FlightLog) -> Iterator[str]:
         yield from _named(name, text.strip())
     if log.summary is None:
         yield from _named("log lost", "its end: the program was killed, or the disk failed")
+    if log.turn_records and not log.records:
+        yield from _named(
+            "ticks",
+            f"left out of this log; its {len(log.turn_records)} turns are whole: perchctl log "
+            f"replay decides them again",
+        )
     if log.ignored_bytes:
         yield from _named("log lost", f"its tail, {log.ignored_bytes} unreadable bytes")
 
@@ -245,7 +251,7 @@ def _notes(log: FlightLog) -> list[dict[str, Any]]:
 
 
 def _after(log: FlightLog, t_s: float) -> float:
-    return round(t_s - log.start_s, 6) + 0.0
+    return round(log.since(t_s), 6) + 0.0
 
 
 def _named(name: str, text: str) -> list[str]:

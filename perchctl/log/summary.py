@@ -126,7 +126,7 @@ def summary_of(log: FlightLog) -> FlightSummary:
     known_v = battery_v[battery_v >= NO_BATTERY_READING_V]
     end: Mapping[str, Any] = log.summary or {
         "outcome": "unknown",
-        "reason": f"the log ends in {phases[-1].phase}" if phases else "the log holds no flight",
+        "reason": _last_known(log),
     }
     last = log.records[-1] if log.records else {}
     battery_min_v = float(np.min(known_v)) if known_v.size else None
@@ -146,6 +146,13 @@ def summary_of(log: FlightLog) -> FlightSummary:
         log_problem=end.get("problem"),
         recording=_recording_in(end, log.path),
     )
+
+
+def _last_known(log: FlightLog) -> str:
+    if log.phases:
+        return f"the log ends in {log.phases[-1].phase}"
+    phases = [r["phase"] for r in log.turn_records if r.get("role") == "flown" and r.get("phase")]
+    return f"the log ends in {phases[-1]}" if phases else "the log holds no flight"
 
 
 def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None) -> str:

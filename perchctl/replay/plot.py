@@ -29,7 +29,7 @@ def plot_replay(replay: Replay, path: Path) -> None:
     figure = new_figure(*SIZE_IN)
     axes = figure.subplots(8, 1, sharex=True, height_ratios=(1, 1, 1, 0.7, 1, 1, 1, 0.8))
     flown = [each for each in replay.decided if each.turn.role == "flown"]
-    t_s = np.array([each.turn.t_s - replay.log.t0_s for each in flown])
+    t_s = np.array([each.turn.t_s - replay.log.start_s for each in flown])
     for k, axis in enumerate(_AXES):
         was = [_setpoint(each.turn.command, k) for each in flown]
         then = [_setpoint(each.command, k) for each in flown]

@@ -125,7 +125,7 @@ def replay(
         decided=decided,
         ticks=sum(each.turn.role == "flown" for each in decided),
         differences=sum(each.differs for each in decided if each.turn.role == "flown"),
-        first=first_of(decided, log.t0_s),
+        first=first_of(decided, log.start_s),
         seen=seen,
         changed=changed,
         observations_anew=bool(observations),
@@ -196,7 +196,9 @@ def _seen(
     first = None
     if differing:
         each, difference = differing[0]
-        first = Difference(_tick_of(each.turn, turns, start), each.turn.t_s - log.t0_s, *difference)
+        first = Difference(
+            _tick_of(each.turn, turns, start), each.turn.t_s - log.start_s, *difference
+        )
     return Seen(
         found,
         _frames_of(each.turn for each in found),

@@ -53,7 +53,7 @@ def gates_of(replay: Replay) -> list[Gate]:
     flown profile: what a log does not hold is compared as well."""
     turns = [each.turn for each in replay.decided]
     flown = list(decide(turns, profile_of(replay.log.header)))
-    one, other = _falls(flown, replay.log.t0_s), _falls(replay.decided, replay.log.t0_s)
+    one, other = _falls(flown, replay.log.start_s), _falls(replay.decided, replay.log.start_s)
     names = [*one, *(name for name in other if name not in one)]
     gates = [Gate(n, tuple(one.get(n, ())), tuple(other.get(n, ()))) for n in names]
     return [gate for gate in gates if gate.flown_s != gate.changed_s]

@@ -46,7 +46,7 @@ class Loss:
 def losses_of(track: Track) -> tuple[Loss, ...]:
     """In order. What is at the ceiling looks at nothing, and loses nothing."""
     taken = [
-        (float(r["frame_t_s"]) - track.log.start_s, shows_target(r))
+        (track.log.since(float(r["frame_t_s"])), shows_target(r))
         for r in track.log.records
         if r.get("frame_t_s") is not None
     ]

@@ -11,7 +11,7 @@ import perchctl
 from perchctl.report import sections
 from perchctl.report.markup import Markup, table, tag
 from perchctl.report.plot import trend
-from perchctl.report.told import Told
+from perchctl.report.told import Told, values_of
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
@@ -31,14 +31,16 @@ PARTS: tuple[tuple[str, Callable[[Told], Markup | None]], ...] = (
 
 
 def page_of(flights: Sequence[Told]) -> str:
-    """HTML that needs nothing else. `flights` has at least one."""
+    """HTML that needs nothing else. `flights` has at least one. Raises InvalidValue for a value
+    that no flight writes."""
     several = len(flights) > 1
     title = f"{len(flights)} flights" if several else flights[0].name
     parts = [tag("h1", counted(flights) if several else "A flight with perchctl")]
+    back = SESSION if several else ""
+    each = [_flight(told, number, back) for number, told in enumerate(flights, start=1)]
     if several:
         parts.append(_session(flights))
-    back = SESSION if several else ""
-    parts += [_flight(told, number, back) for number, told in enumerate(flights, start=1)]
+    parts += each
     parts.append(tag("footer", f"perchctl {perchctl.__version__}"))
     style = files("perchctl.report").joinpath("page.css").read_text(encoding="utf-8")
     head = [
@@ -53,11 +55,12 @@ def page_of(flights: Sequence[Told]) -> str:
 
 
 def _flight(told: Told, number: int, back: str) -> Markup:
-    parts = [sections.headline(told, back)]
-    for title, make in PARTS:
-        made = make(told)
-        if made is not None:
-            parts.append(tag("section", [tag("h3", title), made]))
+    with values_of(told.log.path):
+        parts = [sections.headline(told, back)]
+        for title, make in PARTS:
+            made = make(told)
+            if made is not None:
+                parts.append(tag("section", [tag("h3", title), made]))
     return _own_ids(tag("article", parts, id=f"flight-{number}"), f"f{number}-")
 
 

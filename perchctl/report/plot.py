@@ -155,7 +155,7 @@ def _last_seconds(track: Track) -> Markup | None:
     end_s = float(frames.seen_s[-1])
     low_s, high_s = end_s - LAST_S, end_s + AFTER_S
     inside = (track.t_s >= low_s) & (track.t_s <= high_s)
-    frame_s = track.log.column("frame_t_s") - track.log.start_s
+    frame_s = track.log.since(track.log.column("frame_t_s"))
     near = (frame_s >= low_s) & (frame_s <= high_s)
     ax = _axes("aside [mm]")
     span_mm = [LEAST_SPAN_MM]

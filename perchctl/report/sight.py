@@ -69,7 +69,7 @@ def sight_of(track: Track) -> Sight:
     )
     gaps = frames_of(track.log).gaps_s
     return Sight(
-        _seen(track, "all of them", leading),
+        _seen(track, "in these phases", leading),
         tuple(seen for seen in each if seen.frames),
         tuple((float(a), float(b)) for a, b in gaps),
         track.motion.exposure_s,

@@ -126,7 +126,8 @@ def _complete(track: Track, step: Step) -> str:
 
 def _recover(track: Track, step: Step) -> str:
     heights = track.log.column("z_m")[track.within(step.start_s, step.end_s)]
-    down_m = float(heights[0] - np.nanmin(heights)) if np.isfinite(heights).any() else 0.0
+    heights = heights[np.isfinite(heights)]
+    down_m = float(heights[0] - np.min(heights)) if heights.size else 0.0
     attempts = track.at(step.start_s, "attempts")
     nth = f" (failed attempt {attempts:.0f})" if attempts >= 1 else ""
     away = f"backed off {length(down_m)}" if down_m >= BACKED_OFF_M else "it stayed where it was"
@@ -252,16 +253,17 @@ def _holds(track: Track) -> Iterator[Sentence]:
 def _notes(track: Track) -> Iterator[Sentence]:
     for event in track.log.events:
         if event.get("event") == "note" and event.get("reason"):
-            t_s = float(event["t_s"]) - track.log.start_s
+            t_s = track.log.since(float(event["t_s"]))
             yield Sentence(max(0.0, t_s), _upper(str(event["reason"])))
 
 
 def _motors(track: Track) -> Iterator[Sentence]:
-    told = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
+    """Each kind once: a stop may be repeated, and an emergency cut may come long after it."""
+    tells = {"stop": "The motors were stopped", "emergency": "The motors were cut and locked"}
     for start_s, _end_s, command in track.runs("cmd"):
-        if command in told:
-            yield Sentence(start_s, told[command], "step" if command == "stop" else "bad")
-            return
+        text = tells.pop(command, None)
+        if text is not None:
+            yield Sentence(start_s, text, "step" if command == "stop" else "bad")
 
 
 def _end(track: Track) -> Iterator[Sentence]:

@@ -38,7 +38,7 @@ class Track:
 
     @cached_property
     def t_s(self) -> Array:
-        return self.log.column("t_s") - self.log.start_s
+        return self.log.since(self.log.column("t_s"))
 
     @cached_property
     def motion(self) -> Motion:
@@ -77,7 +77,7 @@ class Track:
         steps = [self._step(span, events) for span in self.log.phases]
         told = {round(step.start_s, 2) for step in steps}
         for event in events:  # an end that no tick followed
-            start_s = float(event["t_s"]) - self.log.start_s
+            start_s = self.log.since(float(event["t_s"]))
             if steps and start_s > steps[-1].end_s - SAME_S and round(start_s, 2) not in told:
                 span = PhaseSpan(
                     str(event.get("phase") or ""),
@@ -99,8 +99,8 @@ class Track:
         )
         return Step(
             span.phase,
-            span.start_s - self.log.start_s,
-            span.end_s - self.log.start_s,
+            self.log.since(span.start_s),
+            self.log.since(span.end_s),
             span.reason or str(event.get("reason") or ""),
             str(event.get("row") or ""),
             str(event.get("severity") or ""),

@@ -9,7 +9,7 @@ from perchctl.files import write_files
 from perchctl.log.read import read_log
 from perchctl.log.recording import pictures_of, recording_of
 from perchctl.report.page import page_of
-from perchctl.report.told import Told, tell
+from perchctl.report.told import Told, tell, values_of
 
 SUFFIXES = (".html", ".htm")
 SESSION_NAME = "session.html"
@@ -32,9 +32,10 @@ def told_of(log_path: Path) -> Told:
     Raises NotFound and InvalidValue for the log, as `read_log`.
     """
     log, recording = read_log(log_path), recording_of(log_path)
-    if not recording.is_file():
-        return tell(log)
-    return tell(log, lambda numbers: pictures_of(recording, exact=False, numbers=numbers))
+    with values_of(log_path):
+        if not recording.is_file():
+            return tell(log)
+        return tell(log, lambda numbers: pictures_of(recording, exact=False, numbers=numbers))
 
 
 def write_report(log_paths: Sequence[Path], output: Path) -> tuple[Told, ...]:

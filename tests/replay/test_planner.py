@@ -61,7 +61,7 @@ def test_a_changed_constant_is_named_by_tick_and_field(monkeypatch: pytest.Monke
     assert found.first.recorded != found.first.replayed
     assert found.first.recorded == pytest.approx(found.first.replayed, abs=1e-12)
     at = next(each for each in found.decided if each.tick == found.first.tick)
-    assert found.first.t_s == at.turn.t_s - log.t0_s
+    assert found.first.t_s == log.since(at.turn.t_s)
     assert isinstance(at.turn.command, PositionSetpoint)
     assert at.turn.command.z_m == found.first.recorded
     assert 0 < found.differences <= found.ticks

@@ -70,7 +70,7 @@ def test_snow_is_told_with_its_true_times(
     begin_s = flights[1]["perched"].begin_s
     assert begin_s is not None
     flight = told(flights, "perched")
-    begin_s -= read_log(flights[0] / "perched.jsonl").start_s
+    begin_s = read_log(flights[0] / "perched.jsonl").since(begin_s)
     lost = [s for s in flight.story if "lost for" in s.text or "No picture" in s.text]
     assert len(lost) == 1, flight.story
     assert lost[0].t_s == pytest.approx(begin_s, abs=0.15)

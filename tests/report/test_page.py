@@ -139,6 +139,18 @@ def test_its_sections_say_what_the_flight_was(perched: str) -> None:
 
 
 @words_only
+def test_the_sum_of_the_frames_says_what_it_counts() -> None:
+    """Frames of the other phases are not in it: `log show` counts those, too."""
+
+    def change(record: dict[str, Any]) -> None:
+        if record["phase"] == "APPROACH":
+            record["frame_t_s"] = record["t_s"]
+
+    sight = told(change).sight
+    assert sight.whole.phase == "in these phases"
+    assert sight.whole.frames == sum(seen.frames for seen in sight.phases)
+
+
 def test_a_log_without_a_tick_says_so() -> None:
     log = made(summary=None)
     log.records.clear()
@@ -271,7 +283,8 @@ def test_the_command_writes_beside_the_log_and_replaces_nothing(tmp_path: Path) 
     said = run("log", "report", str(log))
     assert (said.code, said.stdout.strip()) == (0, str(report_path_of(log)))
     assert "already" in run("log", "report", str(log)).complaint
-    said = run("log", "report", str(log), str(log), "-o", "both.html", "--json")
+    other = written(tmp_path / "other.jsonl")
+    said = run("log", "report", str(log), str(other), "-o", "both.html", "--json")
     answer = json.loads(said.stdout)
     assert answer["report"] == "both.html"
     assert [flight["outcome"] for flight in answer["flights"]] == ["perched", "perched"]

@@ -76,6 +76,30 @@ def test_a_loss_says_what_the_vehicle_did_then() -> None:
     assert "Target lost in ascent: backed off 10 cm" in only(told, "Target lost").text
 
 
+def test_how_far_it_backed_off_counts_from_the_first_known_height() -> None:
+    def change(record: dict[str, Any]) -> None:
+        if 9.0 <= flown_s(record) < 10.0:
+            record |= {"phase": "RECOVER", "reason": "target lost in ascent"}
+            record["z_m"] = 1.5 - 0.2 * (flown_s(record) - 9.0)
+            if flown_s(record) < 9.05:
+                record["z_m"] = None
+
+    assert "backed off 18 cm" in only(story(change), "Target lost").text
+
+
+def test_a_cut_after_a_failed_contact_s_stop_is_told() -> None:
+    def change(record: dict[str, Any]) -> None:
+        if 9.0 <= flown_s(record) < 9.1:
+            record["cmd"] = "stop"
+        if flown_s(record) >= 16.0:
+            record["cmd"] = "emergency"
+
+    told = story(change)
+    assert only(told, "motors were stopped").t_s == pytest.approx(9.0, abs=0.03)
+    cut = only(told, "cut and locked")
+    assert (cut.grade, cut.t_s) == ("bad", pytest.approx(16.0, abs=0.03))
+
+
 def test_at_the_ceiling_nothing_is_lost() -> None:
     def change(record: dict[str, Any]) -> None:
         if record["phase"] in ("PERCH", "COMPLETE", "PERCHED"):

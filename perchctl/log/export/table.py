@@ -146,7 +146,7 @@ def _checked(log: FlightLog, key: str, kind: Kind, value: Any) -> Any:
 
 def _since(log: FlightLog, key: str, value: Any) -> float:
     number: float = _checked(log, key, "number", value)
-    return round(number - log.start_s, _DECIMALS) + 0.0
+    return round(log.since(number), _DECIMALS) + 0.0
 
 
 def _told_fields(log: FlightLog) -> dict[str, Any]:

@@ -11,7 +11,7 @@ _TEXTS = ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd")
 _FLAGS = ("measured", "tracked")
 _LISTS = ("large_px", "small_px")
 LOOP_TIMES = ("t_s", "frame_t_s")
-"""Of a tick's record: in the recording they count from the flight log's start."""
+"""Of a tick's record: in the recording they count from the first flown turn."""
 
 FRAME_FIELDS = {
     "number": ("integer", "number of the frame, as the message's sequence number and the log's"),

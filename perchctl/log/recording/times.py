@@ -25,9 +25,6 @@ class Epoch:
         """Nanoseconds since 1970; what was before that is at 0, which MCAP begins at."""
         return max(0, self.started_ns + round((t_s - self.t0_s) * NS))
 
-    def since_s(self, t_s: float) -> float:
-        return t_s - self.t0_s
-
 
 def epoch_of(header: Mapping[str, Any], first_s: float) -> Epoch:
     """By a log's header; `first_s` is the loop's time of the first record, which counts as the

@@ -46,6 +46,7 @@ class Writing:
         self._camera = camera
         self._container = Container(stream)
         self._epoch: Epoch | None = None
+        self._first_s: float | None = None
         self._said = m.Said3d(Epoch(0, 0.0))
 
     @property
@@ -66,11 +67,13 @@ class Writing:
 
     def tick(self, record: Mapping[str, Any]) -> None:
         ns = self._at(float(record["t_s"]))
-        epoch = self._epoch_at(record["t_s"])
+        if self._first_s is None:
+            self._first_s = float(record["t_s"])
         for topic, message in self._said.of(record):
             self._container.say(topic, ns, message)
+        # Counted as every output does: from the first flown turn.
         times = {
-            key: epoch.since_s(record[key]) for key in LOOP_TIMES if record.get(key) is not None
+            key: record[key] - self._first_s for key in LOOP_TIMES if record.get(key) is not None
         }
         self._container.say_json(m.TICK, ns, encode({**record, **times})[:-1])
 
