@@ -41,6 +41,7 @@ class LogWatcher:
         self.truth: Callable[[], Truth] | None = None
         self._battery_min_v: float | None = None
         self._ticks = 0
+        self._formless_told = False
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
@@ -88,8 +89,12 @@ class LogWatcher:
         return source if self._recorder is None else WatchedSource(source, self._recorder.frame)
 
     def remarks(self) -> list[str]:
-        """What is new about the recording, a sentence each."""
-        return [] if self._recorder is None else self._recorder.take_remarks()
+        """What is new about the recording and about records without a form, a sentence each."""
+        new = [] if self._recorder is None else self._recorder.take_remarks()
+        if self.writer.formless is not None and not self._formless_told:
+            self._formless_told = True
+            new.append(self.writer.formless)
+        return new
 
     @property
     def path(self) -> Path:
@@ -140,7 +145,7 @@ class LogWatcher:
             recording=recording,
         )
         self.writer.close(summary.as_record())
-        lost, problem = self.writer.lost_records, self.writer.problem
+        lost, problem = self.writer.lost_records, self.writer.lacks
         return replace(summary, lost_records=lost, log_problem=problem)
 
     def abandon(self, reason: str) -> None:

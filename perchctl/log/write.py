@@ -89,13 +89,16 @@ class FlightLogWriter:
 
     Attributes:
         path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.
-        problem: None, or one sentence about the first record that was lost.
+        problem: None, or one sentence about the first failure of the disk.
+        formless: None, or one sentence about the first record that no line could be made of. It
+            alone is lost: the disk is well, and nothing lands for it.
         lost_records: how many could not be written.
     """
 
     def __init__(self, path: Path, fd: int, behind: Behind | None) -> None:
         self.path = path
         self.problem: str | None = None
+        self.formless: str | None = None
         self._fd = fd
         self._behind = behind
         self._closed = False
@@ -109,6 +112,11 @@ class FlightLogWriter:
     @property
     def lost_records(self) -> int:
         return self._dropped + self._failed
+
+    @property
+    def lacks(self) -> str | None:
+        """Why the log is not whole, the disk first."""
+        return self.problem or self.formless
 
     @classmethod
     def open(
@@ -171,7 +179,7 @@ class FlightLogWriter:
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            lost = {"lost_records": self.lost_records, "problem": self.problem}
+            lost = {"lost_records": self.lost_records, "problem": self.lacks}
             self._failed_s = None  # one last try, whatever happened before
             self._store({"kind": "summary", **summary, **lost}, None)
         if self._behind is not None:
@@ -194,10 +202,14 @@ class FlightLogWriter:
             return
         try:
             self._append(turn_line(record) if isinstance(record, Turn) else encode(record))
-        except (OSError, TypeError, ValueError, RecursionError) as error:
+        except OSError as error:
             self._failed += 1
             self._failed_s = t_s
             self._remember(_explain(error))
+            return
+        except Exception as error:  # whatever it is: the thread outlives its record
+            self._failed += 1
+            self.formless = self.formless or _formless(error)
             return
         self._failed_s = None
         if self._behind is not None and t_s is not None:
@@ -215,7 +227,7 @@ class FlightLogWriter:
         try:
             while done < len(line):
                 done += os.write(self._fd, line[done:])
-        except OSError:
+        except BaseException:
             if done:
                 with suppress(OSError):
                     os.ftruncate(self._fd, self._good_bytes)
@@ -272,10 +284,12 @@ def _time_of(record: Mapping[str, Any]) -> float | None:
     return float(t_s) if isinstance(t_s, (int, float)) else None
 
 
-def _explain(error: Exception) -> str:
-    if isinstance(error, OSError):
-        return f"the flight log cannot be written: {error.strerror or error}"
-    return f"a record cannot be written into the flight log: {error}"
+def _explain(error: OSError) -> str:
+    return f"the flight log cannot be written: {error.strerror or error}"
+
+
+def _formless(error: Exception) -> str:
+    return f"a record has no form in the flight log: {str(error) or type(error).__name__}"
 
 
 def _cannot_start(path: Path, error: OSError) -> str:
