@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
 Job = Callable[[], None]
 
 
 class Behind:
-    """A bounded queue of jobs and the thread that does them, in order. A job must not raise."""
+    """A bounded queue of jobs and the thread that does them, in order. What a job raises is dropped: it
+    has to remember itself what failed."""
 
     def __init__(self, most: int, name: str) -> None:
         self._most = most
@@ -49,4 +51,5 @@ class Behind:
                         return
                     self._changed.wait()
                 job = self._jobs.popleft()
-            job()
+            with suppress(Exception):  # the next one is done all the same
+                job()

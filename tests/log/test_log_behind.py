@@ -17,6 +17,7 @@ from perchctl.commands import fly
 from perchctl.errors import LogIncomplete
 from perchctl.flight.session import FlyOptions, SessionResult
 from perchctl.log import write
+from perchctl.log.behind import Behind
 from perchctl.log.read import read_log
 from perchctl.log.summary import FlightSummary, summary_text
 from perchctl.log.watch import LogWatcher
@@ -94,6 +95,19 @@ def test_a_live_log_has_every_record_in_order(tmp_path: Path) -> None:
     assert [r["t_s"] for r in read_log(writer.path).records] == pytest.approx(
         [r["t_s"] for r in written]
     )
+
+
+def test_a_job_that_raises_does_not_end_the_thread() -> None:
+    done: list[int] = []
+
+    def fails() -> None:
+        raise AttributeError("odd")
+
+    behind = Behind(10, "test")
+    for job in (fails, lambda: done.append(1), fails):
+        assert behind.put(job)
+    assert behind.finish(lambda: done.append(2), 20.0) == 0
+    assert done == [1, 2]
 
 
 def test_lockstep_writes_without_a_thread(tmp_path: Path) -> None:
