@@ -11,8 +11,9 @@ Job = Callable[[], None]
 
 
 class Behind:
-    """A bounded queue of jobs and the thread that does them, in order. What a job raises is dropped: it
-    has to remember itself what failed."""
+    """A bounded queue of jobs and the thread that does them, in order.
+
+    What a job raises is dropped: it has to remember itself what failed."""
 
     def __init__(self, most: int, name: str) -> None:
         self._most = most
