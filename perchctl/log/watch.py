@@ -100,6 +100,11 @@ class LogWatcher:
     def path(self) -> Path:
         return self.writer.path
 
+    @property
+    def begun(self) -> bool:
+        """Whether the flight has: `abandon` leaves no file of one that has not."""
+        return self._ticks > 0
+
     def tick(self, tick: Tick) -> None:
         self._ticks += 1
         battery_v = tick.telemetry.battery_v
@@ -152,7 +157,7 @@ class LogWatcher:
         """Close the log of a flight that failed. One that never began leaves no file."""
         recording = None if self._recorder is None else self._recorder.close()
         self.writer.close({"outcome": "failed", "reason": reason})
-        if not self._ticks:
+        if not self.begun:
             self.path.unlink(missing_ok=True)
             if recording is not None:
                 recording.path.unlink(missing_ok=True)
