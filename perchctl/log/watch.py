@@ -72,7 +72,7 @@ class LogWatcher:
         cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
     ) -> LogWatcher:
         beside = (SUFFIX,) if record else ()
-        writer = FlightLogWriter.open(path, header, live, beside)
+        writer = FlightLogWriter.open(path, header, live, beside, profile.link.loop_hz)
         if not record:
             return cls(writer)
         from perchctl.log.recording.recorder import Recorder

@@ -10,6 +10,7 @@ in `FlightLogWriter.problem`.
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 from collections.abc import Mapping
@@ -38,8 +39,12 @@ SCHEMA_VERSION = 3
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 3.0
-MOST_BEHIND = 3000
-"""Records that may wait for the disk, half a minute of a flight; more are dropped."""
+BEHIND_S = 30.0
+"""Of a flight may wait for the disk; more is dropped."""
+RECORDS_A_TURN = 2
+TURNS_SHARE = 0.8
+"""Of the queue, beyond which turns are dropped: what is left is for ticks and events."""
+DEFAULT_LOOP_HZ = 50.0
 _ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
 
 
@@ -95,12 +100,12 @@ class FlightLogWriter:
         lost_records: how many could not be written.
     """
 
-    def __init__(self, path: Path, fd: int, behind: Behind | None) -> None:
+    def __init__(self, path: Path, fd: int) -> None:
         self.path = path
         self.problem: str | None = None
         self.formless: str | None = None
         self._fd = fd
-        self._behind = behind
+        self._behind: Behind | None = None
         self._closed = False
         self._dropped = 0  # by the loop's thread
         # Below: of the thread that writes.
@@ -125,6 +130,7 @@ class FlightLogWriter:
         header: Mapping[str, Any],
         live: bool = False,
         beside: tuple[str, ...] = (),
+        loop_hz: float = DEFAULT_LOOP_HZ,
     ) -> FlightLogWriter:
         """Create the file and its folder and write the header.
 
@@ -132,22 +138,26 @@ class FlightLogWriter:
 
         `live` (for flights in real time): a thread of its own writes, and brings the records
         to the disk about once a second of the loop's time; otherwise each record is in the
-        file at once. Raises InvalidValue when the file cannot be created: that is before the
-        flight, where refusing costs nothing.
+        file at once. `loop_hz`: how fast turns come. Raises InvalidValue when the file cannot
+        be created: that is before the flight, where refusing costs nothing.
         """
         make_log_folder(path.parent)
         try:
             free, fd = _create(path, beside)
         except OSError as error:
             raise InvalidValue(_cannot_start(path, error)) from None
-        behind = Behind(MOST_BEHIND, "perchctl-log") if live else None
-        writer = cls(free, fd, behind)
+        writer = cls(free, fd)
         try:
             writer._append(_header_line(header))
-        except OSError as error:
+            if live:  # last: a thread would be left behind by what fails after it
+                most = math.ceil(BEHIND_S * RECORDS_A_TURN * loop_hz)
+                writer._behind = Behind(most, "perchctl-log")
+        except BaseException as error:
             os.close(fd)
             free.unlink(missing_ok=True)
-            raise InvalidValue(_cannot_start(path, error)) from None
+            if isinstance(error, OSError):
+                raise InvalidValue(_cannot_start(path, error)) from None
+            raise
         return writer
 
     def write(self, record: Mapping[str, Any]) -> None:
@@ -172,7 +182,8 @@ class FlightLogWriter:
         if self._behind is None:
             self._end(summary)
             return
-        left = self._behind.finish(partial(self._end, summary), CLOSE_TIMEOUT_S)
+        end = partial(self._end, summary)
+        left = self._behind.finish(end, CLOSE_TIMEOUT_S, self._let_go)
         if left:
             self._dropped += left
             self._remember("the disk does not answer: the flight log lacks its end")
@@ -184,15 +195,23 @@ class FlightLogWriter:
             self._store({"kind": "summary", **summary, **lost}, None)
         if self._behind is not None:
             self._sync_to_disk()
-        with suppress(OSError):
-            os.close(self._fd)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Once: the number may be another file's by the second time."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            with suppress(OSError):
+                os.close(fd)
 
     def _put(self, record: Mapping[str, Any] | Turn, t_s: float | None) -> None:
         if self._closed:
             self._dropped += 1
         elif self._behind is None:
             self._store(record, t_s)
-        elif not self._behind.put(partial(self._store, record, t_s)):
+        elif not self._behind.put(
+            partial(self._store, record, t_s), TURNS_SHARE if isinstance(record, Turn) else 1.0
+        ):
             self._dropped += 1
             self._remember("the disk does not keep up with the flight log: records are dropped")
 

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
+from perchctl.log import write
 from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.jsonl import to_plain
 from perchctl.log.read import read_log
@@ -340,6 +342,28 @@ def test_no_room_for_the_header_is_refused(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(InvalidValue, match="No space left"):
         FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("failing", ["header", "thread"])
+def test_a_log_that_cannot_begin_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    """Whatever the error: no file, no descriptor, no thread."""
+
+    def no_thread(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    closed, threads = list[int](), threading.active_count()
+    close = os.close
+    monkeypatch.setattr(os, "close", lambda fd: (closed.append(fd), close(fd)))
+    if failing == "thread":
+        monkeypatch.setattr(write, "Behind", no_thread)
+    header = synthetic.header() | ({"odd": object()} if failing == "header" else {})
+    with pytest.raises((TypeError, ValueError, RuntimeError)):
+        FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)
+    assert list(tmp_path.iterdir()) == []
+    assert len(closed) == 1
+    assert threading.active_count() == threads
 
 
 # --- reading damaged files -------------------------------------------------------

@@ -129,7 +129,7 @@ class Recorder:
             self._closed = True
             if self._behind is None:
                 self._end()
-            elif self._behind.finish(self._end, CLOSE_TIMEOUT_S):
+            elif self._behind.finish(self._end, CLOSE_TIMEOUT_S, self._writing.give_up):
                 self._over = True
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures

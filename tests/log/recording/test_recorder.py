@@ -210,6 +210,8 @@ def test_closing_does_not_wait_for_ever(hung: MemoryDisk, monkeypatch: pytest.Mo
     assert end.problem is not None
     assert "does not answer" in end.problem
     assert end.missing == 10 - end.pictures > 0
+    hung.gate.set()
+    until(lambda: hung.closed)  # should the disk ever answer, nothing stays open
 
 
 def test_after_its_end_it_takes_nothing(tmp_path: Path) -> None:
