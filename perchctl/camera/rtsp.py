@@ -94,7 +94,8 @@ class RtspSource(StreamSource):
                 return self._read(stream)
         except (av.error.FFmpegError, OSError, ValueError) as error:
             self.not_found = self._count == 0 and isinstance(error, _gone(av.error))
-            return unresolved(self._url) or _reason(error)
+            # Asking is unbounded: only before the first picture, which is before the flight.
+            return (self._count == 0 and unresolved(self._url)) or _reason(error)
 
     def _read(self, stream: Any) -> str:
         """One connection until it ends; why it ended. Errors: those of PyAV."""

@@ -149,9 +149,10 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
             page = stack.enter_context(live_page(options, port, switch))
             result = _session(options, log, DisplayWatcher(reporter), switch, page)
         except BaseException as error:
-            log.abandon(str(error) or type(error).__name__)
+            # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
-                page.end(failed_card(error, log.path if log.path.exists() else None))
+                page.end(failed_card(error, log.path if log.begun else None))
+            log.abandon(str(error) or type(error).__name__)
             raise
         finally:
             reporter.close()

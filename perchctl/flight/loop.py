@@ -36,7 +36,7 @@ from perchctl.mission.state import (
     PlannerState,
 )
 from perchctl.mission.turn import Turn
-from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
+from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport, Tick, Watcher
 from perchctl.pipeline import Pipeline
 from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
@@ -105,7 +105,7 @@ def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
     what = "it is down, or hangs: the motors are off"
     if not safe:
         what = "a landing was ordered, but could not be confirmed: keep away from the vehicle"
-    text = f"{type(error).__name__} in flight: {what}"
+    text = f"{type(error).__name__}{RESCUE}{what}"
     for watcher in parts.watchers:
         with contextlib.suppress(Exception):  # it may be the one that failed
             watcher.event(Event(parts.clock.now(), EventKind.NOTE, text))

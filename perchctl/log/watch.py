@@ -41,6 +41,7 @@ class LogWatcher:
         self.truth: Callable[[], Truth] | None = None
         self._battery_min_v: float | None = None
         self._ticks = 0
+        self._formless_told = False
 
     @classmethod
     def lockstep(cls, path: Path, profile: Profile, seed: int, record: bool = False) -> LogWatcher:
@@ -71,7 +72,7 @@ class LogWatcher:
         cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
     ) -> LogWatcher:
         beside = (SUFFIX,) if record else ()
-        writer = FlightLogWriter.open(path, header, live, beside)
+        writer = FlightLogWriter.open(path, header, live, beside, profile.link.loop_hz)
         if not record:
             return cls(writer)
         from perchctl.log.recording.recorder import Recorder
@@ -88,12 +89,21 @@ class LogWatcher:
         return source if self._recorder is None else WatchedSource(source, self._recorder.frame)
 
     def remarks(self) -> list[str]:
-        """What is new about the recording, a sentence each."""
-        return [] if self._recorder is None else self._recorder.take_remarks()
+        """What is new about the recording and about records without a form, a sentence each."""
+        new = [] if self._recorder is None else self._recorder.take_remarks()
+        if self.writer.formless is not None and not self._formless_told:
+            self._formless_told = True
+            new.append(self.writer.formless)
+        return new
 
     @property
     def path(self) -> Path:
         return self.writer.path
+
+    @property
+    def begun(self) -> bool:
+        """Whether the flight has: `abandon` leaves no file of one that has not."""
+        return self._ticks > 0
 
     def tick(self, tick: Tick) -> None:
         self._ticks += 1
@@ -140,14 +150,14 @@ class LogWatcher:
             recording=recording,
         )
         self.writer.close(summary.as_record())
-        lost, problem = self.writer.lost_records, self.writer.problem
+        lost, problem = self.writer.lost_records, self.writer.lacks
         return replace(summary, lost_records=lost, log_problem=problem)
 
     def abandon(self, reason: str) -> None:
         """Close the log of a flight that failed. One that never began leaves no file."""
         recording = None if self._recorder is None else self._recorder.close()
         self.writer.close({"outcome": "failed", "reason": reason})
-        if not self._ticks:
+        if not self.begun:
             self.path.unlink(missing_ok=True)
             if recording is not None:
                 recording.path.unlink(missing_ok=True)

@@ -10,6 +10,7 @@ in `FlightLogWriter.problem`.
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 from collections.abc import Mapping
@@ -38,8 +39,12 @@ SCHEMA_VERSION = 3
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 3.0
-MOST_BEHIND = 3000
-"""Records that may wait for the disk, half a minute of a flight; more are dropped."""
+BEHIND_S = 30.0
+"""Of a flight may wait for the disk; more is dropped."""
+RECORDS_A_TURN = 2
+TURNS_SHARE = 0.8
+"""Of the queue, beyond which turns are dropped: what is left is for ticks and events."""
+DEFAULT_LOOP_HZ = 50.0
 _ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
 
 
@@ -89,15 +94,18 @@ class FlightLogWriter:
 
     Attributes:
         path: the file; `open` adds ``_2``, ``_3``... rather than overwrite one.
-        problem: None, or one sentence about the first record that was lost.
+        problem: None, or one sentence about the first failure of the disk.
+        formless: None, or one sentence about the first record that no line could be made of. It
+            alone is lost: the disk is well, and nothing lands for it.
         lost_records: how many could not be written.
     """
 
-    def __init__(self, path: Path, fd: int, behind: Behind | None) -> None:
+    def __init__(self, path: Path, fd: int) -> None:
         self.path = path
         self.problem: str | None = None
+        self.formless: str | None = None
         self._fd = fd
-        self._behind = behind
+        self._behind: Behind | None = None
         self._closed = False
         self._dropped = 0  # by the loop's thread
         # Below: of the thread that writes.
@@ -110,6 +118,11 @@ class FlightLogWriter:
     def lost_records(self) -> int:
         return self._dropped + self._failed
 
+    @property
+    def lacks(self) -> str | None:
+        """Why the log is not whole, the disk first."""
+        return self.problem or self.formless
+
     @classmethod
     def open(
         cls,
@@ -117,6 +130,7 @@ class FlightLogWriter:
         header: Mapping[str, Any],
         live: bool = False,
         beside: tuple[str, ...] = (),
+        loop_hz: float = DEFAULT_LOOP_HZ,
     ) -> FlightLogWriter:
         """Create the file and its folder and write the header.
 
@@ -124,22 +138,26 @@ class FlightLogWriter:
 
         `live` (for flights in real time): a thread of its own writes, and brings the records
         to the disk about once a second of the loop's time; otherwise each record is in the
-        file at once. Raises InvalidValue when the file cannot be created: that is before the
-        flight, where refusing costs nothing.
+        file at once. `loop_hz`: how fast turns come. Raises InvalidValue when the file cannot
+        be created: that is before the flight, where refusing costs nothing.
         """
         make_log_folder(path.parent)
         try:
             free, fd = _create(path, beside)
         except OSError as error:
             raise InvalidValue(_cannot_start(path, error)) from None
-        behind = Behind(MOST_BEHIND, "perchctl-log") if live else None
-        writer = cls(free, fd, behind)
+        writer = cls(free, fd)
         try:
             writer._append(_header_line(header))
-        except OSError as error:
+            if live:  # last: a thread would be left behind by what fails after it
+                most = math.ceil(BEHIND_S * RECORDS_A_TURN * loop_hz)
+                writer._behind = Behind(most, "perchctl-log")
+        except BaseException as error:
             os.close(fd)
             free.unlink(missing_ok=True)
-            raise InvalidValue(_cannot_start(path, error)) from None
+            if isinstance(error, OSError):
+                raise InvalidValue(_cannot_start(path, error)) from None
+            raise
         return writer
 
     def write(self, record: Mapping[str, Any]) -> None:
@@ -164,27 +182,36 @@ class FlightLogWriter:
         if self._behind is None:
             self._end(summary)
             return
-        left = self._behind.finish(partial(self._end, summary), CLOSE_TIMEOUT_S)
+        end = partial(self._end, summary)
+        left = self._behind.finish(end, CLOSE_TIMEOUT_S, self._let_go)
         if left:
             self._dropped += left
             self._remember("the disk does not answer: the flight log lacks its end")
 
     def _end(self, summary: Mapping[str, Any] | None) -> None:
         if summary is not None:
-            lost = {"lost_records": self.lost_records, "problem": self.problem}
+            lost = {"lost_records": self.lost_records, "problem": self.lacks}
             self._failed_s = None  # one last try, whatever happened before
             self._store({"kind": "summary", **summary, **lost}, None)
         if self._behind is not None:
             self._sync_to_disk()
-        with suppress(OSError):
-            os.close(self._fd)
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Once: the number may be another file's by the second time."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            with suppress(OSError):
+                os.close(fd)
 
     def _put(self, record: Mapping[str, Any] | Turn, t_s: float | None) -> None:
         if self._closed:
             self._dropped += 1
         elif self._behind is None:
             self._store(record, t_s)
-        elif not self._behind.put(partial(self._store, record, t_s)):
+        elif not self._behind.put(
+            partial(self._store, record, t_s), TURNS_SHARE if isinstance(record, Turn) else 1.0
+        ):
             self._dropped += 1
             self._remember("the disk does not keep up with the flight log: records are dropped")
 
@@ -194,10 +221,14 @@ class FlightLogWriter:
             return
         try:
             self._append(turn_line(record) if isinstance(record, Turn) else encode(record))
-        except (OSError, TypeError, ValueError, RecursionError) as error:
+        except OSError as error:
             self._failed += 1
             self._failed_s = t_s
             self._remember(_explain(error))
+            return
+        except Exception as error:  # whatever it is: the thread outlives its record
+            self._failed += 1
+            self.formless = self.formless or _formless(error)
             return
         self._failed_s = None
         if self._behind is not None and t_s is not None:
@@ -215,7 +246,7 @@ class FlightLogWriter:
         try:
             while done < len(line):
                 done += os.write(self._fd, line[done:])
-        except OSError:
+        except BaseException:
             if done:
                 with suppress(OSError):
                     os.ftruncate(self._fd, self._good_bytes)
@@ -272,10 +303,12 @@ def _time_of(record: Mapping[str, Any]) -> float | None:
     return float(t_s) if isinstance(t_s, (int, float)) else None
 
 
-def _explain(error: Exception) -> str:
-    if isinstance(error, OSError):
-        return f"the flight log cannot be written: {error.strerror or error}"
-    return f"a record cannot be written into the flight log: {error}"
+def _explain(error: OSError) -> str:
+    return f"the flight log cannot be written: {error.strerror or error}"
+
+
+def _formless(error: Exception) -> str:
+    return f"a record has no form in the flight log: {str(error) or type(error).__name__}"
 
 
 def _cannot_start(path: Path, error: OSError) -> str:

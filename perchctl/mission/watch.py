@@ -20,6 +20,10 @@ class EventKind(Enum):
     NOTE = "note"  # something worth a line
 
 
+RESCUE = " in flight: "
+"""In the note of what a rescue did after an error, behind the error's name."""
+
+
 @dataclass(frozen=True)
 class Event:
     """Something that happened. It becomes words only where it is shown.

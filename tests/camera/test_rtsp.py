@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from perchctl.camera import rtsp
 from perchctl.camera.open import open_source
 from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting, unresolved
 from perchctl.camera.source import LiveSource
@@ -72,6 +73,22 @@ def test_it_connects_anew_where_the_stream_is_cut_or_stalls(
     frame = next_frame(source)
     while level(frame) < 150:
         frame = next_frame(source)
+    never.set()
+
+
+def test_the_resolver_is_asked_only_before_the_first_picture(
+    server: RtspServer, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may take half a minute, which in flight is one without pictures."""
+    asked: list[str] = []
+    monkeypatch.setattr(rtsp, "unresolved", lambda url: asked.append(url) or "")
+    never = threading.Event()
+    server.scripts.put([*seconds(20, 60, 80), never])  # it stalls: an error in time
+    server.scripts.put([*seconds(20, 160, 180), never])
+    source = started(server, opened)
+    wait_for(lambda: server.plays == 2)
+    assert source._count > 0
+    assert asked == []
     never.set()
 
 

@@ -99,9 +99,24 @@ def test_the_page_looks_at_the_age_by_itself(page: LivePage) -> None:
     html = page._server.html
     script = html.partition("<script")[2]
     assert "setInterval(watch" in script
-    assert script.count("AbortSignal.timeout") == 2
+    assert script.count("...within(") == 2
     assert "no news for" in script
     assert html.index('id="old"') < html.index('id="live"')  # its sentence is not greyed with it
+
+
+def test_stop_works_in_a_browser_without_bounds_for_answers(page: LivePage) -> None:
+    """`AbortSignal.timeout` is of 2022: it is asked for before each use."""
+    script = page._server.html.partition("<script")[2]
+    uses = [line for line in script.splitlines() if "AbortSignal" in line]
+    assert len(uses) == 1
+    assert "AbortSignal.timeout ? {" in uses[0]
+
+
+def test_stop_is_ready_again_at_a_program_that_was_gone_and_now_hangs(page: LivePage) -> None:
+    """By the page's own script, where something runs it."""
+    script = page._server.html.partition("<script")[2]
+    assert 'showStop(silent ? known : "gone")' in script
+    assert "known = stop;" in script
 
 
 # --- what STOP did ---------------------------------------------------------------------------
@@ -196,6 +211,7 @@ def test_a_flight_that_never_began_has_no_log(tmp_path: Path) -> None:
 def test_an_error_in_flight_tells_what_the_rescue_said(page: LivePage) -> None:
     flight = FlightPage(page, 0.15)
     flight.event(note(START_S, "RuntimeError in flight: it is down, or hangs: the motors are off"))
+    flight.event(note(START_S, "the recording has ended (no space): the flight and its log go on"))
     flight.end(failed_card(RuntimeError("boom"), None))
     assert state_of(page)["card"]["rows"][0][1].endswith("the motors are off")
 
@@ -280,9 +296,14 @@ def test_the_page_of_a_flight_that_failed_says_so(
     def session(*_: object) -> SessionResult:
         raise Interrupted("interrupted before take-off: nothing was started")
 
+    ended: list[str] = []
+    page_end, abandon = FlightPage.end, LogWatcher.abandon
+    monkeypatch.setattr(FlightPage, "end", lambda *a: (ended.append("page"), page_end(*a)))
+    monkeypatch.setattr(LogWatcher, "abandon", lambda *a: (ended.append("log"), abandon(*a)))
     monkeypatch.setattr(fly, "_session", session)
     with pytest.raises(Interrupted):
         fly.fly(options_in(tmp_path), as_json=False, port=0)
     assert last_state["card"]["outcome"] == "FAILED"
     assert "nothing was started" in last_state["card"]["reason"]
     assert last_state["card"]["rows"] == []  # no tick, no log
+    assert ended == ["page", "log"]  # the log's end may wait for a disk

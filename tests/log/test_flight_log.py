@@ -8,6 +8,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,12 +19,14 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
+from perchctl.log import write
 from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.jsonl import to_plain
 from perchctl.log.read import read_log
+from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter, log_path
-from perchctl.mission.state import BatteryOutlook
-from perchctl.mission.watch import Outside
+from perchctl.mission.state import BatteryOutlook, Outcome, Phase
+from perchctl.mission.watch import FlightReport, Outside
 from perchctl.vehicle import (
     EmergencyStop,
     ExternalPosition,
@@ -253,14 +257,54 @@ def test_a_full_disk_that_gets_room_again(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_value_that_has_no_place_in_a_log_never_raises(tmp_path: Path) -> None:
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
     writer.write({"t_s": 0.0, "odd": object()})
-    assert writer.problem is not None
-    assert "object" in writer.problem
+    assert writer.formless is not None
+    assert "object" in writer.formless
     writer.close(synthetic.SUMMARY)
     writer.close(synthetic.SUMMARY)
     writer.write({"t_s": 5.0})
     log = read_log(writer.path)
     assert log.records == []
     assert log.summary is not None
+
+
+class Unruly(Mapping[str, Any]):
+    """A record that fails as its line is made."""
+
+    def __init__(self, error: type[Exception]) -> None:
+        self._error = error
+
+    def __getitem__(self, key: str) -> Any:
+        raise self._error("odd")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(["t_s"])
+
+    def __len__(self) -> int:
+        return 1
+
+
+@pytest.mark.parametrize("live", [False, True])
+@pytest.mark.parametrize("error", [TypeError, ValueError, AttributeError, MemoryError])
+def test_a_record_without_a_form_costs_itself_alone(
+    tmp_path: Path, error: type[Exception], live: bool
+) -> None:
+    """The disk is well: nothing lands, what comes behind is written, and the end tells it."""
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=live)
+    log = LogWatcher(writer)
+    for i in range(4):
+        writer.write({"t_s": 0.02 * i, "odd": Unruly(error)} if i == 1 else {"t_s": 0.02 * i})
+    report = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False)
+    summary = log.close(report)
+    assert log.problem is None
+    assert [r["t_s"] for r in read_log(writer.path).records] == [0.0, 0.04, 0.06]
+    (said,) = log.remarks()
+    assert "no form" in said
+    assert log.remarks() == []
+    assert summary is not None
+    assert (summary.lost_records, summary.log_problem) == (1, said)
+    end = read_log(writer.path).summary
+    assert end is not None
+    assert (end["lost_records"], end["problem"]) == (1, said)
 
 
 def test_fsync_about_once_a_second_and_its_failure(
@@ -298,6 +342,28 @@ def test_no_room_for_the_header_is_refused(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(InvalidValue, match="No space left"):
         FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("failing", ["header", "thread"])
+def test_a_log_that_cannot_begin_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    """Whatever the error: no file, no descriptor, no thread."""
+
+    def no_thread(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    closed, threads = list[int](), threading.active_count()
+    close = os.close
+    monkeypatch.setattr(os, "close", lambda fd: (closed.append(fd), close(fd)))
+    if failing == "thread":
+        monkeypatch.setattr(write, "Behind", no_thread)
+    header = synthetic.header() | ({"odd": object()} if failing == "header" else {})
+    with pytest.raises((TypeError, ValueError, RuntimeError)):
+        FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)
+    assert list(tmp_path.iterdir()) == []
+    assert len(closed) == 1
+    assert threading.active_count() == threads
 
 
 # --- reading damaged files -------------------------------------------------------

@@ -17,14 +17,17 @@ from perchctl.commands import fly
 from perchctl.errors import LogIncomplete
 from perchctl.flight.session import FlyOptions, SessionResult
 from perchctl.log import write
+from perchctl.log.behind import Behind
 from perchctl.log.read import read_log
 from perchctl.log.summary import FlightSummary, summary_text
 from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission.state import Outcome, Phase
+from perchctl.mission.turn import Taken, Turn
 from perchctl.mission.watch import FlightReport
 from perchctl.profile import load_profile
 from tests.helpers import log as synthetic
+from tests.helpers.mission import note
 
 
 class HungDisk:
@@ -43,7 +46,7 @@ class HungDisk:
 def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[HungDisk]:
     hung = HungDisk()
     monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(write, "MOST_BEHIND", 50)
+    monkeypatch.setattr(write, "BEHIND_S", 0.5)  # 50 records
     yield hung
     hung.gate.set()
 
@@ -82,6 +85,35 @@ def test_closing_does_not_wait_for_ever(
     assert writer.problem is not None
     assert "does not answer" in writer.problem
     assert writer.lost_records == 11  # the summary too
+    held = writer._fd
+    disk.gate.set()
+    assert writer._behind is not None
+    writer._behind._thread.join(20.0)
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(held)
+
+
+@pytest.mark.parametrize("loop_hz", [50.0, 200.0])
+def test_half_a_minute_may_wait_and_turns_give_way_to_ticks_and_events(
+    tmp_path: Path, disk: HungDisk, monkeypatch: pytest.MonkeyPatch, loop_hz: float
+) -> None:
+    writer = FlightLogWriter.open(
+        tmp_path / "f.jsonl", synthetic.header(), live=True, loop_hz=loop_hz
+    )
+    monkeypatch.setattr(os, "write", disk)
+    places = round(0.5 * 2 * loop_hz)
+    for i in range(places):
+        writer.turn(Turn(i, "flown", i / loop_hz, i / loop_hz, Taken()))
+    taken = places - writer.lost_records
+    assert taken in (round(0.8 * places), round(0.8 * places) + 1)  # one is being written
+    lost = writer.lost_records
+    for i in range(places // 10):
+        writer.write({"t_s": 1.0 + i / loop_hz})
+        writer.event(note(1.0 + i / loop_hz, "odd"))
+    assert writer.lost_records == lost
+    writer.write({"t_s": 9.0})
+    writer.write({"t_s": 9.1})
+    assert writer.lost_records > lost  # and it is bounded
 
 
 def test_a_live_log_has_every_record_in_order(tmp_path: Path) -> None:
@@ -94,6 +126,19 @@ def test_a_live_log_has_every_record_in_order(tmp_path: Path) -> None:
     assert [r["t_s"] for r in read_log(writer.path).records] == pytest.approx(
         [r["t_s"] for r in written]
     )
+
+
+def test_a_job_that_raises_does_not_end_the_thread() -> None:
+    done: list[int] = []
+
+    def fails() -> None:
+        raise AttributeError("odd")
+
+    behind = Behind(10, "test")
+    for job in (fails, lambda: done.append(1), fails):
+        assert behind.put(job)
+    assert behind.finish(lambda: done.append(2), 20.0, fails) == 0
+    assert done == [1, 2]
 
 
 def test_lockstep_writes_without_a_thread(tmp_path: Path) -> None:

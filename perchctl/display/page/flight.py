@@ -14,7 +14,7 @@ from perchctl.display.page.told import Card, answered
 from perchctl.display.status import status_rows
 from perchctl.display.watch import status_of
 from perchctl.mission.planner import is_over
-from perchctl.mission.watch import Event, EventKind, Tick
+from perchctl.mission.watch import RESCUE, Event, EventKind, Tick
 from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput
 
 AXES_OF_SIDE = 0.5
@@ -66,9 +66,10 @@ class FlightPage:
     def end(self, card: Card) -> None:
         """The flight is over, and this is how: the last that the page shows. After an error in
         flight, with what the rescue said."""
-        last = self._events[-1] if self._events else None
-        if last is not None and last.kind is EventKind.NOTE and not card["good"]:
-            card = card | {"rows": [["flight", last.reason], *card["rows"]]}
+        notes = [e for e in self._events if e.kind is EventKind.NOTE]
+        rescue = next((e for e in reversed(notes) if RESCUE in e.reason), None)
+        if rescue is not None and not card["good"]:
+            card = card | {"rows": [["flight", rescue.reason], *card["rows"]]}
         self.page.end(card)
 
     def _seen(self, frame: Frame) -> None:

@@ -95,6 +95,7 @@ class Container:
         self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
         self._channels: dict[str, int] = {}
         self._pending_bytes = 0
+        self._closed = False
         self._writer.start(library=f"perchctl {perchctl.__version__}")
 
     @property
@@ -138,10 +139,15 @@ class Container:
         """With the index; nothing can be said any more."""
         self._writer.finish()
         self._stream.flush()
+        self._closed = True
         self._stream.close()
 
     def give_up(self) -> None:
-        """End the file where its last whole record ends, without an index: the disk failed."""
+        """End the file where its last whole record ends, without an index: the disk failed.
+        One that was ended stays as it is."""
+        if self._closed:
+            return
+        self._closed = True
         end = RecordBuilder()
         DataEnd(0).write(end)
         Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(end)

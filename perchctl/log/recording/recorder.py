@@ -42,6 +42,12 @@ class _Turn:
     tick: Mapping[str, Any] | None = None
 
     @property
+    def held_bytes(self) -> int:
+        """In memory, while it waits; a frame that repeats holds its picture too."""
+        frame = self.frame
+        return 0 if frame is None else frame.image.nbytes + len(frame.encoded or b"")
+
+    @property
     def picture_bytes(self) -> int:
         frame = self.frame
         return 0 if frame is None or frame.repeated else frame.image.nbytes
@@ -129,7 +135,7 @@ class Recorder:
             self._closed = True
             if self._behind is None:
                 self._end()
-            elif self._behind.finish(self._end, CLOSE_TIMEOUT_S):
+            elif self._behind.finish(self._end, CLOSE_TIMEOUT_S, self._writing.give_up):
                 self._over = True
                 self._remember("the disk does not answer: the recording lacks its end")
         kept = self._flushed_pictures
@@ -140,7 +146,7 @@ class Recorder:
         if self._behind is None:
             self._write(turn)
             return
-        size = turn.picture_bytes
+        size = turn.held_bytes
         if self._over:
             return
         if self._handed_bytes - self._done_bytes + size > MOST_PICTURE_BYTES:
@@ -157,7 +163,7 @@ class Recorder:
     # The thread that writes, or lockstep.
 
     def _write(self, turn: _Turn) -> None:
-        self._done_bytes += turn.picture_bytes
+        self._done_bytes += turn.held_bytes
         if self._over:
             return
         try:

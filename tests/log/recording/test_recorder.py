@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -165,8 +166,8 @@ def test_a_disk_that_hangs_holds_up_nobody(
     hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The queue's place for pictures is used up, and then its place for turns."""
-    picture_bytes = recorded.picture(0).nbytes
-    monkeypatch.setattr(recording_module, "MOST_PICTURE_BYTES", 10 * picture_bytes)
+    held_bytes = recording_module._Turn(recorded.frame(0, 1.0, as_jpeg=True)).held_bytes
+    monkeypatch.setattr(recording_module, "MOST_PICTURE_BYTES", 10 * held_bytes)
     monkeypatch.setattr(container, "CHUNK_BYTES", 1)
     recorder, flight = onto(hung, live=True), recorded.flown(120)
     hung.gate.clear()
@@ -185,6 +186,22 @@ def test_a_disk_that_hangs_holds_up_nobody(
     assert end.pictures + end.missing == 121
     assert 10 <= len(kept) <= 13  # and it goes on with the next that there is room for
     assert kept[-1] == 200
+
+
+def test_pictures_that_repeat_and_their_jpegs_count_as_held(
+    hung: MemoryDisk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_module, "MOST_PICTURE_BYTES", 100)  # less than any picture
+    recorder = onto(hung, live=True)
+    hung.gate.clear()
+    flight = recorded.flown(4)
+    recorder.frame(replace(flight.frames[0], repeated=True))
+    recorder.tick(flight.ticks[0])
+    assert "pictures are missing" in recorder.take_remarks()[0]
+    frame = recorded.frame(0, 1.0, as_jpeg=True)
+    held = recording_module._Turn(frame=frame).held_bytes
+    assert frame.encoded is not None
+    assert held == frame.image.nbytes + len(frame.encoded)
 
 
 def test_a_queue_that_is_full_drops_turns(
@@ -210,6 +227,8 @@ def test_closing_does_not_wait_for_ever(hung: MemoryDisk, monkeypatch: pytest.Mo
     assert end.problem is not None
     assert "does not answer" in end.problem
     assert end.missing == 10 - end.pictures > 0
+    hung.gate.set()
+    until(lambda: hung.closed)  # should the disk ever answer, nothing stays open
 
 
 def test_after_its_end_it_takes_nothing(tmp_path: Path) -> None:
@@ -257,8 +276,6 @@ def test_frames_before_the_first_tick_are_kept(tmp_path: Path) -> None:
 
 
 def test_a_repetition_is_told_and_not_kept(tmp_path: Path) -> None:
-    from dataclasses import replace
-
     recorder, frame = recorded.recorder(tmp_path / "f.mcap"), recorded.frame(0, 1.0, False)
     recorder.frame(frame)
     recorder.frame(replace(frame, repeated=True))
