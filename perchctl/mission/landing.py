@@ -38,8 +38,6 @@ vehicle comes sinking, and what the vehicle then catches up with must be slow.""
 MOST_DRIFT_M = 1.0
 BLIND_DRIFT_MPS = 0.08
 """Of a height that no position from outside corrects: the most that 40 simulated landings had."""
-MOST_BELOW_M = 3.0
-"""An estimate that is farther below the ground is no height, and no order aims along with it."""
 UNKNOWN_M = 1.0
 """The height to come down from where none is known."""
 PEELED_M = 0.1
@@ -68,16 +66,14 @@ def own_landing(
     It aims below the ground, and the lower the longer the estimate has had to drift: the
     motors stop at the trajectory's end, and over a floor that lies lower they would drop it.
     It never aims above where the estimate has the vehicle, which may be far below the ground by
-    now: that would be a climb; beyond `MOST_BELOW_M` it is no height, and it aims slowly at
-    that. `blind_s`: for how long no position from outside has come; until
+    now: that would be a climb. `blind_s`: for how long no position from outside has come; until
     the floor none will, so it aims deeper in the same time, which is faster.
     """
     z_m = math.nan if newest is None else newest.position_m[2]
     below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
     known = math.isfinite(z_m)
-    lowest_m = ground_z_m - MOST_BELOW_M
-    aim_m = (max(lowest_m, min(ground_z_m, z_m)) if known else ground_z_m) - below_m
-    way_m = UNKNOWN_M if not known else (z_m if z_m >= lowest_m else ground_z_m) - aim_m
+    aim_m = (min(ground_z_m, z_m) if known else ground_z_m) - below_m
+    way_m = z_m - aim_m if known else UNKNOWN_M
     lasts_s = SETTLING_S + _PEAK_OF_MEAN * way_m / PLANNED_MPS
     if blind_s > 0.0:
         aim_m -= min(MOST_DRIFT_M, BLIND_DRIFT_MPS * (blind_s + lasts_s))
