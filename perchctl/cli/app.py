@@ -16,7 +16,12 @@ import typer
 from typer.core import TyperGroup
 
 from perchctl import __version__
-from perchctl.cli.complete import complete_positioning, complete_profile, complete_source
+from perchctl.cli.complete import (
+    complete_log,
+    complete_positioning,
+    complete_profile,
+    complete_source,
+)
 from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
@@ -99,6 +104,10 @@ ViewOption = Annotated[
 ViewPortOption = Annotated[
     int,
     typer.Option("--view-port", min=0, max=65535, help="Port of the live page; 0: any free one."),
+]
+LogArgument = Annotated[
+    Path | None,
+    typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
 ]
 LogProfileOption = Annotated[
     str | None,

@@ -10,19 +10,16 @@ import typer
 from perchctl.cli.app import (
     ForceOption,
     JsonOption,
+    LogArgument,
     LogDirOption,
     LogProfileOption,
     perform,
     reported,
 )
-from perchctl.cli.complete import complete_log
 
 
 def export(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
-    ] = None,
+    file: LogArgument = None,
     csv: Annotated[bool, typer.Option("--csv", help="A table for any program, t_s first.")] = False,
     parquet: Annotated[
         bool, typer.Option("--parquet", help="The same table for pandas, polars, DuckDB.")

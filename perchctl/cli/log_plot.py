@@ -10,19 +10,16 @@ import typer
 from perchctl.cli.app import (
     ForceOption,
     JsonOption,
+    LogArgument,
     LogDirOption,
     LogProfileOption,
     perform,
     reported,
 )
-from perchctl.cli.complete import complete_log
 
 
 def plot(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
-    ] = None,
+    file: LogArgument = None,
     output: Annotated[
         Path | None,
         typer.Option(

@@ -7,15 +7,12 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, JsonOption, perform, reported
-from perchctl.cli.complete import complete_log, complete_profile
+from perchctl.cli.app import ForceOption, JsonOption, LogArgument, perform, reported
+from perchctl.cli.complete import complete_profile
 
 
 def replay(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
-    ] = None,
+    file: LogArgument = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(

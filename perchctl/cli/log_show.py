@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import JsonOption, LogDirOption, LogProfileOption, perform, reported
-from perchctl.cli.complete import complete_log
+from perchctl.cli.app import (
+    JsonOption,
+    LogArgument,
+    LogDirOption,
+    LogProfileOption,
+    perform,
+    reported,
+)
 
 
 def show(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="A flight log; by default the newest.", autocompletion=complete_log),
-    ] = None,
+    file: LogArgument = None,
     listed: Annotated[bool, typer.Option("--list", help="The newest logs, a line each.")] = False,
     count: Annotated[
         int | None, typer.Option("--count", "-n", min=1, help="How many --list shows. Default: 10.")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.commands.log_file import log_file, opened
+from perchctl.commands.log_plot import DRAWN_IN, FORMATS
 from perchctl.commands.output import print_record, say
 from perchctl.errors import ReplayDiffers
 from perchctl.files import check_output
@@ -19,8 +20,6 @@ from perchctl.replay.run import check_readable, replay
 from perchctl.replay.sense import Picture
 from perchctl.replay.told import replay_lines, replay_record
 from perchctl.replay.whatif import changes_of, gates_of
-
-FORMATS = (".png", ".pdf", ".svg")
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ def run(request: ReplayRequest) -> int:
     UsageError."""
     path = log_file(request.file, None, None)
     if request.output is not None:
-        check_output(request.output, FORMATS, request.force, "what plots are drawn in")
+        check_output(request.output, FORMATS, request.force, DRAWN_IN)
     with opened(path) as log:
         wanted = _profile(request, log)
         check_readable(log)

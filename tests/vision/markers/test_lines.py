@@ -192,6 +192,11 @@ def test_none_leaves_the_corners_alone_and_both_markers_go_together() -> None:
         assert not result.refined
     together = refine(image, raw, [RIMS[6], RIMS[7]], CAMERA, "line")
     alone = [refine(image, raw[i : i + 1], [RIMS[6 + i]], CAMERA, "line")[0] for i in (0, 1)]
+    near = [refine(image, raw[i : i + 1] - 0.29, [RIMS[6 + i]], CAMERA, "line")[0] for i in (0, 1)]
+    for a, b in zip(
+        refine(image, raw - 0.29, [RIMS[6], RIMS[7]], CAMERA, "line"), near, strict=True
+    ):
+        assert np.allclose(a.corners_px, b.corners_px, atol=1e-6)
     for a, b in zip(together, alone, strict=True):
         # All sides take as many rounds as the one that needs most.
         assert np.abs(a.corners_px - b.corners_px).max() < 0.03
