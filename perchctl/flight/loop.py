@@ -28,6 +28,7 @@ from perchctl.flight.watchdog import Watchdog
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
 from perchctl.mission.context import Context
+from perchctl.mission.sent import Sent
 from perchctl.mission.state import (
     FLYING_PHASES,
     Observation,
@@ -36,7 +37,15 @@ from perchctl.mission.state import (
     PlannerState,
 )
 from perchctl.mission.turn import Turn
-from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport, Tick, Watcher
+from perchctl.mission.watch import (
+    RESCUE,
+    Event,
+    EventKind,
+    FlightReport,
+    SentWatcher,
+    Tick,
+    Watcher,
+)
 from perchctl.pipeline import Pipeline
 from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
@@ -77,8 +86,8 @@ def fly(parts: FlightParts) -> FlightReport:
     _wait_until_ready(parts, senses, turns)  # nothing is started before it returns
     if senses.history.newest is not None:
         senses.ground_z_m = senses.history.newest.position_m[2]
-    watchdog = Watchdog(parts.profile, parts.operator)
-    parts.link.guard(watchdog)
+    watchdog, told = Watchdog(parts.profile, parts.operator), _teller(parts.watchers)
+    parts.link.guard(watchdog, told)
     started_s = parts.clock.now()
     try:
         return _mission(parts, senses, watchdog, turns)
@@ -94,11 +103,24 @@ def fly(parts: FlightParts) -> FlightReport:
             flown_s=parts.clock.now() - started_s,
             held_m=watchdog.held_m,
             blind_s=watchdog.blind_s(parts.clock.now()),
+            told=told,
         )
         with contextlib.suppress(Exception):  # the log may be what failed
             turns.failed(senses)
         _tell_rescue(parts, error, safe)
         raise
+
+
+def _teller(watchers: Sequence[Watcher]) -> Callable[[Sent], None]:
+    """What is sent in the loop's place is told to those who want it."""
+    told = [watcher for watcher in watchers if isinstance(watcher, SentWatcher)]
+
+    def tell(sent: Sent) -> None:
+        for watcher in told:
+            with contextlib.suppress(Exception):
+                watcher.sent(sent)
+
+    return tell
 
 
 def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:

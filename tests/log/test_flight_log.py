@@ -22,9 +22,10 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.log import write
 from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.jsonl import to_plain
+from perchctl.log.place import log_path
 from perchctl.log.read import read_log
 from perchctl.log.watch import LogWatcher
-from perchctl.log.write import FlightLogWriter, log_path
+from perchctl.log.write import FlightLogWriter
 from perchctl.mission.state import BatteryOutlook, Outcome, Phase
 from perchctl.mission.watch import FlightReport, Outside
 from perchctl.vehicle import (
