@@ -106,7 +106,7 @@ def fly(parts: FlightParts) -> FlightReport:
             told=told,
         )
         with contextlib.suppress(Exception):  # the log may be what failed
-            turns.failed(senses)
+            turns.failed(senses, error)
         _tell_rescue(parts, error, safe)
         raise
 
@@ -144,7 +144,7 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
         newest = senses.history.newest
         refuse(newest, parts.profile)
         outside = None if parts.positions is None else parts.positions(now_s)
-        refuse_strange(outside, newest, parts.profile, at_rest)
+        refuse_strange(outside, newest, parts.profile, now_s, at_rest)
         turns.waiting(senses, now_s, outside)
         waiting = still_waiting_for(
             newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
@@ -181,6 +181,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         turns.observed(obs)
         before = state
         new, command = planner.step(before or planner.start(obs), obs, parts.profile)
+        turns.decided(obs, new, command, outside)
         turns.lap()
         overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):

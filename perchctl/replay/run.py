@@ -131,7 +131,7 @@ def replay(
         changed=changed,
         observations_anew=bool(observations),
         gap=whole.gap,
-        notes=tuple(_notes(log, whole.gap, seen, changed)),
+        notes=(*_notes(log, whole.gap, seen, changed), *_failures(decided)),
     )
 
 
@@ -210,6 +210,12 @@ def _seen(
         another=isinstance(missing, PictureAnother),
         unreadable=isinstance(missing, PicturesUnreadable),
     )
+
+
+def _failures(decided: Sequence[Decided]) -> Iterator[str]:
+    for each in decided:
+        if each.error is not None:
+            yield f"the planner breaks down on turn {each.turn.number}, as in flight: {each.error}"
 
 
 def _frames_of(turns: Iterable[Turn]) -> int:
