@@ -429,7 +429,7 @@ def test_not_a_flight_log(tmp_path: Path) -> None:
     refused(b'{"kind":"header"}\n', "line 1: not a flight log")
     refused(b"[1]\n", "line 1: not a flight log")
     refused(good[0][:-20], "line 1: not a flight log")
-    refused(good[0].replace(b'"version":3', b'"version":99'), "line 1: schema version 99")
+    refused(good[0].replace(b'"version":4', b'"version":99'), "line 1: schema version 99")
     refused(b"".join([*good[:3], b"garbage\n", *good[3:]]), "line 4: not a record")
     refused(b"".join([*good[:3], b'{"kind":"tick"}\n', *good[3:]]), "line 4: .*t_s must be")
     refused(b"".join([*good[:2], b'{"kind":"?","t_s":1}\n', *good[3:]]), "line 3: .*allowed are")
