@@ -61,7 +61,7 @@ def test_another_version_names_both(good: bytes, tmp_path: Path) -> None:
         b'"perchctl":"0.2.0"', b'"perchctl":"9.1"'
     )
     said = refusal(tmp_path / "x.jsonl", newer)
-    assert "schema version 9, this perchctl reads 1 to 3" in said
+    assert "schema version 9, this perchctl reads 1 to 4" in said
     assert "written by perchctl 9.1, this is" in said
     assert said.endswith("update perchctl")
     older = good.replace(b'"version":4', b'"version":0')
