@@ -19,6 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
 from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S, CflibLink
 from perchctl.link.estimate import EstimateLink
+from perchctl.mission.sent import Sent
 from perchctl.profile import LinkConfig
 from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.scenario import Scenario
@@ -122,6 +123,20 @@ def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
 
     cf(link).packet_sent.add_callback(note)
     return bits
+
+
+class Nobody:
+    """A guard that has nothing to send."""
+
+    def poll(self, now_s: float, newest: Telemetry | None) -> None:
+        return None
+
+
+def told_by(link: CflibLink) -> list[Sent]:
+    """Collects what the link sends of itself."""
+    told: list[Sent] = []
+    link.guard(Nobody(), told.append)
+    return told
 
 
 def take_off(link: CflibLink, sim: SimProcess) -> None:
@@ -240,8 +255,9 @@ def test_raw_thrust_works_and_a_perched_vehicle_is_left_unlocked(sim: SimProcess
         link.send(StopMotors())
         until(lambda: max(sim.truth()["motors"]) == 0)
         assert info(sim) & FLYING
-        raw = sent_raw(link, sim)
+        raw, told = sent_raw(link, sim), told_by(link)
         link.close()
+        assert [(each.by, each.command) for each in told] == [("farewell", RawThrust(0))]
         until(lambda: raw)  # cflib's farewell: on a busy computer `close` does not wait for it
         assert not any(bits & FLYING for bits in raw)
         let_pass(sim, 2.5)
@@ -271,9 +287,9 @@ def test_a_flying_vehicle_is_neither_taken_over_nor_dropped(sim: SimProcess) -> 
     may send one."""
     with linked(sim, landing_wait_s=1.0) as link:
         take_off(link, sim)
-        raw = sent_raw(link, sim)
+        raw, told = sent_raw(link, sim), told_by(link)
         link.close()  # nobody lands it: waits, gives up
-        assert raw == []
+        assert (raw, told) == ([], [])
         assert sim.truth()["position_m"][2] > 0.3
         second = CflibLink(sim.uri, CONFIG, time.monotonic)
         with pytest.raises(ConnectionFailed, match="flying already: land it"):

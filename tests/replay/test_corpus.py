@@ -13,6 +13,7 @@ import pytest
 
 from perchctl.log.read import FlightLog, read_log
 from perchctl.log.setup import other_computer
+from perchctl.log.write import SCHEMA_VERSION
 from perchctl.mission.state import Phase
 from perchctl.replay.run import Replay, replay
 from perchctl.replay.told import difference_text
@@ -53,6 +54,17 @@ def test_the_corpus_is_worth_its_place() -> None:
     assert any(turn.role == "redone" for turn in corpus("hung-within").turns)
     assert any(turn.taken.late for turn in corpus("hung-within").turns)
     assert any(turn.row == "telemetry-stale" for turn in corpus("link-silent").turns)
+
+
+def test_flights_of_two_formats_are_in_it() -> None:
+    """Those of version 3, which stay readable, and some of today's, in which the planner's words
+    and what the watchdog sent are held too."""
+    of = {name: corpus(name).header["version"] for name in NAMES}
+    assert {3, SCHEMA_VERSION} == {*of.values()}
+    for name, version in of.items():
+        told = [turn.reason is not None for turn in corpus(name).turns if turn.command]
+        assert all(told) if version == SCHEMA_VERSION else not any(told)
+    assert {each.by for each in corpus("hung").sent} == {"watchdog"}
 
 
 def test_each_flight_of_the_corpus_can_be_made_anew() -> None:

@@ -19,7 +19,7 @@ from perchctl.log.jsonl import line_of
 from perchctl.log.read import FlightLog, read_log
 from perchctl.log.setup import camera_in, mask_in, profile_of
 from perchctl.log.write import FlightLogWriter, make_header
-from perchctl.mission import conditions, guidance
+from perchctl.mission import conditions, guidance, planner
 from perchctl.profile import Profile
 from perchctl.profile.changed import changed
 from perchctl.replay.compare import first_differing, same
@@ -77,6 +77,53 @@ def test_a_gate_that_falls_later_is_a_difference_of_the_phase(
     assert found.first is not None
     assert (found.first.field, found.first.recorded) == ("phase", "PERCH")
     assert found.first.replayed == "ASCEND"
+
+
+def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And passes a log of version 3, which does not hold it."""
+    step = planner.step
+
+    def says_otherwise(state: Any, obs: Any, profile: Any) -> Any:
+        new, command = step(state, obs, profile)
+        return replace(new, reason=new.reason.replace("hovering", "hanging")), command
+
+    log, old = corpus("hung"), corpus("perched")
+    at = [turn for turn in log.turns if turn.role == "flown"]
+    first = next(k for k, turn in enumerate(at) if "hovering" in (turn.reason or ""))
+    monkeypatch.setattr(planner, "step", says_otherwise)
+    found = replay(log)
+    assert found.first is not None
+    assert (found.first.tick, found.first.field) == (first, "reason")
+    assert "hanging" in found.first.replayed
+    assert any("reason was" in line for line in replay_lines(found, [], []))
+    assert old.header["version"] == 3
+    assert replay(old).same
+
+
+def test_a_planner_that_broke_down_has_to_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    step, log = planner.step, replace(corpus("hung"))
+    *turns, last = log.turns
+    failed = replace(
+        last, role="failed", command=None, phase=None, outcome=None, reason=None, error="KeyError"
+    )
+    log.__dict__["turns"] = [*turns, failed]
+    mended = replay(log)
+    assert mended.first is not None
+    assert (mended.first.field, mended.first.recorded) == ("error", "KeyError")
+    assert mended.first.replayed is None
+    assert not mended.same
+
+    def fails(state: Any, obs: Any, profile: Any) -> Any:
+        if obs.t_s == last.t_s:
+            raise KeyError("by the test")
+        return step(state, obs, profile)
+
+    monkeypatch.setattr(planner, "step", fails)
+    again = replay(log)
+    assert again.same
+    assert any("breaks down on turn" in note for note in again.notes)
 
 
 @pytest.mark.parametrize(

@@ -2,10 +2,10 @@
 
     python tests/data/flights/make.py [NAME ...]
 
-Each file holds a log's header, turns, events and summary, packed; the ticks, which say the same
-rounded, are left out. They were flown by the planner of their day: `tests/replay/test_corpus.py`
-demands that today's decides the same from the same observations. Where it is meant to decide
-otherwise, see docs/replay.md, "The corpus".
+Each file holds a log's header, turns, what was sent in the loop's place, events and summary,
+packed; the ticks, which say the same as the turns, but rounded, are left out. They were flown by
+the planner of their day: `tests/replay/test_corpus.py` demands that today's decides the same from
+the same observations. Where it is meant to decide otherwise, see docs/replay.md, "The corpus".
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from perchctl.mission.watch import FlightReport  # noqa: E402
 from tests.helpers.flights import short_profile  # noqa: E402
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner  # noqa: E402
 
-KEPT = (b'{"kind":"header"', b'{"kind":"turn"', b'{"kind":"event"', b'{"kind":"summary"')
+KINDS = (b"header", b"turn", b"sent", b"event", b"summary")
+KEPT = tuple(b'{"kind":"' + kind + b'"' for kind in KINDS)
 
 
 SMALL = {"link.telemetry_period_s": 0.02, "link.loop_hz": 25}
