@@ -14,7 +14,7 @@ from typing import Protocol
 from perchctl.camera.source import FrameSource, SourceAround
 from perchctl.flight.clock import Clock
 from perchctl.flight.senses import Senses
-from perchctl.link.protocol import Guard
+from perchctl.link.protocol import Guard, ToldSent, tell_nobody
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.target.print_check import PrintCheck, PrintVerdict
@@ -48,7 +48,7 @@ class Silent:
     def problem(self, now_s: float) -> str | None:
         return None
 
-    def guard(self, guard: Guard) -> None:
+    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
         return None
 
     def close(self) -> None:

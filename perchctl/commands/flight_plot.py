@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from perchctl.commands.output import say
+from perchctl.log.place import beside
 from perchctl.log.read import read_log
 from perchctl.profile import Profile
 
@@ -15,7 +16,7 @@ def plot_of(log_path: Path, profile: Profile) -> Path | None:
         return None
     from perchctl.log.plot import plot_flight
 
-    picture = log_path.with_suffix(".png")
+    picture = beside(log_path, ".png")
     try:
         plot_flight(read_log(log_path), picture)
     except Exception as error:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.commands.log_file import log_file, opened
-from perchctl.commands.log_plot import beside
 from perchctl.commands.output import print_record, say
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_output, same_file, write_files
 from perchctl.log.export.as_csv import csv_text
 from perchctl.log.export.as_parquet import check_parquet, parquet_bytes
 from perchctl.log.export.table import columns_of
+from perchctl.log.place import beside
 from perchctl.log.recording import export_mcap
 from perchctl.log.recording.place import recording_of
 
@@ -103,8 +103,8 @@ def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
             f"{own} is the flight's own recording, with its pictures: open that, or name another "
             f"file with -o"
         )
-    with opened(path):  # what of it is no flight's is told as of the other forms
-        done = export_mcap(path, place, force)
+    with opened(path) as log:
+        done = export_mcap(log, place, force)
     for note in done.notes:
         say(note)
     return {"layout": str(done.layout), "pictures": done.pictures, "notes": list(done.notes)}

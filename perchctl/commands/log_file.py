@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from perchctl.commands.output import say
-from perchctl.errors import InvalidValue, UsageError
+from perchctl.errors import UsageError
 from perchctl.log.newest import newest_logs
-from perchctl.log.read import FlightLog, read_log
+from perchctl.log.read import FlightLog, read_log, values_of
 from perchctl.profile import Profile, load_profile
 
 
@@ -46,11 +46,5 @@ def opened(path: Path) -> Iterator[FlightLog]:
     Errors: NotFound, InvalidValue.
     """
     log = read_log(path)
-    try:
+    with values_of(path):
         yield log
-    except (TypeError, ValueError, KeyError, AttributeError) as error:
-        if isinstance(error, OSError):
-            raise
-        raise InvalidValue(
-            f"{path}: it holds a value that no flight writes ({error}): take the original"
-        ) from error

@@ -8,6 +8,7 @@ from pathlib import Path
 from perchctl.commands.log_file import log_file, opened
 from perchctl.commands.output import print_record
 from perchctl.files import check_output
+from perchctl.log.place import beside
 from perchctl.log.summary import summary_of
 
 FORMATS = (".png", ".pdf", ".svg")
@@ -41,9 +42,3 @@ def run(request: PlotRequest) -> int:
     else:
         print(f"plot:      {picture}")
     return 0
-
-
-def beside(log: Path, suffix: str) -> Path:
-    """The file of the log's name with another ending."""
-    stem = log.name.removesuffix(".gz").removesuffix(".jsonl")
-    return log.with_name(stem + suffix)

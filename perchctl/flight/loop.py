@@ -28,6 +28,7 @@ from perchctl.flight.watchdog import Watchdog
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
 from perchctl.mission.context import Context
+from perchctl.mission.sent import Sent
 from perchctl.mission.state import (
     FLYING_PHASES,
     Observation,
@@ -36,7 +37,15 @@ from perchctl.mission.state import (
     PlannerState,
 )
 from perchctl.mission.turn import Turn
-from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport, Tick, Watcher
+from perchctl.mission.watch import (
+    RESCUE,
+    Event,
+    EventKind,
+    FlightReport,
+    SentWatcher,
+    Tick,
+    Watcher,
+)
 from perchctl.pipeline import Pipeline
 from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
@@ -77,8 +86,8 @@ def fly(parts: FlightParts) -> FlightReport:
     _wait_until_ready(parts, senses, turns)  # nothing is started before it returns
     if senses.history.newest is not None:
         senses.ground_z_m = senses.history.newest.position_m[2]
-    watchdog = Watchdog(parts.profile, parts.operator)
-    parts.link.guard(watchdog)
+    watchdog, told = Watchdog(parts.profile, parts.operator), _teller(parts.watchers)
+    parts.link.guard(watchdog, told)
     started_s = parts.clock.now()
     try:
         return _mission(parts, senses, watchdog, turns)
@@ -94,11 +103,24 @@ def fly(parts: FlightParts) -> FlightReport:
             flown_s=parts.clock.now() - started_s,
             held_m=watchdog.held_m,
             blind_s=watchdog.blind_s(parts.clock.now()),
+            told=told,
         )
         with contextlib.suppress(Exception):  # the log may be what failed
-            turns.failed(senses)
+            turns.failed(senses, error)
         _tell_rescue(parts, error, safe)
         raise
+
+
+def _teller(watchers: Sequence[Watcher]) -> Callable[[Sent], None]:
+    """What is sent in the loop's place is told to those who want it."""
+    told = [watcher for watcher in watchers if isinstance(watcher, SentWatcher)]
+
+    def tell(sent: Sent) -> None:
+        for watcher in told:
+            with contextlib.suppress(Exception):
+                watcher.sent(sent)
+
+    return tell
 
 
 def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
@@ -122,7 +144,7 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
         newest = senses.history.newest
         refuse(newest, parts.profile)
         outside = None if parts.positions is None else parts.positions(now_s)
-        refuse_strange(outside, newest, parts.profile, at_rest)
+        refuse_strange(outside, newest, parts.profile, now_s, at_rest)
         turns.waiting(senses, now_s, outside)
         waiting = still_waiting_for(
             newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
@@ -159,6 +181,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         turns.observed(obs)
         before = state
         new, command = planner.step(before or planner.start(obs), obs, parts.profile)
+        turns.decided(obs, new, command, outside)
         turns.lap()
         overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):

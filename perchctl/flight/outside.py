@@ -146,8 +146,8 @@ class AtRest:
         self._from: ExternalPosition | None = None
 
     def strange(self, place: ExternalPosition | None, profile: Profile) -> Problem | None:
-        """Asked in each turn; `place` None while the vehicle does not stand still, or nothing
-        fresh tells where it is: then it begins anew."""
+        """Asked in each turn of which fresh telemetry and a fresh position tell; `place` None
+        where the vehicle does not stand still: then it begins anew."""
         self._from = None if place is None else self._from or place
         if place is None or self._from is None:
             return None

@@ -97,5 +97,5 @@ def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: 
     end_s, newest, at_rest = clock.now() + STRANGE_S, None, AtRest()
     while (now_s := clock.now()) < end_s:
         newest = next(reversed(link.telemetry()), newest)
-        refuse_strange(feed.status(now_s), newest, profile, at_rest)
+        refuse_strange(feed.status(now_s), newest, profile, now_s, at_rest)
         clock.wait_until(now_s + 0.02)

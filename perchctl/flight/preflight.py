@@ -44,17 +44,23 @@ def refuse_strange(
     status: FeedStatus | None,
     telemetry: Telemetry | None,
     profile: Profile,
+    now_s: float,
     at_rest: AtRest | None = None,
 ) -> None:
     """Raises SafetyAbort for positions in another unit, or of another world or body. Held askew or
-    moved it is not judged: capture and attitude are not of one moment. `at_rest`: what has been
-    seen in the turns before."""
-    place = None
+    moved it is not judged, nor by anything old: capture and attitude are not of one moment.
+    `at_rest`: what has been seen in the turns before."""
+    if status is None or telemetry is None:
+        return
+    if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
+        return  # unknown: neither judged, nor is what was seen so far forgotten
+    stands = tilted(telemetry, profile) is None and moving(telemetry) is None
     # What was sent last before a problem may have been elsewhere.
-    if status is not None and status.problem is None and telemetry is not None:
-        stands = tilted(telemetry, profile) is None and moving(telemetry) is None
-        place = status.measured if stands else None
-    if place is not None and telemetry is not None:
+    told = status.problem is None and status.age_s <= profile.positioning.hold_s
+    if stands and not told:
+        return
+    place = status.measured if stands else None
+    if place is not None:
         _refuse(strange(place, telemetry, profile))
     if at_rest is not None:
         _refuse(at_rest.strange(place, profile))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from perchctl.flight.clock import Clock
 from perchctl.flight.history import is_finite
 from perchctl.link.evidence import is_known, motors_may_run
-from perchctl.link.protocol import Link
+from perchctl.link.protocol import Link, ToldSent, tell_nobody
 from perchctl.mission.landing import (
     LEAST_ORDERS,
     MAX_ORDERS,
@@ -17,9 +17,10 @@ from perchctl.mission.landing import (
     REPEAT_ORDER_S,
     own_landing,
 )
+from perchctl.mission.sent import Sent
 from perchctl.mission.state import Operator
 from perchctl.profile import LandingConfig
-from perchctl.vehicle import HL_ACTIVE, EmergencyStop, PositionSetpoint, Telemetry
+from perchctl.vehicle import HL_ACTIVE, Command, EmergencyStop, PositionSetpoint, Telemetry
 
 LOOK_S = 0.5
 """For so long a vehicle must be seen with its motors off before a rescue leaves it."""
@@ -36,6 +37,7 @@ def rescue(
     flown_s: float = 0.0,
     held_m: float | None = None,
     blind_s: float = 0.0,
+    told: ToldSent = tell_nobody,
 ) -> bool:
     """Order a landing and wait for it, bounded; whether the motors were seen off at the end.
     The landing needs no further packet once it is under way.
@@ -45,14 +47,20 @@ def rescue(
     positions from outside that it needs. What the ceiling held at
     `held_m` is first peeled off: its own landing would run by the clock, and end up there. On
     the ground it is looked at again for `LOOK_S`: a take-off just begun does not show at once.
+    `told` is given what was sent.
     """
+
+    def send(command: Command) -> None:
+        link.send(command)
+        told(Sent(clock.now(), "rescue", command))
+
     newest = known
     start_s = off_since_s = clock.now()
     ordered_s, orders = -REPEAT_ORDER_S, 0
     while clock.now() < start_s + landing.timeout_s:
         now_s = clock.now()
         if operator() is Operator.STOP:
-            link.send(EmergencyStop())  # the link's guard repeats it
+            send(EmergencyStop())  # the link's guard repeats it
             return False
         samples = link.telemetry()
         newest = next((s for s in reversed(samples) if is_finite(s)), newest)
@@ -61,7 +69,7 @@ def rescue(
             if orders == 0 and now_s < start_s + PEEL_BLIND_S:
                 peel = _peel(newest, now_s, held_m)
                 if peel is not None:
-                    link.send(peel)
+                    send(peel)
                     clock.wait_until(now_s + PERIOD_S)
                     continue
             under_way = newest is not None and is_known(newest, now_s) and newest.has(HL_ACTIVE)
@@ -69,7 +77,7 @@ def rescue(
             due = orders == 0 or (not seen and now_s - ordered_s > REPEAT_ORDER_S)
             if due and orders < MAX_ORDERS:
                 gone_s = blind_s + now_s - start_s if blind_s > 0.0 else 0.0
-                link.send(own_landing(landing, ground_z_m, flown_s, newest, gone_s))
+                send(own_landing(landing, ground_z_m, flown_s, newest, gone_s))
                 ordered_s, orders = now_s, orders + 1
         elif now_s - off_since_s >= LOOK_S:
             return True

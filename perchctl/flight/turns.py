@@ -12,9 +12,6 @@ from perchctl.mission.watch import TurnWatcher, Watcher
 from perchctl.positioning.feed import FeedStatus
 from perchctl.vehicle import Command
 
-UNDECIDED: TurnRole = "redone"
-"""The role of a turn on which the planner raised: not sent either, and without a command."""
-
 
 class Turns:
     """Counts them. In lockstep there are no timings: the same seed gives the same turns."""
@@ -26,6 +23,7 @@ class Turns:
         self._began_s = 0.0
         self._laps_s = [0.0]
         self._undecided: Observation | None = None
+        self._untold: tuple[Observation, PlannerState, Command, FeedStatus | None] | None = None
 
     def begin(self, now_s: float) -> None:
         self._began_s, self._laps_s = now_s, [now_s]
@@ -49,15 +47,29 @@ class Turns:
         """What is about to be decided on."""
         self._undecided = obs
 
-    def failed(self, senses: Senses) -> None:
-        """The flight broke off. Where the planner was at work, tell what it was shown: by that its
-        fault can be found again."""
-        obs, self._undecided = self._undecided, None
-        if obs is not None:
+    def decided(
+        self,
+        obs: Observation,
+        new: PlannerState,
+        command: Command,
+        outside: FeedStatus | None,
+    ) -> None:
+        """The planner has done its part: what fails from now on is not its fault."""
+        self._undecided, self._untold = None, (obs, new, command, outside)
+
+    def failed(self, senses: Senses, error: BaseException) -> None:
+        """The flight broke off. Where the planner raised, tell what it was shown: by that its
+        fault can be found again. Where it had decided, tell what: it may have been sent."""
+        obs, untold = self._undecided, self._untold
+        self._undecided = self._untold = None
+        if untold is not None:
+            obs, new, command, outside = untold
+            self._tell(self._turn("flown", senses, obs, new, command, told_of(outside)))
+        elif obs is not None and isinstance(error, Exception):  # else it was only interrupted
             self._tell(
                 Turn(
-                    self._counted(), UNDECIDED, self._began_s, obs.t_s, senses.taken, senses.poses,
-                    observation=obs,
+                    self._counted(), "failed", self._began_s, obs.t_s, senses.taken, senses.poses,
+                    observation=obs, error=type(error).__name__,
                 )
             )  # fmt: skip
 
@@ -80,7 +92,7 @@ class Turns:
         command: Command,
         outside: Outside | None,
     ) -> Turn:
-        self._undecided = None
+        self._undecided = self._untold = None
         return Turn(
             number=self._counted(),
             role=role,
@@ -96,6 +108,8 @@ class Turns:
             attempts=new.attempts,
             outside=outside,
             timing=self._timing(),
+            outcome=new.outcome,
+            reason=new.reason,
         )
 
     def _timing(self) -> TurnTiming | None:

@@ -7,6 +7,7 @@ zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints s
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -30,10 +31,11 @@ from perchctl.link.evidence import is_known, may_fly
 from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.outside import Feed, Settling, parameters_of
 from perchctl.link.prepare import check_firmware, set_parameters
-from perchctl.link.protocol import Guard
+from perchctl.link.protocol import Guard, ToldSent, tell_nobody
 from perchctl.link.sender import Sender
 from perchctl.link.uri import check_uri
 from perchctl.link.variables import measured_by
+from perchctl.mission.sent import Sent
 from perchctl.profile import LinkConfig
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import (
@@ -45,6 +47,7 @@ from perchctl.vehicle import (
     Idle,
     Land,
     MeasuredBy,
+    RawThrust,
     Telemetry,
 )
 
@@ -52,6 +55,8 @@ SILENCE_S = 1.5
 SENDER_STUCK_S = 0.5
 DRAIN_S = 1.0
 LANDING_WAIT_S = 6.0
+FAREWELL = RawThrust(0)
+"""What cflib's `close_link` sends."""
 
 
 class CflibLink:
@@ -79,6 +84,7 @@ class CflibLink:
         self._blocks = LogBlocks(clock)
         self._sender: Sender | None = None
         self._guard: Guard | None = None
+        self._told: ToldSent = tell_nobody
         self._reopener: threading.Thread | None = None
         self.connection: Connection | None = None
 
@@ -123,8 +129,8 @@ class CflibLink:
             self._clock,
         ).settle(feed)
 
-    def guard(self, guard: Guard) -> None:
-        self._guard = guard
+    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+        self._guard, self._told = guard, told
 
     def problem(self, now_s: float) -> str | None:
         if self.connection is not None and self.connection.lost is not None:
@@ -168,7 +174,9 @@ class CflibLink:
             parameters_of(self._positioning),
             needed_by="positioning from outside",
         )
-        self._sender = Sender(self._hand_over, self._ask_guard, self._clock)
+        self._sender = Sender(
+            self._hand_over, self._ask_guard, self._clock, lambda sent: self._told(sent)
+        )
 
     def _start_logging(self, connection: Connection) -> None:
         self._blocks.start(connection.cf.log, self._uri, self._config.telemetry_period_s)
@@ -215,8 +223,8 @@ class CflibLink:
             return
 
         def run() -> None:
-            if connection.reopen():
-                self.send(order)
+            if connection.reopen() and self._sender is not None:
+                self._sender.put(order, "reconnect")
 
         self._reopener = threading.Thread(target=run, name="perchctl-reconnect", daemon=True)
         self._reopener.start()
@@ -237,6 +245,10 @@ class CflibLink:
         if connection is None:
             return
         if farewell:
+            at_s, linked = self._clock(), connection.lost is None
             connection.close()
+            if linked:
+                with contextlib.suppress(Exception):  # whatever looks on
+                    self._told(Sent(at_s, "farewell", FAREWELL))
         else:
             connection.abandon()

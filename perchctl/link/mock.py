@@ -23,8 +23,9 @@ from perchctl.link.encode import (
     encode,
     encode_external,
 )
-from perchctl.link.protocol import Guard
+from perchctl.link.protocol import Guard, ToldSent, tell_nobody
 from perchctl.link.variables import EXTERNAL, LISTEN_S, decks_of
+from perchctl.mission.sent import Sent
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
@@ -76,6 +77,7 @@ class MockLink:
         self._arrived: list[Telemetry] = []
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
+        self._told: ToldSent = tell_nobody
         self._watched_s = -math.inf
         self._turn: Callable[[float], object] = lambda now_s: None
         self._turn_due_s = self._turn_period_s = math.inf
@@ -123,8 +125,8 @@ class MockLink:
         samples, self._arrived = self._arrived, []
         return samples
 
-    def guard(self, guard: Guard) -> None:
-        self._guard = guard
+    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+        self._guard, self._told = guard, told
 
     def _ask_guard(self) -> None:
         if self._guard is None or self.now_s < self._watched_s + WATCH_PERIOD_S - 1e-9:
@@ -134,6 +136,7 @@ class MockLink:
         command = self._guard.poll(self.now_s, self._newest)
         if command is not None:
             self.send(command)
+            self._told(Sent(self.now_s, "watchdog", command))
 
     def _collect(self) -> None:
         while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
@@ -213,8 +216,8 @@ class ScriptedLink:
         self.places.append((self.now_s, place))
         return True
 
-    def guard(self, guard: Guard) -> None:
-        self.watchdog = guard
+    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+        self.watchdog, self.told = guard, told
 
     def close(self) -> None:
         self.closed = True

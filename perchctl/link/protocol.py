@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
+from perchctl.mission.sent import Sent
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
+
+ToldSent = Callable[[Sent], None]
+"""Given what a link sends of itself; neither waits nor raises."""
+
+
+def tell_nobody(sent: Sent) -> None:
+    return None
 
 
 class Guard(Protocol):
@@ -45,8 +54,11 @@ class Link(Protocol):
     def problem(self, now_s: float) -> str | None:
         """None while the link works, otherwise one sentence with the cause."""
 
-    def guard(self, guard: Guard) -> None:
-        """From now on ask `guard` regularly, until the link is closed."""
+    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+        """From now on ask `guard` regularly, until the link is closed. `told` is given, once it
+        is on its way, each command that the link sends of itself: its guard's, an order once more
+        over a link that was lost, and the farewell; from the link's own thread where it has one.
+        """
 
     def close(self) -> None:
         """Leave the vehicle safe: closes only when it is not flying (bounded wait)."""

@@ -11,7 +11,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 
+from perchctl.link.protocol import ToldSent, tell_nobody
+from perchctl.mission.sent import Sent, SentBy
 from perchctl.vehicle import Command, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
@@ -22,18 +25,21 @@ GUARD_PERIOD_S = 0.05
 
 class Sender:
     """`guard` gives the command to send of itself, None almost always; asked in the thread,
-    every `GUARD_PERIOD_S` and after each command."""
+    every `GUARD_PERIOD_S` and after each command. `told` is given what the loop did not put in,
+    once it is handed over."""
 
     def __init__(
         self,
         hand_over: Callable[[Command], None],
         guard: Callable[[], Command | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
+        told: ToldSent = tell_nobody,
     ) -> None:
         self._hand_over = hand_over
         self._guard = guard
         self._clock = clock
-        self._queue: deque[tuple[float, Command]] = deque()
+        self._told = told
+        self._queue: deque[tuple[float, Command, SentBy | None]] = deque()
         self._ready = threading.Condition()
         self._busy_since_s: float | None = None
         self._running = True
@@ -41,11 +47,12 @@ class Sender:
         self._thread = threading.Thread(target=self._run, name="perchctl-sender", daemon=True)
         self._thread.start()
 
-    def put(self, command: Command) -> None:
+    def put(self, command: Command, by: SentBy | None = None) -> None:
+        """`by`: who sends it in the loop's place."""
         with self._ready:
             if self._queue and isinstance(self._queue[-1][1], _STREAMED):
                 self._queue.pop()
-            self._queue.append((self._clock(), command))
+            self._queue.append((self._clock(), command, by))
             self._ready.notify()
 
     def stuck_s(self) -> float:
@@ -78,10 +85,10 @@ class Sender:
                     self._ready.wait(GUARD_PERIOD_S)
                 if not self._running:
                     return
-                command = self._next()
+                waiting = self._next()
             try:
-                if command is not None:
-                    self._hand_over(command)
+                if waiting is not None:
+                    self._give(*waiting)
                 if self._clock() - asked_s >= GUARD_PERIOD_S:
                     asked_s = self._clock()
                     self._send_for_guard()
@@ -91,17 +98,24 @@ class Sender:
                 self._busy_since_s = None
                 self._ready.notify_all()
 
-    def _next(self) -> Command | None:
+    def _next(self) -> tuple[Command, SentBy | None] | None:
         while self._queue:
-            put_s, command = self._queue.popleft()
+            put_s, command, by = self._queue.popleft()
             if isinstance(command, _STREAMED) and self._clock() - put_s > STALE_S:
                 continue
             self._busy_since_s = self._clock()
-            return command
+            return command, by
         return None
 
     def _send_for_guard(self) -> None:
         command = self._guard()
         if command is not None:
             self._busy_since_s = self._clock()
-            self._hand_over(command)
+            self._give(command, "watchdog")
+
+    def _give(self, command: Command, by: SentBy | None) -> None:
+        at_s = self._clock()
+        self._hand_over(command)
+        if by is not None:
+            with suppress(Exception):  # whatever looks on: the next command goes out all the same
+                self._told(Sent(at_s, by, command))

@@ -32,6 +32,21 @@ class Behind:
             self._changed.notify()
         return True
 
+    def wait(self, job: Job, timeout_s: float) -> bool:
+        """One more, however many there are; whether it was done by then. Later it may be, too."""
+        done = threading.Event()
+
+        def run() -> None:
+            try:
+                job()
+            finally:
+                done.set()
+
+        with self._changed:
+            self._jobs.append(run)
+            self._changed.notify()
+        return done.wait(timeout_s)
+
     def finish(self, job: Job, timeout_s: float, late: Job) -> int:
         """One last job; waits for it. How many jobs were not done by then: 0 is all done.
 

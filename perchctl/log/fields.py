@@ -212,7 +212,7 @@ def tick_record(
         **_telemetry_values(telemetry),
         **_output_values(output),
         **_target_values(target),
-        **_command_values(command),
+        **command_values(command),
     }
     return {key: values.get(key) for key in FIELDS}
 
@@ -319,7 +319,8 @@ def _target_values(target: TargetEstimate | None) -> dict[str, Any]:
     }
 
 
-def _command_values(command: Command | None) -> Mapping[str, Any]:
+def command_values(command: Command | None) -> Mapping[str, Any]:
+    """``cmd`` and what belongs to it; nothing for None."""
     match command:
         case None:
             return {}

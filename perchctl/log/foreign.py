@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from perchctl.log.place import beside
+
 SUFFIX = ".jsonl"
+KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
+"""Of a log's records behind its header."""
 _BEGINS: tuple[tuple[bytes, str], ...] = (
     (b"\x89PNG", "a PNG picture"),
     (b"\xff\xd8\xff", "a JPEG picture"),
@@ -48,7 +52,7 @@ def _kind_of_text(line: bytes) -> str:
     except (ValueError, RecursionError):
         comma = b"," in line and not line.lstrip().startswith((b"{", b"["))
         return "it is a table" if comma else "it is some other text"
-    if isinstance(record, dict) and record.get("kind") in ("tick", "turn", "event", "summary"):
+    if isinstance(record, dict) and record.get("kind") in KINDS:
         return "its header is missing"
     return "it is some other JSON"
 
@@ -65,7 +69,7 @@ def _is_binary(data: bytes) -> bool:
 
 def _remedy(path: Path) -> str:
     """The log that lies beside a plot or a table of it, where there is one."""
-    beside = path.with_suffix(SUFFIX)
-    if beside != path and beside.is_file():
-        return f"its flight's log is {beside}"
+    log = beside(path, SUFFIX)
+    if log != path and log.is_file():
+        return f"its flight's log is {log}"
     return f"logs are the {SUFFIX} files in the profile's log.directory"

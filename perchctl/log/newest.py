@@ -80,9 +80,11 @@ def _from_both_ends(path: Path) -> Listed | None:
         with path.open("rb") as stream:
             first = stream.readline()
             stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
-            last = stream.read().rstrip(b"\n").rpartition(b"\n")[2]
-        header, end = decode(first), decode(last)
-    except (OSError, ValueError):
+            last = stream.read().splitlines()[-2:]
+        header, end = decode(first), decode(last[-1])
+        if end.get("kind") == "recording":
+            end = decode(last[0]) | {k: v for k, v in end.items() if k != "kind"}
+    except (OSError, ValueError, IndexError):
         return None
     if end.get("kind") != "summary" or not first.startswith(_BEGIN):
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,16 +16,17 @@ from perchctl import __version__
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
 from perchctl.log.fields import FIELDS
-from perchctl.log.foreign import why_no_log
+from perchctl.log.foreign import KINDS, why_no_log
 from perchctl.log.jsonl import decode
+from perchctl.log.sent import Takeover, sent_of, takeovers_of
 from perchctl.log.turn import turn_of
 from perchctl.log.write import FORMAT, SCHEMA_VERSION
+from perchctl.mission.sent import Sent
 from perchctl.mission.turn import Turn
 
-KINDS = ("tick", "turn", "event", "summary")
-READABLE_VERSIONS = (1, 2, SCHEMA_VERSION)
+READABLE_VERSIONS = (1, 2, 3, SCHEMA_VERSION)
 """1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
-turns."""
+turns; 3 neither why a turn was decided so, nor what was sent in the loop's place."""
 Times = TypeVar("Times", float, Array)
 _GZIP = b"\x1f\x8b"
 _BEGIN_BYTES = 1 << 16
@@ -62,11 +64,22 @@ class FlightLog:
     truncated: bool
     ignored_bytes: int = 0
     turn_records: list[dict[str, Any]] = field(default_factory=list)
+    sent_records: list[dict[str, Any]] = field(default_factory=list)
 
     @cached_property
     def turns(self) -> list[Turn]:
         """All turns of the loop, exact; empty in a log of version 1 or 2. Errors: InvalidValue."""
         return [turn_of(record) for record in self.turn_records]
+
+    @cached_property
+    def sent(self) -> list[Sent]:
+        """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
+        return [sent_of(record) for record in self.sent_records]
+
+    @cached_property
+    def takeovers(self) -> tuple[Takeover, ...]:
+        """The same, told by each go. Errors: InvalidValue."""
+        return takeovers_of(self.sent)
 
     def column(self, key: str) -> Array:
         """A field over the ticks, shape (n,); NaN where it is missing.
@@ -133,17 +146,32 @@ def read_log(path: Path | str) -> FlightLog:
             )
         good.append(record)
     summary = next((r for r in good if r["kind"] == "summary"), None)
+    recording = next((r for r in good if r["kind"] == "recording"), {})
     blank = dict.fromkeys(FIELDS)
     return FlightLog(
         path=path,
         header=header,
         records=[blank | _without_kind(r) for r in good if r["kind"] == "tick"],
         events=[_without_kind(r) for r in good if r["kind"] == "event"],
-        summary=None if summary is None else _without_kind(summary),
+        summary=None if summary is None else _without_kind(summary | recording),
         truncated=summary is None or ignored > 0,
         ignored_bytes=ignored,
         turn_records=[r for r in good if r["kind"] == "turn"],
+        sent_records=[r for r in good if r["kind"] == "sent"],
     )
+
+
+@contextlib.contextmanager
+def values_of(path: Path) -> Iterator[None]:
+    """Around what works with the values of a log: one that is of no flight raises InvalidValue."""
+    try:
+        yield
+    except OSError:
+        raise
+    except (TypeError, ValueError, LookupError, AttributeError) as error:
+        raise InvalidValue(
+            f"{path}: it holds a value that no flight writes ({error}): take the original"
+        ) from error
 
 
 def _lines(path: Path) -> list[bytes]:
@@ -208,7 +236,8 @@ def _checked(record: dict[str, Any]) -> dict[str, Any]:
     if kind not in KINDS:
         raise ValueError(f"kind {kind!r}, allowed are {', '.join(KINDS)}")
     t_s = record.get("t_s")
-    if kind != "summary" and (isinstance(t_s, bool) or not isinstance(t_s, (int, float))):
+    timeless = kind in ("summary", "recording")
+    if not timeless and (isinstance(t_s, bool) or not isinstance(t_s, (int, float))):
         raise ValueError(f"t_s must be a number of seconds, found {t_s!r}")
     return record
 

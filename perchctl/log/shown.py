@@ -54,6 +54,15 @@ def show_record(log: FlightLog) -> dict[str, Any]:
             }
             for hold in holds_of(log)
         ],
+        "sent": [
+            {
+                "by": go.by,
+                "start_s": _after(log, go.start_s),
+                "end_s": _after(log, go.end_s),
+                "commands": dict(go.sent),
+            }
+            for go in log.takeovers
+        ],
         "notes": [
             {"t_s": _after(log, float(event["t_s"])), "note": str(event.get("reason") or "")}
             for event in _notes(log)
@@ -85,6 +94,7 @@ def show_text(log: FlightLog) -> str:
             *_measured(measures),
             *_phase_lines(log),
             *_hold_lines(log, holds_of(log)),
+            *_sent_lines(log),
             *_note_lines(log),
         ]
     )
@@ -231,6 +241,18 @@ def _hold_lines(log: FlightLog, holds: Sequence[Held]) -> Iterator[str]:
         yield from hung(f"{at_s:8.2f} {for_s:8.2f}  {plain(hold.phase):<9} ", hold.reason)
     if len(holds) > _MOST_HOLDS:
         yield f"                   and {len(holds) - _MOST_HOLDS} more: --json has all"
+
+
+def _sent_lines(log: FlightLog) -> Iterator[str]:
+    if not log.takeovers:
+        return
+    yield ""
+    yield "  at [s]  for [s]  sent by    in the loop's place"
+    for go in log.takeovers[:_MOST_HOLDS]:
+        at_s, for_s = _after(log, go.start_s), go.end_s - go.start_s
+        yield from hung(f"{at_s:8.2f} {for_s:8.2f}  {go.by:<10} ", go.text)
+    if len(log.takeovers) > _MOST_HOLDS:
+        yield f"                   and {len(log.takeovers) - _MOST_HOLDS} more: --json has all"
 
 
 def _note_lines(log: FlightLog) -> Iterator[str]:

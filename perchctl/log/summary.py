@@ -57,14 +57,12 @@ class FlightSummary:
             "locked": self.locked,
             "fell": self.fell,
             **_found(self.findings),
-            **_recorded(self.recording),
+            **({} if self.recording is None else recording_values(self.recording)),
         }
 
 
-def _recorded(recording: RecordingEnd | None) -> dict[str, Any]:
+def recording_values(recording: RecordingEnd) -> dict[str, Any]:
     """The recording lies beside the log: its name is enough."""
-    if recording is None:
-        return {}
     return {
         "recording": recording.path.name,
         "pictures": recording.pictures,

@@ -11,16 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 from perchctl.camera.source import FrameSource, WatchedSource
 from perchctl.log.fields import event_record, tick_record
+from perchctl.log.place import log_path
 from perchctl.log.read import PhaseSpan
 from perchctl.log.recording.place import SUFFIX, recording_of
-from perchctl.log.summary import FlightSummary
-from perchctl.log.write import FlightLogWriter, log_path, make_header
+from perchctl.log.sent import sent_values
+from perchctl.log.summary import FlightSummary, recording_values
+from perchctl.log.write import FlightLogWriter, make_header
+from perchctl.mission.sent import Sent
 from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.profile import Profile
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 if TYPE_CHECKING:
+    from perchctl.log.recording.end import RecordingEnd
     from perchctl.log.recording.recorder import Recorder
 
 Truth = tuple[tuple[float, float, float], float]
@@ -71,8 +75,8 @@ class LogWatcher:
     def _opened(
         cls, path: Path, header: Mapping[str, Any], profile: Profile, record: bool, live: bool
     ) -> LogWatcher:
-        beside = (SUFFIX,) if record else ()
-        writer = FlightLogWriter.open(path, header, live, beside, profile.link.loop_hz)
+        taken = (SUFFIX,) if record else ()
+        writer = FlightLogWriter.open(path, header, live, taken, profile.link.loop_hz)
         if not record:
             return cls(writer)
         from perchctl.log.recording.recorder import Recorder
@@ -122,6 +126,12 @@ class LogWatcher:
         """One without a tick."""
         self.writer.turn(turn)
 
+    def sent(self, sent: Sent) -> None:
+        """From any thread: it goes to those that write, and waits for none of them."""
+        self.writer.sent(sent)
+        if self._recorder is not None:
+            self._recorder.sent(sent_values(sent))
+
     def event(self, event: Event) -> None:
         self.writer.event(event)
         if self._recorder is not None:
@@ -130,10 +140,12 @@ class LogWatcher:
     def close(
         self, report: FlightReport | None = None, miss_m: float | None = None, fell: bool = False
     ) -> FlightSummary | None:
-        """Write the summary and close; without a report (the flight raised) only close."""
-        recording = None if self._recorder is None else self._recorder.close()
+        """Write the summary and close; without a report (the flight raised) only close.
+
+        The summary comes first: a recording's disk that hangs holds up its own end only."""
         if report is None:
             self.writer.close()
+            self._ended_recording()
             return None
         summary = FlightSummary(
             outcome=report.phase.value.lower(),
@@ -147,20 +159,24 @@ class LogWatcher:
             fell=fell,
             phases=spans_of(report),
             findings=report.findings,
-            recording=recording,
         )
-        self.writer.close(summary.as_record())
+        self.writer.conclude(summary.as_record())
+        recording = self._ended_recording()
+        self.writer.close(recording=None if recording is None else recording_values(recording))
         lost, problem = self.writer.lost_records, self.writer.lacks
-        return replace(summary, lost_records=lost, log_problem=problem)
+        return replace(summary, lost_records=lost, log_problem=problem, recording=recording)
 
     def abandon(self, reason: str) -> None:
         """Close the log of a flight that failed. One that never began leaves no file."""
-        recording = None if self._recorder is None else self._recorder.close()
         self.writer.close({"outcome": "failed", "reason": reason})
+        recording = self._ended_recording()
         if not self.begun:
             self.path.unlink(missing_ok=True)
             if recording is not None:
                 recording.path.unlink(missing_ok=True)
+
+    def _ended_recording(self) -> RecordingEnd | None:
+        return None if self._recorder is None else self._recorder.close()
 
     @property
     def problem(self) -> str | None:

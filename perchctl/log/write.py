@@ -2,7 +2,8 @@
 
 Line 1 is the header; then a `tick` and a `turn` record for each turn of the loop (the one
 rounded, for people and plots, the other exact and whole), `event` records between them, and one
-`summary` at the end. A flight is never troubled by its
+`summary` at the end, followed by what became of the `recording`. `sent` records hold what went to
+the vehicle in the loop's place. A flight is never troubled by its
 log: in real time a thread of its own writes it, and a write that fails is remembered
 in `FlightLogWriter.problem`.
 """
@@ -12,12 +13,11 @@ from __future__ import annotations
 import errno
 import math
 import os
-import re
+import threading
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,17 @@ from perchctl.log.behind import Behind
 from perchctl.log.exact import to_exact
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
 from perchctl.log.jsonl import encode, line_of
+from perchctl.log.place import cannot_start, make_log_folder, new_file
+from perchctl.log.sent import SENT_NOTE, sent_line
 from perchctl.log.setup import camera_record, computer_record
 from perchctl.log.turn import TURN_NOTE, turn_line
+from perchctl.mission.sent import Sent
 from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Event
 from perchctl.profile import Profile
 
 FORMAT = "perchctl-flight-log"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
 CLOSE_TIMEOUT_S = 3.0
@@ -45,7 +48,8 @@ RECORDS_A_TURN = 2
 TURNS_SHARE = 0.8
 """Of the queue, beyond which turns are dropped: what is left is for ticks and events."""
 DEFAULT_LOOP_HZ = 50.0
-_ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
+NO_ANSWER = "the disk does not answer: the flight log lacks its end"
+_Record = Mapping[str, Any] | Turn | Sent
 
 
 def make_header(
@@ -77,16 +81,8 @@ def make_header(
         "fields": FIELDS,
         "event_fields": EVENT_FIELDS,
         "turns": TURN_NOTE,
+        "sent": SENT_NOTE,
     }
-
-
-def log_path(directory: Path, profile_name: str, started: datetime) -> Path:
-    """``flight_<UTC yyyymmdd_hhmmss>_<profile>.jsonl`` in the directory.
-
-    (A flight in lockstep is named ``flight_seed<seed>.jsonl`` by the campaign.)
-    """
-    safe = re.sub(r"[^A-Za-z0-9._-]+", "-", profile_name).strip("-.") or "profile"
-    return directory / f"flight_{started.astimezone(UTC):%Y%m%d_%H%M%S}_{safe[:60]}.jsonl"
 
 
 class FlightLogWriter:
@@ -106,8 +102,9 @@ class FlightLogWriter:
         self.formless: str | None = None
         self._fd = fd
         self._behind: Behind | None = None
-        self._closed = False
-        self._dropped = 0  # by the loop's thread
+        self._closed = self._concluded = self._hung = False
+        self._dropped = 0  # by the loop's thread, and by the link's
+        self._dropping = threading.Lock()
         # Below: of the thread that writes.
         self._failed = 0
         self._good_bytes = 0
@@ -129,12 +126,12 @@ class FlightLogWriter:
         path: Path,
         header: Mapping[str, Any],
         live: bool = False,
-        beside: tuple[str, ...] = (),
+        none_beside: tuple[str, ...] = (),
         loop_hz: float = DEFAULT_LOOP_HZ,
     ) -> FlightLogWriter:
         """Create the file and its folder and write the header.
 
-        `beside`: suffixes of files of the same name that must not be there, either.
+        `none_beside`: suffixes of files of the same name that must not be there, either.
 
         `live` (for flights in real time): a thread of its own writes, and brings the records
         to the disk about once a second of the loop's time; otherwise each record is in the
@@ -143,9 +140,9 @@ class FlightLogWriter:
         """
         make_log_folder(path.parent)
         try:
-            free, fd = _create(path, beside)
+            free, fd = new_file(path, none_beside)
         except OSError as error:
-            raise InvalidValue(_cannot_start(path, error)) from None
+            raise InvalidValue(cannot_start(path, error)) from None
         writer = cls(free, fd)
         try:
             writer._append(_header_line(header))
@@ -156,7 +153,7 @@ class FlightLogWriter:
             os.close(fd)
             free.unlink(missing_ok=True)
             if isinstance(error, OSError):
-                raise InvalidValue(_cannot_start(path, error)) from None
+                raise InvalidValue(cannot_start(path, error)) from None
             raise
         return writer
 
@@ -168,31 +165,63 @@ class FlightLogWriter:
         """Append a whole turn, exactly (`perchctl.log.turn`). Never raises."""
         self._put(turn, turn.t_s)
 
+    def sent(self, sent: Sent) -> None:
+        """Append what was sent in the loop's place, exactly (`perchctl.log.sent`); from any
+        thread. Never raises."""
+        self._put(sent, sent.t_s)
+
     def event(self, event: Event) -> None:
         """Append an event (`perchctl.log.fields.event_record`). Never raises."""
         self._put({"kind": "event", **event_record(event)}, event.t_s)
 
-    def close(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Append the summary, if there is one, and close. Never raises; twice is once.
+    def conclude(self, summary: Mapping[str, Any]) -> None:
+        """Append the summary, and bring it to the disk: what is still to be done before `close`
+        may hang. Never raises; waits as `close` does."""
+        if self._closed or self._concluded:
+            return
+        self._concluded = True
+        if self._behind is None:
+            self._summarise(summary)
+        elif not self._behind.wait(partial(self._summarise, summary), CLOSE_TIMEOUT_S):
+            self._hung = True
+            self._remember(NO_ANSWER)
 
-        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most."""
+    def close(
+        self,
+        summary: Mapping[str, Any] | None = None,
+        recording: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Append the summary, if there is one, and what became of a recording, and close. Never
+        raises; twice is once.
+
+        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most, and not once more where
+        `conclude` did in vain."""
         if self._closed:
             return
         self._closed = True
+        end = partial(self._end, summary, recording)
         if self._behind is None:
-            self._end(summary)
+            end()
             return
-        end = partial(self._end, summary)
-        left = self._behind.finish(end, CLOSE_TIMEOUT_S, self._let_go)
+        left = self._behind.finish(end, 0.0 if self._hung else CLOSE_TIMEOUT_S, self._let_go)
         if left:
-            self._dropped += left
-            self._remember("the disk does not answer: the flight log lacks its end")
+            self._drop(left)
+            self._remember(NO_ANSWER)
 
-    def _end(self, summary: Mapping[str, Any] | None) -> None:
+    def _summarise(self, summary: Mapping[str, Any]) -> None:
+        lost = {"lost_records": self.lost_records, "problem": self.lacks}
+        self._failed_s = None  # one last try, whatever happened before
+        self._store({"kind": "summary", **summary, **lost}, None)
+        if self._behind is not None:
+            self._sync_to_disk()
+
+    def _end(
+        self, summary: Mapping[str, Any] | None, recording: Mapping[str, Any] | None = None
+    ) -> None:
         if summary is not None:
-            lost = {"lost_records": self.lost_records, "problem": self.lacks}
-            self._failed_s = None  # one last try, whatever happened before
-            self._store({"kind": "summary", **summary, **lost}, None)
+            self._summarise(summary)
+        if recording is not None:
+            self._store({"kind": "recording", **recording}, None)
         if self._behind is not None:
             self._sync_to_disk()
         self._let_go()
@@ -204,23 +233,27 @@ class FlightLogWriter:
             with suppress(OSError):
                 os.close(fd)
 
-    def _put(self, record: Mapping[str, Any] | Turn, t_s: float | None) -> None:
-        if self._closed:
-            self._dropped += 1
+    def _drop(self, count: int = 1) -> None:
+        with self._dropping:
+            self._dropped += count
+
+    def _put(self, record: _Record, t_s: float | None) -> None:
+        if self._closed or self._concluded:
+            self._drop()
         elif self._behind is None:
             self._store(record, t_s)
         elif not self._behind.put(
             partial(self._store, record, t_s), TURNS_SHARE if isinstance(record, Turn) else 1.0
         ):
-            self._dropped += 1
+            self._drop()
             self._remember("the disk does not keep up with the flight log: records are dropped")
 
-    def _store(self, record: Mapping[str, Any] | Turn, t_s: float | None) -> None:
+    def _store(self, record: _Record, t_s: float | None) -> None:
         if self._is_waiting(t_s):
             self._failed += 1
             return
         try:
-            self._append(turn_line(record) if isinstance(record, Turn) else encode(record))
+            self._append(_line_of(record))
         except OSError as error:
             self._failed += 1
             self._failed_s = t_s
@@ -277,25 +310,14 @@ def _header_line(header: Mapping[str, Any]) -> bytes:
     return line_of(to_exact({k: v for k, v in header.items() if v is not None}))
 
 
-def make_log_folder(directory: Path) -> None:
-    """Where it is missing. Errors: InvalidValue."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        why = "it is a file" if directory.is_file() else error.strerror or str(error)
-        raise InvalidValue(f"{directory} cannot hold flight logs ({why}): {_ELSEWHERE}") from None
-
-
-def _create(path: Path, beside: tuple[str, ...] = ()) -> tuple[Path, int]:
-    """A file that did not exist before, by `path`'s name or the next free one."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
-    for number in count(1):
-        free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
-        if any(free.with_suffix(suffix).exists() for suffix in beside):
-            continue
-        with suppress(FileExistsError):
-            return free, os.open(free, flags, 0o644)
-    raise AssertionError("unreachable")
+def _line_of(record: _Record) -> bytes:
+    match record:
+        case Turn():
+            return turn_line(record)
+        case Sent():
+            return sent_line(record)
+        case _:
+            return encode(record)
 
 
 def _time_of(record: Mapping[str, Any]) -> float | None:
@@ -309,10 +331,3 @@ def _explain(error: OSError) -> str:
 
 def _formless(error: Exception) -> str:
     return f"a record has no form in the flight log: {str(error) or type(error).__name__}"
-
-
-def _cannot_start(path: Path, error: OSError) -> str:
-    return (
-        f"{path}: the flight log cannot be created ({error.strerror or error}): free the place, "
-        f"or {_ELSEWHERE}"
-    )

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from perchctl.geometry import Array
-from perchctl.mission.state import Observation, Phase
+from perchctl.mission.state import Observation, Outcome, Phase
 from perchctl.vehicle import Command, ExternalPosition, Telemetry
 from perchctl.vision.types import PictureKind
 
-TurnRole = Literal["waiting", "redone", "flown"]
+TurnRole = Literal["waiting", "redone", "flown", "failed"]
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,16 @@ class Turn:
 
     Attributes:
         number: counts all turns of a flight from 0; a gap is a turn that is not there.
-        role: ``waiting`` before take-off, ``flown``, or ``redone``: decided before a hang was
-            noticed, not sent, and decided anew in the next turn.
+        role: ``waiting`` before take-off; ``flown``; ``redone``: decided before a hang was
+            noticed, not sent, and decided anew in the next turn; or ``failed``: the planner
+            raised on it, and there is no next one.
         began_s: when it took in; `t_s`, for when it was decided, is later where it hung.
         poses: by ``large``, ``small``, ``joint``, of this turn's picture; of a field's the later.
-        observation, command: what the planner saw and decided; None while waiting.
-        phase, row, held, attempts: the planner's, once it had decided.
+        observation, command: what the planner saw and decided; None while waiting, and no command
+            of one that failed.
+        phase, row, held, attempts, outcome, reason: the planner's, once it had decided. No reason
+            at all: the log is of before version 4, and does not hold the outcome, either.
+        error: the name of what the planner raised on a turn that failed.
         timing: None in lockstep.
     """
 
@@ -111,3 +115,6 @@ class Turn:
     attempts: int = 0
     outside: Outside | None = None
     timing: TurnTiming | None = None
+    outcome: Outcome | None = None
+    reason: str | None = None
+    error: str | None = None

@@ -7,6 +7,7 @@ from enum import Enum
 from typing import Protocol, runtime_checkable
 
 from perchctl.mission.findings import Findings
+from perchctl.mission.sent import Sent
 from perchctl.mission.state import Outcome, Phase, PlannerState, Severity
 from perchctl.mission.turn import Outside, Turn
 from perchctl.vehicle import Command, Telemetry
@@ -88,6 +89,14 @@ class TurnWatcher(Watcher, Protocol):
     decided anew."""
 
     def turn(self, turn: Turn) -> None: ...
+
+
+@runtime_checkable
+class SentWatcher(Watcher, Protocol):
+    """One that is told of what was sent in the loop's place, too."""
+
+    def sent(self, sent: Sent) -> None:
+        """Called by whoever sent it, in its own thread: must neither wait nor raise."""
 
 
 class EventKeeper:

@@ -24,13 +24,16 @@ from perchctl.vehicle import Command
 @dataclass(frozen=True, eq=False)
 class Decided:
     """One turn, decided again: `state` and `command` are the replay's, what was flown is in
-    `turn`. `tick` counts the turns that were flown, from 0."""
+    `turn`. `tick` counts the turns that were flown, from 0. `error`: the name of what the planner
+    raised, where it had raised in flight, too: then the state is the one before, None at the first
+    turn, and there is no command."""
 
     tick: int
     turn: Turn
     observation: Observation
-    state: PlannerState
-    command: Command
+    state: PlannerState | None
+    command: Command | None
+    error: str | None = None
 
     @property
     def differs(self) -> bool:
@@ -38,10 +41,19 @@ class Decided:
 
     @cached_property
     def difference(self) -> tuple[str, Any, Any] | None:
-        """The first field in which it does; a turn on which the planner raised has none."""
+        """The first field in which it does. Of a turn on which the planner raised that is what it
+        raised; a log of before version 4 does not tell whether it did, and has none."""
         turn, state = self.turn, self.state
-        if turn.command is None:
+        if turn.role == "failed":
+            return first_differing("error", turn.error, self.error)
+        if turn.command is None or state is None:
             return None
+        told: tuple[tuple[str, Any, Any], ...] = ()
+        if turn.reason is not None:
+            told = (
+                ("outcome", turn.outcome, state.outcome),
+                ("reason", turn.reason, state.reason),
+            )
         return next(
             (
                 found
@@ -51,6 +63,7 @@ class Decided:
                     ("held", turn.held, bool(state.hold)),
                     ("attempts", turn.attempts, state.attempts),
                     ("command", turn.command, self.command),
+                    *told,
                 )
                 if (found := first_differing(name, recorded, replayed)) is not None
             ),
@@ -86,17 +99,32 @@ def decide(
     seen: Callable[[Turn], Observation | None] = lambda turn: turn.observation,
 ) -> Iterator[Decided]:
     """Each turn of the planner, in order, with the observation that `seen` gives for it: by
-    default the recorded one. A turn that was decided anew is decided, but does not count."""
+    default the recorded one. A turn that was decided anew is decided, but does not count; on one
+    on which the planner raised it may raise again."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
         obs = seen(turn)
         if obs is None or turn.role == "waiting":
             continue
+        if turn.command is None:
+            yield _failed_again(tick, turn, obs, state, profile)
+            continue
         new, command = planner.step(state or planner.start(obs), obs, profile)
         yield Decided(tick, turn, obs, new, command)
         if turn.role == "flown":
             state, tick = new, tick + 1
+
+
+def _failed_again(
+    tick: int, turn: Turn, obs: Observation, state: PlannerState | None, profile: Profile
+) -> Decided:
+    try:
+        before = state or planner.start(obs)
+        new, command = planner.step(before, obs, profile)
+    except Exception as error:
+        return Decided(tick, turn, obs, state, None, type(error).__name__)
+    return Decided(tick, turn, obs, new, command)
 
 
 def first_of(decided: Iterable[Decided], t0_s: float) -> Difference | None:

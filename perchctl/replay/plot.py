@@ -70,7 +70,7 @@ def _both(ax: Axes, t_s: Array, was: list[float], then: list[float], label: str)
 def _phases(ax: Axes, t_s: Array, flown: Sequence[Decided]) -> None:
     """Two strips."""
     was = [_phase(each.turn) for each in flown]
-    then = [each.state.phase.value for each in flown]
+    then = ["" if each.state is None else each.state.phase.value for each in flown]
     for level, names in ((1.0, was), (0.0, then)):
         starts = [k for k in range(len(names)) if k == 0 or names[k] != names[k - 1]]
         for number, k in enumerate(starts):

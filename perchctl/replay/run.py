@@ -128,7 +128,7 @@ def replay(
     by_telemetry = None
     if seen is None or (seen.unreadable and not seen.frames):
         by_telemetry = _shown(log, turns, flown, used)
-    again = by_telemetry or seen
+    again, ended = by_telemetry or seen, "" if seen is None else seen.ended
     observations: dict[int, Observation | None] = {}
     if again is not None and changed:
         observations = {each.turn.number: each.observation for each in again.turns}
@@ -147,14 +147,9 @@ def replay(
         shown=by_telemetry,
         changed=changed,
         gap=whole.gap,
-        notes=tuple(
-            notes_of(
-                log,
-                whole.gap,
-                "" if seen is None else seen.ended,
-                changed,
-                pictures=by_telemetry is None,
-            )
+        notes=(
+            *notes_of(log, whole.gap, ended, changed, pictures=by_telemetry is None),
+            *_failures(decided),
         ),
     )
 
@@ -243,6 +238,12 @@ def _differing(
     turn, difference = differing[0]
     first = Difference(_tick_of(turn, turns, start), turn.t_s - log.start_s, *difference)
     return len(differing), first
+
+
+def _failures(decided: Sequence[Decided]) -> Iterator[str]:
+    for each in decided:
+        if each.error is not None:
+            yield f"the planner breaks down on turn {each.turn.number}, as in flight: {each.error}"
 
 
 def _frames_of(turns: Iterable[Turn]) -> int:

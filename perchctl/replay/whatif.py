@@ -74,7 +74,7 @@ def _falls(decided: Iterable[Decided], t0_s: float) -> dict[str, list[float]]:
     before: frozenset[Condition] = frozenset()
     row = ""
     for each in decided:
-        if each.turn.role != "flown":
+        if each.turn.role != "flown" or each.state is None:
             continue
         t_s, state = each.turn.t_s - t0_s, each.state
         now = frozenset(state.since)

@@ -8,10 +8,11 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 
 import perchctl
+from perchctl.log.read import values_of
 from perchctl.report import sections
 from perchctl.report.markup import Markup, table, tag
 from perchctl.report.plot import trend
-from perchctl.report.told import Told, values_of
+from perchctl.report.told import Told
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""

@@ -18,6 +18,18 @@ from perchctl.vehicle import NO_BATTERY_READING_V
 HELD_LEAST_S = 0.1
 BACKED_OFF_M = 0.01
 FLYING = frozenset(phase.value for phase in FLYING_PHASES)
+TOOK_OVER = {
+    "watchdog": "The watchdog took over",
+    "rescue": "The rescue took over, after an error",
+    "reconnect": "The link was opened once more",
+}
+ACTS = {
+    "position": "it gave it a place to hold",
+    "thrust": "it kept the thrust",
+    "land": "it ordered a landing",
+    "stop": "it stopped the motors",
+    "emergency": "it cut the motors",
+}
 PAPERS = tuple(phase.value for phase in SEVEN)
 
 
@@ -38,6 +50,7 @@ def story_of(track: Track) -> tuple[Sentence, ...]:
         *_steps(track),
         *(_told_loss(track, loss) for loss in losses_of(track)),
         *_holds(track),
+        *_taken_over(track),
         *_notes(track),
         *_motors(track),
         *_end(track),
@@ -248,6 +261,22 @@ def _holds(track: Track) -> Iterator[Sentence]:
         if end_s - start_s >= HELD_LEAST_S:
             text = f"Held in place for {end_s - start_s:.1f} s: {reason}"
             yield Sentence(start_s, text, "warn")
+
+
+def _taken_over(track: Track) -> Iterator[Sentence]:
+    """What came from elsewhere than the loop. The farewell, to a vehicle that is down, is none of
+    the flight's."""
+    for go in track.log.takeovers:
+        who = TOOK_OVER.get(go.by)
+        if who is None:
+            continue
+        acts = [ACTS[name] for name, _ in go.sent]
+        for_s = go.end_s - go.start_s
+        lasted = f" for {for_s:.1f} s" if for_s >= HELD_LEAST_S else ""
+        steered = all(name in ("position", "thrust") for name, _ in go.sent)
+        t_s = max(0.0, track.log.since(go.start_s))
+        text = f"{who}{lasted}: {' and '.join(acts)}"
+        yield Sentence(t_s, text, "warn" if steered else "bad")
 
 
 def _notes(track: Track) -> Iterator[Sentence]:

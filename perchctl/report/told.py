@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
-from perchctl.errors import InvalidValue
 from perchctl.log.energy import EnergyStory, energy_of
 from perchctl.log.read import FlightLog
 from perchctl.log.summary import FlightSummary, summary_of
@@ -74,19 +71,6 @@ class Told:
         """In ALIGN altogether, NaN where it never came to that."""
         stays = [s.end_s - s.start_s for s in self.track.steps if s.phase == "ALIGN"]
         return sum(stays) if stays else math.nan
-
-
-@contextlib.contextmanager
-def values_of(log_path: Path) -> Iterator[None]:
-    """Around what works with the values of a log: one that is of no flight raises InvalidValue."""
-    try:
-        yield
-    except OSError:
-        raise
-    except (TypeError, ValueError, LookupError, AttributeError) as error:
-        raise InvalidValue(
-            f"{log_path}: it holds a value that no flight writes ({error}): take the original"
-        ) from error
 
 
 def tell(log: FlightLog, recorded: Recorded | None = None) -> Told:

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from perchctl.files import write_files
-from perchctl.log.read import read_log
+from perchctl.log.place import beside
+from perchctl.log.read import read_log, values_of
 from perchctl.log.recording import pictures_of, recording_of
 from perchctl.report.page import page_of
-from perchctl.report.told import Told, tell, values_of
+from perchctl.report.told import Told, tell
 
 SUFFIXES = (".html", ".htm")
 SESSION_NAME = "session.html"
@@ -17,7 +18,7 @@ SESSION_NAME = "session.html"
 
 def report_path_of(log_path: Path) -> Path:
     """Where a flight's report stands: beside its log, by its name."""
-    return recording_of(log_path).with_suffix(SUFFIXES[0])
+    return beside(log_path, SUFFIXES[0])
 
 
 def session_path_of(log_paths: Sequence[Path]) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import unmeasured
 from perchctl.flight.outside import AtRest, apart, strange, with_another_up
+from perchctl.flight.preflight import refuse_strange
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission.state import Operator, Outcome
 from perchctl.positioning.feed import FeedStatus
@@ -253,3 +255,52 @@ def test_an_occlusion_that_holds_nothing_is_told() -> None:
     it.fly()
     notes = [e.reason for e in seen.events if e.kind.value == "note" and HIDDEN in e.reason]
     assert len(notes) == 1
+
+
+# --- only what is fresh is judged -------------------------------------------------------------
+
+
+def asked(at_rest: AtRest, x_m: float, tel_age_s: float, age_s: float, **changes: Any) -> None:
+    place = at(x_m, 0.0, 0.012)
+    status = FeedStatus(age_s, None, 9, place, 100.0, place)
+    sample = replace(REST, t_s=50.0 - tel_age_s, **changes)
+    refuse_strange(status, sample, MOCAP, 50.0, at_rest)
+
+
+OLD_S = MOCAP.safety.proof_age_s + 0.01
+LATE_S = MOCAP.positioning.hold_s + 0.01
+
+
+@pytest.mark.parametrize(
+    ("tel_age_s", "age_s", "refused"),
+    [(0.02, 0.02, True), (OLD_S, 0.02, False), (0.02, LATE_S, False)],
+)
+def test_a_body_that_moves_is_judged_by_fresh_telemetry_and_a_fresh_position(
+    tel_age_s: float, age_s: float, refused: bool
+) -> None:
+    at_rest = AtRest()
+    asked(at_rest, 0.0, tel_age_s, age_s)
+    with pytest.raises(SafetyAbort, match="has moved") if refused else nullcontext():
+        asked(at_rest, 0.5, tel_age_s, age_s)
+
+
+def test_telemetry_whose_place_is_behind_is_old() -> None:
+    at_rest = AtRest()
+    asked(at_rest, 0.0, 0.02, 0.02)
+    asked(at_rest, 0.5, 0.02, 0.02, behind_s=OLD_S)
+
+
+def test_what_is_not_known_for_a_while_forgets_nothing() -> None:
+    """It moved unseen, and the vehicle was not seen to: that is another's body all the same."""
+    at_rest = AtRest()
+    asked(at_rest, 0.0, 0.02, 0.02)
+    asked(at_rest, 0.3, OLD_S, 0.02)
+    with pytest.raises(SafetyAbort, match="has moved"):
+        asked(at_rest, 0.5, 0.02, 0.02)
+
+
+def test_a_vehicle_that_is_carried_begins_anew() -> None:
+    at_rest = AtRest()
+    asked(at_rest, 0.0, 0.02, 0.02)
+    asked(at_rest, 0.3, 0.02, LATE_S, acc_z_g=1.3)  # hidden in a hand
+    asked(at_rest, 0.5, 0.02, 0.02)

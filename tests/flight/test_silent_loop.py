@@ -11,6 +11,7 @@ import pytest
 
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
+from perchctl.mission.sent import Sent
 from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import EventKind, Tick
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, Telemetry
@@ -41,6 +42,7 @@ class Guarded(Vehicle):
                 if command is not None:
                     self.own.append((self.now_s, command))
                     self.send(command)
+                    self.told(Sent(self.now_s, "watchdog", command))
 
 
 def hanging_camera(link: Guarded, for_s: float) -> Camera:

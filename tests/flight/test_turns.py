@@ -12,12 +12,12 @@ from perchctl.flight.loop import fly
 from perchctl.flight.senses import SENSED
 from perchctl.flight.turns import Turns
 from perchctl.mission import planner
-from perchctl.mission.state import Observation, Operator, PlannerState
+from perchctl.mission.state import Observation, Operator, Outcome, PlannerState
 from perchctl.mission.turn import Turn
 from perchctl.mission.watch import Tick, TurnWatcher
 from perchctl.profile import Profile
-from perchctl.replay.decide import decide
-from perchctl.vehicle import Land
+from perchctl.replay.decide import decide, first_of
+from perchctl.vehicle import Command, Land
 from tests.flight.test_loop import Rig, Vehicle
 from tests.flight.test_loop import Watcher as LooksOn
 from tests.helpers.hangs import hang_in_the_planner
@@ -66,7 +66,7 @@ def test_each_turn_is_told_once_and_in_order(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the landing; deciding on it again raises again."""
+    """After the landing; a replay demands that deciding on it raises again."""
     step = planner.step
 
     def fails(state: PlannerState, obs: Observation, profile: Profile) -> Any:
@@ -82,13 +82,77 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     last = told.turns[-1]
     assert last.observation is not None
     assert last.observation.t_s > 0.5
-    assert last.command is None
+    assert (last.role, last.command, last.error) == ("failed", None, "ZeroDivisionError")
     flown = [tick.turn for tick in told.ticks if tick.turn is not None]
     assert last.number == flown[-1].number + 1
-    with pytest.raises(ZeroDivisionError):
-        list(decide([*flown, last], rig.profile))
-    monkeypatch.setattr(planner, "step", step)  # mended
     assert not any(each.differs for each in decide([*flown, last], rig.profile))
+    monkeypatch.setattr(planner, "step", step)  # mended
+    *others, again = decide([*flown, last], rig.profile)
+    assert not any(each.differs for each in others)
+    assert again.difference == ("error", "ZeroDivisionError", None)
+
+
+def test_a_planner_that_fails_on_the_first_turn_fails_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fails(obs: Observation) -> PlannerState:
+        raise ValueError("by the test")
+
+    monkeypatch.setattr(planner, "start", fails)
+    told, rig = Told(), Rig()
+    with pytest.raises(ValueError, match="by the test"):
+        fly(replace(rig.parts(), watchers=(told,)))
+    (again,) = decide(told.turns, rig.profile)
+    assert (again.turn.role, again.error, again.differs) == ("failed", "ValueError", False)
+
+
+def test_what_fails_behind_the_planner_is_not_the_planner_s() -> None:
+    """The command may have been sent: the turn is told with it, and replays."""
+    told, rig = Told(), Rig()
+    send = rig.link.send
+
+    def fails(command: Command) -> None:
+        send(command)
+        if rig.link.now_s > 0.5 and not isinstance(command, Land):
+            raise ZeroDivisionError("by the test")
+
+    rig.link.send = fails  # type: ignore[method-assign]
+    with pytest.raises(ZeroDivisionError):
+        fly(replace(rig.parts(), watchers=(told,)))
+    last = told.turns[-1]
+    assert (last.role, last.error) == ("flown", None)
+    assert (last.t_s, last.command) in rig.link.sent
+    flown = [tick.turn for tick in told.ticks if tick.turn is not None]
+    assert not any(each.differs for each in decide([*flown, last], rig.profile))
+
+
+def test_a_planner_that_was_interrupted_did_not_fail(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(planner, "step", interrupted)
+    told = Told()
+    with pytest.raises(KeyboardInterrupt):
+        fly(replace(Rig().parts(), watchers=(told,)))
+    assert {turn.role for turn in told.turns} == {"waiting"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [({"reason": "another word"}, "reason"), ({"outcome": Outcome.SAFETY}, "outcome")],
+)
+def test_a_planner_that_changes_only_what_it_says_is_found_out(
+    changes: dict[str, Any], field: str
+) -> None:
+    rig = Rig()
+    told = flown(rig, 0.3)
+    turns = [tick.turn for tick in told.ticks if tick.turn is not None]
+    turns[7] = replace(turns[7], **changes)
+    found = first_of(decide(turns, rig.profile), 0.0)
+    assert found is not None
+    assert (found.tick, found.field) == (7, field)
+    turns[7] = replace(turns[7], reason=None)  # of before version 4
+    assert first_of(decide(turns, rig.profile), 0.0) is None
 
 
 def test_where_something_else_fails_no_turn_is_told_twice() -> None:

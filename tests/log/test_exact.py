@@ -15,7 +15,9 @@ from hypothesis import strategies as st
 from perchctl.errors import InvalidValue
 from perchctl.log.exact import from_exact, to_exact
 from perchctl.log.jsonl import decode
+from perchctl.log.sent import sent_line, sent_of
 from perchctl.log.turn import turn_line, turn_of
+from perchctl.mission.sent import Sent
 from perchctl.mission.state import Condition, Observation, Operator, Outcome, Phase
 from perchctl.mission.turn import FrameSeen, Outside, PoseSeen, Taken, Turn, TurnTiming
 from perchctl.positioning.feed import FeedStatus
@@ -136,7 +138,7 @@ def whole_turn() -> Turn:
         {"joint": PoseSeen(0.9, np.ones(3), 0.1)},
         Observation(1.3, sample, estimate((1.0, 2.0, 3.0), None, 0.1)), Land(0.0, 2.0),
         Phase.LANDING, "fence", True, 2, Outside(0.1, None, 3, 99.0, None),
-        TurnTiming(0.01, 0.001, 0.0001, 0.02),
+        TurnTiming(0.01, 0.001, 0.0001, 0.02), Outcome.SAFETY, "beyond the fence", "KeyError",
     )  # fmt: skip
 
 
@@ -146,6 +148,20 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
     assert line.count(b"\n") == 1
     assert line.count(b"position_m") == 2  # the newest sample stands there once
     assert bits(turn_of(decode(line))) == bits(turn)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [PositionSetpoint(0.1, -0.0, 1e-300, math.pi), RawThrust(0), StopMotors(), Land(-0.05, 2.5),
+     EmergencyStop()],
+)  # fmt: skip
+def test_what_was_sent_is_one_line_and_comes_back(command: Command) -> None:
+    sent = Sent(0.1 + 0.2, "watchdog", command)
+    line = sent_line(sent)
+    assert line.count(b"\n") == 1
+    assert bits(sent_of(decode(line))) == bits(sent)
+    with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):
+        sent_of(decode(line) | {"t_s": "soon"})
 
 
 def test_an_observation_of_older_telemetry_has_its_own() -> None:
@@ -167,7 +183,7 @@ def test_an_observation_of_older_telemetry_has_its_own() -> None:
      ({"command": ["Jump", {}]}, "command: one of Idle, "),
      ({"poses": {"joint": {"t_s": 0.0, "e_m": [0.0, "x"], "e_yaw_rad": 0.0}}}, "poses: e_m: "),
      ({"observation": {}}, "observation: "),
-     ({"role": "flying"}, "role: 'flying' is none of waiting, redone, flown")],
+     ({"role": "flying"}, "role: 'flying' is none of waiting, redone, flown, failed")],
 )  # fmt: skip
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
     record = decode(turn_line(whole_turn())) | changes

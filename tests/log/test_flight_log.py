@@ -22,9 +22,10 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.log import write
 from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.jsonl import to_plain
+from perchctl.log.place import log_path
 from perchctl.log.read import read_log
 from perchctl.log.watch import LogWatcher
-from perchctl.log.write import FlightLogWriter, log_path
+from perchctl.log.write import FlightLogWriter
 from perchctl.mission.state import BatteryOutlook, Outcome, Phase
 from perchctl.mission.watch import FlightReport, Outside
 from perchctl.vehicle import (
@@ -428,7 +429,7 @@ def test_not_a_flight_log(tmp_path: Path) -> None:
     refused(b'{"kind":"header"}\n', "line 1: not a flight log")
     refused(b"[1]\n", "line 1: not a flight log")
     refused(good[0][:-20], "line 1: not a flight log")
-    refused(good[0].replace(b'"version":3', b'"version":99'), "line 1: schema version 99")
+    refused(good[0].replace(b'"version":4', b'"version":99'), "line 1: schema version 99")
     refused(b"".join([*good[:3], b"garbage\n", *good[3:]]), "line 4: not a record")
     refused(b"".join([*good[:3], b'{"kind":"tick"}\n', *good[3:]]), "line 4: .*t_s must be")
     refused(b"".join([*good[:2], b'{"kind":"?","t_s":1}\n', *good[3:]]), "line 3: .*allowed are")

@@ -57,14 +57,14 @@ def test_a_header_that_is_cut_off(good: bytes, tmp_path: Path) -> None:
 
 
 def test_another_version_names_both(good: bytes, tmp_path: Path) -> None:
-    newer = good.replace(b'"version":3', b'"version":9').replace(
+    newer = good.replace(b'"version":4', b'"version":9').replace(
         b'"perchctl":"0.2.0"', b'"perchctl":"9.1"'
     )
     said = refusal(tmp_path / "x.jsonl", newer)
-    assert "schema version 9, this perchctl reads 1 to 3" in said
+    assert "schema version 9, this perchctl reads 1 to 4" in said
     assert "written by perchctl 9.1, this is" in said
     assert said.endswith("update perchctl")
-    older = good.replace(b'"version":3', b'"version":0')
+    older = good.replace(b'"version":4', b'"version":0')
     assert "update" not in refusal(tmp_path / "x.jsonl", older)
 
 

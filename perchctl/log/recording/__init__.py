@@ -10,6 +10,7 @@ from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from perchctl.log.read import FlightLog, read_log
 from perchctl.log.recording.place import recording_of
 
 if TYPE_CHECKING:
@@ -35,11 +36,14 @@ def pictures_of(
     return pictures_in(recording_of(path), exact, numbers)
 
 
-def export_mcap(log_path: Path | str, out_path: Path | str, overwrite: bool = False) -> Exported:
+def export_mcap(
+    log: FlightLog | Path | str, out_path: Path | str, overwrite: bool = False
+) -> Exported:
     """Write a flight log as an MCAP file, with the pictures of the recording that lies beside it,
     and beside the file a layout for Foxglove.
 
     Args:
+        log: its path, or one that is read already.
         overwrite: what is there already may be replaced, the recording itself among it.
 
     Errors: those of `perchctl.log.read.read_log`; InvalidValue for a place that cannot be
@@ -47,4 +51,5 @@ def export_mcap(log_path: Path | str, out_path: Path | str, overwrite: bool = Fa
     """
     from perchctl.log.recording.export import exported
 
-    return exported(Path(log_path), Path(out_path), overwrite)
+    log = log if isinstance(log, FlightLog) else read_log(log)
+    return exported(log, Path(out_path), overwrite)

@@ -15,18 +15,19 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from perchctl.calibration.files import camera_of
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
-from perchctl.log.read import FlightLog, read_log
+from perchctl.log.read import FlightLog
 from perchctl.log.recording.container import DiskStream
 from perchctl.log.recording.layout import layout
 from perchctl.log.recording.messages import FRAME, IMAGE
 from perchctl.log.recording.place import LAYOUT_SUFFIX, SUFFIX, recording_of
 from perchctl.log.recording.walk import Walked, walk
 from perchctl.log.recording.writing import Writing
+from perchctl.log.sent import sent_values
 from perchctl.log.setup import camera_in, profile_of
 from perchctl.profile import Profile
 from perchctl.vision.types import CameraModel
 
-Kind = Literal["event", "tick", "frame"]
+Kind = Literal["event", "sent", "tick", "frame"]
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,11 @@ class _Frame:
     picture: tuple[bytes, str] | None
 
 
-def exported(log_path: Path, out_path: Path, overwrite: bool) -> Exported:
+def exported(log: FlightLog, out_path: Path, overwrite: bool) -> Exported:
     """As `perchctl.log.recording.export_mcap`."""
     check_output(out_path, (SUFFIX,), overwrite)
     layout_path = out_path.with_suffix(LAYOUT_SUFFIX)
     check_place(layout_path, overwrite)
-    log = read_log(log_path)
     notes: list[str] = []
     profile, camera = _setup(log, notes)
     part = PartFile(out_path)
@@ -64,6 +64,8 @@ def exported(log_path: Path, out_path: Path, overwrite: bool) -> Exported:
                 writing.tick(what)
             elif kind == "event":
                 writing.event(what)
+            elif kind == "sent":
+                writing.sent(what)
             else:
                 writing.frame(what.told, what.picture)
         writing.finish()
@@ -93,10 +95,13 @@ def _setup(log: FlightLog, notes: list[str]) -> tuple[Profile | None, CameraMode
 
 
 def _told(log: FlightLog) -> Iterator[tuple[float, Kind, Any]]:
-    """Events and ticks by time; an event comes before the tick in which it was."""
+    """Events, what was sent in the loop's place and ticks by time; an event comes before the tick
+    in which it was."""
     events = ((float(event["t_s"]), "event", event) for event in log.events)
     ticks = ((float(tick["t_s"]), "tick", tick) for tick in log.records)
-    yield from heapq.merge(events, ticks, key=lambda each: each[0])  # type: ignore[misc]
+    by_time = sorted(log.sent, key=lambda each: each.t_s)
+    sent = ((each.t_s, "sent", sent_values(each)) for each in by_time)
+    yield from heapq.merge(events, sent, ticks, key=lambda each: each[0])  # type: ignore[misc]
 
 
 def _frames(log: FlightLog, notes: list[str]) -> Iterator[tuple[float, Kind, _Frame]]:

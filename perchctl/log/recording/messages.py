@@ -40,6 +40,7 @@ IMAGE, FRAME, CALIBRATION = "/camera/image", "/camera/frame", "/camera/calibrati
 TF, VEHICLE, PATH, TARGET_POSE = "/tf", "/vehicle/pose", "/vehicle/path", "/target/pose"
 SETPOINT, SCENE, LOG, TICK = "/setpoint", "/scene", "/log", "/tick"
 CORNERS = "/camera/corners"
+SENT = "/sent"
 
 PATH_PERIOD_S = 1.0
 """The whole path so far is said so often: who jumps into the middle sees what was flown."""

@@ -39,6 +39,7 @@ class _Turn:
 
     frame: Frame | None = None
     events: list[Mapping[str, Any]] = field(default_factory=list)
+    sent: Mapping[str, Any] | None = None
     tick: Mapping[str, Any] | None = None
 
     @property
@@ -114,6 +115,17 @@ class Recorder:
         if not self._closed:
             self._turn.events.append(record)
 
+    def sent(self, values: Mapping[str, Any]) -> None:
+        """What was sent in the loop's place (`perchctl.log.sent.sent_values`). From any thread:
+        the loop hangs, perhaps, and its turn is left alone. Never raises."""
+        if self._closed or self._over:
+            return
+        alone = _Turn(sent=values)
+        if self._behind is None:
+            self._write(alone)
+        elif not self._behind.put(partial(self._write, alone)):
+            self._behind_hand("turns are missing in it")
+
     def tick(self, record: Mapping[str, Any]) -> None:
         """A tick's record (`perchctl.log.fields.tick_record`). Never raises."""
         if not self._closed:
@@ -184,6 +196,8 @@ class Recorder:
                 )
         for event in turn.events:
             writing.event(event)
+        if turn.sent is not None:
+            writing.sent(turn.sent)
         if turn.tick is not None:
             writing.tick(turn.tick)
         now_s = writing.newest_s

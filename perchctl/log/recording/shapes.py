@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from perchctl.log.fields import FIELDS
-from perchctl.log.recording.messages import FRAME, TICK
+from perchctl.log.recording.messages import FRAME, SENT, TICK
 
 _TEXTS = ("phase", "stage", "reason", "hold", "pos_note", "lock_note", "cmd")
 _FLAGS = ("measured", "tracked")
@@ -32,6 +32,10 @@ def _tick_property(key: str, meaning: str) -> dict[str, Any]:
     return {"type": "number", "description": meaning}
 
 
+def _commands(key: str) -> bool:
+    return key == "cmd" or key.startswith("cmd_")
+
+
 SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     TICK: (
         "perchctl.Tick",
@@ -39,6 +43,18 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             "type": "object",
             "title": "One turn of the flight loop, as the flight log has it",
             "properties": {key: _tick_property(key, text) for key, text in FIELDS.items()},
+        },
+    ),
+    SENT: (
+        "perchctl.Sent",
+        {
+            "type": "object",
+            "title": "What was sent to the vehicle in the flight loop's place",
+            "properties": {
+                "t_s": _tick_property("t_s", FIELDS["t_s"]),
+                "by": {"type": "string", "description": "watchdog, rescue, reconnect or farewell"},
+                **{key: _tick_property(key, FIELDS[key]) for key in FIELDS if _commands(key)},
+            },
         },
     ),
     FRAME: (

@@ -71,11 +71,12 @@ class Writing:
             self._first_s = float(record["t_s"])
         for topic, message in self._said.of(record):
             self._container.say(topic, ns, message)
-        # Counted as every output does: from the first flown turn.
-        times = {
-            key: record[key] - self._first_s for key in LOOP_TIMES if record.get(key) is not None
-        }
-        self._container.say_json(m.TICK, ns, encode({**record, **times})[:-1])
+        self._container.say_json(m.TICK, ns, encode(self._counted(record))[:-1])
+
+    def sent(self, values: Mapping[str, Any]) -> None:
+        """What was sent in the loop's place (`perchctl.log.sent.sent_values`)."""
+        ns = self._at(float(values["t_s"]))
+        self._container.say_json(m.SENT, ns, encode(self._counted(values))[:-1])
 
     def event(self, record: Mapping[str, Any]) -> None:
         ns = self._at(float(record["t_s"]))
@@ -93,6 +94,16 @@ class Writing:
     def give_up(self) -> None:
         """End what the disk took; never raises."""
         self._container.give_up()
+
+    def _counted(self, record: Mapping[str, Any]) -> dict[str, Any]:
+        """With its times as every output counts them, from the first flown turn; before that
+        without them."""
+        first_s = self._first_s
+        times = [key for key in LOOP_TIMES if record.get(key) is not None]
+        return {
+            **record,
+            **{key: None if first_s is None else record[key] - first_s for key in times},
+        }
 
     def _at(self, t_s: float) -> int:
         self.newest_s = t_s

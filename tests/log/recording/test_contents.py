@@ -36,6 +36,9 @@ from perchctl.log.recording import pictures_of
 from perchctl.log.recording.layout import layout
 from perchctl.log.recording.messages import calibration_message
 from perchctl.log.recording.shapes import SCHEMAS
+from perchctl.log.sent import sent_values
+from perchctl.mission.sent import Sent
+from perchctl.vehicle import Land
 from perchctl.vision.types import CameraModel
 from tests.helpers import recorded
 
@@ -72,6 +75,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "flight.mcap"
     recorder = recorded.recorder(path, **STARTED)
     recorded.fly(recorder, FLIGHT)
+    recorder.sent(sent_values(Sent(FLIGHT.ticks[-1]["t_s"], "watchdog", Land(-0.05, 2.0))))
     end = recorder.close()
     assert (end.pictures, end.missing, end.problem) == (len(FLIGHT.frames), 0, None)
     return path

@@ -1,0 +1,273 @@
+"""What goes to the vehicle in the loop's place is in the log, in its recording, and is told."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from perchctl.flight.loop import fly
+from perchctl.flight.rescue import rescue
+from perchctl.link.mock import ScriptedLink
+from perchctl.link.sender import Sender
+from perchctl.log import write
+from perchctl.log.read import read_log
+from perchctl.log.recording import export_mcap
+from perchctl.log.recording import recorder as recording_module
+from perchctl.log.recording.recorder import Recorder
+from perchctl.log.sent import sent_values, takeovers_of
+from perchctl.log.shown import show_record, show_text
+from perchctl.log.watch import LogWatcher
+from perchctl.log.write import FlightLogWriter
+from perchctl.mission.sent import Sent
+from perchctl.mission.state import Outcome, Phase
+from perchctl.mission.watch import FlightReport
+from perchctl.profile import load_profile
+from perchctl.report.story import story_of
+from perchctl.report.track import Track
+from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
+from tests.flight.test_loop import PROFILE, Clock
+from tests.flight.test_silent_loop import HANG_AT_S, hung_rig
+from tests.helpers import log as synthetic
+from tests.helpers import recorded
+from tests.helpers.mission import telemetry
+from tests.helpers.recorded import MemoryDisk
+
+HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
+TOLD = (
+    Sent(4.0, "watchdog", HOLD),
+    Sent(4.05, "watchdog", HOLD),
+    Sent(4.7, "watchdog", LAND),
+    Sent(9.0, "rescue", EmergencyStop()),
+    Sent(9.5, "farewell", RawThrust(0)),
+)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
+    recorder = recorded.recorder(tmp_path / "f.mcap")
+    left = list(TOLD)
+    for tick in synthetic.ticks():
+        while left and left[0].t_s < tick["t_s"]:
+            writer.sent(left[0])
+            recorder.sent(sent_values(left.pop(0)))
+        writer.write(tick)
+        recorder.tick(tick)
+    writer.close(synthetic.SUMMARY)
+    recorder.close()
+    return writer.path
+
+
+def test_it_comes_back_to_the_bit(log: Path) -> None:
+    assert tuple(read_log(log).sent) == TOLD
+
+
+def test_a_log_of_before_has_none(tmp_path: Path) -> None:
+    path = synthetic.write(tmp_path / "f.jsonl", synthetic.header(), synthetic.SUMMARY, most=5)
+    assert read_log(path).takeovers == ()
+    assert "loop's place" not in show_text(read_log(path))
+
+
+def test_recording_and_export_say_it_alike(log: Path, tmp_path: Path) -> None:
+    export_mcap(log, tmp_path / "out.mcap")
+    own = recorded.messages(tmp_path / "f.mcap")["/sent"]
+    assert own == recorded.messages(tmp_path / "out.mcap")["/sent"]
+    first = json.loads(own[0])
+    start_s = read_log(log).start_s
+    assert first["t_s"] == pytest.approx(4.0 - start_s)
+    assert (first["by"], first["cmd"], first["cmd_z_m"]) == ("watchdog", "position", 0.333333)
+    assert [json.loads(each)["cmd"] for each in own] == [
+        "position", "position", "land", "emergency", "thrust",
+    ]  # fmt: skip
+
+
+def test_what_one_sends_in_one_go_is_told_together() -> None:
+    goes = takeovers_of(TOLD)
+    assert [(go.by, go.start_s, go.end_s) for go in goes] == [
+        ("watchdog", 4.0, 4.7), ("rescue", 9.0, 9.0), ("farewell", 9.5, 9.5),
+    ]  # fmt: skip
+    assert goes[0].text == "position setpoints (2), landing ordered (1)"
+    later = Sent(4.7 + 2.1, "watchdog", StopMotors())
+    assert len(takeovers_of((*TOLD[:3], later))) == 2
+
+
+def test_show_and_story_tell_who_took_over(log: Path) -> None:
+    read = read_log(log)
+    text = show_text(read)
+    assert "watchdog   position setpoints (2), landing ordered (1)" in text
+    assert show_record(read)["sent"][0]["commands"] == {"position": 2, "land": 1}
+    told = [s for s in story_of(Track(read)) if "took over" in s.text]
+    assert [s.t_s for s in told] == pytest.approx([4.0 - read.start_s, 9.0 - read.start_s])
+    assert told[0].text.endswith("for 0.7 s: it gave it a place to hold and it ordered a landing")
+    assert told[1].grade == "bad"
+
+
+# --- who sends --------------------------------------------------------------------------------
+
+
+def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
+    rig, link = hung_rig(5.0)
+    watcher = LogWatcher.lockstep(tmp_path / "f.jsonl", PROFILE, 1)
+    parts = rig.parts()
+    report = fly(type(parts)(**{**vars(parts), "watchers": (watcher,)}))
+    watcher.close(report)
+    read = read_log(watcher.path)
+    assert [(each.t_s, each.command) for each in read.sent] == link.own
+    (go,) = read.takeovers
+    assert go.start_s == pytest.approx(HANG_AT_S + 0.3, abs=0.08)
+    assert dict(go.sent)["land"] > 0
+    assert not read.truncated
+
+
+def test_a_rescue_s_orders_are_told() -> None:
+    link, told = ScriptedLink([]), []
+    landing = PROFILE.planner.landing
+    rescue(link, Clock(link), landing, lambda: 0, telemetry(0.0, 1.0), told=told.append)  # type: ignore[arg-type,return-value]
+    assert told
+    assert [(each.t_s, each.command) for each in told] == link.sent
+    assert {each.by for each in told} == {"rescue"}
+
+
+def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
+    sent: list[Command] = []
+    told: list[Sent] = []
+    enough = threading.Event()
+
+    def tell(each: Sent) -> None:
+        told.append(each)
+        if len(told) == 3:
+            enough.set()
+        raise OSError("the log's")  # and the next one goes out all the same
+
+    sender = Sender(sent.append, guard=EmergencyStop, told=tell)
+    sender.put(HOLD)
+    assert sender.drain(20.0)
+    assert enough.wait(20.0)
+    sender.put(LAND, "reconnect")
+    assert sender.drain(20.0)
+    sender.stop()
+    assert sender.problem is None
+    assert HOLD in sent
+    assert all(each.command != HOLD for each in told)
+    assert Sent in {type(each) for each in told if each.by == "reconnect" and each.command == LAND}
+    assert len(told) == len(sent) - 1
+
+
+# --- never in the flight's way ----------------------------------------------------------------
+
+
+def hung_recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LogWatcher, MemoryDisk]:
+    disk = MemoryDisk()
+    monkeypatch.setattr(recording_module, "CLOSE_TIMEOUT_S", 0.3)
+    header = synthetic.header()
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)
+    recorder = Recorder(tmp_path / "f.mcap", disk, header, recorded.PROFILE, True)
+    watcher = LogWatcher(writer, recorder)
+    watcher.sent(TOLD[0])
+    disk.gate.clear()
+    return watcher, disk
+
+
+def test_the_guard_waits_for_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    watcher, disk = hung_recorder(tmp_path, monkeypatch)
+    gate, real = threading.Event(), write.os.write
+    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    spent_s = time.thread_time()
+    began_s = time.monotonic()
+    for _ in range(50):
+        watcher.sent(TOLD[1])
+    assert time.monotonic() - began_s < 5.0  # a disk that were waited for takes 20
+    assert time.thread_time() - spent_s < 1.0
+    gate.set()
+    disk.gate.set()
+    watcher.close()
+    assert len(read_log(watcher.path).sent) == 51
+
+
+REPORT = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging still", 1, 9.0, False)
+
+
+def test_the_summary_is_safe_before_the_recording_s_end_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watcher, disk = hung_recorder(tmp_path, monkeypatch)
+    recorder: Any = watcher._recorder
+    seen: list[Any] = []
+    close = recorder.close
+
+    def looked() -> Any:
+        seen.append(read_log(watcher.path).summary)
+        return close()
+
+    recorder.close = looked
+    summary = watcher.close(REPORT)
+    assert seen[0] is not None
+    assert seen[0]["outcome"] == "perched"
+    assert "pictures" not in seen[0]
+    assert summary is not None
+    assert summary.recording is not None
+    assert "does not answer" in (summary.recording.problem or "")
+    end = read_log(watcher.path).summary
+    assert end is not None
+    assert end["recording_problem"] == summary.recording.problem
+    assert (summary.lost_records, summary.log_problem) == (0, None)
+    disk.gate.set()
+
+
+def test_a_killed_wait_for_the_recording_costs_no_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watcher, disk = hung_recorder(tmp_path, monkeypatch)
+
+    def killed() -> Any:
+        raise KeyboardInterrupt
+
+    watcher._recorder.close = killed  # type: ignore[union-attr,method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        watcher.close(REPORT)
+    log = read_log(watcher.path)
+    assert log.summary is not None
+    assert not log.truncated
+    disk.gate.set()
+
+
+def test_a_log_s_disk_that_hangs_is_waited_for_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.2)
+    watcher, disk = hung_recorder(tmp_path, monkeypatch)
+    gate, real = threading.Event(), write.os.write
+    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    waits: list[float] = []
+    finish = watcher.writer._behind.finish  # type: ignore[union-attr]
+
+    def waited(job: Any, timeout_s: float, late: Any) -> int:
+        waits.append(timeout_s)
+        return finish(job, timeout_s, late)
+
+    watcher.writer._behind.finish = waited  # type: ignore[union-attr,method-assign]
+    summary = watcher.close(REPORT)
+    assert waits == [0.0]
+    assert summary is not None
+    assert "does not answer" in (summary.log_problem or "")
+    gate.set()
+    disk.gate.set()
+
+
+def test_lockstep_logs_of_one_seed_are_the_same_bytes(tmp_path: Path) -> None:
+    """With what the watchdog sent in them."""
+    logs = []
+    for name in ("a", "b"):
+        rig, _ = hung_rig(0.6)
+        watcher = LogWatcher.lockstep(tmp_path / f"{name}.jsonl", load_profile("sim"), 1)
+        parts = rig.parts()
+        report = fly(type(parts)(**{**vars(parts), "watchers": (watcher,)}))
+        watcher.close(report)
+        logs.append(watcher.path.read_bytes())
+    assert b'"kind":"sent"' in logs[0]
+    assert logs[0] == logs[1]
