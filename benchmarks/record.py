@@ -6,7 +6,12 @@ of handing over frame and tick, and of the whole turn, which a busy other thread
 Turns in which the system took the processor away for another program are left out, of both: they
 say what else the machine does. A wait for the thread that writes is none of these.
 
-Exit 1 where handing over costs more than 0.3 ms at the 99th percentile.
+The whole turn is judged where it has no frame: the thread writes the last one just then. What the
+pipeline takes for a frame differs by more from one second to the next than a recording costs; those
+turns are shown.
+
+Exit 1 where handing over, or a whole turn without a frame, costs more than 0.3 ms at the 99th
+percentile.
 """
 
 from __future__ import annotations
@@ -28,7 +33,8 @@ from speed import RATE_HZ, sequence
 from perchctl.camera.source import FrameSource, SourceAround
 from perchctl.log.recording.end import RecordingEnd
 from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import PlannerState
+from perchctl.mission.state import Observation, PlannerState
+from perchctl.mission.turn import FrameSeen, PoseSeen, Taken, Turn, TurnTiming
 from perchctl.mission.watch import Tick
 from perchctl.pipeline import FieldState, pictures, step
 from perchctl.profile import Profile
@@ -40,7 +46,8 @@ BLOCK_S = 1.0
 PROFILE = Profile()
 PERIOD_S = 1.0 / PROFILE.link.loop_hz
 FORMS = ("JPEG as it came", "PNG, encoded here")
-PARTS = ("handing over", "whole turn")
+PARTS = ("handing over", "whole turn without a frame", "whole turn with one")
+JUDGED = PARTS[:2]
 Times = dict[tuple[str, bool], list[float]]
 
 
@@ -75,7 +82,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
     sources = {record: log.watched(camera) for record, log in logs.items()}
     setup, state, stream = setup_with(), PipelineState(), FieldState()
     took: Times = {(part, record): [] for part in PARTS for record in logs}
-    due_s = began_s
+    due_s, number = began_s, 0
     while due_s < began_s + for_s:
         record = int((due_s - began_s) / BLOCK_S) % 2 == 1
         before = preempted()
@@ -88,7 +95,8 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
             stream, found = pictures(stream, frame, setup)
             for picture in found:
                 state, output = step(state, picture, None, setup)
-        tick = tick_of(now_s, output)
+        tick = tick_of(number, now_s, frame, output)
+        number += 1
         worked = preempted()
         ready = time.perf_counter()
         logs[record].tick(tick)
@@ -96,7 +104,7 @@ def flown(frames: list[Frame], for_s: float, folder: Path) -> tuple[Times, Recor
         if (mid, after) == (before, worked):
             took[PARTS[0], record].append(1e3 * (given - start + end - ready))
         if after == before:
-            took[PARTS[1], record].append(1e3 * (end - start))
+            took[PARTS[1 if frame is None else 2], record].append(1e3 * (end - start))
         due_s += PERIOD_S
         time.sleep(max(0.0, due_s - time.monotonic()))
     logs[False].close()
@@ -112,13 +120,28 @@ def preempted() -> int:
     return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
 
 
-def tick_of(t_s: float, output: PipelineOutput | None) -> Tick:
-    telemetry = Telemetry(
-        t_s - 0.01, (0.1, 0.2, 1.0), (0.0, 0.0, 0.1), 0.01, 0.02, 0.3, 1.0, 42000.0, 3.9, 0x1A
-    )
+def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput | None) -> Tick:
+    """As the loop makes it, with the whole turn: two samples, the frame, its poses, and all that
+    the planner would be shown."""
+    samples = tuple(
+        Telemetry(
+            t_s - ago_s, (0.1 + t_s / 97.0, 0.2 + ago_s, 1.0), (0.01 * ago_s, 0.0, 0.1), 0.01,
+            0.02, 0.3, 1.0, 42000.0, 3.9, 0x1A,
+        )
+        for ago_s in (0.02, 0.01)
+    )  # fmt: skip
     target = None if output is None else output.target
-    command = PositionSetpoint(0.1, 0.2, 1.1, 0.3)
-    return Tick(t_s, telemetry, output, target, PlannerState(), command, 0.0, 0.03, 0.01)
+    state, command = PlannerState(), PositionSetpoint(0.1 + t_s / 97.0, 0.2, 1.1, 0.3)
+    seen = None if frame is None else FrameSeen(frame.index, frame.t_s, frame.t_arrival_s)
+    found = {} if output is None else output.poses
+    obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
+    turn = Turn(
+        number, "flown", t_s, t_s, Taken(samples, frame=seen),
+        {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
+        obs, command, state.phase, "seek", reason="the target is looked for",
+        timing=TurnTiming(0.004, 0.0003, 0.0001, 0.005),
+    )  # fmt: skip
+    return Tick(t_s, samples[-1], output, target, state, command, 0.0, 0.03, 0.01, turn=turn)
 
 
 def percentiles(values: list[float]) -> NDArray[np.float64]:
@@ -131,7 +154,8 @@ def main() -> int:
     for_s = 20.0 if parser.parse_args().quick else 60.0
     cv2.setNumThreads(1)
     plain = [frame for frame, _, _ in sequence(60)]
-    rows, worst_ms, ends = [], 0.0, []
+    rows, ends = [], []
+    worst_ms = dict.fromkeys(JUDGED, 0.0)
     for form, frames in zip(FORMS, ([as_jpeg(f) for f in plain], plain), strict=True):
         with tempfile.TemporaryDirectory() as folder:
             took, ended = flown(frames, for_s, Path(folder))
@@ -143,8 +167,8 @@ def main() -> int:
             without, recorded = (percentiles(took[part, record]) for record in (False, True))
             turns = len(took[part, True])
             rows.append((form, part, turns, *without, *recorded, *(recorded - without)))
-            if part == PARTS[0]:
-                worst_ms = max(worst_ms, float(recorded[1] - without[1]))
+            if part in JUDGED:
+                worst_ms[part] = max(worst_ms[part], float(recorded[1] - without[1]))
     size_px = "{}x{}".format(*CAMERA.size_px)
     table(
         f"wall ms of a turn at {1 / PERIOD_S:g} Hz, {size_px} at {RATE_HZ:g} Hz",
@@ -152,8 +176,9 @@ def main() -> int:
         rows,
     )
     print("\n" + "\n".join(ends))
-    print(f"handing over costs {worst_ms:.3f} ms at the 99th percentile, goal {GOAL_MS} ms")
-    return int(worst_ms > GOAL_MS)
+    for part, cost_ms in worst_ms.items():
+        print(f"{part}: {cost_ms:.3f} ms more at the 99th percentile, goal {GOAL_MS} ms")
+    return int(max(worst_ms.values()) > GOAL_MS)
 
 
 if __name__ == "__main__":

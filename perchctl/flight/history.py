@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import SafetyConfig
@@ -61,6 +61,19 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
         first = bisect.bisect_left(samples, oldest, key=_time_s)
         samples = samples[first:]
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v)
+
+
+def belated(history: History, late: list[Telemetry], safety: SafetyConfig) -> History:
+    """With what has come since in the same turn: what `history` says of its own samples stays."""
+    after = extended(history, late, safety)
+    turned_rad = max(history.turned_rad, after.turned_rad)
+    return replace(after, jumped=history.jumped or after.jumped, turned_rad=turned_rad)
+
+
+def battery_age_s(history: History, now_s: float) -> float:
+    """Since the last new reading; 0 before there is telemetry."""
+    changed_s = history.battery_changed_s
+    return 0.0 if changed_s is None else now_s - changed_s
 
 
 def attitude_at(history: History, t_s: float) -> Attitude | None:

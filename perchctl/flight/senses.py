@@ -9,12 +9,19 @@ from typing import Protocol
 from perchctl.camera.health import MEANING, HealthState, assess
 from perchctl.camera.mirror import MIRRORED
 from perchctl.camera.source import FrameSource, check_size
-from perchctl.flight.history import History, attitude_at, attitude_of, extended
+from perchctl.flight.history import (
+    History,
+    attitude_at,
+    attitude_of,
+    battery_age_s,
+    belated,
+    extended,
+)
 from perchctl.flight.noticed import Noticed, noticed
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
-from perchctl.profile import Profile
+from perchctl.profile import Profile, SafetyConfig
 from perchctl.vehicle import Telemetry
 from perchctl.vision.consistency import Consistency, solved
 from perchctl.vision.fields import BLENDED, INTERLACED
@@ -113,10 +120,8 @@ class Senses:
 
     def present(self, began_s: float, now_s: float) -> None:
         """What has arrived while camera or vision hung, since the turn of `began_s`."""
-        before, late = self.history, self.link.telemetry()
-        after = extended(before, late, self.profile.safety)
-        turned_rad = max(before.turned_rad, after.turned_rad)
-        self.history = replace(after, jumped=before.jumped or after.jumped, turned_rad=turned_rad)
+        late = self.link.telemetry()
+        self.history = belated(self.history, late, self.profile.safety)
         self.taken = replace(self.taken, late=tuple(late))
         if self.last_good_frame_s == began_s:
             self.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
@@ -125,7 +130,6 @@ class Senses:
         """The part of it that is seen: the fields of `SENSED`."""
         newest = self.history.newest
         assert newest is not None
-        changed_s = self.history.battery_changed_s
         return Observation(
             t_s=now_s,
             telemetry=newest,
@@ -133,7 +137,7 @@ class Senses:
             new_frame=self.output is not None,
             camera_age_s=now_s - self.last_good_frame_s,
             camera_problem=self.camera_problem,
-            battery_age_s=0.0 if changed_s is None else now_s - changed_s,
+            battery_age_s=battery_age_s(self.history, now_s),
             jumped=self.history.jumped,
             turned_rad=self.history.turned_rad,
             disagreeing_frames=self.state.disagreeing_frames,
@@ -217,10 +221,12 @@ class Senses:
         self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
         if not verdict.usable and self._note is None:
             return verdict.text
-        age_s = now_s - frame.t_s
-        if live and age_s > self.profile.safety.max_frame_age_s:
-            return f"the picture is {age_s:.1f} s late"
-        return None
+        return lateness(now_s - frame.t_s, self.profile.safety) if live else None
+
+
+def lateness(age_s: float, safety: SafetyConfig) -> str | None:
+    """Why a live picture of this age is no measurement."""
+    return f"the picture is {age_s:.1f} s late" if age_s > safety.max_frame_age_s else None
 
 
 def _seen(frame: Frame | None) -> FrameSeen | None:

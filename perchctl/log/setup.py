@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from perchctl.calibration.files import camera_of
 from perchctl.errors import InvalidValue, PerchError
+from perchctl.log.arithmetic import arithmetic
 from perchctl.log.exact import from_exact, to_exact
 from perchctl.profile import Profile
 from perchctl.profile.load import first_fault
@@ -48,6 +49,7 @@ def computer_record() -> dict[str, Any]:
             "python": platform.python_version(),
             "numpy": np.__version__,
             "opencv": cv2.__version__,
+            "arithmetic": arithmetic(),
         }
     }
 

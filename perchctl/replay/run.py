@@ -6,18 +6,18 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-import perchctl
 from perchctl.calibration.files import camera_of
 from perchctl.errors import InvalidValue
 from perchctl.flight.senses import SENSED
 from perchctl.log.read import FlightLog
-from perchctl.log.setup import camera_in, mask_in, other_computer, profile_of
+from perchctl.log.setup import camera_in, mask_in, profile_of
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import Turn
 from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.replay.compare import Difference, first_differing, same
 from perchctl.replay.decide import Decided, decide, first_of, whole_turns
+from perchctl.replay.notes import notes_of
 from perchctl.replay.sense import (
     Picture,
     PictureAnother,
@@ -27,6 +27,7 @@ from perchctl.replay.sense import (
     one_thread,
     sense,
 )
+from perchctl.replay.shown import shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +61,24 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
+class Shown:
+    """What came of telemetry and times, without pictures: `differences` counts the turns in which
+    the planner is shown something else."""
+
+    turns: Sequence[Sensed]
+    differences: int
+    first: Difference | None
+
+
+@dataclass(frozen=True, eq=False)
 class Replay:
     """Attributes:
     decided: each turn of the planner, decided again.
     ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
         may be of one that was not sent.
     seen: None without pictures.
+    shown: None where pictures were looked at.
     changed: the keys in which the profile is another than the flown one's.
-    observations_anew: the planner was given what another profile sees in the pictures.
     gap: which turn is the first that the log has lost, or empty.
     notes: what limits the replay, in sentences.
     """
@@ -79,14 +90,15 @@ class Replay:
     differences: int
     first: Difference | None
     seen: Seen | None = None
+    shown: Shown | None = None
     changed: tuple[str, ...] = ()
-    observations_anew: bool = False
     gap: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def same(self) -> bool:
-        return self.first is None and (self.seen is None or self.seen.same)
+        shown = self.shown is None or self.shown.first is None
+        return self.first is None and shown and (self.seen is None or self.seen.same)
 
 
 def replay(
@@ -99,7 +111,8 @@ def replay(
 
     As it was flown the planner is given the recorded observations, and the pictures are compared
     for themselves; with another profile it is given what that sees in the pictures. `pipeline`
-    looks at them; by default the profile's, with the flown calibration and mask.
+    looks at them; by default the profile's, with the flown calibration and mask. Without pictures
+    the same goes for what telemetry and times alone give.
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
     flown = profile_of(log.header)
@@ -112,11 +125,14 @@ def replay(
         # A source takes the latency off the time at which a picture came.
         later_s = flown.camera.start_latency_s - used.camera.start_latency_s
         seen = _seen(log, turns, used, pictures, pipeline, later_s)
+    by_telemetry = None
+    if seen is None or (seen.unreadable and not seen.frames):
+        by_telemetry = _shown(log, turns, flown, used)
+    again, ended = by_telemetry or seen, "" if seen is None else seen.ended
     observations: dict[int, Observation | None] = {}
-    unseen = seen is not None and seen.unreadable and not seen.frames
-    if seen is not None and changed and not unseen:
-        observations = {each.turn.number: each.observation for each in seen.turns}
-        turns = turns[: len(seen.turns)]
+    if again is not None and changed:
+        observations = {each.turn.number: each.observation for each in again.turns}
+        turns = turns[: len(again.turns)]
     decided = list(
         decide(turns, used, lambda turn: observations.get(turn.number, turn.observation))
     )
@@ -128,10 +144,13 @@ def replay(
         differences=sum(each.differs for each in decided if each.turn.role == "flown"),
         first=first_of(decided, log.start_s),
         seen=seen,
+        shown=by_telemetry,
         changed=changed,
-        observations_anew=bool(observations),
         gap=whole.gap,
-        notes=(*_notes(log, whole.gap, seen, changed), *_failures(decided)),
+        notes=(
+            *notes_of(log, whole.gap, ended, changed, pictures=by_telemetry is None),
+            *_failures(decided),
+        ),
     )
 
 
@@ -192,24 +211,33 @@ def _seen(
                 found.append(each)
         except PictureMissing as error:
             missing = error
-    start = next((t.number for t in turns if t.role != "waiting"), len(turns))
-    differing = [(each, d) for each in found if (d := _unlike(each)) is not None]
-    first = None
-    if differing:
-        each, difference = differing[0]
-        first = Difference(
-            _tick_of(each.turn, turns, start), each.turn.t_s - log.start_s, *difference
-        )
     return Seen(
         found,
         _frames_of(each.turn for each in found),
-        len(differing),
-        first,
+        *_differing(log, turns, found),
         frames_flown=_frames_of(turns),
         ended=f"{missing}: what came after it cannot be seen again" if missing else "",
         another=isinstance(missing, PictureAnother),
         unreadable=isinstance(missing, PicturesUnreadable),
     )
+
+
+def _shown(log: FlightLog, turns: Sequence[Turn], flown: Profile, profile: Profile) -> Shown:
+    found = list(shown(turns, flown, profile))
+    return Shown(found, *_differing(log, turns, found))
+
+
+def _differing(
+    log: FlightLog, turns: Sequence[Turn], found: Iterable[Sensed]
+) -> tuple[int, Difference | None]:
+    """In how many turns it is not what was seen, and the first."""
+    start = next((t.number for t in turns if t.role != "waiting"), len(turns))
+    differing = [(each.turn, d) for each in found if (d := _unlike(each)) is not None]
+    if not differing:
+        return 0, None
+    turn, difference = differing[0]
+    first = Difference(_tick_of(turn, turns, start), turn.t_s - log.start_s, *difference)
+    return len(differing), first
 
 
 def _failures(decided: Sequence[Decided]) -> Iterator[str]:
@@ -234,56 +262,8 @@ def _unlike(sensed: Sensed) -> tuple[str, object, object] | None:
     found = first_differing("poses", turn.poses, sensed.poses)
     if found is not None or turn.observation is None or seen is None:
         return found
-    for name in SENSED:
+    for name in (*SENSED, "position_age_s"):
         found = first_differing(name, getattr(turn.observation, name), getattr(seen, name))
         if found is not None:
             return found
     return None
-
-
-_ON_PICTURES = ("camera", "detector", "pose", "kalman", "merge", "target", "vehicle")
-_ON_SENSES = ("safety.jump_", "safety.camera_hold_s", "safety.max_frame_age_s")
-"""What the senses make of telemetry and pictures by them stands in the observations already."""
-_ON_FEED = ("positioning",)
-_ON_NEITHER = ("link", "simulation", "log")
-
-
-def _notes(log: FlightLog, gap: str, seen: Seen | None, changed: Sequence[str]) -> Iterator[str]:
-    made_by = log.header.get("perchctl")
-    if made_by != perchctl.__version__:
-        yield (
-            f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may be "
-            f"what has been changed on purpose since"
-        )
-    elsewhere = other_computer(log.header)
-    if elsewhere:
-        yield f"it was flown with {elsewhere}: the last bits of a number may differ for that alone"
-    if log.truncated:
-        yield "the log ends in the flight, without its summary: replayed is what is there"
-    if gap:
-        yield gap
-    if seen is not None and seen.ended:
-        yield seen.ended
-    sections = {key: key.split(".")[0] for key in changed}
-    if seen is None or (seen.unreadable and not seen.frames):
-        blind = [key for key, section in sections.items() if section in _ON_PICTURES]
-        if blind:
-            yield (
-                f"{', '.join(blind)}: what it would change in the pictures cannot be shown, as "
-                f"there are none to look at"
-            )
-        unsensed = [key for key in changed if key.startswith(_ON_SENSES)]
-        if unsensed:
-            yield (
-                f"{', '.join(unsensed)}: what it would change in what the planner is shown was "
-                f"not looked at, which takes the flight's pictures"
-            )
-    fed = [key for key, section in sections.items() if section in _ON_FEED]
-    if fed:
-        yield (
-            f"{', '.join(fed)}: what it would change in the positions that reach the vehicle was "
-            f"not looked at, only what the planner makes of their age"
-        )
-    idle = [key for key, section in sections.items() if section in _ON_NEITHER]
-    if idle:
-        yield f"{', '.join(idle)}: a replay has nothing that it acts on"

@@ -19,7 +19,7 @@ def replay_record(
     replay: Replay, gates: Sequence[Gate], changes: Sequence[Change]
 ) -> dict[str, Any]:
     """`ticks`, `differences` and `first_difference` are the planner's; `pictures` None without
-    any; `what_if` None where nothing was changed."""
+    any, and else `shown`; `what_if` None where nothing was changed."""
     seen = replay.seen
     return {
         "log": str(replay.log.path),
@@ -28,6 +28,13 @@ def replay_record(
         "differences": replay.differences,
         "first_difference": _difference_record(replay.first),
         "gap": replay.gap or None,
+        "shown": None
+        if replay.shown is None
+        else {
+            "turns": len(replay.shown.turns),
+            "differences": replay.shown.differences,
+            "first_difference": _difference_record(replay.shown.first),
+        },
         "pictures": None
         if seen is None
         else {
@@ -51,7 +58,8 @@ def replay_record(
 
 def replay_lines(replay: Replay, gates: Sequence[Gate], changes: Sequence[Change]) -> list[str]:
     """For people; `replay.notes` are told apart."""
-    lines = [*_what_if_head(replay), *_planner_lines(replay), *_picture_lines(replay)]
+    lines = [*_what_if_head(replay), *_planner_lines(replay), *_shown_lines(replay)]
+    lines += _picture_lines(replay)
     if not replay.changed:
         return lines
     lines += [_gate_line(gate) for gate in gates]
@@ -75,8 +83,8 @@ def _planner_lines(replay: Replay) -> list[str]:
         same = "all with the same commands"
         if what_if:
             same = "no command would have been another"
-            if not replay.observations_anew:
-                same += ", by the observations as they were recorded"
+            if replay.shown is not None:
+                same += ", with the target as it was estimated"
         if replay.gap:
             same += ", up to where the log has lost a turn"
         return [f"planner:   {ticks}, {same}"]
@@ -88,6 +96,18 @@ def _planner_lines(replay: Replay) -> list[str]:
     return [
         f"planner:   {ticks}, {replay.differences} {would}",
         f"first:     {difference_text(replay.first, what_if)}",
+    ]
+
+
+def _shown_lines(replay: Replay) -> list[str]:
+    """Only a difference is worth a line: that there is none is the planner's line's to say."""
+    found, what_if = replay.shown, bool(replay.changed)
+    if found is None or found.first is None:
+        return []
+    would = "would show" if what_if else "show"
+    return [
+        f"telemetry: {found.differences} turns {would} the planner something else",
+        f"first:     {difference_text(found.first, what_if)}",
     ]
 
 

@@ -83,11 +83,13 @@ def test_an_observation_comes_back(
     assert bits(there_and_back(Observation, bare)) == bits(bare)
 
 
-@pytest.mark.parametrize(
-    "command",
-    [Idle(), PositionSetpoint(0.1, -0.0, 1e-300, math.pi), RawThrust(48000), StopMotors(),
-     Land(-0.05, 2.5), EmergencyStop()],
-)  # fmt: skip
+SENT = [
+    PositionSetpoint(0.1, -0.0, 1e-300, math.pi), RawThrust(48000), StopMotors(),
+    Land(-0.05, 2.5), EmergencyStop(),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", [Idle(), *SENT])
 def test_a_command_keeps_its_kind(command: Command) -> None:
     """Three of them have no field at all."""
     turn = Turn(0, "flown", 0.0, 0.0, Taken(), command=command)
@@ -150,11 +152,7 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
     assert bits(turn_of(decode(line))) == bits(turn)
 
 
-@pytest.mark.parametrize(
-    "command",
-    [PositionSetpoint(0.1, -0.0, 1e-300, math.pi), RawThrust(0), StopMotors(), Land(-0.05, 2.5),
-     EmergencyStop()],
-)  # fmt: skip
+@pytest.mark.parametrize("command", SENT)
 def test_what_was_sent_is_one_line_and_comes_back(command: Command) -> None:
     sent = Sent(0.1 + 0.2, "watchdog", command)
     line = sent_line(sent)

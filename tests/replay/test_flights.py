@@ -20,8 +20,9 @@ from tests.helpers.flights import short_profile
 
 EVERY_FAULT = tuple(fault.name for fault in FAULTS)
 PLAIN, FAULTY, RECORDED = range(10, 35), range(100, 125), range(10)
-LEAST_REPLAYED = 13
-"""More than half of the 25 with faults: some of these refuse the flight, or leave no log."""
+LEAST_REPLAYED = 23
+"""Of the 25 with faults. Today all of them leave turns; a fault that is new to the catalogue makes
+the seeds draw others, and one that refuses the flight, or takes the log's disk, leaves none."""
 
 
 def flown(folder: Path, seed: int, faults: tuple[str, ...] = ()) -> Replay | None:

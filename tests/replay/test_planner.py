@@ -300,24 +300,6 @@ def test_what_acts_on_pictures_only_is_said() -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "why"),
-    [
-        ("safety.jump_m=0.9", "takes the flight's pictures"),
-        ("safety.camera_hold_s=0.2", "takes the flight's pictures"),
-        ("safety.max_frame_age_s=0.3", "takes the flight's pictures"),
-        ("positioning.rate_hz=50", "positions that reach the vehicle"),
-    ],
-)
-def test_what_was_not_looked_at_is_said(setting: str, why: str) -> None:
-    log = corpus("stopped")
-    found = replay(log, None, changed(profile_of(log.header), [setting]))
-    key = setting.partition("=")[0]
-    assert any(note.startswith(f"{key}: ") and why in note for note in found.notes)
-    same = "no command would have been another, by the observations as they were recorded"
-    assert any(same in line for line in replay_lines(found, [], []))
-
-
-@pytest.mark.parametrize(
     ("times_s", "text"),
     [((1.0,), "at 1.00 s as"), ((1.0, 2.0), "once more as"), ((1.0, 2.0, 3.0), "2 times more as")],
 )

@@ -3,18 +3,21 @@
     python tests/data/flights/make.py [NAME ...]
 
 Each file holds a log's header, turns, what was sent in the loop's place, events and summary,
-packed; the ticks, which say the same as the turns, but rounded, are left out. They were flown by
-the planner of their day: `tests/replay/test_corpus.py` demands that today's decides the same from
-the same observations. Where it is meant to decide otherwise, see docs/replay.md, "The corpus".
+packed; the ticks, which say the same rounded, are left out. `seen.mcap` holds the pictures of one of them. They were flown by the
+planner of their day: `tests/replay/test_corpus.py` demands that today's decides the same from the
+same observations, and `test_seen.py` that today's pipeline sees the same in the pictures. Where it
+is meant to decide otherwise, see docs/replay.md, "The corpus".
 """
 
 from __future__ import annotations
 
 import gzip
+import json
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +25,19 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parents[2]))
 
 import cv2  # noqa: E402
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage  # noqa: E402
 
 from perchctl.faults.flight import fly_fault_seed  # noqa: E402
 from perchctl.flight import lockstep  # noqa: E402
 from perchctl.flight.lockstep import fly_lockstep  # noqa: E402
 from perchctl.flight.loop import FlightParts  # noqa: E402
+from perchctl.log.recording.container import Container, DiskStream  # noqa: E402
+from perchctl.log.recording.messages import FRAME, IMAGE  # noqa: E402
+from perchctl.log.recording.place import recording_of  # noqa: E402
+from perchctl.log.recording.walk import walk  # noqa: E402
+from perchctl.log.watch import LogWatcher  # noqa: E402
 from perchctl.mission.state import Operator, Phase  # noqa: E402
 from perchctl.mission.watch import FlightReport  # noqa: E402
 from tests.helpers.flights import short_profile  # noqa: E402
@@ -37,12 +47,28 @@ KINDS = (b"header", b"turn", b"sent", b"event", b"summary")
 KEPT = tuple(b'{"kind":"' + kind + b'"' for kind in KINDS)
 
 
+PICTURES = 34
+"""So many are kept: from the first before take-off until only the small marker is in view."""
 SMALL = {"link.telemetry_period_s": 0.02, "link.loop_hz": 25}
 """Half the turns, and half the samples."""
 
 
 def _fly(log: Path, changes: Mapping[str, Any] | None = None, **more: Any) -> None:
     fly_lockstep(short_profile({**SMALL, **(changes or {})}), 3, log, **more)
+
+
+def _seen(log: Path) -> None:
+    """With its pictures, which are few and small."""
+    changes = {
+        "camera.calibration": "example_aideck_324x244.yaml",
+        "planner.takeoff_height_m": 0.8,
+        "simulation.camera_rate_hz": 4,
+        "simulation.camera_noise_sigma": [0.4, 0.4],
+    }
+    profile = short_profile(SMALL | changes)
+    watcher = LogWatcher.lockstep(log, profile, 3, record=True)
+    flight = fly_lockstep(profile, 3, watcher, operator_at={Phase.PERCH: Operator.STOP})
+    watcher.close(flight.report, flight.perched_miss_m, flight.fell)
 
 
 def _fault(log: Path, fault: str, seed: int) -> None:
@@ -67,6 +93,7 @@ FLIGHTS: dict[str, Callable[[Path], None]] = {
     "perched": _fly,
     "searched-out": partial(_fly, changes={"simulation.no_target": True}),
     "slipped": partial(_fly, changes={"simulation.first_contact_fails": 1.0}),
+    "seen": _seen,
     "stopped": partial(_fly, operator_at={Phase.ALIGN: Operator.STOP}),
     "link-silent": partial(_fault, fault="link-silent", seed=2),
     "hung-within": _hung_within,
@@ -82,9 +109,49 @@ def made(name: str) -> Path:
         log = Path(folder) / f"{name}.jsonl"
         FLIGHTS[name](log)
         lines = [line for line in log.read_bytes().splitlines(True) if line.startswith(KEPT)]
+        if recording_of(log).is_file():
+            lines = lines[: _end_of(lines)]
+            _keep_pictures(recording_of(log), HERE / f"{name}.mcap")
     path = HERE / f"{name}.jsonl.gz"
     path.write_bytes(gzip.compress(b"".join(lines), compresslevel=9, mtime=0))
     return path
+
+
+def _end_of(lines: list[bytes]) -> int:
+    """Where the turn begins that took one more picture."""
+    taken = 0
+    for k, line in enumerate(lines):
+        record = json.loads(line)
+        taken += record["kind"] == "turn" and record["taken"].get("frame") is not None
+        if taken > PICTURES:
+            return k
+    return len(lines)
+
+
+def _packed(data: bytes) -> CompressedImage:
+    """The same pixels in fewer bytes: noise is best left to Huffman alone."""
+    picture = CompressedImage.FromString(data)
+    pixels = np.frombuffer(picture.data, np.uint8)
+    image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    how = [
+        cv2.IMWRITE_PNG_COMPRESSION, 9,
+        cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+    ]  # fmt: skip
+    picture.data = cv2.imencode(".png", image, how)[1].tobytes()
+    return picture
+
+
+def _keep_pictures(recording: Path, path: Path) -> None:
+    """Of a recording, what a replay takes from it."""
+    path.unlink(missing_ok=True)
+    kept = Container(DiskStream(path))
+    for each in islice(walk(recording, (IMAGE, FRAME)), 2 * PICTURES):
+        if each.topic == IMAGE:
+            kept.say(IMAGE, each.log_ns, _packed(each.data), each.sequence)
+        else:
+            kept.say_json(FRAME, each.log_ns, each.data, each.sequence)
+    kept.finish()
 
 
 def main() -> None:
@@ -93,7 +160,9 @@ def main() -> None:
         if name not in FLIGHTS:
             sys.exit(f"{name} is none of {', '.join(FLIGHTS)}")
         path = made(name)
-        print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
+        for file in (path, recording_of(path)):
+            if file.is_file():
+                print(f"{file.name}: {file.stat().st_size / 1000:.0f} kB")
 
 
 if __name__ == "__main__":

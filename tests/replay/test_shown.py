@@ -1,0 +1,272 @@
+"""What the planner would be shown by another profile, from telemetry and times alone."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import pkgutil
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import perchctl.mission
+from perchctl.camera.health import MEANING
+from perchctl.flight import history
+from perchctl.flight.senses import SENSED
+from perchctl.log.read import FlightLog
+from perchctl.log.setup import profile_of
+from perchctl.mission.turn import Turn
+from perchctl.profile import Profile
+from perchctl.profile.changed import changed
+from perchctl.profile.mission import SafetyConfig
+from perchctl.profile.positioning import PositioningConfig
+from perchctl.replay.compare import first_differing, same
+from perchctl.replay.run import Replay, replay
+from perchctl.replay.shown import shown
+from perchctl.replay.told import replay_lines, replay_record
+from perchctl.vehicle import Telemetry
+from perchctl.vision.types import Frame
+from tests.flight.test_loop import PROFILE, Camera, Rig
+from tests.replay.test_corpus import corpus
+from tests.replay.test_senses import begun, flown
+
+JUDGED = ("jumped", "turned_rad", "battery_age_s", "camera_age_s", "new_frame", "camera_problem")
+
+
+def what_if(log: FlightLog, *settings: str) -> Replay:
+    return replay(log, None, changed(profile_of(log.header), settings))
+
+
+def flown_by(log: FlightLog, *settings: str) -> FlightLog:
+    """The log of a flight by another profile, which was shown what that makes of it."""
+    was = profile_of(log.header)
+    profile = changed(was, settings)
+    turns = [
+        replace(each.turn, observation=each.observation) for each in shown(log.turns, was, profile)
+    ]
+    return with_turns(log, turns, profile)
+
+
+def with_turns(log: FlightLog, turns: list[Turn], profile: Profile) -> FlightLog:
+    other = replace(log, header=log.header | {"profile": profile.model_dump(mode="json")})
+    other.__dict__["turns"] = turns
+    return other
+
+
+# --- telemetry -------------------------------------------------------------------------------
+
+
+def moved(sample: Telemetry, *, x_m: float = 0.0, z_m: float = 0.0) -> Telemetry:
+    x, y, z = sample.position_m
+    return replace(sample, position_m=(x + x_m, y, z + z_m))
+
+
+STEPS: dict[str, tuple[str, str, Callable[[Telemetry], Telemetry]]] = {
+    "safety.jump_m": ("4", "0.25", lambda s: moved(s, x_m=0.6)),
+    "safety.jump_z_m": ("4", "0.15", lambda s: moved(s, z_m=0.24)),
+    "safety.jump_deg": ("179", "15", lambda s: replace(s, yaw_rad=s.yaw_rad + math.radians(30))),
+    "safety.jump_mps": ("9", "1", lambda s: replace(s, velocity_mps=(2.5, 0.0, 0.0))),
+}
+"""Key; a value with which the step is none, and one with which it is; and the step."""
+
+
+def stepped(key: str) -> FlightLog:
+    """From tick 30 on the estimate is another."""
+    log, step = corpus("stopped"), STEPS[key][2]
+    at = next(t.number for t in log.turns if t.role == "flown") + 30
+    turns = [
+        turn
+        if turn.number < at
+        else replace(turn, taken=replace(turn.taken, samples=tuple(map(step, turn.taken.samples))))
+        for turn in log.turns
+    ]
+    return with_turns(log, turns, profile_of(log.header))
+
+
+@pytest.mark.parametrize("key", STEPS)
+def test_a_jump_is_judged_anew(key: str) -> None:
+    """Flown with a wide threshold, replayed with a narrow one, and the other way round."""
+    wide, narrow, _ = STEPS[key]
+    log = stepped(key)
+    for flown_with, replayed_with in ((wide, narrow), (narrow, wide)):
+        other = flown_by(log, f"{key}={flown_with}")
+        again = replay(other)
+        assert again.shown is not None
+        assert again.shown.first is None
+        found = what_if(other, f"{key}={replayed_with}")
+        assert found.shown is not None
+        first = found.shown.first
+        assert first is not None
+        assert (first.tick, first.field) == (30, "jumped")
+        assert (first.recorded, first.replayed) == (flown_with == narrow, flown_with == wide)
+        assert found.decided[30].observation.jumped == (flown_with == wide)
+        text = "\n".join(replay_lines(found, [], []))
+        assert re.search(r"telemetry: \d+ turns would show the planner something else", text)
+        assert "first:     tick 30 at" in text
+        assert replay_record(found, [], [])["shown"]["first_difference"]["field"] == "jumped"
+        if flown_with == wide:
+            assert found.first is not None  # the planner's, which then holds
+            assert found.first.tick == 30
+
+
+def test_a_changed_constant_of_the_history_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pictures; then the replay is not the same."""
+    log = flown_by(stepped("safety.jump_deg"))
+    same_as_before = replay(log).shown
+    assert same_as_before is not None
+    assert same_as_before.first is None
+    monkeypatch.setattr(history, "FASTEST_TURN_RADPS", 7.000001)
+    found = replay(log)
+    assert found.shown is not None
+    assert found.shown.first is not None
+    assert found.shown.first.field == "turned_rad"
+    assert not found.same
+    text = "\n".join(replay_lines(found, [], []))
+    assert "telemetry: 1 turns show the planner something else" in text
+
+
+# --- pictures' times -------------------------------------------------------------------------
+
+
+def test_another_patience_with_the_camera() -> None:
+    log = corpus("hung")
+    for setting, replayed in (
+        ("safety.camera_hold_s=0.05", False),
+        ("safety.camera_hold_s=2.9", True),
+    ):
+        found = what_if(log, setting)
+        assert found.shown is not None
+        assert found.shown.first is not None
+        assert found.shown.first.field == "target.tracked"
+        assert found.shown.first.replayed is replayed
+
+
+def test_pictures_that_would_come_too_late() -> None:
+    """The camera's age grows from the last that was not, and the planner holds by it. The other
+    way round they count again."""
+    log = corpus("perched")
+    strict = flown_by(log, "safety.max_frame_age_s=0.08")
+    refused = [
+        (was.observation, now.observation)
+        for was, now in zip(log.turns, strict.turns, strict=True)
+        if was.observation is not None and not same(was.observation, now.observation)
+    ]
+    assert len(refused) > 5
+    for was, now in refused:
+        assert was is not None
+        assert now is not None
+        assert now.camera_age_s > was.camera_age_s
+        assert now.camera_problem == "the picture is 0.1 s late"
+        assert not now.new_frame
+    found = what_if(log, "safety.max_frame_age_s=0.08")
+    assert found.shown is not None
+    assert found.shown.first is not None
+    assert found.shown.differences == len(refused)
+    assert any(note.startswith("safety.max_frame_age_s: ") for note in found.notes)
+    back = flown_by(strict, "safety.max_frame_age_s=0.4")
+    for turn, original in zip(back.turns, log.turns, strict=True):
+        one, other = turn.observation, original.observation
+        if one is not None and other is not None:
+            assert (one.camera_age_s, one.camera_problem) == (other.camera_age_s, None)
+
+
+class Unsteady(Camera):
+    """Pictures of another age each time."""
+
+    def poll(self, now_s: float) -> Frame | None:
+        return super().poll(now_s - 0.03 * (self.count % 3))
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "safety.max_frame_age_s=0.071",
+        "safety.jump_z_m=0.001",
+        "safety.jump_m=0.001",
+    ],
+)
+def test_with_pictures_it_is_judged_alike(tmp_path: Path, setting: str) -> None:
+    """What needs none is the same to the bit as by the loop's own senses, with pictures."""
+    log, pictures = flown(tmp_path, Rig(camera=Unsteady()))
+    log = begun(log)
+    other = changed(PROFILE, [setting])
+    seen = replay(log, pictures, other, Rig().setup).seen
+    alone = replay(log, None, other).shown
+    assert seen is not None
+    assert alone is not None
+    assert alone.first is not None
+    assert len(seen.turns) == len(alone.turns)
+    for one, two in zip(seen.turns, alone.turns, strict=True):
+        assert (one.observation is None) == (two.observation is None)
+        for name in JUDGED if one.observation is not None else ():
+            found = first_differing(
+                name, getattr(one.observation, name), getattr(two.observation, name)
+            )
+            assert found is None, (one.turn.number, found)
+
+
+# --- positions from outside --------------------------------------------------------------------
+
+
+def test_another_latency_of_a_capture_makes_positions_older() -> None:
+    log = corpus("external-occluded")
+    found = what_if(log, "positioning={by: mocap, latency_s: 0.04, host: x}")
+    later_s = 0.04 - profile_of(log.header).positioning.latency_s
+    assert found.shown is not None
+    assert found.shown.first is not None
+    assert found.shown.first.field == "position_age_s"
+    for each in found.decided:
+        assert each.turn.observation is not None
+        was_s = each.turn.observation.position_age_s
+        assert each.observation.position_age_s == pytest.approx(was_s + later_s)
+
+
+# --- what cannot be judged ---------------------------------------------------------------------
+
+
+def planner_s() -> str:
+    """The text of what the planner is made of."""
+    names = [m.name for m in pkgutil.iter_modules(perchctl.mission.__path__, "perchctl.mission.")]
+    return "\n".join(inspect.getsource(import_module(name)) for name in names)
+
+
+def test_each_key_is_judged_or_said() -> None:
+    """A key of `safety` or `positioning` acts on the planner, or on what it is shown, or a note
+    says what a replay cannot tell of it."""
+    log, text = corpus("stopped"), planner_s()
+    rerun = {
+        *(key.removeprefix("safety.") for key in STEPS),
+        "camera_hold_s",
+    }
+    keys = [("safety", key) for key in SafetyConfig.model_fields]
+    keys += [("positioning", key) for key in PositioningConfig.model_fields]
+    for section, key in keys:
+        planned = re.search(rf"\b{section}\.{key}\b", text) is not None
+        noted = said_of(log, f"{section}.{key}")
+        assert planned or noted or key in rerun or key == "latency_s", key
+        if key in ("hold_s", "land_s", *rerun):
+            assert not noted, key
+
+
+def said_of(log: FlightLog, key: str) -> bool:
+    from perchctl.replay.notes import notes_of
+
+    notes = notes_of(log, "", "", [key], pictures=False)
+    return any(note.startswith(f"{key}: ") for note in notes)
+
+
+def test_what_was_asked_before_take_off_is_said() -> None:
+    found = what_if(corpus("stopped"), "safety.min_rest_v=3.9")
+    assert any("before take-off only" in note for note in found.notes)
+    lines = replay_lines(found, [], [])
+    assert any("no command would have been another" in line for line in lines)
+
+
+def test_repeated_and_late_are_told_apart() -> None:
+    """By their words: a late picture is found in a log by its own."""
+    assert not any("late" in text for text in MEANING.values())
+    assert {*JUDGED} < {*SENSED}
