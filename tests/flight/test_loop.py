@@ -8,31 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perchctl.link.mock import ScriptedLink
 from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import Tick
 from perchctl.vehicle import (
     Land,
     PositionSetpoint,
 )
-from tests.helpers.loop_rig import PROFILE, Camera, Clock, Rig, Vehicle, noise
+from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle, noise
 
 PERIOD_S = 1.0 / PROFILE.link.loop_hz
-
-
-class SleepyClock(Clock):
-    """A computer that is suspended once, at `at_s`, for `for_s`."""
-
-    def __init__(self, link: ScriptedLink, at_s: float, for_s: float) -> None:
-        super().__init__(link)
-        self._at_s, self._for_s = at_s, for_s
-        self._slept = False
-
-    def wait_until(self, t_s: float) -> None:
-        super().wait_until(t_s)
-        if not self._slept and self.now() >= self._at_s:
-            self._slept = True
-            self._link.advance_to(self.now() + self._for_s)
 
 
 # --- Bad measurements ---------------------------------------------------------------------------

@@ -20,12 +20,8 @@ from perchctl.vehicle import (
     Land,
     PositionSetpoint,
 )
-from tests.helpers.loop_rig import PROFILE, Camera, Rig, Vehicle, Watcher
+from tests.helpers.loop_rig import PROFILE, Broken, Camera, Rig, Vehicle, Watcher
 from tests.helpers.mission import AIRBORNE, HOVER_THRUST, telemetry
-
-
-class Broken(RuntimeError):
-    pass
 
 
 def _break(*_: Any, **__: Any) -> Any:

@@ -50,6 +50,10 @@ CLIMB_MPS = 0.5
 SINK_MPS = 0.4
 
 
+class Broken(RuntimeError):
+    pass
+
+
 class Vehicle(ScriptedLink):
     """A scripted link that also does as it is told: takes off, lands, stops.
 
@@ -133,6 +137,21 @@ class Clock:
 
     def wait_until(self, t_s: float) -> None:
         self._link.advance_to(max(t_s, self._link.now_s))
+
+
+class SleepyClock(Clock):
+    """A computer that is suspended once, at `at_s`, for `for_s`."""
+
+    def __init__(self, link: ScriptedLink, at_s: float, for_s: float) -> None:
+        super().__init__(link)
+        self._at_s, self._for_s = at_s, for_s
+        self._slept = False
+
+    def wait_until(self, t_s: float) -> None:
+        super().wait_until(t_s)
+        if not self._slept and self.now() >= self._at_s:
+            self._slept = True
+            self._link.advance_to(self.now() + self._for_s)
 
 
 def noise(number: int) -> np.ndarray:
