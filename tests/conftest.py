@@ -43,9 +43,13 @@ SLOW_FIRST = (
     "target/test_design.py",
     "link/test_cflib_link.py",
     "calibration/test_calibration_command.py",
+    "calibration/test_calibration_live.py",
     "faults/test_flights.py",
     "sim/test_crtp_process.py",
+    "sim/test_crtp_spoilt.py",
     "sim/test_crtp_link.py",
+    "sim/test_crtp_logs.py",
+    "weights/test_command_sessions.py",
     "weights/test_command.py",
 )
 

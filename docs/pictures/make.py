@@ -62,8 +62,7 @@ from perchctl.sim.draw import draw_scenario  # noqa: E402
 from perchctl.sim.renderer import Renderer  # noqa: E402
 from perchctl.vision.types import Frame, PipelineState  # noqa: E402
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-PAGE_PX, REPORT_PX = "1100,560", "1200,1250"
+PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
 NEAR_WIDTH_M = 0.2
 """Of the side view where the vehicle is at the ceiling."""
 
@@ -231,10 +230,6 @@ def calibration(_: Flight, file: Path) -> None:
 
 def page(flown: Flight, file: Path) -> None:
     """The live page of the flight, in a browser without a window."""
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if browser is None:
-        print(f"{file.name}: skipped, none of {', '.join(BROWSERS)} is installed")
-        return
     index = _shown(flown)
     status, picture = flown.status(index), flown.sketch(flown.frame(index))
     live = LivePage(flown.camera, "perchctl fly sim://", on_stop=lambda: None)
@@ -251,7 +246,8 @@ def page(flown: Flight, file: Path) -> None:
     feeder = threading.Thread(target=feed, daemon=True)
     feeder.start()
     try:
-        _photograph(browser, live.url, file)
+        # The rate that it shows is that of the last seconds.
+        _photograph(file, live.url, PAGE_PX, "performance.now() > 4000")
     finally:
         closing.set()
         live.close()
@@ -260,16 +256,10 @@ def page(flown: Flight, file: Path) -> None:
 
 def report(flown: Flight, file: Path) -> None:
     """The head of the report of the flight, in a browser without a window."""
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
-    if browser is None:
-        print(f"{file.name}: skipped, none of {', '.join(BROWSERS)} is installed")
-        return
     with tempfile.TemporaryDirectory() as folder:
         told = Path(folder) / "report.html"
         write_report([flown.log.path], told)
-        _photograph(browser, told.as_uri(), file, REPORT_PX)
-    whole = np.asarray(cv2.imread(str(file)), np.uint8)
-    _write(file, np.asarray(cv2.resize(whole, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_AREA)))
+        _photograph(file, told.as_uri(), REPORT_PX, scale=0.7)
 
 
 PICTURES: dict[str, Callable[[Flight, Path], None]] = {
@@ -374,25 +364,21 @@ def _page_state(status: FlightStatus) -> dict[str, Any]:
     }
 
 
-def _photograph(browser: str, url: str, file: Path, size_px: str = PAGE_PX) -> None:
-    with tempfile.TemporaryDirectory() as profile:
-        subprocess.run(
-            [
-                browser,
-                "--headless=new",
-                "--no-sandbox",
-                "--disable-gpu",
-                "--hide-scrollbars",
-                f"--user-data-dir={profile}",
-                f"--window-size={size_px}",
-                "--timeout=4000",
-                f"--screenshot={file.resolve()}",
-                url,
-            ],
-            check=True,
-            capture_output=True,
-            timeout=60,
-        )
+def _photograph(
+    file: Path, url: str, size_px: tuple[int, int], until: str = "true", scale: float = 1.0
+) -> None:
+    from tests.helpers.browser import browsing, why_no_browser
+
+    if why := why_no_browser():
+        print(f"{file.name}: skipped, {why}")
+        return
+    with browsing() as browser:
+        browser.open(url, *size_px)
+        browser.until(until)
+        shot = browser.photograph()
+    if scale != 1.0:
+        shot = np.asarray(cv2.resize(shot, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    _write(file, shot)
 
 
 def _perchctl(*words: str) -> None:

@@ -200,7 +200,8 @@ def _measured(m: Measures) -> Iterator[str]:
     if m.frames:
         gaps = "no gap"
         if m.frame_gaps:
-            gaps = f"{of('frame_gaps')} gaps of {of('frame_gaps_s')} s together"
+            gaps = "1 gap of" if m.frame_gaps == 1 else f"{of('frame_gaps')} gaps of"
+            gaps += f" {of('frame_gaps_s')} s" + (" together" if m.frame_gaps > 1 else "")
         yield from _named(
             "frames",
             f"{of('frames')}, {of('frames_unseen')} without the target; {of('frame_rate_hz')} Hz, "

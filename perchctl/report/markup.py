@@ -5,6 +5,8 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
+from perchctl.report.words import kept_together
+
 _VOID = frozenset({"img", "meta", "br"})
 
 
@@ -64,4 +66,7 @@ def table(
 
 def pairs(rows: Iterable[tuple[str, str]]) -> Markup:
     """Names and values beneath each other."""
-    return tag("dl", [tag("div", [tag("dt", name), tag("dd", value)]) for name, value in rows])
+    return tag(
+        "dl",
+        [tag("div", [tag("dt", name), tag("dd", kept_together(value))]) for name, value in rows],
+    )

@@ -21,6 +21,8 @@ Recorded = Callable[[Collection[int]], Iterable[tuple[int, float, NDArray[np.uin
 PerchError where the recording cannot be read."""
 
 DECIDED = {"ESTIMATE": "found", "ASCEND": "aligned", "PERCH": "settled", "COMPLETE": "contact"}
+OLD_S = 0.2
+"""An older picture shows another moment, and its caption says which."""
 MOST = 16
 """Of a flight with many attempts the first and the last ones."""
 WIDEST_PX, JPEG_QUALITY = 480, 80
@@ -29,16 +31,20 @@ LARGE_BGR, SMALL_BGR = (0xDC, 0x9B, 0x3A), (0x00, 0x9F, 0xE6)
 
 @dataclass(frozen=True)
 class Decision:
-    """A moment worth a picture; `frame`: the number of the newest frame then."""
+    """A moment worth a picture; `frame`: the number of the newest frame then, which the loop
+    had at `seen_s`."""
 
     t_s: float
     name: str
     frame: int
     record: dict[str, Any]
+    seen_s: float
 
     @property
     def caption(self) -> str:
         text = f"{self.name}, {self.t_s:.1f} s"
+        if self.t_s - self.seen_s > OLD_S:  # the last centimetres are flown without a picture
+            text += f"; the picture is from {self.seen_s:.1f} s"
         up_m = self.record.get("ez_m")
         return text if up_m is None else f"{text}, {length(float(up_m))} below"
 
@@ -64,7 +70,8 @@ def decisions_of(track: Track) -> tuple[Decision, ...]:
     for t_s, name in sorted(moments):
         record = _frame_before(track, t_s)
         if record is not None:
-            found.append(Decision(t_s, name, int(record["frame"]), record))
+            seen_s = track.log.since(float(record["t_s"]))
+            found.append(Decision(t_s, name, int(record["frame"]), record, seen_s))
     if len(found) > MOST:
         found = found[: MOST // 2] + found[-MOST // 2 :]
     return tuple(found)

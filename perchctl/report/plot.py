@@ -153,7 +153,7 @@ def _last_seconds(track: Track) -> Markup | None:
     if not frames.seen_s.size:
         return None
     end_s = float(frames.seen_s[-1])
-    low_s, high_s = end_s - LAST_S, end_s + AFTER_S
+    low_s, high_s = max(0.0, end_s - LAST_S), min(end_s + AFTER_S, max(track.end_s, 0.1))
     inside = (track.t_s >= low_s) & (track.t_s <= high_s)
     frame_s = track.log.since(track.log.column("frame_t_s"))
     near = (frame_s >= low_s) & (frame_s <= high_s)
@@ -272,9 +272,12 @@ def _mark_unseen(ax: Axes, track: Track) -> None:
     """At the bottom: frames without the target, and when no picture came."""
     frames = frames_of(track.log)
     upright = ax.get_xaxis_transform()
-    ax.vlines(frames.unseen_s, 0.0, 0.05, transform=upright, color=INK, linewidth=0.6)
-    for start_s, end_s in frames.gaps_s:
-        ax.axvspan(start_s, end_s, 0.0, 0.05, color=RED, linewidth=0.0)
+    if frames.unseen_s.size:
+        ax.vlines(frames.unseen_s, 0.0, 0.05, transform=upright, color=INK, linewidth=0.6,
+                  label="no target")  # fmt: skip
+    for i, (start_s, end_s) in enumerate(frames.gaps_s):
+        ax.axvspan(start_s, end_s, 0.0, 0.05, color=RED, linewidth=0.0,
+                   label=None if i else "no picture")  # fmt: skip
 
 
 def _tracked(track: Track, key: str) -> Array:

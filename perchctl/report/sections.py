@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 
 from perchctl.mission.findings import latency_text, turn_text
 from perchctl.report.edges import timings_of
@@ -12,7 +11,7 @@ from perchctl.report.plot import battery_plot, flight_plots, histogram
 from perchctl.report.sight import Seen, part_of
 from perchctl.report.story import PAPERS
 from perchctl.report.told import UNFINISHED, Told
-from perchctl.report.words import count, length, milliseconds, share
+from perchctl.report.words import count, kept_together, length, milliseconds, share
 
 WORDS = {
     "perched": "Perched",
@@ -22,7 +21,6 @@ WORDS = {
     UNFINISHED: "Unfinished: the log has no end",
 }
 GRADES = {"perched": "good", "landed": "warn"}
-_UNIT = re.compile(r"(?<=\d) (?=(?:%|s|ms|mm|cm|m|m/s|px|deg|V|mAh)\b|%)")
 
 
 def headline(told: Told, back: str = "") -> Markup:
@@ -186,7 +184,7 @@ def pictures(told: Told) -> Markup | None:
                 "figure",
                 [
                     tag("img", src=shown.address, alt=shown.decision.caption),
-                    tag("figcaption", _prose(shown.decision.caption)[:-1]),
+                    tag("figcaption", kept_together(shown.decision.caption)),
                 ],
             )
             for shown in told.pictures
@@ -335,7 +333,7 @@ def timing(told: Told) -> Markup | None:
 
 def _prose(sentence: str) -> str:
     """With its end, and each figure beside its unit."""
-    return _UNIT.sub("\N{NO-BREAK SPACE}", f"{sentence}.")
+    return kept_together(f"{sentence}.")
 
 
 def _upper(sentence: str) -> str:

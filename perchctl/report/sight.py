@@ -15,8 +15,6 @@ from perchctl.report.track import Track
 
 PHASES = ("SEARCH", "ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER")
 RMS_KEYS = ("j_rms_px", "l_rms_px", "s_rms_px")
-TURN_PERIODS = 1.5
-"""Frames farther apart than that many median periods do not tell a rate."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class Seen:
 
     Attributes:
         frames, with_target: that the pipeline was given, and those of them that held it.
-        rate_hz: by the median time between two frames.
+        rate_hz: by the median time between two frames, as `perchctl log show` has it.
         age_s, age_most_s: of the picture when it was used: median, and 95 of 100 are below.
         rms_px: what the corners miss the pose by, median.
         blur_px, blur_most_px: as `perchctl.report.motion`: median, and 95 of 100 are below.
@@ -99,10 +97,7 @@ def _seen(track: Track, phase: str, taken: Sequence[tuple[int, dict[str, Any]]])
 def _rate_hz(at_s: Array) -> float:
     between = np.diff(at_s)
     between = between[between > 0]
-    if not between.size:
-        return math.nan
-    usual = between[between < TURN_PERIODS * np.median(between)]
-    return 1.0 / float(np.mean(usual)) if usual.size else math.nan
+    return 1.0 / float(np.median(between)) if between.size else math.nan
 
 
 def part_of(values: Array, percent: float) -> float:

@@ -16,7 +16,7 @@ from perchctl.flight.told import events_of
 from perchctl.mission import planner
 from perchctl.mission.state import Outcome
 from perchctl.vehicle import Telemetry
-from tests.flight.test_loop import PROFILE, Rig, Vehicle
+from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
 from tests.helpers.mission import observation, telemetry
 
 SAFETY = PROFILE.safety

@@ -24,8 +24,8 @@ from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition, MeasuredBy, PositionSetpoint
-from tests.flight.test_loop import PROFILE, Rig, Vehicle
 from tests.helpers.capture import TURNS, named_up
+from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
 from tests.helpers.mission import READY, telemetry
 
 MOCAP = PROFILE.model_copy(

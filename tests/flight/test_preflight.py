@@ -15,8 +15,8 @@ from perchctl.flight.preflight import still_waiting_for
 from perchctl.mission.state import Operator, Outcome
 from perchctl.vehicle import PositionSetpoint
 from perchctl.vision.types import Detections
-from tests.flight.test_loop import PROFILE, Camera, Rig, Vehicle, noise
 from tests.helpers.flights import fly_short
+from tests.helpers.loop_rig import PROFILE, Camera, Rig, Vehicle, noise
 from tests.helpers.mission import READY, target_at, telemetry
 
 LOWEST_M = PROFILE.planner.takeoff_height_m

@@ -16,7 +16,7 @@ from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import EventKind, Tick
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, Telemetry
 from perchctl.vision.types import Frame
-from tests.flight.test_loop import PROFILE, Broken, Camera, Rig, Vehicle, Watcher
+from tests.helpers.loop_rig import PROFILE, Broken, Camera, Rig, Vehicle, Watcher
 
 HANG_AT_S = 2.5
 LAND_AT_S = 4.5

@@ -18,9 +18,9 @@ from perchctl.mission.watch import Tick, TurnWatcher
 from perchctl.profile import Profile
 from perchctl.replay.decide import decide, first_of
 from perchctl.vehicle import Command, Land
-from tests.flight.test_loop import Rig, Vehicle
-from tests.flight.test_loop import Watcher as LooksOn
 from tests.helpers.hangs import hang_in_the_planner
+from tests.helpers.loop_rig import Rig, Vehicle
+from tests.helpers.loop_rig import Watcher as LooksOn
 
 
 @dataclass

@@ -1,15 +1,7 @@
-"""The flight log: what is written comes back, whatever happens on the way."""
+"""The flight log: what is written comes back."""
 
 from __future__ import annotations
 
-import errno
-import json
-import os
-import signal
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,16 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.errors import InvalidValue, NotFound
-from perchctl.log import write
 from perchctl.log.fields import FIELDS, tick_record
 from perchctl.log.jsonl import to_plain
 from perchctl.log.place import log_path
 from perchctl.log.read import read_log
-from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.state import BatteryOutlook, Outcome, Phase
-from perchctl.mission.watch import FlightReport, Outside
+from perchctl.mission.state import BatteryOutlook
+from perchctl.mission.watch import Outside
 from perchctl.vehicle import (
     EmergencyStop,
     ExternalPosition,
@@ -39,22 +28,9 @@ from perchctl.vehicle import (
 )
 from perchctl.vision.consistency import Consistency
 from tests.helpers import log as synthetic
-from tests.helpers.mission import held, note
+from tests.helpers.mission import held
 
 STARTED = datetime(2024, 3, 1, 14, 5, 9, tzinfo=UTC)
-
-
-def small_log(path: Path, ticks: int = 5) -> Path:
-    writer = FlightLogWriter.open(path, synthetic.header())
-    for i in range(ticks):
-        writer.write({"t_s": 0.02 * i, "phase": "SEARCH", "z_m": 0.1 * i})
-        writer.event(note(0.02 * i, f"event {i}"))
-    writer.close(synthetic.SUMMARY)
-    assert writer.problem is None
-    return writer.path
-
-
-# --- the way out and back ----------------------------------------------------
 
 
 def test_a_flight_comes_back(tmp_path: Path) -> None:
@@ -179,275 +155,3 @@ def test_every_field_is_filled_by_something() -> None:
         )
         seen |= {key for key, value in record.items() if value is not None}
     assert set(FIELDS) - seen == {"var_m2"}  # this vehicle does not report it
-
-
-def _python(code: str, path: Path) -> subprocess.CompletedProcess[str]:
-    """Run the code in a process of its own, with the path as its argument."""
-    root = Path(__file__).resolve().parents[2]
-    command = [sys.executable, "-c", code, str(path)]
-    return subprocess.run(command, cwd=root, check=False, capture_output=True, text=True)
-
-
-# --- failures of the disk ----------------------------------------------------
-
-
-class FullDisk:
-    """`os.write` on a disk with `room` bytes left."""
-
-    def __init__(self, room: int) -> None:
-        self.room = room
-        self.real = os.write
-
-    def __call__(self, fd: int, data: Any) -> int:
-        if self.room == 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        part = bytes(data[: self.room])
-        self.room -= len(part)
-        return self.real(fd, part)
-
-
-def test_a_file_that_cannot_grow_never_raises_and_stays_whole(tmp_path: Path) -> None:
-    """A real failing write: the process may not let a file grow beyond 20 kB."""
-    path = tmp_path / "f.jsonl"
-    code = (
-        "import resource, signal, sys\n"
-        "from pathlib import Path\n"
-        "from perchctl.log.write import FlightLogWriter\n"
-        "from tests.helpers import log as synthetic\n"
-        "from tests.helpers.mission import note\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
-        "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header())\n"
-        "for i in range(300):\n"
-        "    w.write({'t_s': 0.02 * i, 'reason': 'x' * 200})\n"
-        "w.event(note(6.1, 'still flying'))\n"
-        "w.close(synthetic.SUMMARY)\n"
-        "print(w.lost_records, w.problem)\n"
-    )
-    lost, problem = _python(code, path).stdout.split(maxsplit=1)
-    assert int(lost) > 100
-    assert problem.startswith("the flight log cannot be written: File too large")
-    log = read_log(path)
-    assert log.truncated
-    assert log.ignored_bytes == 0  # no piece of a record was left behind
-    assert 0 < len(log.records) < 300
-
-
-def test_a_full_disk_that_gets_room_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    disk = FullDisk(room=100)
-    monkeypatch.setattr(os, "write", disk)
-    for i in range(10):
-        writer.write({"t_s": 0.02 * i, "phase": "SEARCH"})
-    assert writer.problem == "the flight log cannot be written: No space left on device"
-    lost = writer.lost_records
-    assert lost > 5
-    disk.room = 10**9
-    writer.write({"t_s": 0.21, "phase": "SEARCH"})  # too soon after the failure
-    assert writer.lost_records == lost + 1
-    writer.write({"t_s": 2.0, "phase": "ALIGN"})
-    writer.close(synthetic.SUMMARY)
-    log = read_log(writer.path)
-    assert log.records[-1]["phase"] == "ALIGN"
-    assert log.ignored_bytes == 0
-    assert log.summary is not None
-    assert log.summary["lost_records"] == lost + 1
-    assert log.summary["problem"] == writer.problem
-
-
-def test_a_value_that_has_no_place_in_a_log_never_raises(tmp_path: Path) -> None:
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    writer.write({"t_s": 0.0, "odd": object()})
-    assert writer.formless is not None
-    assert "object" in writer.formless
-    writer.close(synthetic.SUMMARY)
-    writer.close(synthetic.SUMMARY)
-    writer.write({"t_s": 5.0})
-    log = read_log(writer.path)
-    assert log.records == []
-    assert log.summary is not None
-
-
-class Unruly(Mapping[str, Any]):
-    """A record that fails as its line is made."""
-
-    def __init__(self, error: type[Exception]) -> None:
-        self._error = error
-
-    def __getitem__(self, key: str) -> Any:
-        raise self._error("odd")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(["t_s"])
-
-    def __len__(self) -> int:
-        return 1
-
-
-@pytest.mark.parametrize("live", [False, True])
-@pytest.mark.parametrize("error", [TypeError, ValueError, AttributeError, MemoryError])
-def test_a_record_without_a_form_costs_itself_alone(
-    tmp_path: Path, error: type[Exception], live: bool
-) -> None:
-    """The disk is well: nothing lands, what comes behind is written, and the end tells it."""
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=live)
-    log = LogWatcher(writer)
-    for i in range(4):
-        writer.write({"t_s": 0.02 * i, "odd": Unruly(error)} if i == 1 else {"t_s": 0.02 * i})
-    report = FlightReport(Phase.PERCHED, Outcome.PERCHED, "hanging", 1, 9.0, False)
-    summary = log.close(report)
-    assert log.problem is None
-    assert [r["t_s"] for r in read_log(writer.path).records] == [0.0, 0.04, 0.06]
-    (said,) = log.remarks()
-    assert "no form" in said
-    assert log.remarks() == []
-    assert summary is not None
-    assert (summary.lost_records, summary.log_problem) == (1, said)
-    end = read_log(writer.path).summary
-    assert end is not None
-    assert (end["lost_records"], end["problem"]) == (1, said)
-
-
-def test_fsync_about_once_a_second_and_its_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[int] = []
-
-    def failing(fd: int) -> None:
-        calls.append(fd)
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    monkeypatch.setattr(os, "fsync", failing)
-    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
-    for i in range(251):
-        writer.write({"t_s": 100.0 + 0.02 * i})
-    writer.close()
-    assert 2 <= len(calls) <= 6  # at most five while flying, one at the end
-    assert writer.problem is not None
-    assert writer.lost_records == 0
-
-
-def test_no_fsync_in_lockstep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "fsync", lambda fd: pytest.fail("fsync in lockstep"))
-    small_log(tmp_path / "f.jsonl", ticks=200)
-
-
-def test_a_folder_that_cannot_be_made_is_refused_before_the_flight(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidValue, match=r"log\.directory"):
-        FlightLogWriter.open(tmp_path / "file" / "f.jsonl", synthetic.header())
-
-
-def test_no_room_for_the_header_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "write", FullDisk(room=50))
-    with pytest.raises(InvalidValue, match="No space left"):
-        FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("failing", ["header", "thread"])
-def test_a_log_that_cannot_begin_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
-) -> None:
-    """Whatever the error: no file, no descriptor, no thread."""
-
-    def no_thread(*_: object) -> None:
-        raise RuntimeError("can't start new thread")
-
-    closed, threads = list[int](), threading.active_count()
-    close = os.close
-    monkeypatch.setattr(os, "close", lambda fd: (closed.append(fd), close(fd)))
-    if failing == "thread":
-        monkeypatch.setattr(write, "Behind", no_thread)
-    header = synthetic.header() | ({"odd": object()} if failing == "header" else {})
-    with pytest.raises((TypeError, ValueError, RuntimeError)):
-        FlightLogWriter.open(tmp_path / "f.jsonl", header, live=True)
-    assert list(tmp_path.iterdir()) == []
-    assert len(closed) == 1
-    assert threading.active_count() == threads
-
-
-# --- reading damaged files -------------------------------------------------------
-
-
-def test_any_cut_of_the_file_is_readable_behind_its_header(tmp_path: Path) -> None:
-    data = small_log(tmp_path / "f.jsonl").read_bytes()
-    header = data.index(b"\n") + 1
-    cut = tmp_path / "cut.jsonl"
-    for length in range(header, len(data) - 1):
-        cut.write_bytes(data[:length])
-        log = read_log(cut)
-        assert log.truncated
-        whole = data[:length].rfind(b"\n") + 1
-        # A last line that lacks only its newline is whole.
-        assert log.ignored_bytes in (length - whole, 0)
-        kept = len(log.records) + len(log.events) + (log.summary is not None)
-        assert kept == data[:whole].count(b"\n") - 1 + (length > whole and log.ignored_bytes == 0)
-
-
-def test_zeros_after_a_power_cut_are_ignored(tmp_path: Path) -> None:
-    path = small_log(tmp_path / "f.jsonl")
-    path.write_bytes(path.read_bytes() + b"\0" * 4096)
-    log = read_log(path)
-    assert len(log.records) == 5
-    assert log.ignored_bytes == 4096
-    assert log.truncated
-
-
-def test_a_killed_writer_leaves_a_readable_log(tmp_path: Path) -> None:
-    """A process that dies without a word, in the middle of its flight."""
-    path = tmp_path / "f.jsonl"
-    code = (
-        "import os, sys\n"
-        "from pathlib import Path\n"
-        "from perchctl.log.write import FlightLogWriter\n"
-        "from tests.helpers import log as synthetic\n"
-        "from tests.helpers.mission import note\n"
-        "w = FlightLogWriter.open(Path(sys.argv[1]), synthetic.header(), live=True)\n"
-        "for n, record in enumerate(synthetic.ticks()):\n"
-        "    w.write(record)\n"
-        "    while n == 150 and Path(sys.argv[1]).read_bytes().count(b'\\n') < 152: pass\n"
-        "    if n == 150: os.kill(os.getpid(), 9)\n"
-    )
-    done = _python(code, path)
-    assert done.returncode == -signal.SIGKILL
-    log = read_log(path)
-    assert len(log.records) == 151
-    assert log.truncated
-
-
-def test_not_a_flight_log(tmp_path: Path) -> None:
-    def refused(content: bytes, match: str) -> None:
-        path = tmp_path / "x.jsonl"
-        path.write_bytes(content)
-        with pytest.raises(InvalidValue, match=match):
-            read_log(path)
-
-    good = small_log(tmp_path / "f.jsonl").read_bytes().splitlines(keepends=True)
-    refused(b"", "line 1: the file is empty")
-    refused(b"\x89PNG\r\n\x1a\n" + bytes(100), "line 1: not a flight log")
-    refused(b'{"kind":"header"}\n', "line 1: not a flight log")
-    refused(b"[1]\n", "line 1: not a flight log")
-    refused(good[0][:-20], "line 1: not a flight log")
-    refused(good[0].replace(b'"version":4', b'"version":99'), "line 1: schema version 99")
-    refused(b"".join([*good[:3], b"garbage\n", *good[3:]]), "line 4: not a record")
-    refused(b"".join([*good[:3], b'{"kind":"tick"}\n', *good[3:]]), "line 4: .*t_s must be")
-    refused(b"".join([*good[:2], b'{"kind":"?","t_s":1}\n', *good[3:]]), "line 3: .*allowed are")
-    refused(b"".join([*good[:2], b'{"kind":"tick","t_s":NaN}\n', *good[3:]]), "line 3: .*NaN")
-    refused(b"".join([*good[:2], b"[" * 100_000 + b"\n", *good[3:]]), "line 3")
-
-
-def test_missing_files(tmp_path: Path) -> None:
-    with pytest.raises(NotFound, match="does not exist"):
-        read_log(tmp_path / "none.jsonl")
-    with pytest.raises(NotFound, match="is a folder"):
-        read_log(tmp_path)
-
-
-def test_columns(tmp_path: Path) -> None:
-    log = read_log(small_log(tmp_path / "f.jsonl"))
-    np.testing.assert_allclose(log.column("z_m"), [0.0, 0.1, 0.2, 0.3, 0.4])
-    assert np.isnan(log.column("ex_m")).all()
-    with pytest.raises(InvalidValue, match="phase is not a number"):
-        log.column("phase")
-    assert json.dumps(log.header)  # plain values only

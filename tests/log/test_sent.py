@@ -30,10 +30,10 @@ from perchctl.profile import load_profile
 from perchctl.report.story import story_of
 from perchctl.report.track import Track
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
-from tests.flight.test_loop import PROFILE, Clock
 from tests.flight.test_silent_loop import HANG_AT_S, hung_rig
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
+from tests.helpers.loop_rig import PROFILE, Clock
 from tests.helpers.mission import telemetry
 from tests.helpers.recorded import MemoryDisk
 

@@ -24,8 +24,8 @@ from perchctl.replay.run import Replay, replay
 from perchctl.replay.sense import Picture
 from perchctl.replay.told import replay_lines, replay_record
 from perchctl.vision.types import Frame
-from tests.flight.test_loop import PROFILE, Camera, Rig, SleepyClock, Vehicle
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
+from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle
 
 
 @dataclass

@@ -30,7 +30,7 @@ from perchctl.replay.shown import shown
 from perchctl.replay.told import replay_lines, replay_record
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import Frame
-from tests.flight.test_loop import PROFILE, Camera, Rig
+from tests.helpers.loop_rig import PROFILE, Camera, Rig
 from tests.replay.test_corpus import corpus
 from tests.replay.test_senses import begun, flown
 

@@ -14,10 +14,12 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.report.page import page_of
+from perchctl.report.plot import flight_plots
 from perchctl.report.told import Told, tell
+from perchctl.report.track import Track
 from perchctl.report.write import report_path_of
 from tests.helpers.commands import elsewhere, run  # noqa: F401 - a fixture
-from tests.helpers.told import Change, made, written
+from tests.helpers.told import Change, flown_s, made, written
 
 MOST_BYTES = 3_000_000
 VOID = {"meta", "img", "br"}
@@ -306,3 +308,32 @@ def test_the_command_refuses(
     said = run("log", "report", *words)
     assert said.code == code
     assert sentence in said.complaint
+
+
+@words_only
+def test_no_figure_is_parted_from_its_unit() -> None:
+    html = page_of([told()])
+    for parted in (r"\d (?:s|ms|mm|cm|V|mAh|px|deg)\b", r"\d %", r"\+- \d"):
+        inside = re.findall(rf"<(?:dd|span|figcaption)>[^<]*?({parted})", html)
+        assert not inside, inside
+
+
+def test_the_last_seconds_of_a_short_flight_begin_with_it() -> None:
+    """A flight that was killed soon has no time before its first turn to draw."""
+    flight = made(summary=None)
+    del flight.records[200:]
+    (figure,) = [svg for title, svg in flight_plots(Track(flight)) if "millimetres" in title]
+    times_s = re.findall(r"text-anchor: middle[^>]*>([^<]+)<", figure)
+    assert times_s
+    assert not any(text.startswith("\N{MINUS SIGN}") for text in times_s)
+
+
+def test_what_the_marks_at_the_bottom_mean_is_said() -> None:
+    def unseen(record: dict[str, Any]) -> None:
+        if 6.0 < flown_s(record) < 7.0:
+            record.update({key: None for key in record if re.match(r"[jls]x_m", key)})
+
+    figures = dict(flight_plots(Track(made(unseen))))
+    figure = figures["The target relative to the gear"]
+    assert "no target" in figure
+    assert "no picture" in figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from perchctl.report.track import Track
 from perchctl.report.write import told_of
 from perchctl.vision.types import Frame
 from tests.helpers import log as synthetic
-from tests.helpers.told import made, written
+from tests.helpers.told import flown_s, made, written
 
 
 def grey(number: int) -> np.ndarray:
@@ -66,3 +67,16 @@ def test_a_recording_that_is_none_costs_the_pictures_only(tmp_path: Path) -> Non
     assert "flight.mcap" in flight.picture_problem
     assert str(tmp_path) not in flight.picture_problem
     assert flight.outcome == "perched"
+
+
+def test_an_old_picture_says_from_when_it_is() -> None:
+    """The last centimetres are flown without one: it shows another moment than the contact's."""
+
+    def blind(record: dict[str, Any]) -> None:
+        if flown_s(record) > 14.5:
+            record.update(dict.fromkeys([key for key in record if key.startswith("frame")]))
+
+    (seen,) = [d for d in decisions_of(Track(made())) if d.name == "contact"]
+    (old,) = [d for d in decisions_of(Track(made(blind))) if d.name == "contact"]
+    assert "from" not in seen.caption
+    assert old.caption.startswith("contact, 15.2 s; the picture is from 14.5 s")

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
+
+from tests.helpers.crtp_rig import Client, Pilot
+
+if TYPE_CHECKING:
+    from perchctl.sim.process.handle import SimProcess
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
@@ -18,7 +24,6 @@ def toc_cache(tmp_path_factory: pytest.TempPathFactory) -> str:
 @pytest.fixture(scope="session")
 def shared_pilot(toc_cache: str) -> Iterator[object]:
     from perchctl.sim.process.handle import SimProcess
-    from tests.helpers.crtp_rig import Pilot
 
     with SimProcess.start(pace="stepped") as sim:
         pilot = Pilot(sim, toc_cache)
@@ -32,3 +37,21 @@ def shared_pilot(toc_cache: str) -> Iterator[object]:
 def pilot(shared_pilot: object) -> object:
     """The connection with a new 42 g vehicle, ready on the floor."""
     return shared_pilot.fresh()  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module")
+def sim() -> Iterator[SimProcess]:
+    from perchctl.sim.process.handle import SimProcess
+
+    with SimProcess.start(pace="stepped") as process:
+        process.advance(1.0)
+        yield process
+
+
+@pytest.fixture(scope="module")
+def client(sim: SimProcess, toc_cache: str) -> Iterator[Client]:
+    """A connection of its own, whose log blocks these tests may spoil."""
+    connection = Client(sim.uri, toc_cache)
+    assert connection.connect()
+    yield connection
+    connection.close()

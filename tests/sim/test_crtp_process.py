@@ -1,8 +1,7 @@
-"""The simulated vehicle's process: start, paces, video, and what happens without a parent."""
+"""The simulated vehicle's process: start, paces, and what happens without a parent."""
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
@@ -12,33 +11,18 @@ import subprocess
 import sys
 import threading
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 
-import perchctl
-from perchctl.calibration.files import load_calibration
-from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.profile.places import data_file
+from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.sim.crtp.codec import Packet, Port
-from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.child import main
-from perchctl.sim.process.control import HostSetup
 from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.mjpeg import MjpegServer
 from perchctl.sim.process.runner import MAX_LAG_S, Runner
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.vision.types import CameraModel
+from tests.helpers.crtp_process import ROOT, WAIT_S, wired
 from tests.helpers.crtp_rig import Client
-
-ROOT = str(Path(perchctl.__file__).resolve().parents[1])
-WAIT_S = 20.0
 
 
 def eventually(condition: Callable[[], bool], limit_s: float = WAIT_S) -> bool:
@@ -62,14 +46,6 @@ def alive(pid: int) -> bool:
 
 
 @pytest.fixture(scope="module")
-def camera() -> CameraModel:
-    path = data_file("calib", "example_640x480")
-    if path is None:
-        raise NotFound("the shipped calibration is missing")
-    return load_calibration(path)
-
-
-@pytest.fixture(scope="module")
 def stepped() -> Iterator[SimProcess]:
     """A process for the tests that leave it running."""
     with SimProcess.start(pace="stepped") as sim:
@@ -83,24 +59,6 @@ def live() -> Iterator[tuple[SimProcess, float]]:
     before_s = time.monotonic()
     with SimProcess.start(pace="realtime") as sim:
         yield sim, before_s
-
-
-@contextlib.contextmanager
-def wired(uri: str) -> Iterator[socket.socket]:
-    """A socket to a vehicle's link: one datagram, one packet."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
-        mine.connect(("127.0.0.1", int(uri.rsplit(":", 1)[1])))
-        mine.setblocking(False)
-        yield mine
-
-
-def received(mine: socket.socket) -> list[bytes]:
-    """The datagrams that have arrived."""
-    datagrams = []
-    with contextlib.suppress(BlockingIOError):
-        while True:
-            datagrams.append(mine.recv(64))
-    return datagrams
 
 
 # --- Handle -----------------------------------------------------------------------
@@ -252,6 +210,7 @@ def test_a_killed_child_is_reported() -> None:
 
 # --- Without a parent ----------------------------------------------------------------
 
+
 _PARENT = """
 import sys
 sys.path.insert(0, {root!r})
@@ -319,146 +278,3 @@ def test_a_foreign_connection_cannot_take_the_parents_place() -> None:
             channel.receive(5.0)
         channel.close()
         foreign.close()
-
-
-# --- Video ----------------------------------------------------------------------------
-
-
-def _parts(url: str, count: int) -> list[np.ndarray]:
-    """The first pictures of a stream, decoded."""
-    pictures = []
-    with urllib.request.urlopen(url, timeout=WAIT_S) as answer:
-        assert answer.headers.get_content_type() == "multipart/x-mixed-replace"
-        while len(pictures) < count:
-            line = answer.readline()
-            if line.lower().startswith(b"content-length:"):
-                length = int(line.split(b":")[1])
-                answer.readline()
-                raw = np.frombuffer(answer.read(length), np.uint8)
-                pictures.append(cv2.imdecode(raw, cv2.IMREAD_UNCHANGED))
-    return pictures
-
-
-def test_newest_picture_wins_for_several_clients() -> None:
-    server = MjpegServer()
-    try:
-        for grey in (10, 100, 200):
-            server.publish(np.full((48, 64), grey, np.uint8))
-        results: list[list[np.ndarray]] = []
-        watchers = [
-            threading.Thread(target=lambda: results.append(_parts(server.url, 1))) for _ in range(3)
-        ]
-        for watcher in watchers:
-            watcher.start()
-        for watcher in watchers:
-            watcher.join(WAIT_S)
-        assert len(results) == 3
-        for (picture,) in results:
-            assert picture.shape == (48, 64)  # grey
-            assert abs(float(picture.mean()) - 200) < 2
-        with pytest.raises(urllib.error.HTTPError) as refused:
-            urllib.request.urlopen(server.url.replace("stream", "other"), timeout=WAIT_S)
-        refused.value.close()
-        assert refused.value.code == 404
-    finally:
-        server.close()
-
-
-def test_a_taken_http_port_is_a_clear_error() -> None:
-    server = MjpegServer()
-    try:
-        port = int(server.url.split(":")[2].split("/")[0])
-        with pytest.raises(ConnectionFailed, match="choose another"):
-            MjpegServer(port)
-    finally:
-        server.close()
-
-
-def test_the_vehicles_picture_is_streamed(camera: CameraModel) -> None:
-    """In real time, rendering in its own thread; a stock reader opens it too."""
-    with SimProcess.start(Scenario(seed=1), "realtime", camera=camera) as sim:
-        pictures = _parts(sim.stream_url, 3)
-        width, height = camera.size_px
-        assert all(p.shape == (height, width) for p in pictures)
-        assert all(p.std() > 3.0 for p in pictures)
-        assert any(not np.array_equal(pictures[0], p) for p in pictures[1:])  # noise, motion
-        capture = cv2.VideoCapture(sim.stream_url, cv2.CAP_FFMPEG)
-        ok, frame = capture.read()
-        capture.release()
-        assert ok
-        assert frame.shape[:2] == (height, width)
-
-
-def test_stepped_pictures_come_with_the_time(camera: CameraModel) -> None:
-    with SimProcess.start(Scenario(seed=1), "stepped", camera=camera) as sim:
-        sim.advance(0.3)
-        (first,) = _parts(sim.stream_url, 1)
-        (again,) = _parts(sim.stream_url, 1)
-        assert np.array_equal(first, again)
-        sim.advance(0.1)
-        (later,) = _parts(sim.stream_url, 1)
-        assert not np.array_equal(first, later)
-
-
-# --- By hand -----------------------------------------------------------------------------
-
-
-def test_standalone_runs_until_ctrl_c() -> None:
-    command = [sys.executable, "-m", "perchctl.sim.process", "--port", "0", "--http-port", "0"]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": ROOT}
-    ) as process:
-        assert process.stdout is not None
-        uri = process.stdout.readline().split()[1]
-        stream = process.stdout.readline().split()[1]
-        assert uri.startswith("udp://127.0.0.1:")
-        assert len(_parts(stream, 1)) == 1
-        process.send_signal(signal.SIGINT)
-        assert process.wait(WAIT_S) == 0
-
-
-def test_standalone_reports_when_its_port_is_taken(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
-        mine.bind(("127.0.0.1", 0))
-        port = mine.getsockname()[1]
-        assert main(["--port", str(port), "--http-port", "0"]) == ConnectionFailed.exit_code
-    assert "choose another" in capsys.readouterr().err
-
-
-# --- Bad links, in this process ------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def hosted(link: LinkOptions) -> Iterator[VehicleHost]:
-    with contextlib.closing(VehicleHost(HostSetup(link=link), live=False)) as host:
-        yield host
-
-
-def test_lossy_link_is_the_same_for_a_seed() -> None:
-    """Loss is drawn by its own seed: the same packets are lost in each run."""
-
-    def answered(seed: int) -> list[int]:
-        with (
-            hosted(LinkOptions(loss_rate=0.3, loss_seed=seed)) as host,
-            wired(host.uri) as mine,
-        ):
-            for number in range(40):
-                mine.send(bytes((0xFC, number)))
-            host.step()  # all have been served by its end
-            return [datagram[1] for datagram in received(mine)]
-
-    first = answered(1)
-    assert 5 < len(first) < 35
-    assert answered(1) == first
-    assert answered(2) != first
-
-
-def test_silence_at_a_given_time() -> None:
-    """The peer goes silent by the simulated clock and comes back."""
-    link = LinkOptions(silent_from_s=0.2, silent_for_s=0.1)
-    with hosted(link) as host, wired(host.uri) as mine:
-        for number, answers in ((1, True), (2, False), (3, True)):
-            mine.send(bytes((0xFC, number)))
-            host.serve()
-            assert (bytes((0xFC, number)) in received(mine)) == answers
-            host.advance(0.21 if number == 1 else 0.1)

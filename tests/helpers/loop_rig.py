@@ -1,0 +1,245 @@
+"""A flight loop on a scripted vehicle, a scripted camera and a clock that nobody waits for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+from perchctl.flight.loop import FlightParts, fly
+from perchctl.flight.rescue import rescue
+from perchctl.link.mock import ScriptedLink
+from perchctl.mission.state import Operator
+from perchctl.mission.watch import Event, FlightReport, Tick
+from perchctl.pipeline import Pipeline, make_pipeline
+from perchctl.positioning.feed import FeedStatus
+from perchctl.profile import Profile
+from perchctl.vehicle import (
+    HL_ACTIVE,
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    StopMotors,
+    Telemetry,
+)
+from perchctl.vision.types import CameraModel, Frame
+from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
+
+SIZE_PX = (64, 48)
+
+
+CAMERA = CameraModel(
+    SIZE_PX, np.array([[40.0, 0.0, 32.0], [0.0, 40.0, 24.0], [0.0, 0.0, 1.0]]), np.zeros(5)
+)
+
+
+PROFILE = Profile()
+
+
+SETUP = make_pipeline(PROFILE, CAMERA)
+
+
+CLIMB_MPS = 0.5
+
+
+SINK_MPS = 0.4
+
+
+class Broken(RuntimeError):
+    pass
+
+
+class Vehicle(ScriptedLink):
+    """A scripted link that also does as it is told: takes off, lands, stops.
+
+    `changed` alters each sample; None leaves it out. `delay_s` later it has arrived.
+    """
+
+    def __init__(
+        self,
+        changed: Callable[[Telemetry], Telemetry | None] = lambda sample: sample,
+        delay_s: float = 0.01,
+    ) -> None:
+        super().__init__([])
+        self._changed = changed
+        self._delay_s = delay_s
+        self._samples: list[Telemetry] = []
+        self.z_m = 0.0
+        self._goal_m: float | None = None
+        self.by_itself = False
+        self.motors = False
+        self.by_itself = False
+        self._off_s = -math.inf
+
+    def advance_to(self, t_s: float) -> None:
+        while self.now_s < t_s - 1e-9:
+            self.now_s = min(self.now_s + 0.01, t_s)
+            self._live(0.01)
+
+    def telemetry(self) -> list[Telemetry]:
+        due_s = self.now_s - self._delay_s + 1e-9
+        arrived = [s for s in self._samples if s.t_s <= due_s]
+        self._samples = [s for s in self._samples if s.t_s > due_s]
+        return arrived
+
+    def send(self, command: Command) -> None:
+        super().send(command)
+        match command:
+            case PositionSetpoint(z_m=height):
+                self._goal_m, self.motors, self.by_itself = height, True, False
+            case Land(height, _):
+                self._goal_m, self.motors, self.by_itself = height, True, True
+            case StopMotors():
+                self._stop()
+
+    def _live(self, dt_s: float) -> None:
+        if self._goal_m is not None and self.motors:
+            way = self._goal_m - self.z_m
+            self.z_m += max(-SINK_MPS * dt_s, min(CLIMB_MPS * dt_s, way))
+            if self.by_itself and self.z_m <= 0.0 and self._goal_m <= 0.0:
+                self.z_m = 0.0
+                self._stop()
+        in_air = self.motors or self.now_s - self._off_s < 2.0
+        bits = AIRBORNE if in_air else READY
+        if self.motors and self.by_itself:
+            bits |= HL_ACTIVE
+        sample = telemetry(
+            self.now_s,
+            self.z_m,
+            supervisor=bits,
+            thrust=HOVER_THRUST if self.motors else 0.0,
+        )
+        changed = self._changed(sample)
+        if changed is not None:
+            self._samples.append(changed)
+
+    def _stop(self) -> None:
+        if self.motors:
+            self._off_s = self.now_s
+        self.motors = False
+
+    def said(self, kind: type) -> list[float]:
+        """When commands of that kind were sent."""
+        return [t_s for t_s, command in self.sent if isinstance(command, kind)]
+
+
+class Clock:
+    def __init__(self, link: ScriptedLink) -> None:
+        self._link = link
+
+    def now(self) -> float:
+        return self._link.now_s
+
+    def wait_until(self, t_s: float) -> None:
+        self._link.advance_to(max(t_s, self._link.now_s))
+
+
+class SleepyClock(Clock):
+    """A computer that is suspended once, at `at_s`, for `for_s`."""
+
+    def __init__(self, link: ScriptedLink, at_s: float, for_s: float) -> None:
+        super().__init__(link)
+        self._at_s, self._for_s = at_s, for_s
+        self._slept = False
+
+    def wait_until(self, t_s: float) -> None:
+        super().wait_until(t_s)
+        if not self._slept and self.now() >= self._at_s:
+            self._slept = True
+            self._link.advance_to(self.now() + self._for_s)
+
+
+def noise(number: int) -> np.ndarray:
+    rng = np.random.default_rng(number)
+    return rng.normal(120, 6, SIZE_PX[::-1]).clip(0, 255).astype(np.uint8)
+
+
+@dataclass
+class Camera:
+    """Gives a frame a tick; `alter` changes it, or None gives none."""
+
+    alter: Callable[[Frame], Frame | None] = lambda frame: frame
+    live: bool = True
+    frames: int | None = None
+    size_px: tuple[int, int] = SIZE_PX
+    count: int = 0
+    told: str | None = None
+
+    @property
+    def finished(self) -> bool:
+        return self.frames is not None and self.count >= self.frames
+
+    def poll(self, now_s: float) -> Frame | None:
+        if self.finished:
+            return None
+        self.count += 1
+        return self.alter(Frame(self.count, now_s - 0.05, noise(self.count), now_s))
+
+    def problem(self, now_s: float) -> str | None:
+        return self.told
+
+    def describe(self) -> str:
+        return "the scripted camera"
+
+    def close(self) -> None:
+        return None
+
+
+@dataclass
+class Watcher:
+    """Remembers what it saw; `on_tick` may raise, or steer."""
+
+    on_tick: Callable[[Tick], None] = lambda tick: None
+    ticks: list[Tick] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    problem: str | None = None
+
+    def tick(self, tick: Tick) -> None:
+        self.ticks.append(tick)
+        self.on_tick(tick)
+
+    def event(self, event: Event) -> None:
+        self.events.append(event)
+
+
+@dataclass
+class Rig:
+    """A vehicle, a camera, a watcher and a loop around them."""
+
+    link: Vehicle = field(default_factory=Vehicle)
+    camera: Camera = field(default_factory=Camera)
+    watcher: Watcher = field(default_factory=Watcher)
+    clock: Clock | None = None
+    profile: Profile = PROFILE
+    setup: Pipeline = SETUP
+    operator: Callable[[], Operator] = lambda: Operator.NONE
+    positions: Callable[[float], FeedStatus] | None = None
+
+    def parts(self) -> FlightParts:
+        return FlightParts(
+            self.link,
+            self.camera,
+            self.clock or Clock(self.link),
+            self.profile,
+            self.setup,
+            (self.watcher,),
+            self.operator,
+            positions=self.positions,
+        )
+
+    def fly(self) -> FlightReport:
+        return fly(self.parts())
+
+    def rescue(self, known: Telemetry | None, **more: Any) -> None:
+        landing = self.profile.planner.landing
+        rescue(self.link, self.clock or Clock(self.link), landing, self.operator, known, **more)
+
+    def refused(self, error: type[Exception], words: str) -> None:
+        with pytest.raises(error, match=words):
+            self.fly()
+        assert not [c for _, c in self.link.sent if not isinstance(c, Idle)]
