@@ -111,7 +111,7 @@ def fly_each(
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
     were flown. Errors: PerchError where none was.
     """
-    from perchctl.flight.campaign import job_processes
+    from perchctl.flight.hands import job_processes
 
     seeds = request.seeds
     results: list[R] = []
