@@ -16,6 +16,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
@@ -43,6 +44,7 @@ class Hands(Executor):
             threading.Thread(target=self._work, name=f"perchctl-hand-{i}", daemon=True)
             for i in range(count)
         ]
+        resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
         with uninterrupted():  # threads and processes have the mask of who starts them
             for thread in self._threads:
                 thread.start()

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -34,9 +35,9 @@ from perchctl.flight.campaign import FLOWN_AGAIN, fly_all
 from perchctl.flight.hands import job_processes
 from perchctl.flight.uninterrupted import uninterrupted
 from tests.helpers.flights import ROOT
-from tests.helpers.jobs import (
+from tests.helpers.jobs import campaign
+from tests.helpers.seeds import (
     Ended,
-    campaign,
     ends_at_once,
     ends_first_only,
     fails_later,
@@ -110,22 +111,30 @@ def test_a_signal_ends_the_flights_where_they_are(
 
 def test_a_signal_that_another_thread_takes_waits_too() -> None:
     """A library's own: its mask is its own, and Python's handler runs in the main thread."""
-    done: list[str] = []
+    done: list[bytes] = []
     over = threading.Event()
-    other = threading.Thread(target=over.wait)
-    other.start()
+    other = threading.Thread(target=over.wait, daemon=True)
+    taken, tell = socket.socketpair()
+    tell.setblocking(False)
+    taken.settimeout(AT_ONCE_S)
 
     def load() -> None:
         with uninterrupted():
             signal.pthread_kill(other.ident or 0, signal.SIGINT)
-            for _ in range(1000):
-                done.append("loading")
+            done.append(taken.recv(1))
+            done.append(b"loaded")
 
-    with pytest.raises(KeyboardInterrupt):
-        load()
-    over.set()
-    other.join()
-    assert len(done) == 1000
+    before = signal.set_wakeup_fd(tell.fileno())
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            load()
+    finally:
+        signal.set_wakeup_fd(before)
+        over.set()
+        taken.close()
+        tell.close()
+    assert done == [bytes([signal.SIGINT]), b"loaded"]
 
 
 def test_with_nothing_flown_there_is_nothing_to_report() -> None:
