@@ -37,7 +37,7 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     said = json.loads(campaign.stdout)
     assert set(said) == {
         "flights", "perched", "landed", "aborted", "locked", "fell",
-        "miss_m", "realtime_factor", "worst_seeds",
+        "miss_m", "rates", "realtime_factor", "peak_memory_mb", "worst_seeds",
     }  # fmt: skip
     assert set(said["miss_m"]) == {"median", "p95", "max"}
     assert [said[k] for k in ("flights", "perched", "landed", "aborted", "locked", "fell")] == [
@@ -46,6 +46,8 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
     assert said["realtime_factor"] > 0
     assert said["worst_seeds"] == []
+    assert said["rates"]["perched"] == {"rate": 1.0, "interval": [0.158114, 1.0]}
+    assert 50 < said["peak_memory_mb"] < 1000
     assert campaign.complaint == f"the flights' logs are in {logs}"
 
 

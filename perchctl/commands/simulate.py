@@ -52,12 +52,14 @@ def _campaign(request: SimulateRequest) -> int:
             print_record(and_problem(campaign_summary(results), problem))
         else:
             print(campaign_table(results), flush=True)
-        tell_logs(results, request.log_dir)
+        tell_logs(results, request.log_dir, request.keep)
 
-    return fly_each(
-        lambda executor, note: run_campaign(
-            profile, request.seeds, executor, note, request.log_dir, request.record
-        ),
-        request,
-        report,
-    )
+    with request.results(profile, FlightResult) as kept:
+        return fly_each(
+            lambda executor, note: run_campaign(
+                profile, kept.left, executor, note, request.log_dir, request.record
+            ),
+            request,
+            report,
+            kept,
+        )

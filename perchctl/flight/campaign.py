@@ -51,6 +51,10 @@ class LoggedFlight:
     def log_problem(self) -> str | None:
         return self.summary.log_problem
 
+    @property
+    def badness(self) -> tuple[bool]:
+        return (self.outcome != "perched",)
+
 
 def fly_seed(
     profile: Profile, seed: int, log_path: Path | None = None, record: bool = False

@@ -1,4 +1,5 @@
-"""A campaign of flights that are none; run as a program, one that says when its first is done, and then waits for a signal."""
+"""A campaign of flights that are none; run as a program, one that says when its first is done,
+and then waits for a signal."""
 
 from __future__ import annotations
 

@@ -20,6 +20,11 @@ class Ended:
     log_problem: str | None = None
     pid: int = 0
     deaf: bool = False  # to Ctrl-C and SIGTERM
+    log: Path | None = None
+
+    @property
+    def badness(self) -> tuple[bool]:
+        return (self.outcome != "perched",)
 
 
 def ends_at_once(seed: int) -> Ended:
