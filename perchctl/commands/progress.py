@@ -80,8 +80,8 @@ class _Count:
         return f"{60.0 * now / elapsed_s:.1f}/min {_clock_text(left_s)} left"
 
     def line(self) -> str | None:
-        """For what is no terminal, each `LINE_S` at most."""
-        if self._clock() - self.said_s < LINE_S:
+        """For what is no terminal, each `LINE_S` at most; the last flight's is the result's."""
+        if self.flown >= self.total or self._clock() - self.said_s < LINE_S:
             return None
         self.said_s = self._clock()
         return f"perchctl: flown {self.flown} of {self.total} {self.pace} {self.ends}"

@@ -168,7 +168,7 @@ def fly_each(
     seeds = request.seeds
     kept = kept or Kept(seeds, {}, lambda result: None)
     results: list[R] = list(kept.earlier)
-    jobs = min(request.jobs or 1, len(kept.left))
+    jobs = max(1, min(request.jobs or 1, len(kept.left)))
     problem: PerchError | None = None
     try:
         with (
