@@ -25,7 +25,7 @@ from perchctl.faults.truth import WatchedVehicle, sample_of
 from perchctl.flight.lockstep import LockstepSource
 from perchctl.flight.lockstep_positions import by_mocap, feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
-from perchctl.flight.memory import peak_memory_mb
+from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link.mock import MockLink
@@ -238,6 +238,7 @@ def fly_fault_seed(
     case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
     result = fly_with_fault(profile, case, scenario, log, record)
     cpu_s = time.process_time() - cpu_began_s
+    give_back_memory()
     return replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
 
 

@@ -17,7 +17,7 @@ import cv2
 
 from perchctl.errors import PerchError
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
-from perchctl.flight.memory import peak_memory_mb
+from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.results import FlightEnd, FlightResult
 from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.summary import FlightSummary
@@ -65,7 +65,7 @@ def fly_seed(
     began_s, cpu_began_s = time.perf_counter(), time.process_time()
     log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
     flight, summary = _flown(profile, seed, log)
-    return FlightResult(
+    result = FlightResult(
         seed=seed,
         outcome=_outcome(flight),
         reason=flight.report.reason,
@@ -81,6 +81,9 @@ def fly_seed(
         peak_memory_mb=peak_memory_mb(),
         scenario=flight.scenario,
     )
+    del flight
+    give_back_memory()
+    return result
 
 
 def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) -> LoggedFlight:
