@@ -17,6 +17,7 @@ from perchctl.cli.app import (
 )
 
 
+# long: a parameter for each option
 def simulate(
     flights: Annotated[
         int | None,
