@@ -18,8 +18,14 @@ SENTENCE = "Ctrl-C"
 
 def leave_at_ctrl_c() -> None:
     """From now on, unless Ctrl-C is ignored or somebody else's already."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if _is_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
+
+
+def _is_main() -> bool:
+    """Whether this is the thread that may have signals."""
+    threading = sys.modules.get("threading")
+    return threading is None or threading.current_thread() is threading.main_thread()
 
 
 def loaded() -> None:

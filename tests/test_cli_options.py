@@ -58,6 +58,10 @@ def test_a_note_stands_before_the_sentence_of_a_failure(
         ("--only 3 --faults all --heat-map m.png", ["--heat-map m.png does not apply"]),
         ("--faults list --log-dir x", ["flies nothing", "--log-dir x does not apply"]),
         ("--heat-map m.png", ["--faults"]),
+        ("--only 3 --out x.jsonl", ["--out x.jsonl does not apply"]),
+        ("--resume", ["--resume", "--out"]),
+        ("--keep failed", ["--keep", "--log-dir"]),
+        ("--keep best --log-dir x", ["--keep best", "all, failed and worst:N"]),
     ],
 )
 def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str]) -> None:

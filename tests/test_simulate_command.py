@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.flight.record import flown_record, result_from
 from perchctl.log.read import read_log
 from tests.helpers.commands import Said, elsewhere, run, run_apart  # noqa: F401
-from tests.helpers.flights import SEED, SHORT
+from tests.helpers.flights import ROOT, SEED, SHORT
 
 pytestmark = pytest.mark.long
 
@@ -29,7 +35,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def campaign(logs: Path) -> Said:
     """Two seeds, two at a time, with their logs."""
     arguments = ("-p", SHORT, "-n", "2", "--seed", str(SEED), "--jobs", "2", "--json")
-    return run_apart("simulate", *arguments, "--log-dir", str(logs))
+    out = logs.with_name("out.jsonl")
+    return run_apart("simulate", *arguments, "--log-dir", str(logs), "--out", str(out))
 
 
 def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
@@ -37,7 +44,7 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     said = json.loads(campaign.stdout)
     assert set(said) == {
         "flights", "perched", "landed", "aborted", "locked", "fell",
-        "miss_m", "realtime_factor", "worst_seeds",
+        "miss_m", "rates", "realtime_factor", "peak_memory_mb", "worst_seeds",
     }  # fmt: skip
     assert set(said["miss_m"]) == {"median", "p95", "max"}
     assert [said[k] for k in ("flights", "perched", "landed", "aborted", "locked", "fell")] == [
@@ -46,7 +53,54 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     assert 0 < said["miss_m"]["median"] <= said["miss_m"]["max"] < 0.020
     assert said["realtime_factor"] > 0
     assert said["worst_seeds"] == []
+    assert said["rates"]["perched"] == {"rate": 1.0, "interval": [0.158114, 1.0]}
+    assert 50 < said["peak_memory_mb"] < 1000
     assert campaign.complaint == f"the flights' logs are in {logs}"
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    """The whole ones."""
+    if not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_bytes().splitlines(True) if line[-1:] == b"\n"]
+
+
+def test_a_campaign_that_is_killed_goes_on_to_the_same_flights(
+    campaign: Said, logs: Path, tmp_path: Path
+) -> None:
+    """As two processes flew them."""
+    out = tmp_path / "out.jsonl"
+    asked = ["simulate", "-p", SHORT, "-n", "2", "--seed", str(SEED), "--out", str(out)]
+    with subprocess.Popen(
+        [sys.executable, "-m", "perchctl", *asked],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.DEVNULL,
+    ) as program:
+        end_s = time.monotonic() + 60.0
+        while len(_lines(out)) < 2 and time.monotonic() < end_s:
+            time.sleep(0.02)
+        program.kill()
+    assert [line["kind"] for line in _lines(out)] == ["header", "flight"]
+    resumed = run_apart(*asked, "--resume", "--json")
+    assert resumed.code == 0, resumed.stderr
+    figures = json.loads(resumed.stdout)
+    assert (figures["flights"], figures["perched"]) == (2, 2)
+    flights, others = (
+        sorted((flown_record(result_from(r)) for r in _flights(path)), key=lambda r: r["seed"])
+        for path in (out, logs.with_name("out.jsonl"))
+    )
+    assert flights == others
+    assert [flight["seed"] for flight in flights] == [SEED, SEED + 1]
+    again = run_apart(*asked, "--resume", "--json")
+    assert json.loads(again.stdout)["miss_m"] == figures["miss_m"]
+    assert len(_lines(out)) == 3
+
+
+def _flights(path: Path) -> list[dict[str, Any]]:
+    records = [line for line in _lines(path) if line.pop("kind") == "flight"]
+    assert all(record["scenario"]["seed"] == record["seed"] for record in records)
+    assert all(record["timings"]["cpu_s"] > 0 for record in records)
+    return records
 
 
 @pytest.fixture(scope="module")

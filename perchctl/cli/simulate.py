@@ -17,6 +17,7 @@ from perchctl.cli.app import (
 )
 
 
+# long: a parameter for each option
 def simulate(
     flights: Annotated[
         int | None,
@@ -53,6 +54,19 @@ def simulate(
     record: Annotated[
         bool, typer.Option("--record", help="Keep the pictures, in an MCAP file beside each log.")
     ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="JSONL file; each flight's result, as it ends."),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with --out: fly the seeds that it lacks.")
+    ] = False,
+    keep: Annotated[
+        str | None,
+        typer.Option(
+            "--keep", metavar="all|failed|worst:N", help="Of the logs in --log-dir; all by default."
+        ),
+    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -73,5 +87,8 @@ def simulate(
             faults=faults,
             heat_map=heat_map,
             force=force,
+            out=out,
+            resume=resume,
+            keep=keep,
         )
         perform(run, request)

@@ -1,10 +1,13 @@
-"""Bars of progress on stderr: on a terminal only, nothing in a pipe or a file."""
+"""Bars of progress on stderr: on a terminal only; in a pipe or a file nothing, or of campaigns a
+line now and then."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any, Protocol, TextIO
 
@@ -20,6 +23,7 @@ from rich.progress import (
 from rich.text import Text
 
 _REFRESH_HZ = 4
+LINE_S = 10.0
 
 
 class TimeLeft(ProgressColumn):
@@ -29,10 +33,14 @@ class TimeLeft(ProgressColumn):
     def render(self, task: Task) -> Text:
         if not task.completed or task.total is None or task.elapsed is None:
             return Text("")
-        left_s = round(task.elapsed / task.completed * (task.total - task.completed))
-        minutes, seconds = divmod(left_s, 60)
-        hours, minutes = divmod(minutes, 60)
-        return Text(f"{hours}:{minutes:02}:{seconds:02} left")
+        left_s = task.elapsed / task.completed * (task.total - task.completed)
+        return Text(f"{_clock_text(left_s)} left")
+
+
+def _clock_text(s: float) -> str:
+    minutes, seconds = divmod(round(s), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{seconds:02}"
 
 
 class Ended(Protocol):
@@ -42,17 +50,64 @@ class Ended(Protocol):
     def outcome(self) -> str: ...
 
 
+class _Count:
+    """What has been flown so far, and how fast."""
+
+    def __init__(self, total: int, earlier: Iterable[Ended], clock: Callable[[], float]) -> None:
+        self.total, self._clock = total, clock
+        self._ends = Counter(result.outcome for result in earlier)
+        self._before, self._began_s = self._ends.total(), clock()
+        self.said_s = self._began_s
+
+    def add(self, result: Ended) -> None:
+        self._ends[result.outcome] += 1
+
+    @property
+    def flown(self) -> int:
+        return self._ends.total()
+
+    @property
+    def ends(self) -> str:
+        return " ".join(f"{n} {end}" for end, n in self._ends.items())
+
+    @property
+    def pace(self) -> str:
+        """Flights a minute and time left; of those that were flown now."""
+        elapsed_s, now = self._clock() - self._began_s, self.flown - self._before
+        if not now or elapsed_s <= 0.0:
+            return ""
+        left_s = elapsed_s / now * (self.total - self.flown)
+        return f"{60.0 * now / elapsed_s:.1f}/min {_clock_text(left_s)} left"
+
+    def line(self) -> str | None:
+        """For what is no terminal, each `LINE_S` at most; the last flight's is the result's."""
+        if self.flown >= self.total or self._clock() - self.said_s < LINE_S:
+            return None
+        self.said_s = self._clock()
+        return f"perchctl: flown {self.flown} of {self.total} {self.pace} {self.ends}"
+
+
 @contextlib.contextmanager
-def progress_bar(total: int, stream: TextIO | None = None) -> Iterator[Callable[[Ended], None]]:
-    """Yields the function to call with each finished flight."""
-    ends: dict[str, int] = {}
-    columns = (TimeLeft(), TextColumn("{task.description}"))
-    with _bar("flights", *columns, total=total, stream=stream) as update:
+def progress_bar(
+    total: int,
+    stream: TextIO | None = None,
+    earlier: Iterable[Ended] = (),
+    clock: Callable[[], float] = time.monotonic,
+) -> Iterator[Callable[[Ended], None]]:
+    """Yields the function to call with each finished flight: a line of 80 columns that changes
+    on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before."""
+    count = _Count(total, earlier, clock)
+    stream = stream or sys.stderr
+    text = TextColumn("{task.description}")
+    with _bar("flights", text, total=total, stream=stream, width=8) as update:
+        update(completed=count.flown, description=count.ends)
 
         def advance(result: Ended) -> None:
-            ends[result.outcome] = ends.get(result.outcome, 0) + 1
-            text = ", ".join(f"{n} {end}" for end, n in ends.items())
-            update(advance=1, description=text)
+            count.add(result)
+            update(completed=count.flown, description=f"{count.pace} {count.ends}")
+            if not stream.isatty() and (line := count.line()) is not None:
+                with contextlib.suppress(OSError, ValueError):  # nobody reads any more
+                    print(line, file=stream, flush=True)
 
         yield advance
 
@@ -82,13 +137,14 @@ def _bar(
     total: int | None,
     stream: TextIO | None,
     wanted: bool = True,
+    width: int = 40,
 ) -> Iterator[Callable[..., Any]]:
     """Yields what changes the bar, as `Progress.update` does. stdout is left alone."""
     console = Console(file=stream or sys.stderr)
     if not (wanted and console.is_terminal):
         yield lambda **changes: None
         return
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), *more)
+    columns = (TextColumn(what), BarColumn(width), MofNCompleteColumn(), *more)
     with Progress(
         *columns, console=console, refresh_per_second=_REFRESH_HZ, redirect_stdout=False
     ) as progress:

@@ -15,8 +15,8 @@ from perchctl.commands.simulate_request import (
 )
 from perchctl.errors import PerchError, no_simulator
 from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
-from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.place import make_log_folder
+from perchctl.startup import leave_at_ctrl_c, loaded
 
 __all__ = ["SimulateRequest", "run"]
 
@@ -29,9 +29,13 @@ def run(request: SimulateRequest) -> int:
     request.check()
     if find_spec("mujoco") is None:
         raise no_simulator()
-    with uninterrupted():  # a library that is half loaded fails with words of its own
+    # A library that is half loaded fails with words of its own; nothing is open, nothing is lost.
+    leave_at_ctrl_c()
+    try:
         from perchctl.commands.simulate_faults import run_faults
         from perchctl.commands.simulate_only import run_only
+    finally:
+        loaded()
     if request.log_dir is not None:
         make_log_folder(request.log_dir)
     with signals_to(stop_once()):
@@ -52,12 +56,14 @@ def _campaign(request: SimulateRequest) -> int:
             print_record(and_problem(campaign_summary(results), problem))
         else:
             print(campaign_table(results), flush=True)
-        tell_logs(results, request.log_dir)
+        tell_logs(results, request.log_dir, request.keep)
 
-    return fly_each(
-        lambda executor, note: run_campaign(
-            profile, request.seeds, executor, note, request.log_dir, request.record
-        ),
-        request,
-        report,
-    )
+    with request.results(profile, FlightResult) as kept:
+        return fly_each(
+            lambda executor, note: run_campaign(
+                profile, kept.left, executor, note, request.log_dir, request.record
+            ),
+            request,
+            report,
+            kept,
+        )

@@ -37,20 +37,22 @@ def run_faults(request: SimulateRequest) -> int:
             print_record(and_problem(fault_summary(results), problem))
         else:
             print(fault_table(results), flush=True)
-        tell_logs(results, request.log_dir)
+        tell_logs(results, request.log_dir, request.keep)
         if request.heat_map is not None:
             from perchctl.faults.plot import plot_heat_map
 
             plot_heat_map(results, request.heat_map)
             say(f"{request.heat_map} is drawn")
 
-    return fly_each(
-        lambda executor, note: run_fault_campaign(
-            profile, request.seeds, names, executor, note, request.log_dir, request.record
-        ),
-        request,
-        report,
-    )
+    with request.results(profile, FaultResult, names) as kept:
+        return fly_each(
+            lambda executor, note: run_fault_campaign(
+                profile, kept.left, names, executor, note, request.log_dir, request.record
+            ),
+            request,
+            report,
+            kept,
+        )
 
 
 def _list(as_json: bool) -> None:

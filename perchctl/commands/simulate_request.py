@@ -5,29 +5,29 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from perchctl.commands.output import say
 from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import Ended, progress_bar
-from perchctl.errors import Interrupted, PerchError, UsageError
+from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output
+from perchctl.flight.kept import Judged, log_keeper
+from perchctl.flight.results_file import campaign_header, open_results
+from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.profile import Profile, load_profile
 
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
 
 
-class Seeded(Ended, Protocol):
+class Seeded(Ended, Judged, Protocol):
     """A flight's result, of whatever campaign."""
-
-    @property
-    def seed(self) -> int: ...
 
     @property
     def log_problem(self) -> str | None: ...
@@ -52,6 +52,9 @@ class SimulateRequest:
     force: bool = False
     positioning: str | None = None
     record: bool = False
+    out: Path | None = None
+    resume: bool = False
+    keep: str | None = None
 
     def loaded(self) -> Profile:
         """The profile with the command line on top. Errors: NotFound, InvalidValue."""
@@ -80,7 +83,14 @@ class SimulateRequest:
             "--seed": self.seed,
             "--jobs": self.jobs,
             "--heat-map": self.heat_map,
+            "--out": self.out,
         }
+        if self.resume and self.out is None:
+            raise UsageError("--resume goes on with a file of results: name it with --out")
+        if self.keep is not None:
+            if self.log_dir is None or self.only is not None:
+                raise UsageError("--keep chooses among a campaign's logs: log it with --log-dir")
+            log_keeper(self.keep)
         if self.faults == "list":
             others = {"--only": self.only, "--log-dir": self.log_dir}
             _refuse("--faults list flies nothing", {**many, **others}, "")
@@ -89,6 +99,46 @@ class SimulateRequest:
             _refuse(one, many, ", or --only")
         if self.heat_map is not None:
             check_output(self.heat_map, (".png",), self.force)
+        if self.out is not None and self.out.suffix != ".jsonl":
+            raise InvalidValue(f"{self.out} must end in .jsonl: a result is one line of JSON")
+
+    @contextlib.contextmanager
+    def results(
+        self, profile: Profile, kind: type[R], faults: Sequence[str] | None = None
+    ) -> Iterator[Kept[R]]:
+        """What becomes of each result: `--out`, `--resume`, `--keep`. Errors: InvalidValue."""
+        keep = log_keeper(self.keep or "all")
+        if self.out is None:
+            yield Kept(self.seeds, {}, keep)
+            return
+        header = campaign_header(profile, faults)
+        file = open_results(self.out, header, kind, self.resume, self.force)
+        try:
+            yield Kept(self.seeds, file.earlier, keep, file.append)
+        finally:
+            file.close()
+
+
+class Kept(Generic[R]):
+    """A campaign's results: those of a file of results, and those that come."""
+
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        earlier: Mapping[int, R],
+        keep_log: Callable[[R], None],
+        append: Callable[[R], None] = lambda result: None,
+    ) -> None:
+        self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
+        self.left = [seed for seed in seeds if seed not in earlier]
+        self._keep_log, self._append = keep_log, append
+        for result in self.earlier:
+            keep_log(result)
+
+    def note(self, result: R) -> None:
+        """As a flight ends."""
+        self._append(result)
+        self._keep_log(result)
 
 
 def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) -> None:
@@ -104,26 +154,29 @@ def fly_each(
     campaign: Callable[[Executor, Callable[[R], None]], object],
     request: SimulateRequest,
     report: Callable[[list[R], PerchError | None], None],
+    kept: Kept[R] | None = None,
 ) -> int:
     """Flies the request's seeds in processes of their own, and reports those that were flown,
     however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
 
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
-    were flown. Errors: PerchError where none was.
+    were flown. `kept`: those that were flown before, which count, too, and where each goes.
+    Errors: PerchError where none was.
     """
-    from perchctl.flight.campaign import job_processes
+    from perchctl.flight.hands import job_processes
 
     seeds = request.seeds
-    results: list[R] = []
-    jobs = min(request.jobs or 1, len(seeds))
+    kept = kept or Kept(seeds, {}, lambda result: None)
+    results: list[R] = list(kept.earlier)
+    jobs = max(1, min(request.jobs or 1, len(kept.left)))
     problem: PerchError | None = None
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            progress_bar(len(seeds)) as advance,
+            progress_bar(len(seeds), earlier=kept.earlier) as advance,
             job_processes(jobs) as executor,
         ):
-            campaign(executor, noting(results, advance))
+            campaign(executor, noting(results, kept.note, advance))
     except PerchError as error:
         problem = error
     flown = f"{len(results)} of {len(seeds)} flights were flown"
@@ -147,21 +200,24 @@ def and_problem(record: Mapping[str, Any], problem: PerchError | None) -> dict[s
     return {**record, "error": str(problem), "exit_code": problem.exit_code}
 
 
-def noting(results: list[R], advance: Callable[[R], None]) -> Callable[[R], None]:
-    """Keeps each result as it comes, and moves the bar."""
+def noting(results: list[R], *others: Callable[[R], None]) -> Callable[[R], None]:
+    """Keeps each result as it comes, and tells the others; a signal waits meanwhile."""
 
     def note(result: R) -> None:
-        results.append(result)
-        advance(result)
+        with uninterrupted():
+            results.append(result)
+            for tell in others:
+                tell(result)
 
     return note
 
 
-def tell_logs(results: Sequence[Seeded], log_dir: Path | None) -> None:
+def tell_logs(results: Sequence[Seeded], log_dir: Path | None, keep: str | None = None) -> None:
     """Where the logs are, and what they lack."""
     if log_dir is None or not results:
         return
-    say(f"the flights' logs are in {log_dir}")
+    kept = "the logs that are kept" if keep else "the flights' logs"
+    say(f"{kept} are in {log_dir}")
     problems = [result.log_problem for result in results if result.log_problem is not None]
     if problems:
         say(f"{len(problems)} of {len(results)} logs are incomplete: {problems[0]}")

@@ -25,9 +25,11 @@ from perchctl.faults.truth import WatchedVehicle, sample_of
 from perchctl.flight.lockstep import LockstepSource
 from perchctl.flight.lockstep_positions import by_mocap, feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
+from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link.mock import MockLink
+from perchctl.log.exact import to_exact
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import FlightReport, Watcher
@@ -231,9 +233,13 @@ def fly_fault_seed(
     from perchctl.faults.catalogue import BY_NAME
 
     cv2.setNumThreads(1)  # a job is one core
+    cpu_began_s = time.process_time()
     scenario = draw_scenario(profile, seed)
     case = draw_case(seed, scenario, [BY_NAME[name] for name in faults])
-    return fly_with_fault(profile, case, scenario, log, record)
+    result = fly_with_fault(profile, case, scenario, log, record)
+    cpu_s = time.process_time() - cpu_began_s
+    give_back_memory()
+    return replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
 
 
 def claim_of(report: FlightReport) -> Claim:
@@ -268,7 +274,7 @@ def _end_of(ended: _Ended) -> End:
 def _parameters(case: Case) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for effect in case.effects:
-        found[type(effect).__name__] = asdict(effect)
+        found[type(effect).__name__] = to_exact(asdict(effect))
     if case.landed_from is not None:
         found["landed_from"] = case.landed_from.value
         found["landed_after_s"] = case.landed_after_s

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from perchctl.faults.oracle import Flag
+from perchctl.faults.oracle import FLAGS, Flag
+from perchctl.sim.scenario import Scenario
 
 End = Literal["perched", "landed", "aborted", "refused", "gone"]
 """`refused`: never took off, or ended by an error; `gone`: the program ended before its flight."""
@@ -24,6 +25,7 @@ class FaultResult:
         drop_m: the deepest fall until caught, in the simulation's truth; `slip_ratio`: the
             magnet's hold over the weight, where that was a slip from the magnet.
         log, log_problem: the flight's log, and what it lacks; None without.
+        cpu_s, peak_memory_mb, scenario: as a `perchctl.flight.results.FlightResult` has them.
     """
 
     seed: int
@@ -46,7 +48,16 @@ class FaultResult:
     way: tuple[str, ...] = field(default=())
     log: Path | None = None
     log_problem: str | None = None
+    cpu_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    scenario: Scenario | None = None
 
     @property
     def outcome(self) -> str:
         return self.end
+
+    @property
+    def badness(self) -> tuple[bool, int, int, float]:
+        """The larger the worse: by the gravest flag that counts, by how many, then the misses."""
+        gravest = max((-FLAGS.index(flag) for flag in self.counted), default=-len(FLAGS))
+        return bool(self.counted), gravest, len(self.counted), self.miss_m or 0.0

@@ -10,7 +10,8 @@ from typing import Any, get_args
 from perchctl.faults.catalogue import AIR, FAULTS
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.result import End, FaultResult
-from perchctl.flight.results import aligned
+from perchctl.flight.rates import rate_record, rate_text
+from perchctl.flight.results import aligned, peak_mb
 
 ENDS: tuple[End, ...] = get_args(End)
 WORST = 20
@@ -23,14 +24,17 @@ HEADS = ("appr", "srch", "est", "align", "asc", "perch", "compl", "recov", "land
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     """Ready for JSON. The flags are counted outside the unavoidable; `unavoidable` is the
-    number of flights in which one was excused, `drop_m` the deepest slips from a magnet that
+    number of flights in which one was excused, `wrong` the share of flights with a flag and its
+    interval, `drop_m` the deepest slips from a magnet that
     held up to so much of the weight."""
     return {
         "flights": len(results),
         **{end: sum(r.end == end for r in results) for end in ENDS},
         **{flag: sum(flag in r.counted for r in results) for flag in FLAGS},
+        "wrong": rate_record(sum(bool(r.counted) for r in results), len(results)),
         "unavoidable": sum(_is_excused(r) for r in results),
         "drop_m": {name: _deepest_m(results, *bounds) for name, bounds in SLIPS.items()},
+        "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
 
@@ -60,6 +64,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     lines += ["", "a cell: flights, !k of them wrong, u: unavoidable among them", ""]
     ends = ", ".join(f"{figures[end]} {end}" for end in ENDS if figures[end])
     lines.append(f"flights            {figures['flights']}" + (f": {ends}" if ends else ""))
+    lines.append(f"with a flag        {rate_text(len(worst_first(results)), len(results))}")
     lines += [f"{flag.replace('_', ' '):<18} {figures[flag]}" for flag in FLAGS]
     lines.append(f"unavoidable        {figures['unavoidable']}")
     lines += [f"  {count} x {reason}" for reason, count in reasons(results).items()]

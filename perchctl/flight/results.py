@@ -5,12 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from perchctl.flight.memory import peak_memory_mb
+from perchctl.flight.rates import rate_record, rate_text
+from perchctl.sim.scenario import Scenario
+
 FlightEnd = Literal["perched", "landed", "aborted"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
+
+
+class Measured(Protocol):
+    """A flight's result, of whatever campaign."""
+
+    @property
+    def peak_memory_mb(self) -> float: ...
 
 
 @dataclass(frozen=True)
@@ -26,6 +37,10 @@ class FlightResult:
         locked: the supervisor had locked the vehicle at the end.
         fell: it hit the floor other than by landing.
         realtime_factor: loop time over wall time.
+        cpu_s: what it took of a core.
+        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
+            bytes).
+        scenario: what the seed drew.
         log, log_problem: the flight's log, and what it lacks; None without.
     """
 
@@ -40,10 +55,19 @@ class FlightResult:
     realtime_factor: float
     log: Path | None = None
     log_problem: str | None = None
+    cpu_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    scenario: Scenario | None = None
 
     @property
     def is_bad(self) -> bool:
         return self.outcome != "perched" or self.locked or self.fell
+
+    @property
+    def badness(self) -> tuple[bool, int, bool, float]:
+        """The larger the worse: bad ones by their end, then the misses."""
+        harmed = self.locked or self.fell
+        return self.is_bad, ENDS.index(self.outcome), harmed, self.miss_m or 0.0
 
 
 def campaign_summary(
@@ -51,10 +75,11 @@ def campaign_summary(
 ) -> dict[str, Any]:
     """A campaign's figures, ready for JSON.
 
-    `miss_m` is taken over the perched flights (None without any; p95 by linear
-    interpolation). `realtime_factor` is flight time over `wall_s`, or over the
-    sum of the flights' own wall times without it. `worst_seeds` names at most
-    `worst` flights, all of them bad.
+    `rates` has each end's share with its interval. `miss_m` is taken over the
+    perched flights (None without any; p95 by linear interpolation).
+    `realtime_factor` is flight time over `wall_s`, or over the sum of the
+    flights' own wall times without it. `worst_seeds` names at most `worst`
+    flights, all of them bad.
     """
     misses = [r.miss_m for r in results if r.outcome == "perched" and r.miss_m is not None]
     flown_s = sum(r.time_s for r in results)
@@ -63,6 +88,9 @@ def campaign_summary(
     return {
         "flights": len(results),
         **{end: sum(r.outcome == end for r in results) for end in ENDS},
+        "rates": {
+            end: rate_record(sum(r.outcome == end for r in results), len(results)) for end in ENDS
+        },
         "locked": sum(r.locked for r in results),
         "fell": sum(r.fell for r in results),
         "miss_m": {
@@ -71,8 +99,15 @@ def campaign_summary(
             "max": _rounded(max(misses)) if misses else None,
         },
         "realtime_factor": _rounded(flown_s / wall_s) if wall_s > 0 else None,
+        "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:worst]],
     }
+
+
+def peak_mb(results: Iterable[Measured]) -> float:
+    """The most that any process of the campaign ever held (1e6 bytes): this one, and those that
+    flew."""
+    return round(max([peak_memory_mb(), *(r.peak_memory_mb for r in results)]), 1)
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
@@ -131,8 +166,7 @@ def campaign_rows(
     flights = figures["flights"]
     rows = [("flights", str(flights))]
     for end in ENDS:
-        share = f" ({100.0 * figures[end] / flights:.1f} %)" if flights else ""
-        rows.append((end, f"{figures[end]}{share}"))
+        rows.append((end, rate_text(figures[end], flights)))
     rows += [("locked", str(figures["locked"])), ("fell", str(figures["fell"]))]
     miss = figures["miss_m"]
     if miss["max"] is not None:
@@ -146,4 +180,5 @@ def campaign_rows(
         rows.append(("attempts", f"mean {np.mean(attempts):.2f}, max {max(attempts)}"))
     if figures["realtime_factor"] is not None:
         rows.append(("real-time factor", f"{figures['realtime_factor']:.1f}"))
+    rows.append(("peak memory [MB]", f"{figures['peak_memory_mb']:.0f}"))
     return rows

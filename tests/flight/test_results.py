@@ -29,7 +29,7 @@ from tests.helpers import log as synthetic
 
 PERCHED = FlightResult(1, "perched", "hanging still", 0.004, 20.0, 1, False, False, 5.0)
 LANDED = FlightResult(2, "landed", "target not found", None, 30.0, 0, False, False, 5.0)
-ABORTED = FlightResult(3, "aborted", "tilted", None, 10.0, 1, True, True, 2.5)
+ABORTED = FlightResult(3, "aborted", "tilted", None, 10.0, 1, True, True, 2.5, peak_memory_mb=5e6)
 
 results_lists = st.lists(
     st.builds(
@@ -55,10 +55,12 @@ def test_a_campaign_of_three() -> None:
         "perched": 1,
         "landed": 1,
         "aborted": 1,
+        "rates": {end: {"rate": 0.333333, "interval": [0.008404, 0.905701]} for end in ENDS},
         "locked": 1,
         "fell": 1,
         "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
         "realtime_factor": 5.0,
+        "peak_memory_mb": 5e6,
         "worst_seeds": [3, 2],
     }
     without_wall = campaign_summary([PERCHED, LANDED, ABORTED])
@@ -112,7 +114,7 @@ def test_more_bad_flights_than_are_shown_are_counted() -> None:
 def test_table_says_what_happened() -> None:
     lines = campaign_table([PERCHED, LANDED, ABORTED], wall_s=12.0).splitlines()
     said = {line.split("  ")[0]: line for line in lines if line}
-    assert said["perched"].endswith("1 (33.3 %)")
+    assert said["perched"].endswith("1 of 3 (0.8 to 90.6 %)")
     assert said["miss [mm]"].endswith("median 4.0, p95 4.0, max 4.0 (seed 1)")
     assert said["flight time [s]"].endswith("median 20.0, max 30.0")
     assert said["attempts"].endswith("mean 0.67, max 1")
@@ -186,7 +188,35 @@ def test_progress(monkeypatch: pytest.MonkeyPatch) -> None:
             advance(LANDED)
     assert plain.getvalue() == ""
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
-    assert re.search(r"flights .* 2/2 .* left 1 perched, 1 landed", text)
+    assert re.search(r"flights .* 2/2 .*/min .* left 1 perched 1 landed", text)
+
+
+def test_progress_is_one_line_of_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "80")
+    terminal = Terminal()
+    earlier = [LANDED] * 12 + [ABORTED] * 3 + [PERCHED] * 900
+    now_s = [0.0]
+    with progress_bar(1000, terminal, earlier, lambda: now_s[0]) as advance:
+        now_s[0] = 60.0
+        for _ in range(10):
+            advance(PERCHED)
+    lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue()))
+    assert lines[-2].endswith("925/1000 10.0/min 0:07:30 left 12 landed 3 aborted 910 perched")
+    assert len(lines[-2]) <= 80
+
+
+def test_progress_elsewhere_is_a_line_now_and_then() -> None:
+    now_s = [0.0]
+    plain = io.StringIO()
+    with progress_bar(100, plain, [LANDED], lambda: now_s[0]) as advance:
+        for _ in range(12):
+            now_s[0] += 2.0
+            advance(PERCHED)
+    assert plain.getvalue().splitlines() == [
+        "perchctl: flown 6 of 100 30.0/min 0:03:08 left 1 landed 5 perched",
+        "perchctl: flown 11 of 100 30.0/min 0:02:58 left 1 landed 10 perched",
+    ]
 
 
 def test_the_time_left_is_known_from_the_first_flight_on() -> None:

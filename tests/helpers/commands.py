@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from perchctl.cli import app
 from tests.helpers.flights import ROOT
 
-ON_THE_WAY = ("perchctl: connecting", "perchctl: check: ")
+ON_THE_WAY = ("perchctl: connecting", "perchctl: check: ", "perchctl: flown ")
 
 
 @dataclass(frozen=True)

@@ -1,55 +1,17 @@
-"""Flights that are none, for tests of the processes that fly; run as a program, a campaign of
-them that says when its first is done, and then waits for a signal."""
+"""A campaign of flights that are none; run as a program, one that says when its first is done,
+and then waits for a signal."""
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.simulate_request import SimulateRequest, fly_each, stop_once
 from perchctl.errors import PerchError
 from perchctl.flight.campaign import fly_all
-
-FOR_EVER_S = 300.0
-
-
-@dataclass(frozen=True)
-class Ended:
-    seed: int
-    outcome: str = "perched"
-    log_problem: str | None = None
-    pid: int = 0
-    deaf: bool = False  # to Ctrl-C and SIGTERM
-
-
-def ends_at_once(seed: int) -> Ended:
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    return Ended(seed, pid=os.getpid(), deaf={signal.SIGINT, signal.SIGTERM} <= blocked)
-
-
-def ends_first_only(seed: int) -> Ended:
-    """The flight of seed 0 does, the others go on for ever."""
-    if seed:
-        time.sleep(FOR_EVER_S)
-    return ends_at_once(seed)
-
-
-def fails_later(seed: int) -> Ended:
-    if seed:
-        raise ZeroDivisionError("no such luck")
-    return ends_at_once(seed)
-
-
-def is_killed_later(seed: int) -> Ended:
-    if seed:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return ends_at_once(seed)
+from tests.helpers.seeds import Ended, ends_first_only
 
 
 def campaign(

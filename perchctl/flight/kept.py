@@ -1,0 +1,64 @@
+"""Which of a campaign's logs are kept."""
+
+from __future__ import annotations
+
+import heapq
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from perchctl.errors import UsageError
+from perchctl.log.recording.place import recording_of
+
+
+class Judged(Protocol):
+    """A flight's result, of whatever campaign."""
+
+    @property
+    def seed(self) -> int: ...
+
+    @property
+    def log(self) -> Path | None: ...
+
+    @property
+    def badness(self) -> tuple[Any, ...]:
+        """The larger the worse; the first part is whether it is bad at all."""
+        ...
+
+
+R = TypeVar("R", bound=Judged)
+
+
+def log_keeper(keep: str) -> Callable[[Judged], None]:
+    """To be called with each flight as it ends: removes the logs, with the recordings beside them,
+    that `keep` does not want: ``all``, ``failed``, or ``worst:N``. Errors: UsageError."""
+    if keep == "all":
+        return lambda result: None
+    if keep == "failed":
+        return lambda result: None if result.badness[0] else _remove(result.log)
+    found = re.fullmatch(r"worst:([1-9][0-9]{0,5})", keep)
+    if found is None:
+        raise UsageError(f"--keep {keep}: allowed are all, failed and worst:N, as in worst:5")
+    return _Worst(int(found[1]))
+
+
+class _Worst:
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._kept: list[tuple[tuple[Any, ...], int, str]] = []
+
+    def __call__(self, result: Judged) -> None:
+        if result.log is None:
+            return
+        heapq.heappush(self._kept, (result.badness, -result.seed, str(result.log)))
+        if len(self._kept) > self._count:
+            _remove(Path(heapq.heappop(self._kept)[2]))
+
+
+def _remove(log: Path | None) -> None:
+    if log is not None:
+        for path in (log, recording_of(log)):
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
