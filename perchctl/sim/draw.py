@@ -36,11 +36,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     battery_v = between(sim.battery_rest_v)
     latency_s = between(sim.camera_latency_s)
     noise_sigma = between(sim.camera_noise_sigma)
-    burst = None
-    burst_start_s = float(rng.uniform(4.0, 22.0))
-    if sim.camera_burst_frames is not None:
-        low, high = sim.camera_burst_frames
-        burst = (burst_start_s, int(rng.integers(low, high + 1)))
+    burst = _burst(sim, rng)
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
     drift = direction() * sim.drift_mps
     wind_angle = float(rng.uniform(-math.pi, math.pi))
@@ -73,6 +69,16 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         extra=_extra(profile),
         neighbours=_neighbours(sim),
     )
+
+
+def _burst(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, int] | None:
+    """Start and number of the frames that are lost in one go."""
+    start_s = float(rng.uniform(4.0, 22.0))
+    low, high = sim.camera_burst_frames or (0, 0)
+    if low == high:
+        rng.integers(2)  # numpy draws none of one number, and what comes later must stay
+    frames = int(rng.integers(low, high + 1))
+    return None if sim.camera_burst_frames is None else (start_s, frames)
 
 
 def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
