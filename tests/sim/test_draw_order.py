@@ -16,9 +16,7 @@ from perchctl.sim.draw import draw_points, draw_scenario
 def test_lost_frames_leave_what_is_drawn_after_them(frames: tuple[int, int] | None) -> None:
     profile = load_profile("sim")
     without = profile.model_copy(
-        update={
-            "simulation": profile.simulation.model_copy(update={"camera_burst_frames": frames})
-        }
+        update={"simulation": profile.simulation.model_copy(update={"camera_burst_frames": frames})}
     )
     for seed in range(20):
         whole = asdict(draw_scenario(profile, seed)) | {"camera_burst": None}
