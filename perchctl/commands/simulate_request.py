@@ -15,12 +15,17 @@ from typing import Any, Protocol, TypeVar
 from perchctl.commands.output import say
 from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import Ended, progress_bar
+from perchctl.commands.simulate_modes import MOST_UNTIL, check_modes
 from perchctl.errors import Interrupted, PerchError, UsageError
 from perchctl.files import check_output
 from perchctl.profile import Profile, load_profile
 
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
+
+
+class EnoughFlown(Exception):
+    """Raised where a result is noted: the flights that are left are not needed."""
 
 
 class Seeded(Ended, Protocol):
@@ -52,6 +57,11 @@ class SimulateRequest:
     force: bool = False
     positioning: str | None = None
     record: bool = False
+    compare: str | None = None
+    sweep: tuple[str, ...] = ()
+    until: str | None = None
+    minimise: int | None = None
+    output: Path | None = None
 
     def loaded(self) -> Profile:
         """The profile with the command line on top. Errors: NotFound, InvalidValue."""
@@ -62,7 +72,8 @@ class SimulateRequest:
         if self.only is not None:
             return [self.only]
         first = self.seed or 0
-        return list(range(first, first + (10 if self.flights is None else self.flights)))
+        flights = 10 if self.until is None else MOST_UNTIL
+        return list(range(first, first + (flights if self.flights is None else self.flights)))
 
     def log_folder(self, profile: Profile) -> Path:
         """Of one flight, which is always logged."""
@@ -71,8 +82,11 @@ class SimulateRequest:
     def check(self) -> None:
         """Errors: UsageError for an option that does not apply to what is asked for,
         InvalidValue for a place that nothing can be written to."""
-        if self.heat_map is not None and self.faults is None:
-            raise UsageError("--heat-map is drawn of faults: name them with --faults")
+        check_modes(self)
+        if self.heat_map is not None and self.faults is None and not self.sweep:
+            raise UsageError(
+                "--heat-map is drawn of faults, or of two keys: name them with --faults or --sweep"
+            )
         if self.record and self.only is None and self.log_dir is None:
             raise UsageError("--record writes beside the logs: name their folder with --log-dir")
         many: dict[str, int | Path | None] = {
@@ -89,6 +103,8 @@ class SimulateRequest:
             _refuse(one, many, ", or --only")
         if self.heat_map is not None:
             check_output(self.heat_map, (".png",), self.force)
+        if self.output is not None:
+            check_output(self.output, (".yaml", ".yml"), self.force)
 
 
 def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) -> None:
@@ -104,30 +120,35 @@ def fly_each(
     campaign: Callable[[Executor, Callable[[R], None]], object],
     request: SimulateRequest,
     report: Callable[[list[R], PerchError | None], None],
+    flights: int | None = None,
 ) -> int:
     """Flies the request's seeds in processes of their own, and reports those that were flown,
     however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
 
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
-    were flown. Errors: PerchError where none was.
+    were flown. `flights`: how many it flies, by default one a seed. Errors: PerchError where
+    none was.
     """
     from perchctl.flight.campaign import job_processes
 
-    seeds = request.seeds
+    total = len(request.seeds) if flights is None else flights
     results: list[R] = []
-    jobs = min(request.jobs or 1, len(seeds))
+    jobs = min(request.jobs or 1, total)
     problem: PerchError | None = None
+    enough = False
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            progress_bar(len(seeds)) as advance,
+            progress_bar(total) as advance,
             job_processes(jobs) as executor,
         ):
             campaign(executor, noting(results, advance))
     except PerchError as error:
         problem = error
-    flown = f"{len(results)} of {len(seeds)} flights were flown"
-    if problem is None and len(results) < len(seeds):
+    except EnoughFlown:
+        enough = True
+    flown = f"{len(results)} of {total} flights were flown"
+    if problem is None and len(results) < total and not enough:
         problem = Interrupted(f"stopped: {flown}")
     elif problem is not None:
         problem.args = (f"{problem}; {flown}",)

@@ -1,0 +1,89 @@
+"""What `perchctl simulate` may be asked together: the options that answer a question by flights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from perchctl.errors import UsageError
+
+if TYPE_CHECKING:
+    from perchctl.commands.simulate_request import SimulateRequest
+
+MOST_UNTIL = 10_000
+"""Flights of `--until` where -n does not say how many at the most."""
+_NARROWEST, _WIDEST = 0.01, 100.0
+_LOGS = ("--log-dir", "--record")
+_ANSWERS = ("--compare", "--sweep", "--until", "--minimise")
+_NOT_WITH: dict[str, tuple[tuple[str, ...], str]] = {
+    "--compare": (
+        (*_LOGS, "--heat-map", "--output"),
+        "flies each seed by two profiles, and prints a table",
+    ),
+    "--sweep": ((*_LOGS, "--output"), "flies each seed by many profiles, and keeps no logs"),
+    "--until": (("--heat-map", "--output"), "is a plain campaign that ends by itself"),
+    "--minimise": (
+        (*_LOGS, "-n", "--seed", "--heat-map"),
+        "flies one seed under other and other conditions",
+    ),
+}
+
+
+def check_modes(request: SimulateRequest) -> None:
+    """Errors: UsageError for options that do not go together."""
+    given = given_options(request)
+    asked = [name for name in (*_ANSWERS, "--faults", "--only") if name in given]
+    answers = [name for name in asked if name in _ANSWERS]
+    if answers and len(asked) > 1:
+        raise UsageError(
+            f"{' and '.join(asked)} do not go together: each flies its own seeds; ask for one "
+            f"after the other"
+        )
+    if not answers:
+        if "--output" in given:
+            raise UsageError("--output is the profile that --minimise finds: name its SEED, too")
+        return
+    others, what = _NOT_WITH[answers[0]]
+    wrong = [name for name in others if name in given]
+    if wrong:
+        does, it = ("does", "it") if len(wrong) == 1 else ("do", "them")
+        raise UsageError(
+            f"{answers[0]} {what}: {' and '.join(wrong)} {does} not apply; leave {it} out"
+        )
+    if "--heat-map" in given and len(request.sweep) != 2:
+        raise UsageError("--heat-map is drawn of two keys: give --sweep twice")
+    if request.until is not None:
+        width_of(request.until)
+
+
+def given_options(request: SimulateRequest) -> set[str]:
+    """The options that were given, by their names."""
+    values: dict[str, Any] = {
+        "--compare": request.compare,
+        "--sweep": request.sweep or None,
+        "--until": request.until,
+        "--minimise": request.minimise,
+        "--faults": request.faults,
+        "--only": request.only,
+        "-n": request.flights,
+        "--seed": request.seed,
+        "--heat-map": request.heat_map,
+        "--log-dir": request.log_dir,
+        "--record": request.record or None,
+        "--output": request.output,
+    }
+    return {name for name, value in values.items() if value is not None}
+
+
+def width_of(text: str) -> float:
+    """The width of an interval, as a share, of ``0.5%``. Errors: UsageError."""
+    number, sign, rest = text.partition("%")
+    try:
+        percent = float(number)
+    except ValueError:
+        percent = 0.0
+    if not sign or rest.strip() or not _NARROWEST <= percent < _WIDEST:
+        raise UsageError(
+            f"--until {text} must be a width in per cent, from {_NARROWEST:g}% to below "
+            f"{_WIDEST:g}%, as in --until 0.5%"
+        )
+    return percent / 100.0
