@@ -129,7 +129,7 @@ def fly_each(
     were flown. `flights`: how many it flies, by default one a seed. Errors: PerchError where
     none was.
     """
-    from perchctl.flight.campaign import job_processes
+    from perchctl.flight.hands import job_processes
 
     total = len(request.seeds) if flights is None else flights
     results: list[R] = []

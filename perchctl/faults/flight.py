@@ -28,6 +28,7 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link.mock import MockLink
+from perchctl.log.exact import to_exact
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import FlightReport, Watcher
@@ -268,7 +269,7 @@ def _end_of(ended: _Ended) -> End:
 def _parameters(case: Case) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for effect in case.effects:
-        found[type(effect).__name__] = asdict(effect)
+        found[type(effect).__name__] = to_exact(asdict(effect))
     if case.landed_from is not None:
         found["landed_from"] = case.landed_from.value
         found["landed_after_s"] = case.landed_after_s

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import (
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    as_completed,
-)
+from collections import Counter
+from collections.abc import Callable, Iterable
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from queue import SimpleQueue
+from typing import Any, TypeVar
 
 import cv2
 
-from perchctl.children import end_with_parent
 from perchctl.errors import PerchError
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
+from perchctl.flight.memory import peak_memory_mb
 from perchctl.flight.results import FlightEnd, FlightResult
 from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.summary import FlightSummary
@@ -39,6 +33,8 @@ OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.LANDED: "landed",
     Phase.ABORTED: "aborted",
 }
+FLOWN_AGAIN = 2
+"""Times that a flight may be lost with who flew it, and is flown again."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ def fly_seed(
     """Fly one seed of the profile's scenario; a function of its own so that any
     executor can carry it to another process or machine. `record`: with the pictures beside
     the log."""
-    began_s = time.perf_counter()
+    began_s, cpu_began_s = time.perf_counter(), time.process_time()
     log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
     flight, summary = _flown(profile, seed, log)
     return FlightResult(
@@ -77,6 +73,9 @@ def fly_seed(
         realtime_factor=flight.simulated_s / (time.perf_counter() - began_s),
         log=None if log is None else log.path,
         log_problem=None if summary is None else summary.log_problem,
+        cpu_s=time.process_time() - cpu_began_s,
+        peak_memory_mb=peak_memory_mb(),
+        scenario=flight.scenario,
     )
 
 
@@ -131,30 +130,63 @@ def fly_all(
     executor: Executor | None = None,
     on_result: Callable[[R], None] = lambda result: None,
 ) -> list[R]:
-    """`fly` of each seed, in the order of the seeds; `on_result` as they are done."""
-    seeds = list(seeds)
+    """`fly` of each seed, each once, in the order of the seeds; `on_result` as they are done.
+
+    `executor` is anything with ``submit(fly, seed)`` that returns a future of
+    `concurrent.futures`' kind; one that fails with `BrokenExecutor` was lost with who flew it,
+    and is flown again, `FLOWN_AGAIN` times at most. Errors: PerchError.
+    """
+    seeds = list(dict.fromkeys(seeds))
+    by_seed: dict[int, R] = {}
     if executor is None:
-        results = []
         for seed in seeds:
-            results.append(fly(seed))
-            on_result(results[-1])
-        return results
-    with uninterrupted():  # the executor starts its processes as flights are handed to it
-        futures = {executor.submit(fly, seed): seed for seed in seeds}
-    by_seed = {}
-    for future in as_completed(futures):
-        by_seed[futures[future]] = result = _result(future, futures[future])
-        on_result(result)
+            by_seed[seed] = fly(seed)
+            on_result(by_seed[seed])
+        return list(by_seed.values())
+    ended: SimpleQueue[tuple[int, Future[R]]] = SimpleQueue()
+
+    def hand_over(*some: int) -> None:
+        with uninterrupted():  # the executor may start processes as flights are handed to it
+            for seed in some:
+                _submitted(executor, fly, seed).add_done_callback(partial(_put, ended, seed))
+
+    hand_over(*seeds)
+    lost: Counter[int] = Counter()
+    while len(by_seed) < len(seeds):
+        seed, future = ended.get()
+        if _was_lost(future) and lost[seed] < FLOWN_AGAIN:
+            lost[seed] += 1
+            hand_over(seed)
+        else:
+            by_seed[seed] = result = _result(future, seed)
+            on_result(result)
     return [by_seed[seed] for seed in seeds]
+
+
+def _submitted(executor: Executor, fly: Callable[[int], R], seed: int) -> Future[R]:
+    try:
+        return executor.submit(fly, seed)
+    except BrokenExecutor as error:  # nobody is left who could fly it
+        future: Future[R] = Future()
+        future.set_exception(error)
+        return future
+
+
+def _put(ended: SimpleQueue[tuple[int, Future[R]]], seed: int, future: Future[R]) -> None:
+    ended.put((seed, future))
+
+
+def _was_lost(future: Future[Any]) -> bool:
+    return future.cancelled() or isinstance(future.exception(), BrokenExecutor)
 
 
 def _result(future: Future[R], seed: int) -> R:
     try:
         return future.result()
-    except BrokenExecutor:
+    except (BrokenExecutor, CancelledError):
         raise PerchError(
-            "a process that flew was ended from outside (where memory is short, fly fewer at a "
-            "time: --jobs)"
+            f"the process that flew seed {seed} was ended from outside, {1 + FLOWN_AGAIN} times "
+            f"in all (where memory is short, fly fewer at a time: --jobs)"
         ) from None
     except PerchError:
         raise
@@ -165,20 +197,3 @@ def _result(future: Future[R], seed: int) -> R:
             f"unforeseen {type(error).__name__} in the flight of seed {seed}: {error} "
             f"(PERCHCTL_DEBUG=1 shows where; please report it)"
         ) from error
-
-
-@contextlib.contextmanager
-def job_processes(jobs: int) -> Iterator[Executor]:
-    """So many processes that fly. Signals are this process's alone: left by an exception,
-    they are ended where they are; and they end where this one is killed."""
-    context = multiprocessing.get_context("spawn")
-    with uninterrupted():
-        executor = ProcessPoolExecutor(jobs, mp_context=context, initializer=end_with_parent)
-    try:
-        yield executor
-    except BaseException:
-        for child in context.active_children():
-            child.kill()
-        executor.shutdown(cancel_futures=True)
-        raise
-    executor.shutdown()

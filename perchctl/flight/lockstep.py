@@ -121,6 +121,7 @@ class LockstepFlight:
     locked: bool
     simulated_s: float
     touchdown_mps: float
+    scenario: Scenario
 
     @property
     def perched_miss_m(self) -> float | None:
@@ -197,6 +198,7 @@ def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> Loc
         locked=bool(vehicle.firmware.supervisor_info & LOCKED),
         simulated_s=vehicle.firmware.t_s,
         touchdown_mps=truth.touchdown_mps,
+        scenario=vehicle.scenario,
     )
 
 

@@ -9,6 +9,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from perchctl.sim.scenario import Scenario
+
 FlightEnd = Literal["perched", "landed", "aborted"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
 
@@ -26,6 +28,10 @@ class FlightResult:
         locked: the supervisor had locked the vehicle at the end.
         fell: it hit the floor other than by landing.
         realtime_factor: loop time over wall time.
+        cpu_s: what it took of a core.
+        peak_memory_mb: the most that the process that flew it had ever held by its end (1e6
+            bytes).
+        scenario: what the seed drew.
         log, log_problem: the flight's log, and what it lacks; None without.
     """
 
@@ -40,6 +46,9 @@ class FlightResult:
     realtime_factor: float
     log: Path | None = None
     log_problem: str | None = None
+    cpu_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    scenario: Scenario | None = None
 
     @property
     def is_bad(self) -> bool:

@@ -5,6 +5,7 @@ list of keys. A float is written by its shortest text that reads back to the sam
 and NaN as ``"inf"``, ``"-inf"``, ``"nan"``; a row of float64 as a list, any other array with its
 type and shape; an enum by its value; where a field takes one of several dataclasses, such as a
 command, the class's name stands before it. None is left out where it is the field's default.
+A field of type Any holds JSON's own types and comes back as them.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import typing
 from collections.abc import Callable
 from enum import Enum
 from functools import cache
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -119,6 +121,8 @@ def _writer_for(kind: Any) -> _Plan:
         return _fields_writer(kind)
     if issubclass(kind, np.generic):
         return _array_to
+    if issubclass(kind, PurePath):
+        return str
     raise TypeError(f"{kind.__name__} has no exact form in a flight log")
 
 
@@ -166,6 +170,10 @@ def _decoder_of(members: list[Any]) -> _Plan:
         return hint
     if hint in (bool, int, float, str):
         return lambda data: _plain_from(data, hint)
+    if hint is Path:
+        return lambda data: Path(_plain_from(data, str))
+    if hint is Any:
+        return _as_it_is
     raise TypeError(f"{hint} has no exact form in a flight log")
 
 

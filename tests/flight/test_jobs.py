@@ -8,8 +8,12 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -26,6 +30,8 @@ from perchctl.commands.simulate_request import (
     tell_logs,
 )
 from perchctl.errors import Interrupted, PerchError
+from perchctl.flight.campaign import FLOWN_AGAIN, fly_all
+from perchctl.flight.hands import job_processes
 from perchctl.flight.uninterrupted import uninterrupted
 from tests.helpers.flights import ROOT
 from tests.helpers.jobs import (
@@ -35,6 +41,8 @@ from tests.helpers.jobs import (
     ends_first_only,
     fails_later,
     is_killed_later,
+    is_lost,
+    no_form,
 )
 
 pytestmark = pytest.mark.long
@@ -100,6 +108,26 @@ def test_a_signal_ends_the_flights_where_they_are(
     assert capsys.readouterr().err == "perchctl: stopped: 1 of 6 flights were flown\n"
 
 
+def test_a_signal_that_another_thread_takes_waits_too() -> None:
+    """A library's own: its mask is its own, and Python's handler runs in the main thread."""
+    done: list[str] = []
+    over = threading.Event()
+    other = threading.Thread(target=over.wait)
+    other.start()
+
+    def load() -> None:
+        with uninterrupted():
+            signal.pthread_kill(other.ident or 0, signal.SIGINT)
+            for _ in range(1000):
+                done.append("loading")
+
+    with pytest.raises(KeyboardInterrupt):
+        load()
+    over.set()
+    other.join()
+    assert len(done) == 1000
+
+
 def test_with_nothing_flown_there_is_nothing_to_report() -> None:
     def flown(_executor: object, _note: object) -> None:
         signal.raise_signal(signal.SIGINT)
@@ -142,6 +170,46 @@ def test_a_flight_that_fails_loses_none_of_the_others(
     said = capsys.readouterr().err
     assert words in said
     assert said.endswith("; 1 of 3 flights were flown\n")
+
+
+@pytest.mark.parametrize("times", [1, FLOWN_AGAIN])
+def test_a_lost_flight_is_flown_again_and_counted_once(times: int, tmp_path: Path) -> None:
+    """And those that others were flying meanwhile are flown once."""
+    fly = partial(is_lost, folder=tmp_path, times=times)
+    told: list[int] = []
+    with job_processes(2) as hands:
+        results = fly_all(fly, [0, 1, 2, 1, 3], hands, lambda result: told.append(result.seed))
+    assert [result.seed for result in results] == [0, 1, 2, 3]
+    assert sorted(told) == [0, 1, 2, 3]
+    flown = Counter(path.name[0] for path in tmp_path.iterdir())
+    assert flown == {"0": 1, "1": 1 + times, "2": 1, "3": 1}
+
+
+def test_a_flight_that_is_lost_always_is_told(tmp_path: Path) -> None:
+    fly = partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN + 1)
+    with (
+        pytest.raises(PerchError, match="flew seed 1 was ended from outside, 3 times in all"),
+        job_processes(1) as hands,
+    ):
+        fly_all(fly, [1], hands)
+    assert len(list(tmp_path.iterdir())) == FLOWN_AGAIN + 1
+
+
+def test_any_executor_that_breaks_for_good_is_told() -> None:
+    class Broken(Executor):
+        def submit(self, fn: object, /, *args: object, **kwargs: object) -> Future[Ended]:  # type: ignore[override]
+            raise BrokenExecutor
+
+    with pytest.raises(PerchError, match="flew seed 5 was ended from outside"):
+        fly_all(ends_at_once, [5], Broken())
+
+
+def test_what_has_no_form_is_told_and_ends_no_process() -> None:
+    with job_processes(1) as hands:
+        assert isinstance(hands.submit(no_form).exception(), RuntimeError)
+        assert hands.submit(len, (1, 2)).result() == 2
+        assert hands.submit(lambda: None).exception() is not None
+        assert hands.submit(len, ()).result() == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -4,12 +4,14 @@ them that says when its first is done, and then waits for a signal."""
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.simulate_request import SimulateRequest, fly_each, stop_once
@@ -43,6 +45,19 @@ def ends_first_only(seed: int) -> Ended:
 def fails_later(seed: int) -> Ended:
     if seed:
         raise ZeroDivisionError("no such luck")
+    return ends_at_once(seed)
+
+
+def no_form() -> object:
+    return lambda: None
+
+
+def is_lost(seed: int, folder: Path, times: int) -> Ended:
+    """The flight of seed 1 loses its process so many times; each flight leaves a mark."""
+    mark = folder / f"{seed}_{secrets.token_hex(4)}"
+    mark.touch()
+    if seed == 1 and len(list(folder.glob("1_*"))) <= times:
+        os.kill(os.getpid(), signal.SIGKILL)
     return ends_at_once(seed)
 
 
