@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ from perchctl.commands.progress import count_bar
 from perchctl.commands.simulate_request import SimulateRequest
 from perchctl.errors import Interrupted, InvalidValue
 from perchctl.files import write_files
-from perchctl.flight.campaign import fly_all, job_processes
+from perchctl.flight.campaign import fly_all
 from perchctl.flight.conditions import Condition, Conditions, conditions_of
 from perchctl.flight.failure import Ended, fly_to_its_end, minimised_failure
+from perchctl.flight.hands import job_processes
 from perchctl.log.jsonl import to_plain
 from perchctl.profile.load import is_path
 from perchctl.profile.written import scalar_text
@@ -36,8 +38,6 @@ def run_minimise(request: SimulateRequest) -> int:
 
     Errors: NotFound, InvalidValue (a seed that perches, too), Interrupted before it has failed.
     """
-    from functools import partial
-
     assert request.minimise is not None
     seed, profile = request.minimise, request.loaded()
     conditions = conditions_of(profile, seed)
