@@ -9,6 +9,7 @@ asked together err together in one comparison of twenty at most: each gets its p
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +25,8 @@ FEWEST_PAIRS = 8
 RESAMPLES = 9999
 _MOST_AT_ONCE = 500
 _SEED = 0
+_SAME = 1e-9
+"""Values that differ by less of themselves do so by rounding."""
 NOT_PROVEN = "no difference proven"
 
 
@@ -168,13 +171,15 @@ def _difference(
 
 def mean_interval(values: np.ndarray, level: float = LEVEL) -> tuple[float, float]:
     """The bootstrap's interval of the mean; the same for the same values."""
-    if np.ptp(values) == 0.0:
+    if np.ptp(values) <= _SAME * np.max(np.abs(values)):
         return float(values[0]), float(values[0])
-    for method in ("BCa", "percentile"):  # few values that are not the same leave BCa without
-        found = bootstrap(
-            (values,), np.mean, n_resamples=RESAMPLES, batch=_MOST_AT_ONCE, method=method,
-            confidence_level=level, rng=np.random.default_rng(_SEED),
-        ).confidence_interval  # fmt: skip
+    for method in ("BCa", "percentile"):
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")  # of values for which BCa has no answer
+            found = bootstrap(
+                (values,), np.mean, n_resamples=RESAMPLES, batch=_MOST_AT_ONCE, method=method,
+                confidence_level=level, rng=np.random.default_rng(_SEED),
+            ).confidence_interval  # fmt: skip
         low, high = float(found.low), float(found.high)
         if math.isfinite(low) and math.isfinite(high):
             break
