@@ -44,6 +44,6 @@ def test_a_record() -> None:
 
 def test_what_is_no_rate_is_refused() -> None:
     for k, n, level in ((3, 2, 0.95), (-1, 2, 0.95), (1, 2, 1.0)):
-        with pytest.raises(ValueError, match="is no rate|a level is between"):
+        with pytest.raises(ValueError, match=r"is no rate|a level is between"):
             rate_interval(k, n, level)
     assert rate_interval(0, 0) == (0.0, 1.0)

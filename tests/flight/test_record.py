@@ -75,5 +75,5 @@ def test_what_is_no_result_is_refused() -> None:
         {**record, "more": 1},
         {**record, "timings": 1},
     ):
-        with pytest.raises(ValueError, match="needed|none of|no field|missing"):
+        with pytest.raises(ValueError, match=r"needed|none of|no field|missing"):
             result_from(wrong)
