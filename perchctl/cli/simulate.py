@@ -18,6 +18,7 @@ from perchctl.cli.app import (
 from perchctl.cli.complete import complete_profile
 
 
+# long: a list of options
 def simulate(
     flights: Annotated[
         int | None,

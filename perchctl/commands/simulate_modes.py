@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 from perchctl.errors import UsageError
-
-if TYPE_CHECKING:
-    from perchctl.commands.simulate_request import SimulateRequest
 
 MOST_UNTIL = 10_000
 """Flights of `--until` where -n does not say how many at the most."""
@@ -28,9 +26,10 @@ _NOT_WITH: dict[str, tuple[tuple[str, ...], str]] = {
 }
 
 
-def check_modes(request: SimulateRequest) -> None:
-    """Errors: UsageError for options that do not go together."""
-    given = given_options(request)
+def check_modes(options: Mapping[str, Any]) -> None:
+    """By the options' names; None or an empty tuple was not given. Errors: UsageError for options
+    that do not go together."""
+    given = {name: value for name, value in options.items() if value is not None and value != ()}
     asked = [name for name in (*_ANSWERS, "--faults", "--only") if name in given]
     answers = [name for name in asked if name in _ANSWERS]
     if answers and len(asked) > 1:
@@ -49,29 +48,10 @@ def check_modes(request: SimulateRequest) -> None:
         raise UsageError(
             f"{answers[0]} {what}: {' and '.join(wrong)} {does} not apply; leave {it} out"
         )
-    if "--heat-map" in given and len(request.sweep) != 2:
+    if "--heat-map" in given and len(given["--sweep"]) != 2:
         raise UsageError("--heat-map is drawn of two keys: give --sweep twice")
-    if request.until is not None:
-        width_of(request.until)
-
-
-def given_options(request: SimulateRequest) -> set[str]:
-    """The options that were given, by their names."""
-    values: dict[str, Any] = {
-        "--compare": request.compare,
-        "--sweep": request.sweep or None,
-        "--until": request.until,
-        "--minimise": request.minimise,
-        "--faults": request.faults,
-        "--only": request.only,
-        "-n": request.flights,
-        "--seed": request.seed,
-        "--heat-map": request.heat_map,
-        "--log-dir": request.log_dir,
-        "--record": request.record or None,
-        "--output": request.output,
-    }
-    return {name for name, value in values.items() if value is not None}
+    if "--until" in given:
+        width_of(given["--until"])
 
 
 def width_of(text: str) -> float:

@@ -79,10 +79,27 @@ class SimulateRequest:
         """Of one flight, which is always logged."""
         return self.log_dir or Path(profile.log.directory)
 
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {
+            "--compare": self.compare,
+            "--sweep": self.sweep,
+            "--until": self.until,
+            "--minimise": self.minimise,
+            "--faults": self.faults,
+            "--only": self.only,
+            "-n": self.flights,
+            "--seed": self.seed,
+            "--heat-map": self.heat_map,
+            "--log-dir": self.log_dir,
+            "--record": self.record or None,
+            "--output": self.output,
+        }
+
     def check(self) -> None:
         """Errors: UsageError for an option that does not apply to what is asked for,
         InvalidValue for a place that nothing can be written to."""
-        check_modes(self)
+        check_modes(self._options)
         if self.heat_map is not None and self.faults is None and not self.sweep:
             raise UsageError(
                 "--heat-map is drawn of faults, or of two keys: name them with --faults or --sweep"
