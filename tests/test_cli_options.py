@@ -62,6 +62,17 @@ def test_a_note_stands_before_the_sentence_of_a_failure(
         ("--resume", ["--resume", "--out"]),
         ("--keep failed", ["--keep", "--log-dir"]),
         ("--keep best --log-dir x", ["--keep best", "all, failed and worst:N"]),
+        ("--compare sim --sweep a.b=1", ["--compare and --sweep do not go together"]),
+        ("--only 3 --minimise 4", ["--minimise and --only do not go together"]),
+        ("--until 1% --faults all", ["--until and --faults do not go together"]),
+        ("--compare sim --log-dir x", ["--log-dir does not apply", "leave it out"]),
+        ("--minimise 3 -n 5 --seed 1", ["-n and --seed do not apply", "leave them out"]),
+        ("--until 1% --heat-map m.png", ["--heat-map does not apply"]),
+        ("--sweep planner.attempts=1 --heat-map m.png", ["two keys", "--sweep twice"]),
+        ("-o a.yaml", ["--minimise"]),
+        ("--until 5", ["per cent", "--until 0.5%"]),
+        ("--until nan%", ["per cent"]),
+        ("--until 100%", ["below 100%"]),
     ],
 )
 def test_options_that_do_not_apply_are_refused(arguments: str, words: list[str]) -> None:

@@ -15,6 +15,7 @@ from perchctl.cli.app import (
     perform,
     reported,
 )
+from perchctl.cli.complete import complete_profile
 
 
 # long: a parameter for each option
@@ -46,7 +47,8 @@ def simulate(
         ),
     ] = None,
     heat_map: Annotated[
-        Path | None, typer.Option("--heat-map", help="PNG of faults against phases.")
+        Path | None,
+        typer.Option("--heat-map", help="PNG of faults against phases, or of two swept keys."),
     ] = None,
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Log the flights, into this folder.")
@@ -66,6 +68,47 @@ def simulate(
         typer.Option(
             "--keep", metavar="all|failed|worst:N", help="Of the logs in --log-dir; all by default."
         ),
+    ] = None,
+    compare: Annotated[
+        str | None,
+        typer.Option(
+            "--compare",
+            metavar="OTHER_PROFILE",
+            help="Fly each seed by this profile (B), too: what differs, and what of it is proven.",
+            autocompletion=complete_profile,
+        ),
+    ] = None,
+    sweep: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sweep",
+            metavar="KEY=VALUE,VALUE",
+            help="A key of the profile at several values, each over the same seeds; twice: each "
+            "with each.",
+        ),
+    ] = None,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            "--until",
+            metavar="WIDTH%",
+            help="Fly until the 95 % interval of the success rate, from its lower to its upper "
+            "end, is narrower, as 0.5%; -n is the most then, 10000 by default.",
+        ),
+    ] = None,
+    minimise: Annotated[
+        int | None,
+        typer.Option(
+            "--minimise",
+            metavar="SEED",
+            min=0,
+            help="Tone a failing seed's conditions down to those that make it fail, and print "
+            "them as a profile.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="YAML file for the profile of --minimise."),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -90,5 +133,10 @@ def simulate(
             out=out,
             resume=resume,
             keep=keep,
+            compare=compare,
+            sweep=tuple(sweep or ()),
+            until=until,
+            minimise=minimise,
+            output=output,
         )
         perform(run, request)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.util import find_spec
 
 from perchctl.commands.interrupt import signals_to
@@ -43,7 +44,32 @@ def run(request: SimulateRequest) -> int:
             return run_faults(request)
         if request.only is not None:
             return run_only(request)
+        answer = _answer(request)
+        if answer is not None:
+            return answer(request)
         return _campaign(request)
+
+
+def _answer(request: SimulateRequest) -> Callable[[SimulateRequest], int] | None:
+    """What answers the question that was asked; None: it is a plain campaign."""
+    with uninterrupted():
+        if request.compare is not None:
+            from perchctl.commands.simulate_compare import run_compare
+
+            return run_compare
+        if request.sweep:
+            from perchctl.commands.simulate_sweep import run_sweep
+
+            return run_sweep
+        if request.until is not None:
+            from perchctl.commands.simulate_until import run_until
+
+            return run_until
+        if request.minimise is not None:
+            from perchctl.commands.simulate_minimise import run_minimise
+
+            return run_minimise
+    return None
 
 
 def _campaign(request: SimulateRequest) -> int:

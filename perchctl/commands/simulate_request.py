@@ -10,20 +10,25 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from perchctl.commands.output import say
 from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import Ended, progress_bar
+from perchctl.commands.simulate_modes import MOST_UNTIL, check_modes
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output
-from perchctl.flight.kept import Judged, log_keeper
+from perchctl.flight.kept import Judged, Kept, log_keeper
 from perchctl.flight.results_file import campaign_header, open_results
 from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.profile import Profile, load_profile
 
 AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
+
+
+class EnoughFlown(Exception):
+    """Raised where a result is noted: the flights that are left are not needed."""
 
 
 class Seeded(Ended, Judged, Protocol):
@@ -55,6 +60,11 @@ class SimulateRequest:
     out: Path | None = None
     resume: bool = False
     keep: str | None = None
+    compare: str | None = None
+    sweep: tuple[str, ...] = ()
+    until: str | None = None
+    minimise: int | None = None
+    output: Path | None = None
 
     def loaded(self) -> Profile:
         """The profile with the command line on top. Errors: NotFound, InvalidValue."""
@@ -65,17 +75,41 @@ class SimulateRequest:
         if self.only is not None:
             return [self.only]
         first = self.seed or 0
-        return list(range(first, first + (10 if self.flights is None else self.flights)))
+        flights = 10 if self.until is None else MOST_UNTIL
+        return list(range(first, first + (flights if self.flights is None else self.flights)))
 
     def log_folder(self, profile: Profile) -> Path:
         """Of one flight, which is always logged."""
         return self.log_dir or Path(profile.log.directory)
 
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {
+            "--compare": self.compare,
+            "--sweep": self.sweep,
+            "--until": self.until,
+            "--minimise": self.minimise,
+            "--faults": self.faults,
+            "--only": self.only,
+            "-n": self.flights,
+            "--seed": self.seed,
+            "--heat-map": self.heat_map,
+            "--log-dir": self.log_dir,
+            "--record": self.record or None,
+            "--output": self.output,
+            "--out": self.out,
+            "--resume": self.resume or None,
+            "--keep": self.keep,
+        }
+
     def check(self) -> None:
         """Errors: UsageError for an option that does not apply to what is asked for,
         InvalidValue for a place that nothing can be written to."""
-        if self.heat_map is not None and self.faults is None:
-            raise UsageError("--heat-map is drawn of faults: name them with --faults")
+        check_modes(self._options)
+        if self.heat_map is not None and self.faults is None and not self.sweep:
+            raise UsageError(
+                "--heat-map is drawn of faults, or of two keys: name them with --faults or --sweep"
+            )
         if self.record and self.only is None and self.log_dir is None:
             raise UsageError("--record writes beside the logs: name their folder with --log-dir")
         many: dict[str, int | Path | None] = {
@@ -101,6 +135,8 @@ class SimulateRequest:
             check_output(self.heat_map, (".png",), self.force)
         if self.out is not None and self.out.suffix != ".jsonl":
             raise InvalidValue(f"{self.out} must end in .jsonl: a result is one line of JSON")
+        if self.output is not None:
+            check_output(self.output, (".yaml", ".yml"), self.force)
 
     @contextlib.contextmanager
     def results(
@@ -119,28 +155,6 @@ class SimulateRequest:
             file.close()
 
 
-class Kept(Generic[R]):
-    """A campaign's results: those of a file of results, and those that come."""
-
-    def __init__(
-        self,
-        seeds: Sequence[int],
-        earlier: Mapping[int, R],
-        keep_log: Callable[[R], None],
-        append: Callable[[R], None] = lambda result: None,
-    ) -> None:
-        self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
-        self.left = [seed for seed in seeds if seed not in earlier]
-        self._keep_log, self._append = keep_log, append
-        for result in self.earlier:
-            keep_log(result)
-
-    def note(self, result: R) -> None:
-        """As a flight ends."""
-        self._append(result)
-        self._keep_log(result)
-
-
 def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) -> None:
     given = [f"{name} {value}" for name, value in options.items() if value is not None]
     if given:
@@ -155,32 +169,36 @@ def fly_each(
     request: SimulateRequest,
     report: Callable[[list[R], PerchError | None], None],
     kept: Kept[R] | None = None,
+    flights: int | None = None,
 ) -> int:
     """Flies the request's seeds in processes of their own, and reports those that were flown,
     however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
 
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
     were flown. `kept`: those that were flown before, which count, too, and where each goes.
-    Errors: PerchError where none was.
+    `flights`: how many it flies, by default one a seed. Errors: PerchError where none was.
     """
     from perchctl.flight.hands import job_processes
 
-    seeds = request.seeds
-    kept = kept or Kept(seeds, {}, lambda result: None)
+    total = len(request.seeds) if flights is None else flights
+    kept = kept or Kept(request.seeds, {}, lambda result: None)
     results: list[R] = list(kept.earlier)
-    jobs = max(1, min(request.jobs or 1, len(kept.left)))
+    jobs = max(1, min(request.jobs or 1, total - len(results)))
     problem: PerchError | None = None
+    enough = False
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            progress_bar(len(seeds), earlier=kept.earlier) as advance,
+            progress_bar(total, earlier=kept.earlier) as advance,
             job_processes(jobs) as executor,
         ):
             campaign(executor, noting(results, kept.note, advance))
     except PerchError as error:
         problem = error
-    flown = f"{len(results)} of {len(seeds)} flights were flown"
-    if problem is None and len(results) < len(seeds):
+    except EnoughFlown:
+        enough = True
+    flown = f"{len(results)} of {total} flights were flown"
+    if problem is None and len(results) < total and not enough:
         problem = Interrupted(f"stopped: {flown}")
     elif problem is not None:
         problem.args = (f"{problem}; {flown}",)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +27,8 @@ from perchctl.mission.watch import Event, EventKeeper, Watcher
 from perchctl.profile import Profile
 
 R = TypeVar("R")
+K = TypeVar("K", bound=Hashable)
+"""A seed, or what else names a flight of many; its text names it to people."""
 
 OUTCOMES: dict[Phase, FlightEnd] = {
     Phase.PERCHED: "perched",
@@ -132,8 +134,8 @@ def log_of(seed: int, log_dir: Path) -> Path:
 
 
 def fly_all(
-    fly: Callable[[int], R],
-    seeds: Iterable[int],
+    fly: Callable[[K], R],
+    seeds: Iterable[K],
     executor: Executor | None = None,
     on_result: Callable[[R], None] = lambda result: None,
 ) -> list[R]:
@@ -144,21 +146,21 @@ def fly_all(
     and is flown again, `FLOWN_AGAIN` times at most. Errors: PerchError.
     """
     seeds = list(dict.fromkeys(seeds))
-    by_seed: dict[int, R] = {}
+    by_seed: dict[K, R] = {}
     if executor is None:
         for seed in seeds:
             by_seed[seed] = fly(seed)
             on_result(by_seed[seed])
         return list(by_seed.values())
-    ended: SimpleQueue[tuple[int, Future[R]]] = SimpleQueue()
+    ended: SimpleQueue[tuple[K, Future[R]]] = SimpleQueue()
 
-    def hand_over(*some: int) -> None:
+    def hand_over(*some: K) -> None:
         with uninterrupted():  # the executor may start processes as flights are handed to it
             for seed in some:
                 _submitted(executor, fly, seed).add_done_callback(partial(_put, ended, seed))
 
     hand_over(*seeds)
-    lost: Counter[int] = Counter()
+    lost: Counter[K] = Counter()
     while len(by_seed) < len(seeds):
         seed, future = ended.get()
         if _was_lost(future) and lost[seed] < FLOWN_AGAIN:
@@ -170,7 +172,7 @@ def fly_all(
     return [by_seed[seed] for seed in seeds]
 
 
-def _submitted(executor: Executor, fly: Callable[[int], R], seed: int) -> Future[R]:
+def _submitted(executor: Executor, fly: Callable[[K], R], seed: K) -> Future[R]:
     try:
         return executor.submit(fly, seed)
     except BrokenExecutor as error:  # nobody is left who could fly it
@@ -179,7 +181,7 @@ def _submitted(executor: Executor, fly: Callable[[int], R], seed: int) -> Future
         return future
 
 
-def _put(ended: SimpleQueue[tuple[int, Future[R]]], seed: int, future: Future[R]) -> None:
+def _put(ended: SimpleQueue[tuple[K, Future[R]]], seed: K, future: Future[R]) -> None:
     ended.put((seed, future))
 
 
@@ -187,7 +189,7 @@ def _was_lost(future: Future[Any]) -> bool:
     return future.cancelled() or isinstance(future.exception(), BrokenExecutor)
 
 
-def _result(future: Future[R], seed: int) -> R:
+def _result(future: Future[R], seed: K) -> R:
     try:
         return future.result()
     except (BrokenExecutor, CancelledError):

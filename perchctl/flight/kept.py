@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import heapq
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from perchctl.errors import UsageError
 from perchctl.log.recording.place import recording_of
@@ -62,3 +62,25 @@ def _remove(log: Path | None) -> None:
         for path in (log, recording_of(log)):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
+
+
+class Kept(Generic[R]):
+    """A campaign's results: those of a file of results, and those that come."""
+
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        earlier: Mapping[int, R],
+        keep_log: Callable[[R], None],
+        append: Callable[[R], None] = lambda result: None,
+    ) -> None:
+        self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
+        self.left = [seed for seed in seeds if seed not in earlier]
+        self._keep_log, self._append = keep_log, append
+        for result in self.earlier:
+            keep_log(result)
+
+    def note(self, result: R) -> None:
+        """As a flight ends."""
+        self._append(result)
+        self._keep_log(result)

@@ -13,26 +13,34 @@ from perchctl.profile.plain_yaml import clipped, parse_yaml
 from perchctl.profile.schema import Profile
 
 
-def changed(profile: Profile, settings: Iterable[str]) -> Profile:
+def changed(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
     """With each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as in a profile's
-    file. Errors: UsageError (of another form), InvalidValue."""
+    file. `option` is where they were given. Errors: UsageError (of another form), InvalidValue."""
     values = profile.model_dump(mode="json")
     for setting in settings:
         key, equals, text = setting.partition("=")
         if not equals or not key.strip():
             raise UsageError(
-                f"--set {clipped(setting)} must be KEY=VALUE with a key of the profile, as in "
-                f"--set planner.align.xy_m=0.03"
+                f"{option} {clipped(setting)} must be KEY=VALUE with a key of the profile, as in "
+                f"{option} planner.align.xy_m=0.03"
             )
         try:
             _put(values, key.strip(), parse_yaml(text))
         except ValueError as error:
-            raise InvalidValue(f"--set {clipped(setting)}: {error}") from None
+            raise InvalidValue(f"{option} {clipped(setting)}: {error}") from None
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
         key, text = first_fault(error)
-        raise InvalidValue(f"--set: {key or 'profile'}: {text}") from None
+        raise InvalidValue(f"{option}: {key or 'profile'}: {text}") from None
+
+
+def value_of(profile: Profile, dotted: str) -> Any:
+    """What the profile has at that key, in JSON's types; None where it has none."""
+    value: Any = profile.model_dump(mode="json")
+    for name in dotted.split("."):
+        value = value.get(name) if isinstance(value, dict) else None
+    return value
 
 
 def _put(values: dict[str, Any], dotted: str, value: Any) -> None:

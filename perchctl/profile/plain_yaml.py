@@ -39,6 +39,16 @@ def parse_yaml(text: str) -> Any:
         raise ValueError(clipped(str(error), 200)) from None
 
 
+def parts_of(text: str) -> list[str]:
+    """The texts of values that commas stand between, as in a list: a value may be a list itself.
+    Raises ValueError as `parse_yaml` does."""
+    row = f"[{text}]"
+    parse_yaml(row)
+    node = yaml.compose(row, yaml.SafeLoader)
+    assert isinstance(node, yaml.SequenceNode)
+    return [row[part.start_mark.index : part.end_mark.index].strip() for part in node.value]
+
+
 def clipped(text: str, most: int = _MOST_SHOWN) -> str:
     """The text, or its beginning where it is longer than anybody reads."""
     return text if len(text) <= most else f"{text[: most - 3]}..."

@@ -40,7 +40,7 @@ def profile_text(profile: Profile, paths: Collection[str] | None = None) -> str:
             _comment(key), _WIDTH, initial_indent=f"{margin}# ", subsequent_indent=f"{margin}# ",
             break_long_words=False, break_on_hyphens=False,
         )  # fmt: skip
-        lines.append(f"{margin}{name}: {_scalar(key.default)}")
+        lines.append(f"{margin}{name}: {scalar_text(key.default)}")
     return "\n".join(lines) + "\n"
 
 
@@ -51,7 +51,7 @@ def _comment(key: Key) -> str:
     return f"{meaning} ({limits})" if limits else meaning
 
 
-def _scalar(value: Any) -> str:
+def scalar_text(value: Any) -> str:
     """The value in YAML, on one line."""
     plain = list(value) if isinstance(value, tuple) else value
     text: str = yaml.safe_dump([plain], default_flow_style=True, width=10**9, allow_unicode=True)

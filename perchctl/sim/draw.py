@@ -19,36 +19,49 @@ _STREAM = 1  # the scenario's own random stream
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
     """The scenario of that seed. Every value is drawn in a fixed order, so adding a
     range at the end leaves the earlier ones of a seed as they were."""
+    return _drawn(profile, seed)[0]
+
+
+def draw_points(profile: Profile, seed: int) -> dict[str, Any]:
+    """What that seed draws from each of the `simulation`'s ranges and shares, as values of the
+    same keys from which every seed draws just that; the seed's scenario with them is the same
+    to the bit. What a seed turns by a direction of its own (a drift, a wrong mount) stays."""
+    return _drawn(profile, seed)[1]
+
+
+def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
     sim = profile.simulation
     rng = np.random.default_rng([seed, _STREAM])
+    points: dict[str, Any] = {}
 
-    def between(bounds: tuple[float, float]) -> float:
-        return float(rng.uniform(*bounds))
+    def between(key: str) -> float:
+        value = float(rng.uniform(*getattr(sim, key)))
+        points[key] = (value, value)
+        return value
 
     def direction() -> Array:
         vector = rng.normal(size=3)
         return np.asarray(vector / np.linalg.norm(vector))
 
     offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
-    yaw_rad = math.radians(between(sim.target_yaw_deg))
-    ceiling_z_m = between(sim.ceiling_z_m)
-    mass_kg = between(sim.mass_kg)
-    battery_v = between(sim.battery_rest_v)
-    latency_s = between(sim.camera_latency_s)
-    noise_sigma = between(sim.camera_noise_sigma)
-    burst = None
-    burst_start_s = float(rng.uniform(4.0, 22.0))
-    if sim.camera_burst_frames is not None:
-        low, high = sim.camera_burst_frames
-        burst = (burst_start_s, int(rng.integers(low, high + 1)))
+    yaw_rad = math.radians(between("target_yaw_deg"))
+    ceiling_z_m = between("ceiling_z_m")
+    mass_kg = between("mass_kg")
+    battery_v = between("battery_rest_v")
+    latency_s = between("camera_latency_s")
+    noise_sigma = between("camera_noise_sigma")
+    burst = _burst(sim, rng)
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
     drift = direction() * sim.drift_mps
     wind_angle = float(rng.uniform(-math.pi, math.pi))
-    wind_mps = between(sim.draught_mps)
+    wind_mps = between("draught_mps")
     tilt_bias = rng.uniform(-1, 1, size=2) * math.radians(sim.estimate_tilt_bias_deg)
     fails = rng.uniform() < sim.first_contact_fails
     weak_part = float(rng.uniform(0.0, 0.6))
-    return Scenario(
+    points["first_contact_fails"] = float(fails)
+    if burst is not None:
+        points["camera_burst_frames"] = (burst[1], burst[1])
+    scenario = Scenario(
         seed=seed,
         mass_kg=mass_kg,
         battery_rest_v=battery_v,
@@ -73,6 +86,17 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         extra=_extra(profile),
         neighbours=_neighbours(sim),
     )
+    return scenario, points
+
+
+def _burst(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, int] | None:
+    """Start and number of the frames that are lost in one go."""
+    start_s = float(rng.uniform(4.0, 22.0))
+    low, high = sim.camera_burst_frames or (0, 0)
+    if low == high:
+        rng.integers(2)  # numpy draws none of one number, and what comes later must stay
+    frames = int(rng.integers(low, high + 1))
+    return None if sim.camera_burst_frames is None else (start_s, frames)
 
 
 def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:

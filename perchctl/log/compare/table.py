@@ -44,7 +44,7 @@ def compared(one: FlightLog, other: FlightLog) -> Comparison:
         (summary_of(one), summary_of(other)),
         (measures_of(one), measures_of(other)),
         tuple(_phase_times(one, other)),
-        _profile_differences(one.header.get("profile"), other.header.get("profile")),
+        profile_differences(one.header.get("profile"), other.header.get("profile")),
     )
 
 
@@ -151,7 +151,8 @@ def _phase_times(one: FlightLog, other: FlightLog) -> Iterator[PhaseTimes]:
         )
 
 
-def _profile_differences(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
+def profile_differences(one: Any, other: Any) -> dict[str, tuple[Any, Any]]:
+    """The dotted keys of two profiles, as JSON has them, that have different values."""
     a, b = _flat(one), _flat(other)
     return {
         key: (a.get(key, _NOT_THERE), b.get(key, _NOT_THERE))

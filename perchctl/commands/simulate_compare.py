@@ -1,0 +1,49 @@
+"""The work behind `perchctl simulate --compare`: two profiles over the same seeds."""
+
+from __future__ import annotations
+
+from perchctl.commands.output import print_record
+from perchctl.commands.positioning import positioned
+from perchctl.commands.simulate_request import SimulateRequest, and_problem, fly_each
+from perchctl.errors import PerchError
+from perchctl.flight.compared import compared, comparison_record, comparison_text
+from perchctl.flight.variants import VariantResult, fly_variants, whole_seeds
+from perchctl.log.compare.table import profile_differences
+from perchctl.profile import load_profile
+
+_NO_DIFFERENCE = ("name", "description", "date")
+
+
+def run_compare(request: SimulateRequest) -> int:
+    """Fly each seed by both profiles and print. Errors: NotFound, InvalidValue."""
+    assert request.compare is not None
+    other = positioned(load_profile(request.compare), request.positioning)
+    profiles = (request.loaded(), other)
+    names = (request.profile, request.compare)
+    keys = profile_differences(*(p.model_dump(mode="json") for p in profiles))
+    keys = {key: values for key, values in keys.items() if key not in _NO_DIFFERENCE}
+
+    def report(results: list[VariantResult], problem: PerchError | None) -> None:
+        pairs = [(a, b) for a, b in whole_seeds(results, len(profiles))]
+        found = compared(names, pairs)
+        if request.as_json:
+            record = {
+                "a": names[0],
+                "b": names[1],
+                **comparison_record(found),
+                "profile": {key: {"a": a, "b": b} for key, (a, b) in keys.items()},
+            }
+            print_record(and_problem(record, problem))
+            return
+        print(comparison_text(found))
+        for key, (a, b) in keys.items():
+            print(f"differs: {key} is {a} in A, {b} in B")
+        if not keys:
+            print("the profiles do not differ")
+
+    return fly_each(
+        lambda executor, note: fly_variants(profiles, request.seeds, executor, note),
+        request,
+        report,
+        flights=len(profiles) * len(request.seeds),
+    )

@@ -1,0 +1,18 @@
+"""Results of flights that were none, for tests of what is made of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from perchctl.flight.results import FlightResult
+
+PERCHED = FlightResult(0, "perched", "hanging still", 0.002, 20.0, 1, False, False, 5.0)
+LANDED = replace(PERCHED, outcome="landed", reason="battery at 2.9 V", miss_m=None, time_s=30.0)
+
+
+def perched(seed: int, miss_m: float = 0.002, time_s: float = 20.0) -> FlightResult:
+    return replace(PERCHED, seed=seed, miss_m=miss_m, time_s=time_s)
+
+
+def landed(seed: int) -> FlightResult:
+    return replace(LANDED, seed=seed)
