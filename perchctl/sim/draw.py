@@ -9,7 +9,7 @@ import numpy as np
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile
-from perchctl.profile.schema import SimulationConfig
+from perchctl.profile.simulation import SimulationConfig
 from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.scenario import Neighbour, Scenario
 
