@@ -10,7 +10,8 @@ import numpy as np
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile
 from perchctl.profile.simulation import SimulationConfig
-from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
+from perchctl.sim.draw_more import beyond
 from perchctl.sim.scenario import Neighbour, Scenario
 
 _STREAM = 1  # the scenario's own random stream
@@ -18,7 +19,8 @@ _STREAM = 1  # the scenario's own random stream
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
     """The scenario of that seed. Every value is drawn in a fixed order, so adding a
-    range at the end leaves the earlier ones of a seed as they were."""
+    range at the end leaves the earlier ones of a seed as they were; harder worlds draw theirs
+    from other streams (`perchctl.sim.draw_more`)."""
     sim = profile.simulation
     rng = np.random.default_rng([seed, _STREAM])
 
@@ -30,6 +32,7 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         return np.asarray(vector / np.linalg.norm(vector))
 
     offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
+    target_xy_m = sim.target_xy_m or (float(offset[0]), float(offset[1]))
     yaw_rad = math.radians(between(sim.target_yaw_deg))
     ceiling_z_m = between(sim.ceiling_z_m)
     mass_kg = between(sim.mass_kg)
@@ -37,23 +40,24 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     latency_s = between(sim.camera_latency_s)
     noise_sigma = between(sim.camera_noise_sigma)
     burst = None
-    burst_start_s = float(rng.uniform(4.0, 22.0))
+    burst_start_s = between(sim.camera_burst_start_s)
     if sim.camera_burst_frames is not None:
         low, high = sim.camera_burst_frames
         burst = (burst_start_s, int(rng.integers(low, high + 1)))
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
     drift = direction() * sim.drift_mps
-    wind_angle = float(rng.uniform(-math.pi, math.pi))
+    towards_deg = sim.draught_towards_deg
+    wind_angle = between((math.radians(towards_deg[0]), math.radians(towards_deg[1])))
     wind_mps = between(sim.draught_mps)
     tilt_bias = rng.uniform(-1, 1, size=2) * math.radians(sim.estimate_tilt_bias_deg)
     fails = rng.uniform() < sim.first_contact_fails
-    weak_part = float(rng.uniform(0.0, 0.6))
+    weak_part = between(sim.first_contact_share)
     return Scenario(
         seed=seed,
         mass_kg=mass_kg,
         battery_rest_v=battery_v,
         ceiling_z_m=ceiling_z_m,
-        target_xy_m=(float(offset[0]), float(offset[1])),
+        target_xy_m=target_xy_m,
         target_yaw_rad=yaw_rad,
         large_side_m=profile.target.large.side_m,
         small_side_m=profile.target.small.side_m,
@@ -63,16 +67,21 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
         camera_burst=burst,
         camera_noise_sigma=noise_sigma,
         **_as_they_stand(sim),
-        estimate_noise_m=sim.estimate_noise_m,
-        estimate_tilt_bias_rad=(float(tilt_bias[0]), float(tilt_bias[1])),
-        drift_mps=(float(drift[0]), float(drift[1]), float(drift[2])),
+        estimate_tilt_bias_rad=_pinned(tilt_bias, sim.estimate_tilt_bias_xy_deg, in_degrees=True),
+        drift_mps=_pinned(drift, sim.drift_xyz_mps),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
-        magnet_force_n=sim.magnet_force_n,
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
-        no_target=sim.no_target,
         extra=_extra(profile),
         neighbours=_neighbours(sim),
+        **beyond(sim, seed, target_xy_m),
     )
+
+
+def _pinned(drawn: Array, pin: tuple[float, ...] | None, *, in_degrees: bool = False) -> Any:
+    """What the profile says that it is, or else what was drawn."""
+    if pin is None:
+        return tuple(float(value) for value in drawn)
+    return tuple(math.radians(value) if in_degrees else value for value in pin)
 
 
 def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
@@ -89,12 +98,15 @@ def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
     if config.by != "mocap":
         return None
     roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
+    holes = draw_scenario(profile, seed).capture_holes_s
+    hidden = CaptureFault(occluded=True)
     return CaptureSettings(
         body=config.body,
         body_rpy_rad=(roll, pitch, yaw),
         body_position_m=config.body_position_m,
         delay_s=sim.capture_delay_s,
         position_noise_m=sim.capture_noise_m,
+        faults=tuple((begin_s, begin_s + length_s, hidden) for begin_s, length_s in holes),
         seed=seed,
     )
 
@@ -109,8 +121,11 @@ def _extra(profile: Profile) -> dict[str, float]:
 
 
 def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
-    """The camera's values that are not drawn."""
+    """The values that are not drawn."""
     return {
+        "estimate_noise_m": sim.estimate_noise_m,
+        "magnet_force_n": sim.magnet_force_n,
+        "no_target": sim.no_target,
         "camera_rate_hz": sim.camera_rate_hz,
         "camera_jitter_s": sim.camera_jitter_s,
         "camera_drop_rate": sim.camera_drop_rate,
@@ -135,4 +150,8 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
     turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
     way = rng.normal(size=3)
     way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
+    if sim.mount_error_rpy_deg is not None:
+        turn = np.radians(sim.mount_error_rpy_deg)
+    if sim.mount_error_xyz_m is not None:
+        way = np.asarray(sim.mount_error_xyz_m)
     return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)
