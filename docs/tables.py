@@ -25,8 +25,9 @@ from perchctl.faults.excuses import EXCUSES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.mission.diagram import diagram, rows_table  # noqa: E402
-from perchctl.profile import Profile  # noqa: E402
+from perchctl.profile import Profile, SimulationConfig  # noqa: E402
 from perchctl.profile.keys import UNITS, allowed, keys  # noqa: E402
+from perchctl.profile.worlds import WORLDS  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 PART = re.compile(r"(<!-- begin ([\w-]+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)
@@ -65,6 +66,18 @@ def _shown(value: Any) -> str:
         case int() | float():
             return f"{value:g}" if isinstance(value, float) else str(value)
     return f"`{value}`"
+
+
+def worlds() -> str:
+    """The keys in which the named worlds differ."""
+    world = {name: SimulationConfig.model_validate({"set": name}) for name in WORLDS}
+    rows = []
+    for key in keys(SimulationConfig()):
+        if any(key.path in values for values in WORLDS.values()):
+            shown = (_shown(getattr(sim, key.path)) for sim in world.values())
+            rows.append(f"| `{key.path}` | {key.unit} | {' | '.join(shown)} | {key.meaning} |")
+    head = f"| key | unit | {' | '.join(f'`{name}`' for name in world)} | meaning |"
+    return "\n".join([head, "|---" * (len(world) + 3) + "|", *rows])
 
 
 def log_fields(fields: dict[str, str] = FIELDS) -> str:
@@ -128,6 +141,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "diagram": lambda: f"```mermaid\n{diagram()}\n```",
     "rows": rows_table,
     "profile-keys": profile_keys,
+    "worlds": worlds,
     "log-fields": log_fields,
     "event-fields": lambda: log_fields(EVENT_FIELDS),
     "exit-codes": exit_codes,

@@ -16,6 +16,7 @@ from perchctl.commands.simulate_request import (
 )
 from perchctl.errors import PerchError, no_simulator
 from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
+from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.place import make_log_folder
 from perchctl.startup import leave_at_ctrl_c, loaded
 

@@ -28,6 +28,7 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.geometry import GRAVITY_MPS2
+from perchctl.link.bursty import radio_of
 from perchctl.link.mock import MockLink
 from perchctl.log.exact import to_exact
 from perchctl.log.watch import LogWatcher
@@ -67,7 +68,7 @@ class FaultyFlight:
         camera = camera_of(profile.camera)
         capture = draw_capture(profile, scenario.seed)
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
-        radio = FaultyRadio()
+        radio = FaultyRadio(radio_of(scenario))
         radio.serves(vehicle.firmware)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
         assert vehicle.camera is not None

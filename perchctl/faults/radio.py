@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from perchctl.faults.effects import BlockDead, PacketLost, PacketTwice, Silence, TelemetryDelayed
-from perchctl.link.mock import TELEMETRY_DELAY_S, Radio
+from perchctl.link.mock import Radio
 from perchctl.sim.crtp.codec import Packet, Port
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
@@ -35,9 +35,11 @@ def order_of(packet: Packet) -> str:
 
 
 class FaultyRadio(Radio):
-    """Loses nothing until effects are begun. `cut` ends the uplink for good."""
+    """Loses what `air` does, and nothing else until effects are begun. `cut` ends the uplink for
+    good."""
 
-    def __init__(self) -> None:
+    def __init__(self, air: Radio | None = None) -> None:
+        self._air = air or Radio()
         self.cut = False
         self._begun: list[tuple[RadioEffect, float]] = []
         self._left: dict[str, int] = {}  # packets of an order still to be lost
@@ -58,7 +60,7 @@ class FaultyRadio(Radio):
                 self._begun.append((effect, now_s))
 
     def up(self, packet: Packet, now_s: float) -> bool:
-        if self.cut:
+        if self.cut or not self._air.up(packet, now_s):
             return False
         order = order_of(packet)
         if self._left.get(order, 0) > 0:
@@ -73,7 +75,9 @@ class FaultyRadio(Radio):
         return True
 
     def down(self, block: str, now_s: float) -> float | None:
-        delay_s = TELEMETRY_DELAY_S
+        delay_s = self._air.down(block, now_s)
+        if delay_s is None:
+            return None
         for effect, begin_s in self._begun:
             if isinstance(effect, (PacketLost, PacketTwice)) or now_s >= begin_s + effect.for_s:
                 continue

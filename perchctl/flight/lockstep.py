@@ -10,6 +10,7 @@ from perchctl.camera.slot import NewestSlot
 from perchctl.camera.source import FrameSource
 from perchctl.flight.lockstep_positions import feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
+from perchctl.link.bursty import radio_of
 from perchctl.link.mock import MockLink
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Operator, Phase
@@ -161,7 +162,7 @@ def fly_lockstep(
     camera = camera_of(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
-    link = MockLink(vehicle, profile.link.telemetry_period_s)
+    link = MockLink(vehicle, profile.link.telemetry_period_s, radio_of(scenario))
     positions = feed_lockstep(link, profile)
     assert vehicle.camera is not None
     source: FrameSource = LockstepSource(vehicle.camera, profile.camera.start_latency_s)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 from perchctl.flight.campaign import fly_all, fly_seed
 from perchctl.flight.results import FlightResult
@@ -35,6 +37,14 @@ class VariantResult:
     @property
     def outcome(self) -> str:
         return self.result.outcome
+
+    @property
+    def badness(self) -> tuple[Any, ...]:
+        return self.result.badness
+
+    @property
+    def log(self) -> Path | None:
+        return self.result.log
 
     @property
     def log_problem(self) -> str | None:

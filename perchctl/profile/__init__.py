@@ -1,7 +1,7 @@
 """Profiles: one YAML file says everything a flight depends on.
 
-schema: the models, each key with its bounds (vision, merge, mission and positioning hold the
-larger sections).
+schema: the models, each key with its bounds (vision, merge, mission, positioning and simulation
+hold the larger sections). worlds: the named sets of the simulation's keys.
 load: reading, `extends`, the files a profile names. plain_yaml: what of YAML is read.
 old_keys: what earlier versions called them. places: where shipped and the user's files are.
 limits: keys that must fit each other. keys: each with its unit, bounds and meaning.
@@ -33,8 +33,8 @@ from perchctl.profile.schema import (
     LinkConfig,
     LogConfig,
     Profile,
-    SimulationConfig,
 )
+from perchctl.profile.simulation import SimulationConfig
 from perchctl.profile.vision import (
     CameraConfig,
     DetectorConfig,

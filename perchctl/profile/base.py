@@ -22,13 +22,14 @@ _OnBody = Annotated[float, Field(ge=-FARTHEST_ON_BODY_M, le=FARTHEST_ON_BODY_M)]
 BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
-def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    """The pair, lowest first. Raises ValueError where it is not."""
     if pair[0] > pair[1]:
         raise ValueError(f"the lower bound {pair[0]} is above the upper bound {pair[1]}")
     return pair
 
 
-Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Range = Annotated[tuple[float, float], AfterValidator(ordered)]
 
 
 class Section(BaseModel):

@@ -9,8 +9,9 @@ import numpy as np
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile
-from perchctl.profile.schema import SimulationConfig
-from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.profile.simulation import SimulationConfig
+from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
+from perchctl.sim.draw_more import beyond
 from perchctl.sim.scenario import Neighbour, Scenario
 
 _STREAM = 1  # the scenario's own random stream
@@ -18,14 +19,16 @@ _STREAM = 1  # the scenario's own random stream
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
     """The scenario of that seed. Every value is drawn in a fixed order, so adding a
-    range at the end leaves the earlier ones of a seed as they were."""
+    range at the end leaves the earlier ones of a seed as they were; harder worlds draw theirs
+    from other streams (`perchctl.sim.draw_more`)."""
     return _drawn(profile, seed)[0]
 
 
 def draw_points(profile: Profile, seed: int) -> dict[str, Any]:
     """What that seed draws from each of the `simulation`'s ranges and shares, as values of the
     same keys from which every seed draws just that; the seed's scenario with them is the same
-    to the bit. What a seed turns by a direction of its own (a drift, a wrong mount) stays."""
+    to the bit. What a seed turns by a direction of its own (a drift, a wrong mount) stays, and so
+    does what comes from streams of its own, as in harder worlds."""
     return _drawn(profile, seed)[1]
 
 
@@ -44,20 +47,22 @@ def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
         return np.asarray(vector / np.linalg.norm(vector))
 
     offset = rng.uniform(-sim.start_offset_m, sim.start_offset_m, size=2)
+    target_xy_m = sim.target_xy_m or (float(offset[0]), float(offset[1]))
     yaw_rad = math.radians(between("target_yaw_deg"))
     ceiling_z_m = between("ceiling_z_m")
     mass_kg = between("mass_kg")
     battery_v = between("battery_rest_v")
     latency_s = between("camera_latency_s")
     noise_sigma = between("camera_noise_sigma")
-    burst = _burst(sim, rng)
+    burst = _burst(sim, rng, between("camera_burst_start_s"))
     T_body_cam = profile.camera.mount.T_body_cam @ _mounting_error(profile, rng)
     drift = direction() * sim.drift_mps
-    wind_angle = float(rng.uniform(-math.pi, math.pi))
+    towards_deg = sim.draught_towards_deg
+    wind_angle = float(rng.uniform(math.radians(towards_deg[0]), math.radians(towards_deg[1])))
     wind_mps = between("draught_mps")
     tilt_bias = rng.uniform(-1, 1, size=2) * math.radians(sim.estimate_tilt_bias_deg)
     fails = rng.uniform() < sim.first_contact_fails
-    weak_part = float(rng.uniform(0.0, 0.6))
+    weak_part = between("first_contact_share")
     points["first_contact_fails"] = float(fails)
     if burst is not None:
         points["camera_burst_frames"] = (burst[1], burst[1])
@@ -66,7 +71,7 @@ def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
         mass_kg=mass_kg,
         battery_rest_v=battery_v,
         ceiling_z_m=ceiling_z_m,
-        target_xy_m=(float(offset[0]), float(offset[1])),
+        target_xy_m=target_xy_m,
         target_yaw_rad=yaw_rad,
         large_side_m=profile.target.large.side_m,
         small_side_m=profile.target.small.side_m,
@@ -76,27 +81,33 @@ def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
         camera_burst=burst,
         camera_noise_sigma=noise_sigma,
         **_as_they_stand(sim),
-        estimate_noise_m=sim.estimate_noise_m,
-        estimate_tilt_bias_rad=(float(tilt_bias[0]), float(tilt_bias[1])),
-        drift_mps=(float(drift[0]), float(drift[1]), float(drift[2])),
+        estimate_tilt_bias_rad=_pinned(tilt_bias, sim.estimate_tilt_bias_xy_deg, in_degrees=True),
+        drift_mps=_pinned(drift, sim.drift_xyz_mps),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
-        magnet_force_n=sim.magnet_force_n,
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
-        no_target=sim.no_target,
         extra=_extra(profile),
         neighbours=_neighbours(sim),
+        **beyond(sim, seed, target_xy_m),
     )
     return scenario, points
 
 
-def _burst(sim: SimulationConfig, rng: np.random.Generator) -> tuple[float, int] | None:
+def _burst(
+    sim: SimulationConfig, rng: np.random.Generator, start_s: float
+) -> tuple[float, int] | None:
     """Start and number of the frames that are lost in one go."""
-    start_s = float(rng.uniform(4.0, 22.0))
     low, high = sim.camera_burst_frames or (0, 0)
     if low == high:
         rng.integers(2)  # numpy draws none of one number, and what comes later must stay
     frames = int(rng.integers(low, high + 1))
     return None if sim.camera_burst_frames is None else (start_s, frames)
+
+
+def _pinned(drawn: Array, pin: tuple[float, ...] | None, *, in_degrees: bool = False) -> Any:
+    """What the profile says that it is, or else what was drawn."""
+    if pin is None:
+        return tuple(float(value) for value in drawn)
+    return tuple(math.radians(value) if in_degrees else value for value in pin)
 
 
 def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
@@ -113,12 +124,15 @@ def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
     if config.by != "mocap":
         return None
     roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
+    holes = draw_scenario(profile, seed).capture_holes_s
+    hidden = CaptureFault(occluded=True)
     return CaptureSettings(
         body=config.body,
         body_rpy_rad=(roll, pitch, yaw),
         body_position_m=config.body_position_m,
         delay_s=sim.capture_delay_s,
         position_noise_m=sim.capture_noise_m,
+        faults=tuple((begin_s, begin_s + length_s, hidden) for begin_s, length_s in holes),
         seed=seed,
     )
 
@@ -133,8 +147,11 @@ def _extra(profile: Profile) -> dict[str, float]:
 
 
 def _as_they_stand(sim: SimulationConfig) -> dict[str, Any]:
-    """The camera's values that are not drawn."""
+    """The values that are not drawn."""
     return {
+        "estimate_noise_m": sim.estimate_noise_m,
+        "magnet_force_n": sim.magnet_force_n,
+        "no_target": sim.no_target,
         "camera_rate_hz": sim.camera_rate_hz,
         "camera_jitter_s": sim.camera_jitter_s,
         "camera_drop_rate": sim.camera_drop_rate,
@@ -159,4 +176,8 @@ def _mounting_error(profile: Profile, rng: np.random.Generator) -> Array:
     turn = axis * math.radians(rng.uniform(0, sim.mount_error_deg))
     way = rng.normal(size=3)
     way *= rng.uniform(0, sim.mount_error_m) / np.linalg.norm(way)
+    if sim.mount_error_rpy_deg is not None:
+        turn = np.radians(sim.mount_error_rpy_deg)
+    if sim.mount_error_xyz_m is not None:
+        way = np.asarray(sim.mount_error_xyz_m)
     return make_T(rotation_from_rpy(*(float(a) for a in turn)), way)

@@ -20,10 +20,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array, invert_T, make_T, rot_z
+from perchctl.geometry import Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim.analogue import spoil
 from perchctl.sim.exposure import line_kernel, path_length_px, sample_count, spread
+from perchctl.sim.gloss import shone_upon
 from perchctl.sim.pixels import Mean, lit, sample, vignetting
 from perchctl.sim.rays import (
     COARSE_PX,
@@ -83,6 +84,9 @@ class Renderer:
         )
         own = () if scenario.no_target else (_Placed(_printed_sheet(printed.model_dump_json())),)
         self._sheets = (*own, *(_beside(n, printed) for n in scenario.neighbours))
+        self._glossy_half_m = 0.0
+        if own and scenario.gloss > 0.0:
+            self._glossy_half_m = own[0].sheet.drawing.sheet_side_m / 2.0
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         self._fine = ray_grid(camera, FINE_PX)
@@ -96,8 +100,10 @@ class Renderer:
         """The target's centre is there from now on."""
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
-        self.T_world_target = make_T(rot_z(scenario.target_yaw_rad), (*xy_m, z_m))
+        turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
+        self.T_world_target = make_T(turn, (*xy_m, z_m))
         self._T_target_world = invert_T(self.T_world_target)
+        self._lamp_m = (self._T_target_world @ (*scenario.lamp_m, 1.0))[:3]
 
     def render(
         self,
@@ -148,6 +154,12 @@ class Renderer:
         by_row = [[plane_map(T) for T in spread(poses, count)] for poses in rows]
         maps = by_row[0] if len(rows) == 1 else [np.stack(m) for m in zip(*by_row, strict=True)]
         picture: Any = self._optical(maps, motion_px)
+        if self._glossy_half_m:
+            middle = rows[len(rows) // 2]
+            picture = shone_upon(
+                picture, self._coarse, middle[len(middle) // 2], self._lamp_m,
+                self.scenario.gloss, self._glossy_half_m,
+            )  # fmt: skip
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
         lens = math.sqrt(max(sigma**2 - SAMPLING_SIGMA_PX**2, 0.0))
         if lens > 0.05:

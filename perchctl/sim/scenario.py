@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from perchctl.sim.gusts import Gust
+
 CONTROL_PERIOD_S = 0.002
 """Step of the physics and of the firmware model (500 Hz)."""
 
@@ -50,7 +52,9 @@ class Scenario:
             again and again, with `camera_receiver_noise` on it each time; None: it does not.
         camera_blank_rate: share of pictures that are a blue screen.
         drift_mps: drift of the state estimate, world axes.
-        draught_mps: the wind with its gusts (`perchctl.sim.wind`).
+        draught_mps: the wind with its smooth gusts (`perchctl.sim.wind`).
+        gusts: single ones beside it (`perchctl.sim.gusts`).
+        ceiling_suction: share of thrust gained with the rotors' plane at the ceiling.
         magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
         no_target: the ceiling is bare.
@@ -64,6 +68,16 @@ class Scenario:
         rssi_dbm: of the radio, at the vehicle.
         parameters: the firmware's, where they differ from its release at boot.
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
+        target_tilt_rad: the target's turns about the world's x and y, after its heading.
+        gloss: peak of the lamp's reflection in the print, in whites of the paper; `lamp_m` the
+            lamp's place (`perchctl.sim.gloss`).
+        flow_noise_radps, flow_bias_radps: of the flow deck's readings, the latter in x and y.
+        flow_reach_m: above this it sees no flow; None: it always does.
+        bare_floors: x, y and radius of patches without texture (`perchctl.sim.flow_deck`).
+        radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
+            such a time lasts on average (`perchctl.sim.bursts`).
+        capture_holes_s: begin and length of the times in which a motion capture does not see
+            the vehicle.
         neighbours: other vehicles' targets. What these vehicles do to the air is in the draught.
     """
 
@@ -117,4 +131,16 @@ class Scenario:
     camera_gone_at_s: float | None = None
     target_above_ceiling_m: float = 0.0
     neighbours: tuple[Neighbour, ...] = ()
+    gusts: tuple[Gust, ...] = ()
+    ceiling_suction: float = 0.10
+    target_tilt_rad: tuple[float, float] = (0.0, 0.0)
+    gloss: float = 0.0
+    lamp_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    flow_noise_radps: float = 0.0
+    flow_bias_radps: tuple[float, float] = (0.0, 0.0)
+    flow_reach_m: float | None = None
+    bare_floors: tuple[tuple[float, float, float], ...] = ()
+    radio_loss: float = 0.0
+    radio_burst_s: float = 0.1
+    capture_holes_s: tuple[tuple[float, float], ...] = ()
     extra: dict[str, float] = field(default_factory=dict)

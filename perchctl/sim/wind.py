@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from perchctl.sim.gusts import blown
 from perchctl.sim.scenario import Scenario
 
 _TERMS = 5
@@ -18,7 +19,8 @@ _Terms = tuple[tuple[float, float, float], ...]
 
 
 class Wind:
-    """`Scenario.draught_mps` is the speed that the gusts reach at two standard deviations."""
+    """`Scenario.draught_mps` is the speed that the smooth gusts reach at two standard deviations;
+    single ones (`Scenario.gusts`) are added."""
 
     def __init__(self, scenario: Scenario) -> None:
         draught = scenario.draught_mps
@@ -27,10 +29,17 @@ class Wind:
         speed_mps = math.hypot(*draught)
         rng = np.random.default_rng([scenario.seed, _STREAM])
         self._still = speed_mps == 0.0
+        self._single = scenario.gusts
         self._gusts = tuple(_draw(rng, share * speed_mps) for share in _SHARES)
 
     def at(self, t_s: float) -> tuple[float, float, float]:
         """The wind at t, m/s, world axes; exactly zero in still air."""
+        if self._single:
+            steady, more = self._smooth(t_s), blown(self._single, t_s)
+            return (steady[0] + more[0], steady[1] + more[1], steady[2] + more[2])
+        return self._smooth(t_s)
+
+    def _smooth(self, t_s: float) -> tuple[float, float, float]:
         if self._still:
             return (0.0, 0.0, 0.0)
         x, y, z = self._mean

@@ -18,13 +18,15 @@ from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.profile.places import listing
 
 
-@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck"])
+@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"])
 def test_shipped_profiles_load(name: str) -> None:
     assert load_profile(name).name == name
 
 
 def test_the_shipped_profiles_are_all_listed() -> None:
-    assert {"sim", "paper", "crazyflie", "fpv", "aideck"} <= set(listing("profiles"))
+    assert {"sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"} <= set(
+        listing("profiles")
+    )
 
 
 def test_paper_constants() -> None:

@@ -29,7 +29,7 @@ def uncommented(text: str) -> list[str]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck"])
+@pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"])
 def test_a_written_profile_is_read_as_it_was(name: str, tmp_path: Path) -> None:
     profile = load_profile(name)
     text = profile_text(profile)

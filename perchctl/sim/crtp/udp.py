@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from perchctl.errors import ConnectionFailed
+from perchctl.sim.bursts import Bursts
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.server import CrtpServer, LinkOptions
 
@@ -27,9 +28,11 @@ class UdpEndpoint:
     datagram that is a packet, before anything is made of it: time, sender, bytes.
     """
 
-    def __init__(self, port: int, options: LinkOptions) -> None:
-        """`port` 0 lets the operating system choose. Raises ConnectionFailed when taken."""
+    def __init__(self, port: int, options: LinkOptions, bursts: Bursts | None = None) -> None:
+        """`port` 0 lets the operating system choose; `bursts`: in which nothing passes. Raises
+        ConnectionFailed when taken."""
         self._options = options
+        self._bursts = bursts
         self._random = np.random.default_rng([options.loss_seed, _STREAM])
         self._peer: Address | None = None
         self.heard: Callable[[float, Address, bytes], None] | None = None
@@ -64,7 +67,7 @@ class UdpEndpoint:
                 return
             except ConnectionError:  # a former peer's port is closed (Windows)
                 continue
-            if self._is_silent(t_s) or self._is_lost():
+            if self._is_silent(t_s) or self._is_lost(t_s):
                 continue
             packet = Packet.decode(datagram)
             if packet is None:
@@ -82,7 +85,7 @@ class UdpEndpoint:
 
     def _send(self, packets: Iterable[Packet], address: Address, t_s: float) -> None:
         for packet in packets:
-            if self._is_silent(t_s) or self._is_lost():
+            if self._is_silent(t_s) or self._is_lost(t_s):
                 continue
             try:
                 self.socket.sendto(packet.encode(), address)
@@ -94,6 +97,8 @@ class UdpEndpoint:
             self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S
         )
 
-    def _is_lost(self) -> bool:
+    def _is_lost(self, t_s: float) -> bool:
+        if self._bursts is not None and self._bursts.lost(t_s):
+            return True
         rate = self._options.loss_rate
         return rate > 0.0 and float(self._random.random()) < rate

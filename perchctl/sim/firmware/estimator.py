@@ -1,6 +1,7 @@
 """The state estimate: the truth with the errors of a flow deck or of motion capture.
 
-Drift runs from the moment the motors first turn. A vehicle without a deck (scenario
+Drift runs from the moment the motors first turn; what a flow deck adds on a bad floor or high
+above it is in `perchctl.sim.flow_deck`. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
@@ -26,6 +27,7 @@ from perchctl.sim.firmware.outside import (
     Vector,
     multiplied,
 )
+from perchctl.sim.flow_deck import FlowDeck, has_flow_errors
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 _STREAM = 2
@@ -82,6 +84,9 @@ class Estimator:
         self.outside: OutsideFilter | None = None
         if scenario.extra.get("external_position"):
             self.outside = OutsideFilter(scenario.seed)
+        self._flow: FlowDeck | None = None
+        if self.outside is None and has_flow_errors(scenario):
+            self._flow = FlowDeck(scenario)
         self._reset_due = True
         self._reset_s = 0.0
         self._rng.uniform()  # keeps the flights of all seeds as they were
@@ -95,6 +100,8 @@ class Estimator:
         self._reset_s = t_s
         self._drift_s = 0.0
         self._reset_due = True
+        if self._flow is not None:
+            self._flow.reset()
 
     def external_position(self, position_m: Vector) -> None:
         """One measurement from outside; counted always, used by a vehicle without a deck."""
@@ -118,9 +125,10 @@ class Estimator:
         where there is no deck."""
         if self.outside is not None:
             return self.outside.variance_m2
-        return _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
+        deck_m2 = _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
             -(t_s - self._reset_s) / _VARIANCE_FALL_S
         )
+        return deck_m2 if self._flow is None else deck_m2 + self._flow.variance_m2
 
     def update(
         self, world: Sensed, t_s: float, *, flown: bool, spinning: bool, pressed: bool = False
@@ -215,6 +223,11 @@ class Estimator:
         now.vx_mps = world.vx_mps + dx + nx
         now.vy_mps = world.vy_mps + dy + ny
         now.vz_mps = world.vz_mps + dz + nz
+        if self._flow is not None and flown:
+            self._flow.step(world)
+            (px, py, pz), (ex, ey) = self._flow.position_error_m, self._flow.velocity_error_mps
+            now.x_m, now.y_m, now.z_m = now.x_m + px, now.y_m + py, now.z_m + pz
+            now.vx_mps, now.vy_mps = now.vx_mps + ex, now.vy_mps + ey
 
     def _move_outside(
         self, outside: OutsideFilter, world: Sensed, *, spinning: bool, pressed: bool

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from perchctl.geometry import rpy_from_rotation
+from perchctl.sim.bursts import bursts_of
 from perchctl.sim.capture.server import SYSTEM, CaptureServer
 from perchctl.sim.crtp.server import CrtpServer
 from perchctl.sim.crtp.udp import Address, UdpEndpoint
@@ -37,7 +38,7 @@ class VehicleHost:
         self._steps = 0
         self.vehicle = self._new_vehicle(setup.scenario)
         self.server = CrtpServer(self.vehicle.firmware, setup.link)
-        self.endpoint = UdpEndpoint(setup.port, setup.link)
+        self.endpoint = UdpEndpoint(setup.port, setup.link, bursts_of(setup.scenario))
         self.stream: MjpegServer | None = None
         self.positions: CaptureServer | None = None
         self._truth: TextIO | None = None

@@ -1,0 +1,199 @@
+"""The profile's keys of the simulation: what a seed's flight is drawn from."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from perchctl.profile.base import Range, Section, Vector3, ordered
+from perchctl.profile.worlds import with_world
+
+MarkerId = Annotated[int, Field(ge=0)]
+_Positive = Annotated[float, Field(ge=0)]
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Tilt = Annotated[float, Field(ge=0, le=20)]
+_Ohm = Annotated[float, Field(ge=0, le=1)]
+_Charge = Annotated[float, Field(ge=0.05, le=1)]
+_Knee = Annotated[float, Field(ge=0.01, le=0.9)]
+_Loss = Annotated[float, Field(ge=0, le=0.5)]
+_Burst = Annotated[float, Field(ge=0.01, le=10)]
+Amounts = Annotated[tuple[_Positive, _Positive], AfterValidator(ordered)]
+Shares = Annotated[tuple[_Share, _Share], AfterValidator(ordered)]
+Tilts = Annotated[tuple[_Tilt, _Tilt], AfterValidator(ordered)]
+Ohms = Annotated[tuple[_Ohm, _Ohm], AfterValidator(ordered)]
+Charges = Annotated[tuple[_Charge, _Charge], AfterValidator(ordered)]
+Knees = Annotated[tuple[_Knee, _Knee], AfterValidator(ordered)]
+Losses = Annotated[tuple[_Loss, _Loss], AfterValidator(ordered)]
+Bursts = Annotated[tuple[_Burst, _Burst], AfterValidator(ordered)]
+
+
+class SimulationConfig(Section):
+    """Ranges from which a seed draws one flight's conditions (`perchctl.sim.draw`).
+
+    `set` gives the defaults (`perchctl.profile.worlds`); keys that are written win over it.
+    """
+
+    set: Literal["nominal", "rough", "extreme"] = Field(
+        "nominal", description="the world whose values stand where a key is not written"
+    )
+    start_offset_m: float = Field(
+        0.5, ge=0, le=5, description="start under the target, at most so far aside in x and in y"
+    )
+    target_yaw_deg: Range = Field((-180.0, 180.0), description="the target's heading")
+    ceiling_z_m: Range = Field((1.8, 2.6), description="over the floor")
+    mass_kg: Range = Field((0.038, 0.042), description="all-up")
+    battery_rest_v: Range = Field((3.85, 4.2), description="at the start")
+    camera_latency_s: Range = Field((0.03, 0.12), description="the true one")
+    camera_jitter_s: float = Field(0.008, ge=0, le=0.2, description="of the latency, one sigma")
+    camera_rate_hz: float = Field(30.0, gt=0, le=200, description="frames")
+    camera_drop_rate: float = Field(0.1, ge=0, lt=1, description="share of frames lost")
+    camera_burst_frames: tuple[int, int] | None = Field(
+        (8, 20), description="frames lost in one go, once a flight"
+    )
+    camera_noise_sigma: Range = Field((4.0, 8.0), description="of 255")
+    camera_exposure_s: float = Field(0.008, ge=0, le=0.05, description="motion blur")
+    camera_defocus_px: float = Field(0.6, ge=0, le=10, description="sigma of the lens's blur")
+    camera_fields: Literal["progressive", "top", "bottom"] = Field(
+        "progressive", description="interlaced: which row's field comes first"
+    )
+    camera_blended: bool = Field(
+        False, description="the two fields averaged, as some converters do"
+    )
+    camera_readout_s: float = Field(
+        0.0, ge=0, le=0.05, description="rolling shutter: from the first row to the last"
+    )
+    camera_flicker: float = Field(
+        0.0, ge=0, le=1, description="share of the light that comes and goes 100 times a second"
+    )
+    camera_pumping: float = Field(
+        0.0, ge=0, le=0.9, description="share by which an exposure control that hunts is off"
+    )
+    camera_analogue: float = Field(
+        0.0, ge=0, le=1, description="trembling, torn and lost lines; 1 is about to be lost"
+    )
+    camera_receiver_hz: float | None = Field(
+        None,
+        gt=0,
+        le=200,
+        description="the receiver's own rate, at which it gives out its newest picture again; "
+        "none: each once, as it comes",
+    )
+    camera_receiver_noise: float = Field(
+        0.0, ge=0, le=50, description="that the receiver adds each time; of 255, one sigma"
+    )
+    camera_blank_rate: float = Field(
+        0.0, ge=0, lt=1, description="share of pictures in whose place the screen is blue"
+    )
+    mount_error_deg: float = Field(
+        1.0, ge=0, le=20, description="what the profile's mount is wrong by, at most"
+    )
+    mount_error_m: float = Field(
+        0.001, ge=0, le=0.05, description="what the profile's mount is wrong by, at most"
+    )
+    estimate_noise_m: float = Field(0.002, ge=0, le=0.2, description="of the state estimate")
+    estimate_tilt_bias_deg: float = Field(
+        0.3, ge=0, le=10, description="of the state estimate, at most"
+    )
+    drift_mps: float = Field(0.01, ge=0, le=0.2, description="of the state estimate")
+    draught_mps: Range = Field((0.0, 0.3), description="wind, with gusts")
+    magnet_force_n: float = Field(1.2, ge=0, le=20, description="that the magnet holds")
+    first_contact_fails: float = Field(
+        0.1, ge=0, le=1, description="share of flights in which the first contact does not hold"
+    )
+    no_target: bool = Field(False, description="a bare ceiling")
+    capture_delay_s: float = Field(
+        0.01, ge=0, le=1, description="motion capture: from exposure to arrival"
+    )
+    capture_noise_m: float = Field(
+        0.001, gt=0, le=0.1, description="motion capture: of a position, one sigma"
+    )
+    neighbours: tuple[tuple[float, float, float], ...] = Field(
+        (),
+        max_length=8,
+        description="other targets beside the own one: x and y (m) in its axes, heading (deg)",
+    )
+    neighbour_ids: tuple[MarkerId, MarkerId] | None = Field(
+        None, description="of their large and small markers; none: the own target's"
+    )
+    target_xy_m: tuple[float, float] | None = Field(
+        None, description="the target's centre, instead of what `start_offset_m` draws"
+    )
+    camera_burst_start_s: Range = Field((4.0, 22.0), description="of the frames lost in one go")
+    mount_error_rpy_deg: Vector3 | None = Field(
+        None, description="what the mount is turned by, instead of what `mount_error_deg` draws"
+    )
+    mount_error_xyz_m: Vector3 | None = Field(
+        None, description="what the mount is shifted by, instead of what `mount_error_m` draws"
+    )
+    drift_xyz_mps: Vector3 | None = Field(
+        None, description="the drift, instead of what `drift_mps` draws"
+    )
+    draught_towards_deg: Range = Field((-180.0, 180.0), description="counted from the world's x")
+    estimate_tilt_bias_xy_deg: tuple[float, float] | None = Field(
+        None, description="of roll and pitch, instead of what `estimate_tilt_bias_deg` draws"
+    )
+    first_contact_share: Shares = Field(
+        (0.0, 0.6), description="of the weight, that a first contact carries which does not hold"
+    )
+    gust_mps: Amounts = Field((0.0, 0.0), description="peak of single gusts beside the draught")
+    gust_every_s: float = Field(8.0, gt=0, le=1000, description="on average")
+    ceiling_suction: Shares = Field(
+        (0.1, 0.1), description="share of thrust gained with the rotors at the ceiling"
+    )
+    cell_resistance_ohm: Ohms | None = Field(None, description="none: a good one's, 0.143")
+    cell_slow_ohm: Ohms = Field(
+        (0.0, 0.0), description="more of it, that an old or cold cell shows within 15 s"
+    )
+    cell_charge: Charges = Field((1.0, 1.0), description="share of a new one's that it holds")
+    cell_knee: Knees = Field(
+        (0.1, 0.1), description="share of its charge where the steep end begins"
+    )
+    target_tilt_deg: Tilts = Field((0.0, 0.0), description="of the target out of the horizontal")
+    target_tilt_towards_deg: Range = Field(
+        (-180.0, 180.0), description="which of its sides is lifted, from the world's x"
+    )
+    gloss: Amounts = Field(
+        (0.0, 0.0), description="brightest of the lamp's reflection in the print, in paper whites"
+    )
+    lamp_aside_m: Amounts = Field((0.1, 0.6), description="of the lamp, from under the target")
+    lamp_z_m: Amounts = Field((0.0, 1.2), description="of the lamp, over the floor")
+    flow_noise_radps: Amounts = Field(
+        (0.0, 0.0), description="of each reading of the flow sensor; times the height it is a speed"
+    )
+    flow_bias_dps: Amounts = Field(
+        (0.0, 0.0), description="of the gyroscope, that is taken for flow: drift grows with height"
+    )
+    flow_reach_m: float | None = Field(
+        None,
+        gt=0,
+        le=20,
+        description="above this the flow sensor sees nothing; none: it always does",
+    )
+    bare_floor_m: Amounts = Field(
+        (0.0, 0.0), description="radius of a patch of floor without texture, where flow is blind"
+    )
+    bare_floor_aside_m: Amounts = Field((0.0, 0.6), description="of it, from under the target")
+    radio_loss: Losses = Field(
+        (0.0, 0.0), description="share of the time in which no packet passes"
+    )
+    radio_burst_s: Bursts = Field((0.1, 0.1), description="mean length of such a time")
+    capture_hole_s: Amounts = Field(
+        (0.0, 0.0), description="motion capture: for so long it does not see the vehicle"
+    )
+    capture_hole_every_s: float = Field(15.0, gt=0, le=1000, description="on average")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_the_set(cls, values: Any) -> Any:
+        return with_world(values) if isinstance(values, dict) else values
+
+
+def in_world(simulation: SimulationConfig, name: str) -> SimulationConfig:
+    """The same keys in another named world: those that are as their own set has them become as
+    the other has them, what was written stays. Raises pydantic's ValidationError for no world."""
+    before = SimulationConfig.model_validate({"set": simulation.set})
+    written = {
+        key: value for key, value in simulation if value != getattr(before, key) and key != "set"
+    }
+    return SimulationConfig.model_validate(written | {"set": name})
