@@ -72,8 +72,10 @@ def plane_map(T_target_cam: Array) -> Array:
     (w is made negative).
     """
     R, t = T_target_cam[:3, :3], T_target_cam[:3, 3]
-    H = np.stack([t[0] * R[2] - t[2] * R[0], t[1] * R[2] - t[2] * R[1], R[2]])
-    return H if t[2] < 0.0 else np.array([H[0], H[1], [0.0, 0.0, -1.0]])
+    H = np.empty((3, 3))
+    H[:2] = t[:2, None] * R[2] - t[2] * R[:2]
+    H[2] = R[2] if t[2] < 0.0 else (0.0, 0.0, -1.0)
+    return H
 
 
 def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -29,6 +29,7 @@ from perchctl.sim.rays import (
     COARSE_PX,
     FINE_PX,
     LEAST_RISE,
+    RayGrid,
     local_px_per_m,
     plane_map,
     ray_grid,
@@ -93,6 +94,7 @@ class Renderer:
         self._tiles = tile_rays(self._fine)
         self.shade = vignetting(self._fine, camera.size_px)
         self._noise = self._noise_bank()
+        self._places = _five_places(self._coarse)
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
@@ -135,10 +137,10 @@ class Renderer:
         rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
         if self._noise is not None:
             width, height = self.camera.size_px
-            rows, cols = self._noise.shape
+            rows, cols = self._noise[0].shape
             r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
-            noise = self._noise[r : r + height, c : c + width]
-            picture = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), np.uint8)
+            more, less = (bank[r : r + height, c : c + width] for bank in self._noise)
+            picture = np.asarray(cv2.subtract(cv2.add(picture, more), less), np.uint8)
         if self._analogue > 0.0:
             picture = spoil(picture, self._analogue, rng)
         return np.asarray(picture, np.uint8)
@@ -147,10 +149,11 @@ class Renderer:
         """What falls onto the sensor in one shot, before noise."""
         rows = [[self._T_target_world @ np.asarray(T) for T in poses] for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
-        count = sample_count(motion_px)
+        length_px = path_length_px(motion_px)
+        count = sample_count(length_px)
         by_row = [[plane_map(T) for T in spread(poses, count)] for poses in rows]
         maps = by_row[0] if len(rows) == 1 else [np.stack(m) for m in zip(*by_row, strict=True)]
-        picture: Any = self._optical(maps, motion_px)
+        picture: Any = self._optical(maps, motion_px, length_px)
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
         lens = math.sqrt(max(sigma**2 - SAMPLING_SIGMA_PX**2, 0.0))
         if lens > 0.05:
@@ -162,13 +165,12 @@ class Renderer:
 
     # -- through the lens ---------------------------------------------------
 
-    def _optical(self, maps: list[Array], motion_px: Array) -> Picture:
+    def _optical(self, maps: list[Array], motion_px: Array, length_px: float) -> Picture:
         """The picture before defocus, at the ray grids' padded size."""
         middle = maps[len(maps) // 2]
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
-        length_px = path_length_px(motion_px)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
         hiding = [view for view in views if view.tiles.inner.all()]
         if hiding:
@@ -239,32 +241,38 @@ class Renderer:
         """Path of the ceiling's image during the exposure at five places, (5, n, 2) px."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
-        xy = self._coarse.xy
-        rows, cols = xy.shape[:2]
-        places = [(rows // 2, cols // 2)] + [
-            (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
-        ]
-        seen = np.array([[*xy[r, c], 1.0] for r, c in places], np.float64).T  # (3, 5)
-        middle = poses[len(poses) // 2]
-        points = plane_map(middle) @ seen
-        height = np.maximum(points[2], LEAST_RISE)
-        points = np.stack([points[0] / height, points[1] / height, np.zeros(5), np.ones(5)])
-        path = []
-        for T in poses:
-            cam = invert_T(T) @ points
-            depth = np.maximum(cam[2], 1e-3)
-            path.append((cam[:2] / depth).T * self._focal_px)
-        return np.stack(path, axis=1)
+        points = plane_map(poses[len(poses) // 2]) @ self._places
+        points /= np.maximum(points[2], LEAST_RISE)
+        points[2] = 0.0
+        T = np.stack(poses)
+        cam = T[:, :3, :3].transpose(0, 2, 1) @ (points - T[:, :3, 3:])  # (n, 3, 5)
+        path = cam[:, :2] * (self._focal_px / np.maximum(cam[:, 2:], 1e-3))
+        return np.asarray(path.transpose(2, 0, 1))
 
-    def _noise_bank(self) -> NDArray[np.int16] | None:
+    def _noise_bank(self) -> tuple[Picture, Picture] | None:
+        """What is added to a picture, and what is taken off: one of them is 0 at each place.
+        Such sums of bytes cost a third of one with signed numbers."""
         sigma = self.scenario.camera_noise_sigma
         if sigma <= 0.0:
             return None
         width, height = self.camera.size_px
         size = (max(_NOISE_BANK_PX, height + 256), max(_NOISE_BANK_PX, width + 256))
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
-        bank = rng.standard_normal(size, np.float32) * np.float32(sigma)
-        return np.asarray(np.rint(bank), np.int16)
+        bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
+        return _bytes(bank), _bytes(-bank)
+
+
+def _bytes(grey: NDArray[np.float32]) -> Picture:
+    return np.clip(grey, 0.0, 255.0).astype(np.uint8)
+
+
+def _five_places(coarse: RayGrid) -> Array:
+    """Rays (3, 5) to the picture's middle and into its quarters."""
+    rows, cols = coarse.xy.shape[:2]
+    places = [(rows // 2, cols // 2)] + [
+        (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
+    ]
+    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
 
 
 @dataclass(frozen=True, eq=False)
