@@ -89,7 +89,7 @@ def assess(
     recordings (`live` false) equal pictures are taken as they are.
     """
     limits = limits or HealthLimits()
-    checksum = zlib.crc32(np.ascontiguousarray(frame.image))
+    checksum = zlib.crc32(np.ascontiguousarray(frame.image).data)
     if live and checksum == state.checksum:
         state = HealthState(checksum, state.changed_at_s, state.repeats + 1)
         unchanged_s = frame.t_s - state.changed_at_s

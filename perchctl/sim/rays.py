@@ -60,9 +60,9 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     xy = undistorted_rays(camera, pixels)
     down = np.asarray(v / (camera.size_px[1] - 1.0), np.float32)
-    xy = np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32)
-    outline = np.concatenate([xy[0], xy[-1], xy[:, 0], xy[:, -1]])
-    return RayGrid(stride, xy, down, outline)
+    rays = np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32)
+    outline = np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1]])
+    return RayGrid(stride, rays, down, outline)
 
 
 def plane_map(T_target_cam: Array) -> Array:

@@ -1,9 +1,10 @@
 """The picture of the ceiling and its target from a camera pose.
 
 Every image pixel is a ray, traced to the ceiling's plane and looked up in
-textures; lens distortion lies in the rays, which are precomputed. The exact
-map is evaluated at every second pixel (the ceiling's at every eighth) and
-interpolated, which errs by less than 0.01 px for lenses up to 90 degrees.
+textures; lens distortion lies in the rays, which are precomputed. The sheets' map
+is exact at each pixel of a tile in which they show an edge; other tiles are filled
+(`perchctl.sim.tiles`). The ceiling's is evaluated at every eighth and interpolated,
+which errs by less than 0.01 px for lenses up to 90 degrees.
 
 Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
 """
@@ -231,8 +232,8 @@ class Renderer:
             on = pixels[: len(outline)]
             rows, cols = (axis[: len(outline)] for axis in places)
             behind = into[rows, cols].view(np.uint8)
-            behind = cv2.multiply(behind, cv2.bitwise_not(alpha.result()), scale=1.0 / 255.0)
-            on[:] = cv2.add(behind, on)
+            rest: Any = cv2.multiply(behind, cv2.bitwise_not(alpha.result()), scale=1.0 / 255.0)
+            on[:] = cv2.add(rest, on)
         into[places] = pixels.view(np.uint64)
 
     # -- motion -------------------------------------------------------------

@@ -47,7 +47,7 @@ def tile_rays(fine: RayGrid) -> TileRays:
     down = np.arange(rows * TILE_PX) * ((fine.down[2] - fine.down[1]) / FINE_PX)
     by_tile = np.repeat(down.reshape(rows, 1, TILE_PX), cols, axis=1)
     return TileRays(
-        np.ascontiguousarray(blocks).reshape(rows * cols, TILE_PX**2, 2),
+        np.ascontiguousarray(blocks, np.float32).reshape(rows * cols, TILE_PX**2, 2),
         np.asarray(by_tile, np.float32).reshape(rows * cols, TILE_PX),
         fine.outline,
     )
@@ -71,7 +71,7 @@ class Reach:
 def reach_of(nodes: NDArray[np.float32], length_px: float) -> Reach:
     """`nodes` are the coarse ones in the sheet's axes, `length_px` is the longest way of its
     picture within the exposure."""
-    x, y = cv2.split(nodes)
+    x, y = (np.asarray(axis, np.float32) for axis in cv2.split(nodes))
     # Half a tile to each side, by the distance of the nodes at both sides; the outermost pixels'
     # centres lie an eighth less far out.
     reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / TILE_PX)

@@ -69,7 +69,7 @@ def _wide(axis: Array, half_node: float) -> Array:
 def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
     """The drawing at n by n nodes over its reach, and perhaps what is beyond its sheet."""
     half_node = drawing.reach / n
-    axis = half_node * (2.0 * np.arange(n) + 1.0 - n)
+    axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
     paper = drawn(drawing, axis, half_node)
     outside = beyond_sheet(drawing, axis, half_node)
     return (paper,) if outside is None else (paper, outside)
