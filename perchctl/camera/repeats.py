@@ -108,8 +108,8 @@ def _unlike(last: Grey, image: Grey) -> float | None:
 
 def _calm(one: Grey, other: Grey) -> float:
     """Mean difference where it is small, grey levels."""
-    counts = np.bincount(cv2.absdiff(one, other).ravel(), minlength=256)
+    counts = cv2.calcHist([cv2.absdiff(one, other)], [0], None, [256], [0.0, 256.0]).ravel()
     most = max(1, int(_CALM * one.size))
-    kept = np.minimum(np.cumsum(counts), most)
+    kept = np.minimum(np.cumsum(counts, dtype=np.float64), most)
     kept = np.diff(kept, prepend=0)
     return float((kept * np.arange(256)).sum() / most)

@@ -27,6 +27,8 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision.types import Frame
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
+_QUEUED = 2
+"""Pictures that wait where nobody takes them; one that is newer replaces the oldest."""
 HARD_LANDING_MPS = 1.0
 """Sinking faster than this into the floor is a fall, whatever the log calls it."""
 
@@ -58,7 +60,7 @@ class LockstepSource:
         self._count = 0
 
     def poll(self, now_s: float) -> Frame | None:
-        for each in self._camera.take():
+        for each in self._camera.take()[-_QUEUED:]:
             self._slot.put(each.image, each.t_arrival_s - self._latency_s, each.t_arrival_s)
         frame = self._slot.take()
         if frame is None:

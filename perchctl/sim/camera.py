@@ -9,11 +9,10 @@ from typing import Protocol
 import numpy as np
 
 from perchctl.geometry import Array, make_T
-from perchctl.sim.receiver import DeliveredFrame, Receiver, blanked
+from perchctl.sim.receiver import DeliveredFrame, Later, Receiver, blanked
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.shutter import Shutter
-from perchctl.sim.surfaces import Picture
 
 __all__ = ["DeliveredFrame", "SimCamera"]
 
@@ -32,7 +31,8 @@ class BodyState(Protocol):
 
 
 class SimCamera:
-    """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes.
+    """Exposes at `camera_rate_hz` with its own phase; same seed, same bytes, whether or not the
+    other frames are looked at.
 
     Each exposure draws the same random numbers whether or not it is lost, and a
     frame's noise hangs on its index, so neither faults nor the steps of
@@ -59,7 +59,7 @@ class SimCamera:
         self._index = 0
         self._burst_left = scenario.camera_burst[1] if scenario.camera_burst else 0
         self._last_arrival_s = -np.inf
-        self._last_image: Picture | None = None
+        self._last: Later | None = None
         self._t_s = -np.inf
         self._under_way: deque[DeliveredFrame] = deque()
         self._receiver = Receiver(scenario)
@@ -103,21 +103,30 @@ class SimCamera:
             return
         self._last_arrival_s = arrival_s
         frozen = s.camera_freeze_at_s is not None and middle_s >= s.camera_freeze_at_s
-        if self._last_image is None or not frozen:
-            self._last_image = self._picture(middle_s, pose_at)
-        image = blanked(s, self._index, self._last_image)
-        self._under_way.append(DeliveredFrame(arrival_s, middle_s, image, self._index))
+        if self._last is None or not frozen:
+            self._last = self._picture(middle_s, pose_at)
+        picture = blanked(s, self._index, self._last)
+        self._under_way.append(DeliveredFrame(arrival_s, middle_s, picture, self._index))
 
-    def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Picture:
+    def develop(self) -> None:
+        """Make the pictures that are under way: what they show is about to change."""
+        for frame in self._under_way:
+            frame.picture()
+        if self._last is not None:
+            self._last()
+
+    def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Later:
+        """The poses are of now; the picture is made when it is looked at."""
+
         def T_world_cam_at(t_s: float) -> Array:
             return self._T_world_cam(pose_at(t_s))
 
+        index, renderer = self._index, self.renderer
         if self._shutter.plain:
             samples = [T_world_cam_at(t) for t in self._shutter.exposure_times(middle_s)]
-            return self.renderer.render(samples, frame_index=self._index)
-        height = self.renderer.camera.size_px[1]
-        shots = self._shutter.shots(middle_s, T_world_cam_at, height)
-        return self.renderer.expose(shots, frame_index=self._index)
+            return Later(lambda: renderer.render(samples, frame_index=index))
+        shots = self._shutter.shots(middle_s, T_world_cam_at, renderer.camera.size_px[1])
+        return Later(lambda: renderer.expose(shots, frame_index=index))
 
     def _T_world_cam(self, state: BodyState) -> Array:
         return make_T(state.R_world_body, state.position_m) @ self._T_body_cam

@@ -20,15 +20,15 @@ MAX_KERNEL_REACH_PX = 12
 
 def path_length_px(motion_px: Array) -> float:
     """Longest path of any of the places, `motion_px` (places, times, 2)."""
-    return float(np.linalg.norm(np.diff(motion_px, axis=1), axis=2).sum(axis=1).max())
+    steps = motion_px[:, 1:] - motion_px[:, :-1]
+    return float(np.sqrt((steps * steps).sum(axis=2)).sum(axis=1).max())
 
 
-def sample_count(motion_px: Array) -> int:
-    """How many poses a blur of that path needs; 1 for a sharp frame."""
-    length = path_length_px(motion_px)
-    if length < SHARP_MOTION_PX:
+def sample_count(length_px: float) -> int:
+    """How many poses the blur of a path of that length needs; 1 for a sharp frame."""
+    if length_px < SHARP_MOTION_PX:
         return 1
-    return min(max(math.ceil(length / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)
+    return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)
 
 
 def spread(poses: list[Array], count: int) -> list[Array]:

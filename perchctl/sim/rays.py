@@ -32,9 +32,7 @@ class RayGrid:
     stride: int
     xy: NDArray[np.float32]  # (rows, cols, 2)
     down: NDArray[np.float32]  # (rows,), 0 in the picture's first row, 1 in its last
-
-    def crop(self, rows: slice, cols: slice) -> RayGrid:
-        return RayGrid(self.stride, self.xy[rows, cols], self.down[rows])
+    outline: NDArray[np.float32]  # (n, 2), rays around all of them
 
     @property
     def rays(self) -> NDArray[np.float32]:
@@ -62,7 +60,9 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
     pixels = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     xy = undistorted_rays(camera, pixels)
     down = np.asarray(v / (camera.size_px[1] - 1.0), np.float32)
-    return RayGrid(stride, np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32), down)
+    rays = np.ascontiguousarray(xy.reshape(rows, cols, 2), np.float32)
+    outline = np.concatenate([rays[0], rays[-1], rays[:, 0], rays[:, -1]])
+    return RayGrid(stride, rays, down, outline)
 
 
 def plane_map(T_target_cam: Array) -> Array:
@@ -72,8 +72,10 @@ def plane_map(T_target_cam: Array) -> Array:
     (w is made negative).
     """
     R, t = T_target_cam[:3, :3], T_target_cam[:3, 3]
-    H = np.stack([t[0] * R[2] - t[2] * R[0], t[1] * R[2] - t[2] * R[1], R[2]])
-    return H if t[2] < 0.0 else np.array([H[0], H[1], [0.0, 0.0, -1.0]])
+    H = np.empty((3, 3))
+    H[:2] = t[:2, None] * R[2] - t[2] * R[:2]
+    H[2] = R[2] if t[2] < 0.0 else (0.0, 0.0, -1.0)
+    return H
 
 
 def trace(grid: RayGrid, to_plane: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -113,9 +115,8 @@ def _met(q: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]
 def _all_rise(grid: RayGrid, to_plane: Array) -> bool:
     """Whether every ray meets the plane. The rise is linear over the rays, so it is least
     on the outline."""
-    xy = grid.xy
-    outline = np.concatenate([xy[0], xy[-1], xy[:, 0], xy[:, -1]])
-    return bool((outline @ to_plane[2, :2] + to_plane[2, 2]).min() >= LEAST_RISE)
+    rise = to_plane[2].astype(np.float32)
+    return bool(grid.outline.dot(rise[:2]).min() + rise[2] >= LEAST_RISE)
 
 
 def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) -> float:

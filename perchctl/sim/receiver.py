@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,21 @@ BLUE_GREY, BLUE_NOISE = 41.0, 0.6
 _BLANKS, _TICKS = 1, 2  # streams of random numbers
 
 
+class Later:
+    """A picture that is made when it is first looked at: most of a simulated camera's time would
+    go into those that nobody takes. What it shows must not hang on when that is."""
+
+    def __init__(self, make: Callable[[], Picture]) -> None:
+        self._make: Callable[[], Picture] | None = make
+        self._made: Picture | None = None
+
+    def __call__(self) -> Picture:
+        if self._make is not None:
+            self._made, self._make = self._make(), None
+        assert self._made is not None
+        return self._made
+
+
 @dataclass(frozen=True, eq=False)
 class DeliveredFrame:
     """A frame that has arrived; `t_exposure_s` is the middle of its exposure: between the
@@ -24,8 +39,12 @@ class DeliveredFrame:
 
     t_arrival_s: float
     t_exposure_s: float
-    image: Picture
+    picture: Later
     index: int  # of the exposure: gaps are lost frames
+
+    @property
+    def image(self) -> Picture:
+        return self.picture()
 
 
 class Receiver:
@@ -56,27 +75,27 @@ class Receiver:
             while waiting and waiting[0].t_arrival_s <= at_s:
                 self._newest = waiting.pop(0)
             if self._newest is not None:
-                yield replace(self._newest, t_arrival_s=at_s, image=self._image(self._newest))
+                yield replace(self._newest, t_arrival_s=at_s, picture=self._noisy(self._newest))
             self._given += 1
         if waiting:
             self._newest = waiting[-1]
 
-    def _image(self, frame: DeliveredFrame) -> Picture:
-        sigma = self._scenario.camera_receiver_noise
+    def _noisy(self, frame: DeliveredFrame) -> Later:
+        sigma, number = self._scenario.camera_receiver_noise, self._given
         if not sigma:
-            return frame.image
-        rng = np.random.default_rng([self._scenario.seed, STREAM, _TICKS, self._given])
-        return _noisy(frame.image, sigma, rng)
+            return frame.picture
+        seed = [self._scenario.seed, STREAM, _TICKS, number]
+        return Later(lambda: _noisy(frame.image, sigma, np.random.default_rng(seed)))
 
 
-def blanked(scenario: Scenario, index: int, image: Picture) -> Picture:
+def blanked(scenario: Scenario, index: int, picture: Later) -> Later:
     """The picture, or the blue screen in its place."""
     if not scenario.camera_blank_rate:
-        return image
+        return picture
     rng = np.random.default_rng([scenario.seed, STREAM, _BLANKS, index])
     if float(rng.random()) >= scenario.camera_blank_rate:
-        return image
-    return _noisy(np.full_like(image, BLUE_GREY), BLUE_NOISE, rng)
+        return picture
+    return Later(lambda: _noisy(np.full_like(picture(), BLUE_GREY), BLUE_NOISE, rng))
 
 
 def _noisy(image: Picture, sigma: float, rng: np.random.Generator) -> Picture:

@@ -1,9 +1,10 @@
 """The picture of the ceiling and its target from a camera pose.
 
 Every image pixel is a ray, traced to the ceiling's plane and looked up in
-textures; lens distortion lies in the rays, which are precomputed. The exact
-map is evaluated at every second pixel (the ceiling's at every eighth) and
-interpolated, which errs by less than 0.01 px for lenses up to 90 degrees.
+textures; lens distortion lies in the rays, which are precomputed. The sheets' map
+is exact at each pixel of a tile in which they show an edge; other tiles are filled
+(`perchctl.sim.tiles`). The ceiling's is evaluated at every eighth and interpolated,
+which errs by less than 0.01 px for lenses up to 90 degrees.
 
 Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
 """
@@ -30,6 +31,7 @@ from perchctl.sim.rays import (
     COARSE_PX,
     FINE_PX,
     LEAST_RISE,
+    RayGrid,
     local_px_per_m,
     plane_map,
     ray_grid,
@@ -44,7 +46,9 @@ from perchctl.sim.surfaces import (
     Ceiling,
     Picture,
     Sheet,
+    SheetTexture,
 )
+from perchctl.sim.tiles import Tiles, by_tile, fill, reach_of, tile_rays, tiles_of
 from perchctl.target.drawing import draw_target
 from perchctl.vision.types import CameraModel
 
@@ -92,8 +96,10 @@ class Renderer:
         self._fine = ray_grid(camera, FINE_PX)
         self._coarse = ray_grid(camera, COARSE_PX)
         self._focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
+        self._tiles = tile_rays(self._fine)
         self.shade = vignetting(self._fine, camera.size_px)
         self._noise = self._noise_bank()
+        self._places = _five_places(self._coarse)
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
@@ -138,10 +144,10 @@ class Renderer:
         rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
         if self._noise is not None:
             width, height = self.camera.size_px
-            rows, cols = self._noise.shape
+            rows, cols = self._noise[0].shape
             r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
-            noise = self._noise[r : r + height, c : c + width]
-            picture = np.asarray(cv2.add(picture, noise, dtype=cv2.CV_8U), np.uint8)
+            more, less = (bank[r : r + height, c : c + width] for bank in self._noise)
+            picture = np.asarray(cv2.subtract(cv2.add(picture, more), less), np.uint8)
         if self._analogue > 0.0:
             picture = spoil(picture, self._analogue, rng)
         return np.asarray(picture, np.uint8)
@@ -150,10 +156,11 @@ class Renderer:
         """What falls onto the sensor in one shot, before noise."""
         rows = [[self._T_target_world @ np.asarray(T) for T in poses] for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
-        count = sample_count(motion_px)
+        length_px = path_length_px(motion_px)
+        count = sample_count(length_px)
         by_row = [[plane_map(T) for T in spread(poses, count)] for poses in rows]
         maps = by_row[0] if len(rows) == 1 else [np.stack(m) for m in zip(*by_row, strict=True)]
-        picture: Any = self._optical(maps, motion_px)
+        picture: Any = self._optical(maps, motion_px, length_px)
         if self._glossy_half_m:
             middle = rows[len(rows) // 2]
             picture = shone_upon(
@@ -171,25 +178,21 @@ class Renderer:
 
     # -- through the lens ---------------------------------------------------
 
-    def _optical(self, maps: list[Array], motion_px: Array) -> Picture:
+    def _optical(self, maps: list[Array], motion_px: Array, length_px: float) -> Picture:
         """The picture before defocus, at the ray grids' padded size."""
         middle = maps[len(maps) // 2]
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
-        views = [(each, each.seen_from(nodes)) for each in self._sheets]
-        hidden = [(each, moved) for each, moved in views if each.covers_all(moved)]
-        height, width = ((n - 2) * COARSE_PX for n in nodes.shape[:2])
-        if hidden:
-            picture = np.zeros((height, width), np.uint8)
+        views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
+        hiding = [view for view in views if view.tiles.inner.all()]
+        if hiding:
+            height, width = ((n - 2) * COARSE_PX for n in nodes.shape[:2])
+            picture = np.empty((height, width), np.uint8)
         else:
             picture = self._background(nodes, misses, motion_px)
-        length_px = path_length_px(motion_px)
-        for each, moved in hidden or views:
-            inside = each.nodes_on(moved)
-            if inside.any():
-                own = maps if each.plane is None else [each.plane @ m for m in maps]
-                self._add_sheet(picture, each.sheet, moved, inside, own, length_px, bool(hidden))
+        for view in hiding or views:
+            self._add_sheet(picture, view, maps)
         return picture
 
     def _background(
@@ -216,44 +219,34 @@ class Renderer:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
 
-    def _add_sheet(
-        self,
-        picture: Picture,
-        sheet: Sheet,
-        nodes: NDArray[np.float32],
-        inside: NDArray[np.bool_],
-        maps: list[Array],
-        length_px: float,
-        opaque: bool,
-    ) -> None:
-        rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-        # One more block all around: motion moves the sheet within the exposure.
-        grow = 1 + math.ceil(length_px / COARSE_PX)
-        top, left = max(rows[0] - 1 - grow, 0), max(cols[0] - 1 - grow, 0)
-        bottom = min(rows[-1] + grow, nodes.shape[0] - 2)
-        right = min(cols[-1] + grow, nodes.shape[1] - 2)
-        if bottom <= top or right <= left:
+    def _add_sheet(self, picture: Picture, view: _View, maps: list[Array]) -> None:
+        tiles, texture, plane = view.tiles, view.texture, view.placed.plane
+        into = by_tile(picture)
+        fill(into, tiles.even, tiles.grey)
+        outline = np.flatnonzero(tiles.outline)
+        wanted = np.concatenate([outline, np.flatnonzero(tiles.edges)])
+        if not len(wanted):
             return
-        j, i = int(rows.mean()), int(cols.mean())
-        texture = sheet.texture(local_px_per_m(nodes, j, i, COARSE_PX))
-        k = COARSE_PX // FINE_PX
-        grid = self._fine.crop(slice(top * k, bottom * k + 2), slice(left * k, right * k + 2))
+        scale, centre = texture.px_per_m, texture.center_px
+        to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
+        if plane is not None:
+            to_texels = to_texels @ plane
+        grid = self._tiles.of(wanted)
         value, alpha = Mean(len(maps)), Mean(len(maps))
         for each in maps:
-            points, _ = trace(grid, each)
-            points *= texture.px_per_m
-            points += texture.center_px
-            texels = cv2.resize(points, None, fx=FINE_PX, fy=FINE_PX)
-            texels = np.ascontiguousarray(texels[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX])
+            texels = trace(grid, to_texels @ each)[0].reshape(-1, COARSE_PX**2, 2)
             value.add(sample(texture.value, texels))
-            if not opaque:
-                alpha.add(sample(texture.alpha, texels))
-        area = picture[top * COARSE_PX : bottom * COARSE_PX, left * COARSE_PX : right * COARSE_PX]
-        if opaque:
-            area[:] = value.result()
-            return
-        behind = cv2.multiply(area, cv2.bitwise_not(alpha.result()), scale=1.0 / 255.0)
-        area[:] = cv2.add(behind, value.result())
+            if len(outline):
+                alpha.add(sample(texture.alpha, texels[: len(outline)]))
+        places = np.divmod(wanted, into.shape[1])
+        pixels = value.result()
+        if len(outline):
+            on = pixels[: len(outline)]
+            rows, cols = (axis[: len(outline)] for axis in places)
+            behind = into[rows, cols].view(np.uint8)
+            rest: Any = cv2.multiply(behind, cv2.bitwise_not(alpha.result()), scale=1.0 / 255.0)
+            on[:] = cv2.add(rest, on)
+        into[places] = pixels.view(np.uint64)
 
     # -- motion -------------------------------------------------------------
 
@@ -261,32 +254,38 @@ class Renderer:
         """Path of the ceiling's image during the exposure at five places, (5, n, 2) px."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
-        xy = self._coarse.xy
-        rows, cols = xy.shape[:2]
-        places = [(rows // 2, cols // 2)] + [
-            (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
-        ]
-        seen = np.array([[*xy[r, c], 1.0] for r, c in places], np.float64).T  # (3, 5)
-        middle = poses[len(poses) // 2]
-        points = plane_map(middle) @ seen
-        height = np.maximum(points[2], LEAST_RISE)
-        points = np.stack([points[0] / height, points[1] / height, np.zeros(5), np.ones(5)])
-        path = []
-        for T in poses:
-            cam = invert_T(T) @ points
-            depth = np.maximum(cam[2], 1e-3)
-            path.append((cam[:2] / depth).T * self._focal_px)
-        return np.stack(path, axis=1)
+        points = plane_map(poses[len(poses) // 2]) @ self._places
+        points /= np.maximum(points[2], LEAST_RISE)
+        points[2] = 0.0
+        T = np.stack(poses)
+        cam = T[:, :3, :3].transpose(0, 2, 1) @ (points - T[:, :3, 3:])  # (n, 3, 5)
+        path = cam[:, :2] * (self._focal_px / np.maximum(cam[:, 2:], 1e-3))
+        return np.asarray(path.transpose(2, 0, 1))
 
-    def _noise_bank(self) -> NDArray[np.int16] | None:
+    def _noise_bank(self) -> tuple[Picture, Picture] | None:
+        """What is added to a picture, and what is taken off: one of them is 0 at each place.
+        Such sums of bytes cost a third of one with signed numbers."""
         sigma = self.scenario.camera_noise_sigma
         if sigma <= 0.0:
             return None
         width, height = self.camera.size_px
         size = (max(_NOISE_BANK_PX, height + 256), max(_NOISE_BANK_PX, width + 256))
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
-        bank = rng.standard_normal(size, np.float32) * np.float32(sigma)
-        return np.asarray(np.rint(bank), np.int16)
+        bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
+        return _bytes(bank), _bytes(-bank)
+
+
+def _bytes(grey: NDArray[np.float32]) -> Picture:
+    return np.clip(grey, 0.0, 255.0).astype(np.uint8)
+
+
+def _five_places(coarse: RayGrid) -> Array:
+    """Rays (3, 5) to the picture's middle and into its quarters."""
+    rows, cols = coarse.xy.shape[:2]
+    places = [(rows // 2, cols // 2)] + [
+        (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
+    ]
+    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,16 +302,28 @@ class _Placed:
         turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
         return np.asarray(nodes @ turn.astype(np.float32) + shift.astype(np.float32))
 
-    def nodes_on(self, nodes: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Nodes, in its axes, on the sheet or within 1.5 nodes of it."""
-        step = np.abs(np.diff(nodes, axis=1)).max(axis=2)  # m a node
-        step = np.minimum(np.pad(step, ((0, 0), (0, 1)), mode="edge"), 1.0)
-        reach = self.sheet.drawing.sheet_side_m / 2.0 + 1.5 * step
-        return np.asarray(np.abs(nodes).max(axis=2) < reach)
+    def view(self, nodes: NDArray[np.float32], length_px: float) -> _View | None:
+        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
+        longest way of the picture within the exposure. None where the sheet is out of view."""
+        moved = self.seen_from(nodes)
+        side_m = self.sheet.drawing.sheet_side_m
+        reach = reach_of(moved, length_px)
+        near = reach.near(side_m)
+        rows, cols = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+        if not len(rows):
+            return None
+        j, i = int(rows.mean()) + 1, int(cols.mean()) + 1
+        texture = self.sheet.texture(local_px_per_m(moved, j, i, COARSE_PX))
+        return _View(self, texture, tiles_of(reach, texture, side_m))
 
-    def covers_all(self, nodes: NDArray[np.float32]) -> bool:
-        """Whether nothing but its paper is in view (with room for motion and blur)."""
-        return float(np.abs(nodes).max()) < 0.45 * self.sheet.drawing.sheet_side_m
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A sheet in one exposure."""
+
+    placed: _Placed
+    texture: SheetTexture
+    tiles: Tiles
 
 
 def _beside(neighbour: Neighbour, own: TargetConfig) -> _Placed:

@@ -29,6 +29,8 @@ window, or one that is no whole number of texels, aliases: edges would be out of
 place by up to 0.03 px."""
 SAMPLING_SIGMA_PX = 1.0 / (PIXEL_WINDOW_TEXELS * math.sqrt(6.0))
 """Blur that bilinear sampling between texels adds to the pixel's own window."""
+FARTHEST_EDGE_TEXELS = 128
+"""Edges farther away than that are not told apart."""
 
 TILE_M = 2.0
 """The ceiling's texture repeats after this length."""
@@ -49,13 +51,16 @@ class SheetTexture:
     """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage.
 
     A point (x, y) of the target's plane (target axes) is at column
-    ``center_px + x * px_per_m`` and row ``center_px + y * px_per_m``.
+    ``center_px + x * px_per_m`` and row ``center_px + y * px_per_m``. `to_edge` is how many
+    texels, along rows or columns, it is to the next that differs from its neighbours; it has
+    `FARTHEST_EDGE_TEXELS` more at each side, and says no more than these.
     """
 
     value: Picture
     alpha: Picture
     px_per_m: float
     center_px: float
+    to_edge: Picture
 
 
 class Sheet:
@@ -79,13 +84,19 @@ class Sheet:
         size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
         ink = ink_coverage(self.drawing, px_per_m, size, window_px)
         sheet = sheet_coverage(self.drawing, px_per_m, size, window_px)
-        value = PAPER_GREY * sheet + (INK_GREY - PAPER_GREY) * ink
-        return SheetTexture(
-            np.rint(value).astype(np.uint8),
-            np.rint(255.0 * sheet).astype(np.uint8),
-            px_per_m,
-            (size - 1) / 2.0,
-        )
+        grey = np.rint(PAPER_GREY * sheet + (INK_GREY - PAPER_GREY) * ink).astype(np.uint8)
+        alpha = np.rint(255.0 * sheet).astype(np.uint8)
+        return SheetTexture(grey, alpha, px_per_m, (size - 1) / 2.0, _to_edge(grey, alpha))
+
+
+def _to_edge(value: Picture, alpha: Picture) -> Picture:
+    even = np.ones(np.add(value.shape, 2 * FARTHEST_EDGE_TEXELS), np.bool_)
+    inside = slice(FARTHEST_EDGE_TEXELS, -FARTHEST_EDGE_TEXELS)
+    near = np.ones((3, 3), np.uint8)
+    for each in (value, alpha):
+        even[inside, inside] &= cv2.dilate(each, near) == cv2.erode(each, near)
+    distance = cv2.distanceTransform(even.astype(np.uint8), cv2.DIST_C, 3)
+    return np.minimum(distance, FARTHEST_EDGE_TEXELS - 1).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,6 +66,7 @@ class SimulatedVehicle:
         """The target and its magnet hang there from now on."""
         self.world.magnet.target_xy_m = xy_m
         if self.camera is not None:
+            self.camera.develop()
             self.camera.renderer.move_target(xy_m)
 
     def _state_at(self, t_s: float) -> TrueState:

@@ -17,6 +17,7 @@ from perchctl.profile import TargetConfig
 from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vision.types import CameraModel
 
 
@@ -141,6 +142,7 @@ def test_a_frozen_camera_repeats_its_last_picture() -> None:
 def test_a_camera_frozen_from_the_start_shows_its_first_picture() -> None:
     frames, stub = run(Scenario(seed=1, camera_freeze_at_s=0.0), 1.0)
     assert len(frames) > 20
+    assert len({id(f.image) for f in frames}) == 1
     assert len(stub.rendered) == 1
 
 
@@ -188,3 +190,30 @@ def test_with_the_renderer_the_same_seed_gives_the_same_bytes() -> None:
     first = flight()
     assert len(first) > 5
     assert first == flight()
+
+
+def test_pictures_that_nobody_looks_at_are_not_made_and_change_no_other() -> None:
+    all_seen, _ = run(Scenario(seed=8))
+    for f in all_seen:
+        assert f.image is f.image
+    frames, stub = run(Scenario(seed=8))
+    assert not stub.rendered
+    assert np.array_equal(frames[30].image, all_seen[30].image)
+    assert stub.rendered == [frames[30].index]
+
+
+def test_a_picture_shows_the_target_where_it_was() -> None:
+    K = np.array([[190.0, 0, 160], [0, 190, 120], [0, 0, 1]])
+    model = CameraModel((320, 240), K, np.zeros(5))
+    still, moved = (SimulatedVehicle(Scenario(seed=3), model, TargetConfig()) for _ in range(2))
+    pictures = []
+    for vehicle in (still, moved):
+        vehicle.advance_to(0.5)
+        if vehicle is moved:
+            vehicle.move_target((0.3, 0.0))
+        vehicle.advance_to(0.7)
+        assert vehicle.camera is not None
+        pictures.append([(f.t_exposure_s, f.image) for f in vehicle.camera.take()])
+    same = [(t_s, np.array_equal(a, b)) for (t_s, a), (_, b) in zip(*pictures, strict=True)]
+    assert any(not equal for _, equal in same)
+    assert all(equal == (t_s < 0.496) for t_s, equal in same)

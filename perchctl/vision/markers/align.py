@@ -24,9 +24,8 @@ from perchctl.vision.markers.cells import cells_seen
 from perchctl.vision.markers.drawing import (
     Drawing,
     Rendering,
-    beyond_sheet,
     blurred,
-    drawn,
+    sheets,
     soft_cells,
 )
 from perchctl.vision.markers.grid import (
@@ -188,15 +187,13 @@ def _scene(
     patch = patch_around(image, grid, H, lens_px)
     if patch is None:
         return None
-    paper = drawn(drawing, grid.axis, reach / n)
-    outside = beyond_sheet(drawing, grid.axis, reach / n)
     return _Scene(
         patch=patch,
         grid=grid,
         camera=camera,
         H=H,
         lens_px=lens_px,
-        sharp=(paper,) if outside is None else (paper, outside),
+        sharp=sheets(drawing, n),
         side_px=side_px,
         node_px=reach * side_px / n,
         max_blur_px=_MAX_BLUR_CELLS * side_px / len(drawing.cells),
@@ -236,9 +233,11 @@ def _equations(fit: _Fit, scene: _Scene) -> _Equations | None:
     if gain < _MIN_GAIN:
         return None
     error = grey - light.grey
-    J = np.concatenate([lit_jacobian(fit.renderings, light, scene.grid), light.columns], axis=1)
+    changes = lit_jacobian(fit.renderings, light, scene.grid)
+    J = np.concatenate([changes, light.columns, error[:, None]], axis=1)
     noise = max(float((error**2).mean()), 1.0)
-    N, g = gram(J, J) / noise, gram(J, error)[:, 0] / noise
+    products = gram(J, J) / noise
+    J, N, g = J[:, :-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT + BEND
     N[_BLUR, _BLUR] += 1.0  # about a node's width a round
     N[bend, bend] += (_BEND_SIGMA * gain) ** -2.0

@@ -41,8 +41,9 @@ def cells_seen(
     """
     n, m = soft.shape
     seen = gain * (soft.T @ error.reshape(n, n) @ soft).ravel()
-    shared = gain * np.einsum("va,vuk,ub->abk", soft, J.reshape(n, n, -1), soft, optimize=True)
-    shared = shared.reshape(m * m, -1)
+    k = J.shape[1]
+    by_row = soft.T @ J.reshape(n, n * k)  # (m, n, k)
+    shared = gain * (soft.T @ by_row.reshape(m, n, k)).reshape(m * m, k)
     squared = (soft**2).sum(axis=0)
     energy = gain**2 * np.outer(squared, squared).ravel()
     taken = np.einsum("ij,ij->i", shared, np.linalg.solve(N, shared.T).T)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 
 _REACH_CELLS = 0.6  # of white around the border
-_EDGE = 12  # nodes more all around, for the blur
+EDGE = 12
+"""Nodes more all around, for the blur."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +61,28 @@ def _coverage(axis: Array, half_node: float, n_cells: int, size: float) -> Array
 
 
 def _wide(axis: Array, half_node: float) -> Array:
-    more = 2.0 * half_node * np.arange(1, _EDGE + 1)
+    more = 2.0 * half_node * np.arange(1, EDGE + 1)
     return np.concatenate([axis[0] - more[::-1], axis, axis[-1] + more])
 
 
+@lru_cache(maxsize=64)
+def sheets(drawing: Drawing, n: int) -> tuple[NDArray[np.float32], ...]:
+    """The drawing at n by n nodes over its reach, and perhaps what is beyond its sheet."""
+    half_node = drawing.reach / n
+    axis: Array = half_node * (2.0 * np.arange(n, dtype=np.float64) + 1.0 - n)
+    paper = drawn(drawing, axis, half_node)
+    outside = beyond_sheet(drawing, axis, half_node)
+    return (paper,) if outside is None else (paper, outside)
+
+
+@lru_cache(maxsize=64)
+def square(cells: int, n: int) -> NDArray[np.float32]:
+    """A black square of so many cells at n by n nodes over their reach."""
+    return sheets(Drawing(np.zeros((cells, cells))), n)[0]
+
+
 def drawn(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32]:
-    """Whiteness of each node and of `_EDGE` nodes more all around, exact in area, as if the
+    """Whiteness of each node and of `EDGE` nodes more all around, exact in area, as if the
     paper had no end."""
     wide = _wide(axis, half_node)
     C = _coverage(wide, half_node, len(drawing.cells), 1.0)
@@ -82,7 +100,7 @@ def soft_cells(drawing: Drawing, axis: Array, half_node: float, sigma: float) ->
     soft = cv2.GaussianBlur(
         wide.astype(np.float32), (1, 0), sigmaX=1e-3, sigmaY=sigma, borderType=cv2.BORDER_REPLICATE
     )
-    return np.asarray(soft[_EDGE : _EDGE + len(axis)], dtype=np.float64)
+    return np.asarray(soft[EDGE : EDGE + len(axis)], dtype=np.float64)
 
 
 def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.float32] | None:
@@ -93,19 +111,29 @@ def beyond_sheet(drawing: Drawing, axis: Array, half_node: float) -> NDArray[np.
     return (1.0 - on @ on.T).astype(np.float32)
 
 
+def softened(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    """Nodes, those all around among them, blurred by so many."""
+    soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(soft, np.float32)
+
+
 def blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> Rendering:
     """The drawing blurred by sigma nodes, and its changes, per unit of the drawing."""
-    soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    soft = softened(sharp, sigma)
     step = float(axis[1] - axis[0])
-    e, n = _EDGE, len(axis)
+    e, n = EDGE, len(axis)
     middle = slice(e, e + n)
     left, right = soft[middle, e - 1 : e + n - 1], soft[middle, e + 1 : e + n + 1]
     up, down = soft[e - 1 : e + n - 1, middle], soft[e + 1 : e + n + 1, middle]
     value = soft[middle, middle]
     du, dv = np.float32(0.5 / step) * (right - left), np.float32(0.5 / step) * (down - up)
     laplace = left + right + up + down - 4.0 * value
-    u, v = np.meshgrid(axis, axis)
+    u, v = axis.astype(np.float32), axis.astype(np.float32)[:, None]
     along = u * du + v * dv
-    parts = [-u * du, -v * du, -du, -u * dv, -v * dv, -dv, u * along, v * along, 0.5 * laplace]
-    flat = np.asarray(np.stack(parts, axis=-1), dtype=np.float64).reshape(n * n, 9)
-    return Rendering(value.ravel().astype(np.float64), flat)
+    flat = np.empty((n, n, 9))
+    for part, one, other in (
+        (0, u, du), (1, v, du), (3, u, dv), (4, v, dv), (6, -u, along), (7, -v, along),
+    ):  # fmt: skip
+        np.multiply(-one, other, out=flat[..., part])
+    flat[..., 2], flat[..., 5], flat[..., 8] = -du, -dv, 0.5 * laplace
+    return Rendering(value.ravel().astype(np.float64), flat.reshape(n * n, 9))

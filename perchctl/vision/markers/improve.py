@@ -23,6 +23,7 @@ _GOOD_BLURS = 6.0  # a cell's width over the blur's sigma, likewise
 _REACH = 0.3  # of the side
 # Where the other marker shows that it must be there, it may be vague.
 _MAX_SIGMA_ALONE, _MAX_SIGMA = 0.06, 0.12  # of the side
+_BLUR_PX = 1.5  # to start with, where it is not known
 _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
@@ -57,8 +58,9 @@ def improved(
         alone = _OTHER[name] not in better
         max_sigma = _MAX_SIGMA_ALONE if alone else _MAX_SIGMA
         exact = aligned(
-            image, start, patterns[name], camera, _REACH, max_sigma=max_sigma, alone=alone
-        )
+            image, start, patterns[name], camera, _REACH, _blur_px(better.get(name)),
+            max_sigma=max_sigma, alone=alone,
+        )  # fmt: skip
         if exact is not None:
             better[name] = exact
         elif alone and searched:
@@ -66,6 +68,13 @@ def improved(
         elif name not in better and resembles(image, start, patterns[name]):
             better[name] = RefinedCorners(start, NESTED_SIGMA_PX, False)
     return better
+
+
+def _blur_px(seen: RefinedCorners | None) -> float:
+    """That of the sides, where lines were fitted: the fit of the drawing gets there sooner."""
+    if seen is None or not seen.refined or seen.blur_px <= 0.0:
+        return _BLUR_PX
+    return min(seen.blur_px, _BLUR_PX)
 
 
 def _start(

@@ -45,10 +45,11 @@ def fit_light(renderings: Sequence[Rendering], grey: Array, grid: Grid) -> Light
     u, v, white = grid.u, grid.v, renderings[0].value
     columns = [np.ones_like(u), u, v, white, white * u, white * v, white * (1.0 - white)]
     columns += [rendering.value for rendering in renderings[1:]]
-    light: Array = np.stack(columns, axis=1)
-    A = gram(light, light) + 1e-6 * np.eye(len(columns))
+    light: Array = np.stack([*columns, grey], axis=1)
+    products = gram(light, light)
+    A = products[:-1, :-1] + 1e-6 * np.eye(len(columns))
     A[BEND, BEND] += 1e-3 * len(u)  # no bend unless it is seen
-    return Light(light, np.asarray(np.linalg.solve(A, gram(light, grey)[:, 0]), dtype=np.float64))
+    return Light(light[:, :-1], np.asarray(np.linalg.solve(A, products[:-1, -1]), np.float64))
 
 
 def lit_jacobian(renderings: Sequence[Rendering], light: Light, grid: Grid) -> Array:

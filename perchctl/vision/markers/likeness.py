@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.drawing import Drawing, blurred, drawn
+from perchctl.vision.markers.drawing import EDGE, Drawing, softened, square
 from perchctl.vision.markers.grid import Grid
 from perchctl.vision.markers.light import BEYOND, GAIN, Light
 from perchctl.vision.markers.products import gram, mixed
@@ -26,20 +26,21 @@ def pattern_seen(
     drawing: Drawing, grid: Grid, sigma: float, light: Light, error: Array
 ) -> PatternSeen:
     """With the drawing blurred by `sigma` nodes; `error` (n * n,) is what the fit left over."""
-    plain = Drawing(np.zeros_like(drawing.cells))
-    half = float(grid.axis[1] - grid.axis[0]) / 2
-    square = blurred(drawn(plain, grid.axis, half), sigma, grid.axis).value
+    plain = softened(square(len(drawing.cells), grid.n), sigma)[EDGE:-EDGE, EDGE:-EDGE]
     columns = light.columns
-    known: Array = np.column_stack([columns[:, :GAIN], square, columns[:, BEYOND:]])
+    known: Array = np.column_stack([columns[:, :GAIN], plain.ravel(), columns[:, BEYOND:]])
     left: Array = np.stack([columns[:, GAIN], light.grey + error], axis=1)
-    A = gram(known, known) + 1e-9 * np.eye(known.shape[1])
-    mix = np.asarray(np.linalg.solve(A, gram(known, left)), dtype=np.float64)
+    both = np.concatenate([known, left], axis=1)
+    count = known.shape[1]
+    products = gram(both, both)[:count]
+    A = products[:, :count] + 1e-9 * np.eye(count)
+    mix = np.asarray(np.linalg.solve(A, products[:, count:]), dtype=np.float64)
     bits, seen = (left[:, k] - mixed(known, mix[:, k]) for k in (0, 1))
     energy, product = float((bits * bits).sum()), float((bits * seen).sum())
-    both = math.sqrt(energy * float((seen * seen).sum()))
-    if both < 1e-9:
+    scale = math.sqrt(energy * float((seen * seen).sum()))
+    if scale < 1e-9:
         return PatternSeen(0.0, 0.0)
-    return PatternSeen(product / both, product / max(energy, 1e-9) / light.gain)
+    return PatternSeen(product / scale, product / max(energy, 1e-9) / light.gain)
 
 
 def likeness(grey: Array, error: Array) -> float:

@@ -6,18 +6,19 @@ save, and far more on a busy machine.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from perchctl.geometry import Array
 
+_BLOCK = 256  # rows
+
 
 def gram(A: Array, B: Array) -> Array:
-    """A^T B of tall matrices (n * n, a) and (n * n, b)."""
-    n = math.isqrt(len(A))
-    blocks = np.matmul(A.reshape(n, n, -1).transpose(0, 2, 1), B.reshape(n, n, -1))
-    return np.asarray(blocks.sum(axis=0))
+    """A^T B of tall matrices (rows, a) and (rows, b)."""
+    whole = len(A) - len(A) % _BLOCK
+    left, right = (M[:whole].reshape(-1, _BLOCK, M.shape[1]) for M in (A, B))
+    total = np.matmul(left.transpose(0, 2, 1), right).sum(axis=0)
+    return np.asarray(total + A[whole:].T.dot(B[whole:]))
 
 
 def mixed(columns: Array, coefficients: Array) -> Array:

@@ -1,0 +1,97 @@
+"""Tiles that are filled with one grey look as if each pixel had been looked up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import perchctl.sim.renderer as rendering
+from perchctl.geometry import Array, make_T, rotation_from_rpy
+from perchctl.profile import TargetConfig
+from perchctl.sim.renderer import Renderer
+from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.sim.shutter import Shot
+from perchctl.sim.surfaces import SheetTexture
+from perchctl.sim.tiles import Reach, Tiles, tiles_of
+from perchctl.vision.types import CameraModel
+
+K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])
+CAMERA = CameraModel((640, 480), K, np.array([-0.17, 0.04, 0.0004, -0.0007, -0.003]))
+SCENE = Scenario(
+    ceiling_z_m=2.0, target_yaw_rad=0.4, camera_noise_sigma=0.0, neighbours=(Neighbour((0.5, 0.1)),)
+)
+
+
+def pose(below_m: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Array:
+    return make_T(rotation_from_rpy(roll, pitch, yaw), (0.02, -0.01, 2.0 - below_m))
+
+
+EXPOSURES = {
+    "far": (pose(1.5, 0.05, 0.1, 1.0),),
+    "near": (pose(0.3, -0.05, 0.03, 0.2),),
+    "nothing but paper": (pose(0.1, 0.02, -0.04, 2.0),),
+    "touching": (pose(0.04, 0.0, 0.01, -1.0),),
+    "moving": (pose(0.5), pose(0.5, 0.006, 0.01, 0.01), pose(0.5, 0.012, 0.02, 0.02)),
+    "turning fast": (pose(0.2), pose(0.2, 0.0, 0.0, 0.03), pose(0.2, 0.0, 0.0, 0.06)),
+    "with the horizon in view": (pose(0.3, 1.3, 0.0, 0.0),),
+}
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(SCENE, CAMERA, TargetConfig())
+
+
+def each_pixel(reach: Reach, texture: SheetTexture, side_m: float) -> Tiles:
+    """No tile counts as even."""
+    found = tiles_of(reach, texture, side_m)
+    nowhere = np.zeros_like(found.inner)
+    return replace(found, even=nowhere, edges=found.inner, outline=~found.inner)
+
+
+@pytest.mark.parametrize("name", EXPOSURES)
+def test_even_tiles_are_what_their_pixels_are(
+    renderer: Renderer, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    quick = renderer.render(EXPOSURES[name])
+    monkeypatch.setattr(rendering, "tiles_of", each_pixel)
+    assert np.array_equal(quick, renderer.render(EXPOSURES[name]))
+
+
+def test_so_they_are_with_a_rolling_shutter(
+    renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = tuple((pose(0.25, 0.01 * k, 0.0, 0.02 * k),) for k in range(5))
+    quick = renderer.expose([Shot(rows)])
+    monkeypatch.setattr(rendering, "tiles_of", each_pixel)
+    assert np.array_equal(quick, renderer.expose([Shot(rows)]))
+
+
+def test_most_of_a_near_sheet_is_even(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = []
+
+    def watched(reach: Reach, texture: SheetTexture, side_m: float) -> Tiles:
+        found = tiles_of(reach, texture, side_m)
+        shares.append(float(found.even.mean()))
+        return found
+
+    monkeypatch.setattr(rendering, "tiles_of", watched)
+    renderer.render(EXPOSURES["nothing but paper"])
+    assert max(shares) > 0.6
+
+
+def test_noise_has_its_spread_and_no_memory() -> None:
+    """Neither of the pixel beside, nor of the frame before; and no mean."""
+    scene = replace(SCENE, no_target=True, neighbours=())
+    bare = Renderer(scene, CAMERA, TargetConfig()).render([pose(1.0)]).astype(float)
+    noisy = Renderer(replace(scene, camera_noise_sigma=6.0), CAMERA, TargetConfig())
+    one, other = (noisy.render([pose(1.0)], frame_index=i) - bare for i in (1, 2))
+    for noise in (one, other):
+        assert abs(noise.mean()) < 0.05
+        assert noise.std() == pytest.approx(6.0, rel=0.02)
+        assert np.abs(noise).max() > 3.5 * 6.0
+        assert abs((noise[:, 1:] * noise[:, :-1]).mean()) < 0.01 * 36.0
+        assert abs((noise[1:] * noise[:-1]).mean()) < 0.01 * 36.0
+    assert abs((one * other).mean()) < 0.01 * 36.0
