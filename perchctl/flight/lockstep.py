@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration.files import camera_of
@@ -22,6 +22,7 @@ from perchctl.sim.draw import draw_capture, draw_scenario
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.told import Teller
 from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.values import replace
 from perchctl.vehicle import LOCKED
 from perchctl.vision.types import Frame
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
@@ -13,6 +12,7 @@ from perchctl.link.telemetry import (
     VARIANCE_BLOCK,
     telemetry_from,
 )
+from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
 BLOCKS: dict[str, dict[str, str]] = {

@@ -11,7 +11,6 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
@@ -28,6 +27,7 @@ from perchctl.link.variables import EXTERNAL, LISTEN_S, decks_of
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
+from perchctl.values import replace
 from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
 
 if TYPE_CHECKING:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from perchctl.geometry import Array, rotation_from_rpy
+from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
 WINDOW_S = 3.0
