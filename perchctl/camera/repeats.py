@@ -108,8 +108,8 @@ def _unlike(last: Grey, image: Grey) -> float | None:
 
 def _calm(one: Grey, other: Grey) -> float:
     """Mean difference where it is small, grey levels."""
-    counts = np.bincount(cv2.absdiff(one, other).ravel(), minlength=256)
+    counts = cv2.calcHist([cv2.absdiff(one, other)], [0], None, [256], [0, 256])
     most = max(1, int(_CALM * one.size))
-    kept = np.minimum(np.cumsum(counts), most)
-    kept = np.diff(kept, prepend=0)
-    return float((kept * np.arange(256)).sum() / most)
+    # Of each level and all below; the sum of the levels is that of what lies above each.
+    below = np.minimum(np.cumsum(counts.ravel(), dtype=np.int64), most)
+    return float((255 * most - int(below[:255].sum())) / most)

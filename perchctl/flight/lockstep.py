@@ -181,6 +181,7 @@ def fly_lockstep(
     )  # fmt: skip
     link.connect()
     report = fly(parts)
+    vehicle.watched = False
     link.close()
     link.advance_to(link.now_s + 1.0)
     return _flown(report, vehicle, truth)

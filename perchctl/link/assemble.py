@@ -12,7 +12,6 @@ from perchctl.link.telemetry import (
     VARIANCE_BLOCK,
     telemetry_from,
 )
-from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
 BLOCKS: dict[str, dict[str, str]] = {
@@ -48,8 +47,7 @@ class Assembler:
         if block != "attitude" or self._state_s is None or self.missing():
             return None
         behind_s = t_s - self._state_s
-        sample = telemetry_from(_carried(self._values, behind_s), t_s)
-        return replace(sample, behind_s=max(0.0, behind_s))
+        return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s))
 
     def missing(self) -> list[str]:
         """The needed variables of which nothing has come yet."""

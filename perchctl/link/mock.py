@@ -168,7 +168,7 @@ class MockLink:
         firmware = self.vehicle.firmware
         delay_s = self.radio.down(block, self.now_s)
         if delay_s is not None:
-            values = {name: firmware.log_value(name) for name in BLOCKS[block]}
+            values = firmware.log_values(BLOCKS[block])
             packet = (self.now_s + delay_s, next(self._count), block, firmware.t_s, values)
             heapq.heappush(self._under_way, packet)
 

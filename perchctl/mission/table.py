@@ -338,11 +338,19 @@ def first_match(c: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
     Whatever the table says, a landing is never undone: a row that would lead from it to a
     flying phase is passed over.
     """
-    for row in table:
-        undoes = c.state.severity >= Severity.LAND and row.to in FLYING_PHASES
-        if c.state.phase in row.phases and not undoes and row.when(c):
+    phase, lands = c.state.phase, c.state.severity >= Severity.LAND
+    rows = _ROWS_OF[phase] if table is TABLE else _rows_of(phase, table)
+    for row in rows:
+        if not (lands and row.to in FLYING_PHASES) and row.when(c):
             return row
     return None
+
+
+def _rows_of(phase: Phase, table: tuple[Row, ...]) -> tuple[Row, ...]:
+    return tuple(row for row in table if phase in row.phases)
+
+
+_ROWS_OF = {phase: _rows_of(phase, TABLE) for phase in Phase}
 
 
 def risen(before: Severity, row: Severity) -> Severity:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, ClassVar
 
 from perchctl.sim.firmware.commands import HighLevelCommand, LowLevelCommand
@@ -227,6 +227,15 @@ class Firmware:
         if name not in LOG_VARIABLES:
             raise KeyError(name)
         return 0.0
+
+    def log_values(self, names: Iterable[str]) -> dict[str, float]:
+        """Those of a whole block. Errors as for one."""
+        if self.log_overrides:
+            return {name: self.log_value(name) for name in names}
+        getters = self._getters
+        return {
+            name: getters[name]() if name in getters else self.log_value(name) for name in names
+        }
 
     def get_parameter(self, name: str) -> float:
         """Raises KeyError for an unknown name."""
