@@ -272,11 +272,13 @@ class Firmware:
         self._setpoint = setpoint
 
     def _consult_planner(self, t_s: float) -> None:
-        setpoint = self.planner.setpoint(t_s)
-        if not self.planner.active:
+        planner = self.planner
+        if planner.active or not self._low_level:
+            setpoint = planner.setpoint(t_s)
+            if not self._low_level:
+                self._accept(setpoint)
+        if not planner.active:
             self._tell_planner()
-        if not self._low_level:
-            self._accept(setpoint)
 
     def _tell_planner(self) -> None:
         now = self.estimator.now
