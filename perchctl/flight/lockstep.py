@@ -9,7 +9,7 @@ from perchctl.calibration.files import camera_of
 from perchctl.camera.slot import NewestSlot
 from perchctl.camera.source import FrameSource
 from perchctl.flight.lockstep_positions import feed_lockstep
-from perchctl.flight.loop import FlightParts, fly
+from perchctl.flight.loop import FlightParts, fly, is_blind
 from perchctl.link.mock import MockLink
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Operator, Phase
@@ -171,6 +171,8 @@ def fly_lockstep(
         log.truth = truth.for_log
         watchers = (*watchers, log)
         source = log.watched(source)
+    elif scenario.camera_receiver_hz is None:
+        watchers = (*watchers, _Eyes(vehicle.camera))
     operator = _OperatorAt(operator_at or {})
     tell = Teller(scenario)
     pipeline = make_pipeline(profile, camera)
@@ -180,6 +182,7 @@ def fly_lockstep(
         positions, tuple if log is None else log.remarks,
     )  # fmt: skip
     link.connect()
+    vehicle.camera.looked_at = True
     report = fly(parts)
     vehicle.watched = False
     link.close()
@@ -200,6 +203,24 @@ def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> Loc
         simulated_s=vehicle.firmware.t_s,
         touchdown_mps=truth.touchdown_mps,
     )
+
+
+class _Eyes:
+    """The camera of a flight of which nothing is kept renders what is looked at: the newest of
+    what came before the flight, and nothing at the ceiling. Where a receiver repeats pictures, it
+    takes all of them to tell."""
+
+    problem: str | None = None
+
+    def __init__(self, camera: SimCamera) -> None:
+        self._camera = camera
+        camera.looked_at = False
+
+    def tick(self, tick: Tick) -> None:
+        self._camera.looked_at = not is_blind(tick.state)
+
+    def event(self, event: Event) -> None:
+        return None
 
 
 class _OperatorAt:

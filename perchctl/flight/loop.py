@@ -151,7 +151,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
     while True:
         now_s = clock.now()
         turns.begin(now_s)
-        senses.take_in(now_s, look=not _is_blind(state))
+        senses.take_in(now_s, look=not is_blind(state))
         now_s = _present(parts, senses, now_s)
         late_s = max(0.0, now_s - due_s)
         outside = None if parts.positions is None else parts.positions(now_s)
@@ -237,7 +237,7 @@ def _tick(
     )
 
 
-def _is_blind(state: PlannerState | None) -> bool:
+def is_blind(state: PlannerState | None) -> bool:
     """Against the ceiling nothing is steered by the picture, and it shows no target."""
     return state is not None and state.phase is Phase.COMPLETE
 

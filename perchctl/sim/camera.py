@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from functools import cache, partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,6 +21,7 @@ __all__ = ["DeliveredFrame", "SimCamera"]
 SCHEDULE_STREAM = 411
 
 JITTER_LIMIT_SIGMAS = 2.5
+STAND_INS = 4  # of some that arrive together the first is not the last
 
 
 class BodyState(Protocol):
@@ -29,6 +31,24 @@ class BodyState(Protocol):
     def position_m(self) -> Array: ...
     @property
     def R_world_body(self) -> Array: ...
+
+
+class _UnderWay(NamedTuple):
+    """A frame on its way; without a picture as long as nobody has looked at it."""
+
+    t_arrival_s: float
+    t_exposure_s: float
+    index: int
+    image: Picture | None
+    later: Callable[[], Picture]
+
+
+@cache
+def noise_pictures(size_px: tuple[int, int]) -> tuple[Picture, ...]:
+    """A few that differ like those of any camera, and show nothing."""
+    width, height = size_px
+    rng = np.random.default_rng(SCHEDULE_STREAM)
+    return tuple(rng.integers(90, 150, (STAND_INS, height, width), dtype=np.uint8))
 
 
 class SimCamera:
@@ -61,7 +81,11 @@ class SimCamera:
         self._last_arrival_s = -np.inf
         self._last_image: Picture | None = None
         self._t_s = -np.inf
-        self._under_way: deque[DeliveredFrame] = deque()
+        self._under_way: deque[_UnderWay] = deque()
+        self.looked_at = True
+        """Where it is not, what is exposed is not rendered, unless it is the newest once it is
+        looked at again; noise stands for what arrives meanwhile, as a sign of life."""
+        self._stand_ins = 0
         self._receiver = Receiver(scenario)
 
     @property
@@ -93,7 +117,19 @@ class SimCamera:
         out = []
         while self._under_way and self._under_way[0].t_arrival_s <= self._t_s:
             out.append(self._under_way.popleft())
-        return self._receiver.given_out(out, self._t_s)
+        frames = [self._delivered(each, each is out[-1]) for each in out]
+        return self._receiver.given_out(frames, self._t_s)
+
+    def _delivered(self, each: _UnderWay, newest: bool) -> DeliveredFrame:
+        image = each.image
+        if image is None:
+            image = each.later() if newest and self.looked_at else self._stand_in()
+            image = blanked(self.scenario, each.index, image)
+        return DeliveredFrame(each.t_arrival_s, each.t_exposure_s, image, each.index)
+
+    def _stand_in(self) -> Picture:
+        self._stand_ins += 1
+        return noise_pictures(self.renderer.camera.size_px)[self._stand_ins % STAND_INS]
 
     def _expose(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> None:
         s = self.scenario
@@ -108,21 +144,28 @@ class SimCamera:
             return
         self._last_arrival_s = arrival_s
         frozen = s.camera_freeze_at_s is not None and middle_s >= s.camera_freeze_at_s
-        if self._last_image is None or not frozen:
-            self._last_image = self._picture(middle_s, pose_at)
-        image = blanked(s, self._index, self._last_image)
-        self._under_way.append(DeliveredFrame(arrival_s, middle_s, image, self._index))
+        image = self._last_image if frozen else None
+        later = self._exposure(middle_s, pose_at)
+        if image is None and (self.looked_at or frozen):
+            image = self._last_image = later()
+        if image is not None:
+            image = blanked(s, self._index, image)
+        self._under_way.append(_UnderWay(arrival_s, middle_s, self._index, image, later))
 
-    def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Picture:
+    def _exposure(
+        self, middle_s: float, pose_at: Callable[[float], BodyState]
+    ) -> Callable[[], Picture]:
+        """The light has come; its picture can be made later."""
+
         def T_world_cam_at(t_s: float) -> Array:
             return self._T_world_cam(pose_at(t_s))
 
         if self._shutter.plain:
             samples = [T_world_cam_at(t) for t in self._shutter.exposure_times(middle_s)]
-            return self.renderer.render(samples, frame_index=self._index)
+            return partial(self.renderer.render, samples, frame_index=self._index)
         height = self.renderer.camera.size_px[1]
         shots = self._shutter.shots(middle_s, T_world_cam_at, height)
-        return self.renderer.expose(shots, frame_index=self._index)
+        return partial(self.renderer.expose, shots, frame_index=self._index)
 
     def _T_world_cam(self, state: BodyState) -> Array:
         return make_T(state.R_world_body, state.position_m) @ self._T_body_cam

@@ -188,3 +188,40 @@ def test_with_the_renderer_the_same_seed_gives_the_same_bytes() -> None:
     first = flight()
     assert len(first) > 5
     assert first == flight()
+
+
+def test_what_nobody_looks_at_is_not_rendered_and_changes_nothing_else() -> None:
+    """Exposed in the dark: the newest is rendered, at its own pose, once it is looked at."""
+    scene = Scenario(seed=5, camera_rate_hz=30.0, camera_latency_s=0.06, camera_jitter_s=0.0)
+    seen, _ = run(scene, until_s=3.0)
+    stub = Stub()
+    stub.camera = type("Camera", (), {"size_px": (64, 48)})  # type: ignore[attr-defined]
+    camera = SimCamera(scene, cast(Renderer, stub))
+    frames, blind = [], []
+    for k in range(1, round(3.0 / CONTROL_PERIOD_S) + 1):
+        now_s = k * CONTROL_PERIOD_S
+        camera.looked_at = not 1.0 <= now_s < 2.0
+        camera.advance(now_s, pose_at)
+        new = camera.take()
+        frames += new
+        blind += new if not camera.looked_at else []
+    assert [f.t_arrival_s for f in frames] == [f.t_arrival_s for f in seen]
+    dark = {f.index for f in blind if f.t_exposure_s > 1.0}
+    assert len(dark) >= 25
+    assert not dark & set(stub.rendered)
+    for a, b in zip(frames, seen, strict=True):
+        if a.index not in dark:
+            np.testing.assert_array_equal(a.image, b.image)
+    assert all(not np.array_equal(a.image, b.image) for a, b in pairwise(blind))
+
+
+def test_of_what_came_unseen_only_the_newest_is_rendered() -> None:
+    stub = Stub()
+    stub.camera = type("Camera", (), {"size_px": (64, 48)})  # type: ignore[attr-defined]
+    camera = SimCamera(Scenario(seed=5), cast(Renderer, stub))
+    camera.looked_at = False
+    camera.advance(1.0, pose_at)
+    camera.looked_at = True
+    frames = camera.take()
+    assert len(frames) > 20
+    assert stub.rendered == [frames[-1].index]
