@@ -330,27 +330,17 @@ TABLE: tuple[Row, ...] = (
         "the landing was not confirmed in time", S.LAND, O.SAFETY,
     ),
 )  # fmt: skip
+_ROWS_OF = {phase: tuple(row for row in TABLE if phase in row.phases) for phase in Phase}
 
 
 def first_match(c: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
-    """The first row that applies to the phase, or None to stay.
-
-    Whatever the table says, a landing is never undone: a row that would lead from it to a
-    flying phase is passed over.
-    """
-    phase, lands = c.state.phase, c.state.severity >= Severity.LAND
-    rows = _ROWS_OF[phase] if table is TABLE else _rows_of(phase, table)
-    for row in rows:
-        if not (lands and row.to in FLYING_PHASES) and row.when(c):
+    """The first row that applies to the phase, or None to stay. Whatever the table says, one that
+    would lead from a landing to a flying phase is passed over."""
+    for row in _ROWS_OF[c.state.phase] if table is TABLE else table:
+        undoes = c.state.severity >= Severity.LAND and row.to in FLYING_PHASES
+        if c.state.phase in row.phases and not undoes and row.when(c):
             return row
     return None
-
-
-def _rows_of(phase: Phase, table: tuple[Row, ...]) -> tuple[Row, ...]:
-    return tuple(row for row in table if phase in row.phases)
-
-
-_ROWS_OF = {phase: _rows_of(phase, TABLE) for phase in Phase}
 
 
 def risen(before: Severity, row: Severity) -> Severity:
