@@ -38,7 +38,7 @@ class _UnderWay(NamedTuple):
 
     t_arrival_s: float
     t_exposure_s: float
-    index: int
+    number: int
     image: Picture | None
     later: Callable[[], Picture]
 
@@ -124,8 +124,8 @@ class SimCamera:
         image = each.image
         if image is None:
             image = each.later() if newest and self.looked_at else self._stand_in()
-            image = blanked(self.scenario, each.index, image)
-        return DeliveredFrame(each.t_arrival_s, each.t_exposure_s, image, each.index)
+            image = blanked(self.scenario, each.number, image)
+        return DeliveredFrame(each.t_arrival_s, each.t_exposure_s, image, each.number)
 
     def _stand_in(self) -> Picture:
         self._stand_ins += 1
