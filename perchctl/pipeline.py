@@ -9,7 +9,7 @@ goes in and comes out.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile
 from perchctl.profile.mask import read_mask
+from perchctl.values import replace
 from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
 from perchctl.vision.filter import MAX_GAP_S, predicted
 from perchctl.vision.markers.cut import prepare

@@ -44,7 +44,13 @@ CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
 # before it; rooms in one line do not know of each other.
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.errors", "perchctl.startup"),
-    ("perchctl.geometry", "perchctl.files", "perchctl.vehicle", "perchctl.children"),
+    (
+        "perchctl.geometry",
+        "perchctl.files",
+        "perchctl.vehicle",
+        "perchctl.values",
+        "perchctl.children",
+    ),
     ("perchctl.plot",),
     ("perchctl.profile",),
     ("perchctl.vision",),

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import bisect
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import SafetyConfig
+from perchctl.values import replace
 from perchctl.vehicle import Telemetry, is_battery_reading
 from perchctl.vision.types import Attitude
 
@@ -42,8 +43,10 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
 
     Samples with NaN or out of order are left out (fault 35).
     """
-    samples = list(history.samples)
     jumped, turned_rad = False, 0.0
+    if not new:
+        return replace(history, jumped=jumped, turned_rad=turned_rad)
+    samples = list(history.samples)
     changed_s, battery_v = history.battery_changed_s, history.battery_v
     for sample in new:
         if not is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
@@ -132,7 +135,7 @@ def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> b
     """Whether the estimate stepped farther than any flight leads: at once, or smeared over a
     few samples by the vehicle's own filter."""
     last = before[-1]
-    first = next(s for s in before if s.t_s >= last.t_s - SMEARED_S)
+    first = before[bisect.bisect_left(before, last.t_s - SMEARED_S, key=_time_s)]
     faster_mps = math.dist(last.velocity_mps, new.velocity_mps)
     return (
         _is_moved(last, new, safety)
@@ -172,4 +175,4 @@ def is_finite(s: Telemetry) -> bool:
         s.acc_z_g,
         s.thrust,
     )
-    return all(math.isfinite(v) for v in values)
+    return all(map(math.isfinite, values))

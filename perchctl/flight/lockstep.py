@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.calibration.files import camera_of
@@ -23,6 +23,7 @@ from perchctl.sim.draw import draw_capture, draw_scenario
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.told import Teller
 from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.values import replace
 from perchctl.vehicle import LOCKED
 from perchctl.vision.types import Frame
 
@@ -184,6 +185,7 @@ def fly_lockstep(
     )  # fmt: skip
     link.connect()
     report = fly(parts)
+    vehicle.watched = False
     link.close()
     link.advance_to(link.now_s + 1.0)
     return _flown(report, vehicle, truth)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
@@ -49,6 +49,7 @@ from perchctl.mission.watch import (
 from perchctl.pipeline import Pipeline
 from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
+from perchctl.values import replace
 from perchctl.vehicle import Command, Idle
 from perchctl.vision.consistency import Consistency
 

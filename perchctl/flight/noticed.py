@@ -8,12 +8,13 @@ that, so that its use does not feed back.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from perchctl.flight.history import History, attitude_at, velocity_at
 from perchctl.geometry import finite
 from perchctl.profile import CameraConfig
 from perchctl.profile.vision import USED_LATENCY_S
+from perchctl.values import replace
 from perchctl.vision.consistency import (
     LEAST_RANGE_M,
     STEP_S,

@@ -10,10 +10,10 @@ on the wall's clock, and a vehicle whose time runs slower would only look older.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 
 from perchctl.mission.state import SEVEN, Outcome, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
+from perchctl.values import replace
 
 WINDOW_S = 2.0
 FEWEST_HZ, FEWEST_SHARE = 10.0, 0.4

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from perchctl.camera.health import MEANING, HealthState, assess
@@ -22,6 +22,7 @@ from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile, SafetyConfig
+from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 from perchctl.vision.consistency import Consistency, solved
 from perchctl.vision.fields import BLENDED, INTERLACED

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
@@ -48,8 +47,7 @@ class Assembler:
         if block != "attitude" or self._state_s is None or self.missing():
             return None
         behind_s = t_s - self._state_s
-        sample = telemetry_from(_carried(self._values, behind_s), t_s)
-        return replace(sample, behind_s=max(0.0, behind_s))
+        return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s))
 
     def missing(self) -> list[str]:
         """The needed variables of which nothing has come yet."""

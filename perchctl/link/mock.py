@@ -11,7 +11,6 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from perchctl.errors import ConnectionFailed
@@ -29,6 +28,7 @@ from perchctl.mission.sent import Sent
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.server import PROTOCOL_VERSION
+from perchctl.values import replace
 from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ class MockLink:
         firmware = self.vehicle.firmware
         delay_s = self.radio.down(block, self.now_s)
         if delay_s is not None:
-            values = {name: firmware.log_value(name) for name in BLOCKS[block]}
+            values = firmware.log_values(BLOCKS[block])
             packet = (self.now_s + delay_s, next(self._count), block, firmware.t_s, values)
             heapq.heappush(self._under_way, packet)
 

@@ -44,8 +44,9 @@ VARIANCE_BLOCK: dict[str, str] = {
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 
 
-def telemetry_from(values: Mapping[str, float], t_s: float) -> Telemetry:
-    """Telemetry from log values by name; KeyError when a needed one is missing."""
+def telemetry_from(values: Mapping[str, float], t_s: float, behind_s: float = 0.0) -> Telemetry:
+    """Telemetry from log values by name; `behind_s` as `Telemetry` has it. KeyError when a needed
+    one is missing."""
     variances = [values[name] for name in VARIANCE_BLOCK if name in values]
     return Telemetry(
         t_s=t_s,
@@ -68,4 +69,5 @@ def telemetry_from(values: Mapping[str, float], t_s: float) -> Telemetry:
         supervisor=int(values["supervisor.info"]),
         battery_state=int(values.get("pm.state", 0)),
         position_variance_m2=max(variances) if variances else None,
+        behind_s=behind_s,
     )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from typing import Any
 
+from perchctl.values import replace
 from perchctl.vehicle import MeasuredBy
 
 ANSWER_S = 1.5

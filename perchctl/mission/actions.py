@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import (
@@ -34,6 +33,7 @@ from perchctl.mission.release import (
     stop_motors,
 )
 from perchctl.mission.state import Condition, MotorStop, Phase
+from perchctl.values import replace
 from perchctl.vehicle import (
     EmergencyStop,
     Idle,

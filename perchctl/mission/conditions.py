@@ -270,6 +270,7 @@ KEPT_OVER_A_CHANGE = (
 )
 """The vehicle's own, whatever the phase, and however it is held."""
 
+_NONE: frozenset[Condition] = frozenset()
 
 PROOFS = frozenset(
     {
@@ -292,20 +293,24 @@ while it does. The others have the accelerometer to go by."""
 def conditions_since(c: Context) -> dict[Condition, float]:
     """`PlannerState.since` of this tick. A condition seen while the vehicle is held
     in place for a fault does not count, a proof in old telemetry neither."""
-    old = c.state.since
+    old, now_s, void = c.state.since, c.obs.t_s, _void(c)
     return {
-        name: old.get(name, c.obs.t_s)
+        name: old.get(name, now_s)
         for name, holds in CONDITIONS.items()
-        if _counts(c, name) and holds(c)
+        if name not in void and holds(c)
     }
 
 
-def _counts(c: Context, name: Condition) -> bool:
-    if name is Condition.HANGING and c.state.phase is Phase.LANDING:
-        # It begins a release, which goes on over fresh telemetry only: late telemetry may do
-        # that, where the vehicle would else hang there until it is cut.
-        # By the same right it goes on without a position.
-        return c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
-    if name in BY_PLACE and not c.placed:
-        return False
-    return c.proves or name not in PROOFS
+def _void(c: Context) -> frozenset[Condition]:
+    """Those that do not count in this tick, whatever they say."""
+    if c.proves:
+        void = _NONE if c.placed else BY_PLACE
+    else:
+        void = PROOFS if c.placed else PROOFS | BY_PLACE
+    if c.state.phase is not Phase.LANDING:
+        return void
+    # In a landing it begins a release, which goes on over fresh telemetry only: late telemetry
+    # may do that, where the vehicle would else hang there until it is cut.
+    # By the same right it goes on without a position.
+    late = c.telemetry_age_s > c.profile.safety.telemetry_hold_s
+    return void | {Condition.HANGING} if late else void - {Condition.HANGING}

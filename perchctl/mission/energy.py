@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, is_battery_reading
 
 CURVE: tuple[tuple[float, float], ...] = (

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from perchctl.profile import CameraConfig
 from perchctl.profile.vision import USED_LATENCY_S
+from perchctl.values import replace
 from perchctl.vision.consistency import Consistency
 
 SURE = 1.96

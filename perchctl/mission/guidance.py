@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from perchctl.geometry import rot_z, wrap_rad
 from perchctl.mission.context import Context
 from perchctl.mission.state import Phase, PlannerState
+from perchctl.values import replace
 from perchctl.vehicle import FULL_THRUST, PositionSetpoint
 
 HEIGHT_GAIN = 1.5

@@ -9,7 +9,6 @@ ends; then the whole weight is put on the magnet instead, and watched.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import has_slipped
@@ -25,6 +24,7 @@ from perchctl.mission.release import (
 )
 from perchctl.mission.state import Condition
 from perchctl.profile import LandingConfig
+from perchctl.values import replace
 from perchctl.vehicle import Idle, Land, Telemetry
 
 REPEAT_ORDER_S = 0.3

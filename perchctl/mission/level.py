@@ -12,11 +12,11 @@ least: it may be another axis'. Then the accelerometer alone tells how fast it s
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.context import Context
 from perchctl.mission.release import Acted
+from perchctl.values import replace
 from perchctl.vehicle import RawThrust
 
 SINK_MPS = 0.3

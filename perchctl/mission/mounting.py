@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from perchctl.geometry import Array, rotation_from_rpy
+from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 
 WINDOW_S = 3.0
@@ -43,6 +44,7 @@ SETTLES_S = 0.4
 """... nor does the filter's way to the new place."""
 ESTIMATE_JUMP_M, FASTEST_MPS = 0.05, 1.5
 """A vehicle that moves more between two sights has a new world."""
+_LONGEST_JUMP_S = max(within_s for _, within_s in JUMPS)
 
 Turn = float
 
@@ -94,10 +96,6 @@ class MountWatch:
         return self.against >= SIGHTS_IN_A_ROW
 
     @property
-    def moved_m(self) -> float:
-        return max((abs(s.aim - self.sights[0].aim) for s in self.sights), default=0.0)
-
-    @property
     def last_from(self) -> tuple[float, float] | None:
         """Where the vehicle was at the last sight."""
         place = self.sights[-1].vehicle if self.sights else None
@@ -127,21 +125,25 @@ def _jumped(before: tuple[Sight, ...], sight: Sight) -> bool:
     far = ESTIMATE_JUMP_M + FASTEST_MPS * (sight.t_s - last.t_s)
     if abs(sight.vehicle - last.vehicle) > far:
         return True
-    return any(
-        abs(sight.target - s.target) > jump_m + 2.0 * abs(sight.aim - s.aim)
-        for s in before
-        for jump_m, within_s in JUMPS
-        if sight.t_s - s.t_s <= within_s
-    )
+    for s in reversed(before):
+        age_s = sight.t_s - s.t_s
+        if age_s > _LONGEST_JUMP_S:
+            return False
+        target_m, vehicle_m = abs(sight.target - s.target), abs(sight.aim - s.aim)
+        for jump_m, within_s in JUMPS:
+            if age_s <= within_s and target_m > jump_m + 2.0 * vehicle_m:
+                return True
+    return False
 
 
 def _judged(watch: MountWatch, against: int) -> MountWatch:
-    n = len(watch.sights)
-    p0 = sum(s.aim for s in watch.sights) / n
-    q0 = sum(s.target for s in watch.sights) / n
-    pairs = [(s.aim - p0, s.target - q0) for s in watch.sights]
-    if (moved_m := watch.moved_m) < JUDGED_M:
+    aims, targets = [s.aim for s in watch.sights], [s.target for s in watch.sights]
+    n, first = len(aims), aims[0]
+    moved_m = max(abs(aim - first) for aim in aims)
+    if moved_m < JUDGED_M:
         return watch
+    p0, q0 = sum(aims) / n, sum(targets) / n
+    pairs = [(aim - p0, target - q0) for aim, target in zip(aims, targets, strict=True)]
     along = sum(p.conjugate() * q for p, q in pairs) / sum(abs(p) ** 2 for p, _ in pairs)
     if abs(along) < STANDS_STILL:
         return replace(watch, fits=moved_m >= PROVEN_M, still=True)

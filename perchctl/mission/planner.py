@@ -8,7 +8,6 @@ One tick: remember what was observed, look up the table, act for the phase.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from perchctl.mission.state import (
 )
 from perchctl.mission.table import IN_THE_OPEN, TABLE, Row, first_match, risen
 from perchctl.profile import Profile
+from perchctl.values import replace
 from perchctl.vehicle import Command, PositionSetpoint
 
 HOVER_WITHIN = 0.2

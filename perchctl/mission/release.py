@@ -9,11 +9,10 @@ and watched, and only then the motors are stopped.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import corrected, hold_here, limited
 from perchctl.mission.state import Condition, Phase, PlannerState
+from perchctl.values import replace
 from perchctl.vehicle import Command, Idle, PositionSetpoint, RawThrust, StopMotors
 
 Acted = tuple[PlannerState, Command]

@@ -15,6 +15,8 @@ from perchctl.vision.types import TargetEstimate
 class Phase(Enum):
     """The paper's seven phases, the two ways down, and the terminals."""
 
+    __hash__ = object.__hash__  # as of any single object: each row of the table looks it up
+
     APPROACH = "APPROACH"
     SEARCH = "SEARCH"
     ESTIMATE = "ESTIMATE"
@@ -65,6 +67,8 @@ class Outcome(Enum):
 
 class Condition(Enum):
     """What the table debounces; `perchctl.mission.conditions` says when each holds."""
+
+    __hash__ = object.__hash__  # as of any single object: twenty are looked up in each tick
 
     AT_TAKEOFF_HEIGHT = "at take-off height"
     ESTIMATED = "estimated"

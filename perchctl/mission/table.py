@@ -330,15 +330,13 @@ TABLE: tuple[Row, ...] = (
         "the landing was not confirmed in time", S.LAND, O.SAFETY,
     ),
 )  # fmt: skip
+_ROWS_OF = {phase: tuple(row for row in TABLE if phase in row.phases) for phase in Phase}
 
 
 def first_match(c: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
-    """The first row that applies to the phase, or None to stay.
-
-    Whatever the table says, a landing is never undone: a row that would lead from it to a
-    flying phase is passed over.
-    """
-    for row in table:
+    """The first row that applies to the phase, or None to stay. Whatever the table says, one that
+    would lead from a landing to a flying phase is passed over."""
+    for row in _ROWS_OF[c.state.phase] if table is TABLE else table:
         undoes = c.state.severity >= Severity.LAND and row.to in FLYING_PHASES
         if c.state.phase in row.phases and not undoes and row.when(c):
             return row

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import mujoco
@@ -33,6 +34,12 @@ _MODEL = """
   </worldbody>
 </mujoco>
 """
+
+
+def extent_m(scenario: Scenario) -> float:
+    """How far from its centre any part of the vehicle is, at most."""
+    gear = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + math.hypot(GEAR_RADIUS_M, 0.004)
+    return max(math.hypot(*FRAME_HALF_M), gear)
 
 
 def build_model(scenario: Scenario) -> Any:

@@ -69,6 +69,11 @@ class SimCamera:
         """From the first light on a frame to the last."""
         return 2.0 * self._half_s
 
+    @property
+    def next_s(self) -> float:
+        """When the next exposure ends."""
+        return self._first_s + self._index / self.scenario.camera_rate_hz + self._half_s
+
     def advance(self, t_s: float, pose_at: Callable[[float], BodyState]) -> None:
         """Take all exposures that end at or before `t_s`.
 

@@ -12,8 +12,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
+from bisect import bisect_right
 from dataclasses import dataclass
 
 from perchctl.sim.scenario import CONTROL_PERIOD_S
@@ -28,6 +28,7 @@ _CURVE: tuple[tuple[float, float], ...] = (
     (0.2, 3.83), (0.3, 3.87), (0.4, 3.89), (0.5, 3.92), (0.6, 3.96), (0.7, 4.0),
     (0.8, 4.04), (0.9, 4.1), (1.0, 4.2), (1.05, 4.3),
 )  # fmt: skip
+_ENDS = tuple(x for x, _ in _CURVE[1:])  # of its straight parts
 _EMPTY_V, _FULL_V = _CURVE[0][1], _CURVE[-1][1]
 
 
@@ -76,10 +77,11 @@ class Cell:
 
 def _resting_v(left: float, knee: float) -> float:
     tenth = 0.1 * left / knee if left < knee else 0.1 + 0.9 * (left - knee) / (1.0 - knee)
-    for (x0, v0), (x1, v1) in itertools.pairwise(_CURVE):
-        if tenth < x1:
-            return max(_EMPTY_V, v0 + (tenth - x0) * (v1 - v0) / (x1 - x0))
-    return _FULL_V
+    i = bisect_right(_ENDS, tenth)
+    if i == len(_ENDS):
+        return _FULL_V
+    (x0, v0), (x1, v1) = _CURVE[i], _CURVE[i + 1]
+    return max(_EMPTY_V, v0 + (tenth - x0) * (v1 - v0) / (x1 - x0))
 
 
 def _charge_at(rest_v: float, knee: float) -> float:

@@ -4,7 +4,11 @@ time."""
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
+import numpy as np
+
+from perchctl.geometry import Array, rotation_from_quaternion
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture.settings import CaptureSettings
@@ -12,8 +16,26 @@ from perchctl.sim.capture.system import SimCapture
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.world import TrueState, World
+from perchctl.sim.world import World
 from perchctl.vision.types import CameraModel
+
+_TICK_S = 1e-6  # less than a control period: an exposure is never passed over
+
+
+class PastPose(NamedTuple):
+    """Where the vehicle was, kept 500 times a second: arrays only for what an exposure asks."""
+
+    t_s: float
+    place_m: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+    @property
+    def position_m(self) -> Array:
+        return np.array(self.place_m)
+
+    @property
+    def R_world_body(self) -> Array:
+        return rotation_from_quaternion(self.quaternion)
 
 
 class SimulatedVehicle:
@@ -35,10 +57,11 @@ class SimulatedVehicle:
             renderer = Renderer(scenario, camera, target or TargetConfig(), scenario.seed)
             self.camera = SimCamera(scenario, renderer)
         self.capture = None if capture is None else SimCapture(capture)
+        self.watched = True  # somebody takes the camera's pictures; no others are made
         # The past that an exposure may need.
         exposed_s = 0.0 if self.camera is None else self.camera.exposed_s
         steps = int(exposed_s / CONTROL_PERIOD_S) + 8
-        self._past: deque[TrueState] = deque(maxlen=steps)
+        self._past: deque[PastPose] = deque(maxlen=steps)
 
     @property
     def t_s(self) -> float:
@@ -46,14 +69,25 @@ class SimulatedVehicle:
 
     def advance_to(self, t_s: float) -> None:
         """Step until `t_s` (to the nearest control period)."""
-        while self.firmware.t_s < t_s - CONTROL_PERIOD_S / 2:
-            self.step()
+        end_s = t_s - CONTROL_PERIOD_S / 2
+        if self.camera is None or not self.watched:
+            while self.firmware.t_s < end_s:
+                self.step_blindly()
+            return
+        due_s = self.camera.next_s - _TICK_S
+        while self.firmware.t_s < end_s:
+            self.step_blindly()
+            self._remember()
+            if self.firmware.t_s >= due_s:
+                self.camera.advance(self.firmware.t_s, self._state_at)
+                due_s = self.camera.next_s - _TICK_S
+        self.camera.advance(self.firmware.t_s, self._state_at)
 
     def step(self) -> None:
         """One control period, and the exposures that fall into it."""
         self.step_blindly()
-        if self.camera is not None:
-            self._past.append(self.world.state())
+        if self.camera is not None and self.watched:
+            self._remember()
             self.camera.advance(self.firmware.t_s, self._state_at)
 
     def step_blindly(self) -> None:
@@ -69,8 +103,13 @@ class SimulatedVehicle:
             self.camera.develop()
             self.camera.renderer.move_target(xy_m)
 
-    def _state_at(self, t_s: float) -> TrueState:
-        """The true state nearest to `t_s` in the recent past."""
+    def _remember(self) -> None:
+        world = self.world
+        place_m = (world.x_m, world.y_m, world.z_m)
+        self._past.append(PastPose(world.t_s, place_m, world.quaternion))
+
+    def _state_at(self, t_s: float) -> PastPose:
+        """The pose nearest to `t_s` in the recent past."""
         newest = self._past[-1]
         back = round((newest.t_s - t_s) / CONTROL_PERIOD_S)
         return self._past[max(-len(self._past), -1 - max(0, back))]

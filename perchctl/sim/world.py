@@ -25,6 +25,7 @@ Assumptions of the model, each with its source:
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -38,7 +39,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from perchctl.sim.body import build_model
+from perchctl.sim.body import build_model, extent_m
 from perchctl.sim.carried import Stop, Way
 from perchctl.sim.cell import RESISTANCE_OHM, CellKind
 from perchctl.sim.magnet import MAGNET_RANGE_M, Magnet
@@ -51,6 +52,8 @@ YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
 DRAG_LEVEL_NSPM = 0.009
 DRAG_VERTICAL_NSPM = 0.009
 SUCTION_LENGTH_M = 0.02
+CLEAR_M = 0.05  # 25 m/s through a control period
+_SIX = struct.Struct("6d")
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
 
@@ -86,6 +89,13 @@ class World:
         self._scenario = scenario
         self._model = build_model(scenario)
         self._data = mujoco.MjData(self._model)
+        self._qpos, self._qvel = self._data.qpos, self._data.qvel
+        self._force = memoryview(self._data.qfrc_applied)
+        # Farther than this from floor and ceiling nothing can touch them within a step.
+        self._clear_m = extent_m(scenario) + CLEAR_M
+        self._on_contact = self._model.opt.disableflags
+        self._off_contact = self._on_contact | mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self._clear = False
         self._floor, self._ceiling = (self._model.geom(n).id for n in ("floor", "ceiling"))
         # Farther than this below the ceiling the gear cannot touch it.
         self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
@@ -162,7 +172,10 @@ class World:
             torque_x += pull_n * (gy * r22 - gz * r21)
             torque_y += pull_n * (gz * r20 - gx * r22)
             torque_z += pull_n * (gx * r21 - gy * r20)
-        self._data.qfrc_applied[:] = (force_x, force_y, force_z, torque_x, torque_y, torque_z)
+        _SIX.pack_into(self._force, 0, force_x, force_y, force_z, torque_x, torque_y, torque_z)
+        clear = self._clear_m < self.z_m and self._clear_m < height_m
+        if clear is not self._clear:
+            self._look_for_contacts(not clear)
         vx, vy, vz = self.vx_mps, self.vy_mps, self.vz_mps
         mujoco.mj_step(self._model, self._data)
         self._read()
@@ -170,6 +183,11 @@ class World:
         self._set_specific_force(
             (self.vx_mps - vx) * rate, (self.vy_mps - vy) * rate, (self.vz_mps - vz) * rate
         )
+
+    def _look_for_contacts(self, near: bool) -> None:
+        """A third of a step's time, for which there is nothing to find in the open."""
+        self._clear = not near
+        self._model.opt.disableflags = self._on_contact if near else self._off_contact
 
     def state(self) -> TrueState:
         """The true state as arrays."""
@@ -257,6 +275,7 @@ class World:
         velocity_mps: Sequence[float] | Array,
         rates_radps: Sequence[float] | Array,
     ) -> None:
+        self._look_for_contacts(True)
         quaternion = np.zeros(4)
         mujoco.mju_mat2Quat(quaternion, R.ravel())
         self._data.qpos[:3] = position_m
@@ -267,9 +286,9 @@ class World:
         self._read()
 
     def _read(self) -> None:
-        self.x_m, self.y_m, self.z_m, w, x, y, z = self._data.qpos.tolist()
+        self.x_m, self.y_m, self.z_m, w, x, y, z = self._qpos.tolist()
         (self.vx_mps, self.vy_mps, self.vz_mps, self.p_radps, self.q_radps, self.r_radps) = (
-            self._data.qvel.tolist()
+            self._qvel.tolist()
         )
         self.quaternion = (w, x, y, z)
         self._up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))

@@ -18,11 +18,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from perchctl.geometry import Array, wrap_rad
+from perchctl.values import replace
 from perchctl.vision.pose import PoseSetup, rotation_matrix
 from perchctl.vision.types import Attitude, MarkerPose
 

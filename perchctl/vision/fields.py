@@ -19,7 +19,7 @@ the mean is taken, which belongs to the middle moment in either order.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import mean, median
 from typing import Literal
 
@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.values import replace
 from perchctl.vision.types import Frame, PictureKind
 
 FieldsMode = Literal["auto", "top", "bottom", "progressive"]

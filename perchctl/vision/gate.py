@@ -24,11 +24,12 @@ target's, too.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from perchctl.geometry import Array, wrap_rad
+from perchctl.values import replace
 from perchctl.vision.filter import (
     MAX_GAP_S,
     FilterSetup,

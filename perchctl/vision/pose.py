@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -21,6 +21,7 @@ import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
+from perchctl.values import replace
 from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.curl import lift_of
 from perchctl.vision.points import Points, make_points

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from perchctl.profile import KalmanConfig
+from perchctl.values import replace
 from perchctl.vision.filter import POSITION, FilterSetup, Measurement, make_filter, step_track
 from perchctl.vision.gate import Sight, Verdict, judged, locked, remembered
 from perchctl.vision.own import NOWHERE, OwnPlace, refusal

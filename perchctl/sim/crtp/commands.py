@@ -83,17 +83,17 @@ class CommandService:
         self._has_supervisor_port = protocol_version >= 12
         self._has_go_to_2 = protocol_version >= 8
         self._groups = 0
-
-    def handle(self, packet: Packet) -> list[Packet]:
-        """Packets too short for their command are passed over, as the firmware does."""
-        handlers: dict[int, Callable[[Packet], list[Packet]]] = {
+        self._handlers: dict[int, Callable[[Packet], list[Packet]]] = {
             Port.COMMANDER: self._commander,
             Port.COMMANDER_GENERIC: self._generic,
             Port.HIGH_LEVEL: self._high_level,
             Port.LOCALIZATION: self._localization,
             Port.SUPERVISOR: self._supervisor,
         }
-        handler = handlers.get(packet.port)
+
+    def handle(self, packet: Packet) -> list[Packet]:
+        """Packets too short for their command are passed over, as the firmware does."""
+        handler = self._handlers.get(packet.port)
         if handler is None or (not packet.data):
             return []
         try:

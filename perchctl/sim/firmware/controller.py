@@ -46,7 +46,26 @@ class Pid:
         self._limit = limit
 
     def update(self, desired: float, measured: float) -> float:
-        return self.respond(desired - measured, measured - self._measured, measured)
+        # `respond` once more: seven calls a control period would cost more than their sums.
+        error = desired - measured
+        integral = self._integral + error * self._period
+        bound = self._i_limit
+        if integral > bound:
+            integral = bound
+        elif integral < -bound:
+            integral = -bound
+        self._integral = integral
+        output = self.kp * error + self.ki * integral
+        if self.kd != 0.0:
+            output -= self.kd * (measured - self._measured) / self._period
+        self._measured = measured
+        limit = self._limit
+        if limit > 0.0:
+            if output > limit:
+                return limit
+            if output < -limit:
+                return -limit
+        return output
 
     def update_angle(self, desired: float, measured: float) -> float:
         """As `update`, on the circle of 360 degrees."""
@@ -84,6 +103,8 @@ def cap_deg(angle: float) -> float:
 
 
 def _saturated(value: float) -> float:
+    if -INT16_MAX <= value <= INT16_MAX:
+        return value
     return max(-INT16_MAX, min(INT16_MAX, value))
 
 

@@ -145,26 +145,28 @@ class Estimator:
         now = self.now
         bias = self._scenario.estimate_tilt_bias_rad
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-        pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - x * z))))
+        lift = 2 * (w * y - x * z)
+        pitch = math.asin(lift if -1.0 <= lift <= 1.0 else math.copysign(1.0, lift))
         now.roll_deg = cap_deg(math.degrees(roll + bias[0]))
         now.pitch_deg = -math.degrees(pitch + bias[1])  # the firmware's pitch is nose up
         now.yaw_deg = math.degrees(math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
         white = self._white
         if len(white) < 12:
             white = self._white = self._rng.standard_normal(_BATCH).tolist()
-        take = white.pop
-        now.gyro_x_dps = math.degrees(world.p_radps) + _GYRO_NOISE_DPS * take()
-        now.gyro_y_dps = math.degrees(world.q_radps) + _GYRO_NOISE_DPS * take()
-        now.gyro_z_dps = math.degrees(world.r_radps) + _GYRO_NOISE_DPS * take()
+        n6, n5, n4, n3, n2, n1 = white[-6:]
+        del white[-6:]
+        now.gyro_x_dps = math.degrees(world.p_radps) + _GYRO_NOISE_DPS * n1
+        now.gyro_y_dps = math.degrees(world.q_radps) + _GYRO_NOISE_DPS * n2
+        now.gyro_z_dps = math.degrees(world.r_radps) + _GYRO_NOISE_DPS * n3
         if self.spoil is not None:
             self.spoil(now)
         ax, ay, az = self.acc_g
         lag, unit = self._acc_lag, 1.0 / GRAVITY_MPS2
         shake = _ACC_NOISE_G + _ACC_VIBRATION_G if spinning else _ACC_NOISE_G
         self.acc_g = (
-            ax + lag * (world.fx_mps2 * unit + shake * take() - ax),
-            ay + lag * (world.fy_mps2 * unit + shake * take() - ay),
-            az + lag * (world.fz_mps2 * unit + shake * take() - az),
+            ax + lag * (world.fx_mps2 * unit + shake * n4 - ax),
+            ay + lag * (world.fy_mps2 * unit + shake * n5 - ay),
+            az + lag * (world.fz_mps2 * unit + shake * n6 - az),
         )
 
     def _integrate(self, world: Sensed) -> tuple[float, float, float, float]:

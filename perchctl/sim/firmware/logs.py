@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Protocol
 
 from perchctl.sim.firmware.controller import Controller
@@ -59,7 +60,10 @@ def log_getters(firmware: Logged) -> dict[str, Getter]:
 
 
 def _field(thing: object, name: str, scale: float = 1.0) -> Getter:
-    return lambda: scale * float(getattr(thing, name))
+    read = attrgetter(name)
+    if scale == 1.0:
+        return lambda: float(read(thing))
+    return lambda: scale * float(read(thing))
 
 
 def _system(firmware: Logged) -> dict[str, Getter]:

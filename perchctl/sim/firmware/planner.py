@@ -10,6 +10,7 @@ from perchctl.sim.firmware.commands import HighLevelCommand, HlGoTo, HlLand, HlS
 from perchctl.sim.firmware.setpoint import MODE_OFF, MODE_POSITION, Setpoint
 
 IDLE, FLYING, LANDING = 0, 1, 3
+Place = tuple[float, float, float]
 
 
 class AxisState(NamedTuple):
@@ -67,8 +68,8 @@ class Planner:
         self._begin_s = 0.0
         self._duration_s = 0.0
         self._axes: tuple[Polynomial, ...] = ()
-        # Where a new plan begins: the last setpoint, or the estimate while idle.
         self._now = [AxisState(0.0)] * 4
+        self._told: tuple[Place, Place, float] | None = None  # since, unless a plan was flown
 
     @property
     def active(self) -> bool:
@@ -94,9 +95,16 @@ class Planner:
         yaw_rad: float,
     ) -> None:
         """New plans begin here."""
-        self._now = [AxisState(p, v) for p, v in zip(position_m, velocity_mps, strict=True)] + [
-            AxisState(yaw_rad)
-        ]
+        self._told = (position_m, velocity_mps, yaw_rad)
+
+    def _begin(self) -> list[AxisState]:
+        """Where a new plan begins: the last setpoint, or the estimate while idle."""
+        if self._told is not None:
+            position_m, velocity_mps, yaw_rad = self._told
+            axes = zip(position_m, velocity_mps, strict=True)
+            self._now = [*(AxisState(p, v) for p, v in axes), AxisState(yaw_rad)]
+            self._told = None
+        return self._now
 
     def command(self, command: HighLevelCommand, t_s: float) -> bool:
         """Accept or refuse a command."""
@@ -122,6 +130,7 @@ class Planner:
         if self.state == IDLE:
             return Setpoint(MODE_OFF)
         x, y, z, yaw = self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
+        self._told = None
         return Setpoint(
             MODE_POSITION,
             (x.value, y.value, z.value),
@@ -131,7 +140,7 @@ class Planner:
         )
 
     def _vertical(self, command: HlTakeoff | HlLand, t_s: float) -> None:
-        x, y, z, yaw = self._now
+        x, y, z, yaw = self._begin()
         heading = wrap_rad(yaw.value)
         turn = 0.0 if command.yaw_rad is None else wrap_rad(command.yaw_rad - heading)
         self._plan(
@@ -143,8 +152,8 @@ class Planner:
 
     def _go_to(self, command: HlGoTo, t_s: float) -> None:
         if self.active:
-            self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
-        x, y, z, yaw = self._now
+            self._now, self._told = [axis.at(t_s - self._begin_s) for axis in self._axes], None
+        x, y, z, yaw = self._begin()
         goal = (command.x_m, command.y_m, command.z_m, command.yaw_rad)
         if command.relative:
             goal = (x.value + goal[0], y.value + goal[1], z.value + goal[2], yaw.value + goal[3])

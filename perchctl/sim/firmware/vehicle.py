@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, ClassVar
 
 from perchctl.sim.firmware.commands import HighLevelCommand, LowLevelCommand
@@ -228,6 +228,15 @@ class Firmware:
             raise KeyError(name)
         return 0.0
 
+    def log_values(self, names: Iterable[str]) -> dict[str, float]:
+        """Those of a whole block. Errors as for one."""
+        if self.log_overrides:
+            return {name: self.log_value(name) for name in names}
+        getters = self._getters
+        return {
+            name: getters[name]() if name in getters else self.log_value(name) for name in names
+        }
+
     def get_parameter(self, name: str) -> float:
         """Raises KeyError for an unknown name."""
         return self._parameters[name]
@@ -263,11 +272,13 @@ class Firmware:
         self._setpoint = setpoint
 
     def _consult_planner(self, t_s: float) -> None:
-        setpoint = self.planner.setpoint(t_s)
-        if not self.planner.active:
+        planner = self.planner
+        if planner.active or not self._low_level:
+            setpoint = planner.setpoint(t_s)
+            if not self._low_level:
+                self._accept(setpoint)
+        if not planner.active:
             self._tell_planner()
-        if not self._low_level:
-            self._accept(setpoint)
 
     def _tell_planner(self) -> None:
         now = self.estimator.now

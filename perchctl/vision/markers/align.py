@@ -13,12 +13,13 @@ of its rows and its last one 0. Coordinates are the marker's own, see
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.values import replace
 from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.markers.cells import cells_seen
 from perchctl.vision.markers.drawing import (

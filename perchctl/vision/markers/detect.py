@@ -13,12 +13,12 @@ and only where the one before saw too little.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.values import replace
 from perchctl.vision.fields import halves, interpolated_sigma_px
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from perchctl.geometry import Array
+from perchctl.values import replace
 from perchctl.vision.types import MARKERS, Detections, MarkerName
 
 _QUARTERS: Array = np.full(4, 0.25)

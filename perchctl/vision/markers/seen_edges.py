@@ -4,12 +4,13 @@ edges of its border, that are in the picture, not hidden, and neither glaring no
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.values import replace
 from perchctl.vision.camera_model import pinhole_px, undistort
 from perchctl.vision.markers.edges import Surroundings, locate
 from perchctl.vision.markers.pattern import Pattern
