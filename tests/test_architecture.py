@@ -19,7 +19,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "click": (),
     "rich": ("perchctl.cli", "perchctl.commands", "perchctl.display"),
     "filterpy": ("perchctl.vision.filter",),
-    "scipy": ("perchctl.flight.rates",),
+    "scipy": ("perchctl.flight.rates", "perchctl.flight.compared"),
     "mujoco": ("perchctl.sim",),
     "matplotlib": ("*.plot",),
     "motioncapture": ("perchctl.positioning",),
