@@ -184,6 +184,11 @@ LONG = (
     "perchctl log plot",
     "perchctl log compare",
     "perchctl simulate",
+    "perchctl calibrate images:april",
+    "perchctl calibrate aideck:",
+    "perchctl calibrate images:board --measured",
+    "perchctl fit-weights --collect",
+    "perchctl make-target --camera",
     "python docs/pictures/make.py",
 )
 

@@ -253,6 +253,7 @@ def test_a_camera_that_freezes_in_flight_lands() -> None:
     assert "PERCH" not in flown.way
 
 
+@pytest.mark.long
 def test_a_nearly_empty_battery_lands() -> None:
     flown = fly_short({"safety.min_rest_v": 3.0}, battery_rest_v=3.3)
     assert is_landed(flown, Outcome.SAFETY), flown
