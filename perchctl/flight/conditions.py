@@ -16,8 +16,12 @@ from perchctl.profile.keys import unit_of
 from perchctl.sim.draw import draw_points, draw_scenario
 from perchctl.sim.scenario import Scenario
 
-NO_CONDITION = frozenset({"set"})
-"""Of the section's keys: only stands for values of the others."""
+NO_CONDITION = frozenset(
+    {"set", "camera_burst_start_s", "first_contact_share", "draught_towards_deg",
+     "target_tilt_towards_deg"}
+)  # fmt: skip
+"""Of the section's keys: what only stands for values of the others, or says when, where to or how
+much of something that another key says whether there is."""
 Told = Callable[[Profile, Scenario], str]
 
 
@@ -56,7 +60,9 @@ CONDITIONS = (
     Condition("mass", ("mass_kg",), lambda _, s: f"{1e3 * s.mass_kg:.1f} g"),
     Condition("battery", ("battery_rest_v",), lambda _, s: f"{s.battery_rest_v:.2f} V at rest"),
     Condition(
-        "start", ("start_offset_m",), lambda _, s: f"{math.hypot(*s.target_xy_m):.2f} m aside"
+        "start",
+        ("start_offset_m", "target_xy_m"),
+        lambda _, s: f"{math.hypot(*s.target_xy_m):.2f} m aside",
     ),
     Condition(
         "heading", ("target_yaw_deg",), lambda _, s: f"{math.degrees(s.target_yaw_rad):.0f} deg"
@@ -70,10 +76,20 @@ CONDITIONS = (
     ),
     Condition("frames lost in one go", ("camera_burst_frames",), lambda _, s: _frames(s)),
     Condition("noise", ("camera_noise_sigma",), lambda _, s: f"{s.camera_noise_sigma:.1f} of 255"),
-    Condition("mounting error", ("mount_error_deg", "mount_error_m"), _mounting),
-    Condition("tilt bias", ("estimate_tilt_bias_deg",), lambda _, s: _tilt(s)),
     Condition(
-        "drift", ("drift_mps",), lambda _, s: f"{1e3 * float(np.linalg.norm(s.drift_mps)):.0f} mm/s"
+        "mounting error",
+        ("mount_error_deg", "mount_error_m", "mount_error_rpy_deg", "mount_error_xyz_m"),
+        _mounting,
+    ),
+    Condition(
+        "tilt bias",
+        ("estimate_tilt_bias_deg", "estimate_tilt_bias_xy_deg"),
+        lambda _, s: _tilt(s),
+    ),
+    Condition(
+        "drift",
+        ("drift_mps", "drift_xyz_mps"),
+        lambda _, s: f"{1e3 * float(np.linalg.norm(s.drift_mps)):.0f} mm/s",
     ),
     Condition("draught", ("draught_mps",), lambda _, s: f"{math.hypot(*s.draught_mps):.2f} m/s"),
     Condition("first contact", ("first_contact_fails",), _contact, gradual=False),

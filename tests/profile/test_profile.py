@@ -308,10 +308,13 @@ def keys_of(model: type[BaseModel], name: str = "profile") -> Iterator[tuple[str
 
 @cache
 def attributes_read() -> set[tuple[str, str]]:
-    """Every ``name.key`` and ``x.name.key`` in the package's code."""
+    """Every ``name.key`` and ``x.name.key`` in the package's code, and what is drawn by its name:
+    ``between("key")``."""
     found: set[tuple[str, str]] = set()
     for path in Path(perchctl.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "between":
+                found |= {("simulation", a.value) for a in node.args if isinstance(a, ast.Constant)}
             if isinstance(node, ast.Attribute):
                 owner = node.value
                 if isinstance(owner, ast.Attribute):
