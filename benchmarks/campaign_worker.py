@@ -122,7 +122,7 @@ def flown(profile: Any, seed: int, by_parts: bool) -> dict[str, Any]:
         "outcome": str(result.outcome),
         "miss_m": result.miss_m,
         "time_s": result.time_s,
-        "simulated_s": result.realtime_factor * wall_s,
+        "simulated_s": result.time_s,
         "wall_s": wall_s,
         "cpu_s": cpu_s,
         "peak_mb": _peak_mb(),
@@ -131,9 +131,9 @@ def flown(profile: Any, seed: int, by_parts: bool) -> dict[str, Any]:
 
 
 def _peak_mb() -> float:
-    """On macOS it is counted in bytes."""
+    """In millions of bytes. On macOS it is counted in bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)
+    return 1e-6 * peak * (1.0 if sys.platform == "darwin" else 1024.0)
 
 
 def main() -> None:

@@ -139,7 +139,7 @@ def test_until_ends_where_the_rate_is_known() -> None:
     assert high - low < 0.2
     bound = run("simulate", "--until", "0.5%", "-n", "7")
     assert bound.code == 0
-    assert bound.stdout.endswith("still not narrower than 0.5 % after all 7 flights\n")
+    assert bound.stdout.endswith("not yet narrower than 0.5 % after 7 flights\n")
 
 
 FAILS = Ended(3, Kind("landed", "battery-low", False, False), "battery at 2.91 V under load")

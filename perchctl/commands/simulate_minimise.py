@@ -12,7 +12,7 @@ from typing import Any
 from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
 from perchctl.commands.simulate_request import SimulateRequest
-from perchctl.errors import Interrupted, InvalidValue
+from perchctl.errors import Interrupted, InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.flight.campaign import fly_all
 from perchctl.flight.conditions import Condition, Conditions, conditions_of
@@ -42,6 +42,7 @@ def run_minimise(request: SimulateRequest) -> int:
     seed, profile = request.minimise, request.loaded()
     conditions = conditions_of(profile, seed)
     found: Minimised | None = None
+    problem: PerchError | None = None
     jobs = request.jobs or 1
     with (
         contextlib.suppress(KeyboardInterrupt),
@@ -65,15 +66,18 @@ def run_minimise(request: SimulateRequest) -> int:
         def less(levels: Mapping[str, float], ended: Ended) -> None:
             so_far.levels, so_far.ended = levels, ended
 
-        minimised_failure(conditions, whole, executor, jobs, flown, less)
-        so_far.whole = True
+        try:
+            minimised_failure(conditions, whole, executor, jobs, flown, less)
+            so_far.whole = True
+        except PerchError as error:  # what was found so far is not lost with it
+            problem = error
     if found is None:
         raise Interrupted("stopped: the seed was not flown to its end")
     _report(request, conditions, found)
     if found.whole:
         return 0
-    say("stopped: less may do; what is known so far is told")
-    return Interrupted.exit_code
+    say(f"{problem or 'stopped'}: less may do; what is known so far is told")
+    return (problem or Interrupted()).exit_code
 
 
 def _report(request: SimulateRequest, conditions: Conditions, found: Minimised) -> None:

@@ -18,7 +18,7 @@ _NOT_WITH: dict[str, tuple[tuple[str, ...], str]] = {
         "flies each seed by two profiles, and prints a table",
     ),
     "--sweep": ((*_LOGS, "--output"), "flies each seed by many profiles, and keeps no logs"),
-    "--until": (("--heat-map", "--output"), "is a plain campaign that ends by itself"),
+    "--until": (("--heat-map", "--output", "--keep"), "is a plain campaign that ends by itself"),
     "--minimise": (
         (*_LOGS, "-n", "--seed", "--heat-map"),
         "flies one seed under other and other conditions",

@@ -65,4 +65,4 @@ def verdict(enough: Enough, width: float) -> str:
     flights = len(enough.counted)
     if enough.met:
         return f"{known}: narrower than {100 * width:g} % after {flights} flights"
-    return f"{known}: still not narrower than {100 * width:g} % after all {flights} flights"
+    return f"{known}: not yet narrower than {100 * width:g} % after {flights} flights"

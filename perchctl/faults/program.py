@@ -40,6 +40,8 @@ class FaultyClock:
             self._pending = effect
 
     def now(self) -> float:
+        if self._gone:
+            raise ProgramKilled  # it rescues nothing any more, and says nothing
         return self._link.now_s
 
     def wait_until(self, t_s: float) -> None:

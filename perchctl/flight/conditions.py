@@ -18,7 +18,8 @@ from perchctl.sim.scenario import Scenario
 
 NO_CONDITION = frozenset(
     {"set", "camera_burst_start_s", "first_contact_share", "draught_towards_deg",
-     "target_tilt_towards_deg"}
+     "target_tilt_towards_deg", "lamp_aside_m", "lamp_z_m", "bare_floor_aside_m", "gust_every_s",
+     "capture_hole_every_s", "flow_reach_m", "radio_burst_s"}
 )  # fmt: skip
 """Of the section's keys: what only stands for values of the others, or says when, where to or how
 much of something that another key says whether there is."""

@@ -14,6 +14,7 @@ from perchctl.errors import PerchError
 from perchctl.flight.campaign import OUTCOMES, fly_all
 from perchctl.flight.conditions import Conditions
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
+from perchctl.flight.memory import give_back_memory
 from perchctl.flight.minimise import Levels, minimised
 from perchctl.flight.results import FlightEnd
 from perchctl.mission.state import Phase
@@ -61,7 +62,10 @@ def fly_to_its_end(profile: Profile, seed: int) -> Ended:
         flight = fly_lockstep(profile, seed)
     except PerchError as error:
         return Ended(seed, Kind("aborted", REFUSED, False, False), str(error))
-    return Ended(seed, kind_of(flight), flight.report.reason)
+    ended = Ended(seed, kind_of(flight), flight.report.reason)
+    del flight
+    give_back_memory()
+    return ended
 
 
 def kind_of(flight: LockstepFlight) -> Kind:

@@ -77,8 +77,6 @@ class Kept(Generic[R]):
         self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
         self.left = [seed for seed in seeds if seed not in earlier]
         self._keep_log, self._append = keep_log, append
-        for result in self.earlier:
-            keep_log(result)
 
     def note(self, result: R) -> None:
         """As a flight ends."""

@@ -20,6 +20,7 @@ from perchctl.profile import Profile
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.draw import draw_capture, draw_scenario
+from perchctl.sim.receiver import DeliveredFrame
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.told import Teller
 from perchctl.sim.vehicle import SimulatedVehicle
@@ -48,6 +49,14 @@ class LockstepClock:
             self._link.advance_to(t_s)
 
 
+def _newest(frames: list[DeliveredFrame]) -> list[DeliveredFrame]:
+    """Of the last exposures, each as it first came and as it came last: what else waited meanwhile
+    nobody looks at."""
+    last = sorted({frame.index for frame in frames})[-_QUEUED:]
+    ends = [[frame for frame in frames if frame.index == index] for index in last]
+    return [frame for same in ends for frame in same[:: max(1, len(same) - 1)]]
+
+
 class LockstepSource:
     """The simulated camera's delivered frames; the newest wins, as for a live camera."""
 
@@ -61,7 +70,7 @@ class LockstepSource:
         self._count = 0
 
     def poll(self, now_s: float) -> Frame | None:
-        for each in self._camera.take()[-_QUEUED:]:
+        for each in _newest(self._camera.take()):
             self._slot.put(each.image, each.t_arrival_s - self._latency_s, each.t_arrival_s)
         frame = self._slot.take()
         if frame is None:

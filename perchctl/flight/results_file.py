@@ -13,8 +13,9 @@ import hashlib
 import json
 import os
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -146,11 +147,15 @@ def open_results(
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         data = path.read_bytes() if resume else b""
-        written, earlier, good = _read(path, data, kind)
+        written, earlier, good = _read(path, data, kind, partial(_check_campaign, path, header))
+        if written is not None and written.program != header.program and not force:
+            raise InvalidValue(
+                f"{path} was flown by another program ({written.program}; this is "
+                f"{header.program}): take that one, name another file, or add --force to go on all "
+                f"the same"
+            )
         os.ftruncate(fd, good)
         results = ResultsFile(path, fd, earlier)
-        if written is not None:
-            _check_same(path, written, header, force)
         if written != header:
             form = {"kind": "header", "format": FORMAT, "version": VERSION}
             results._write({**form, **asdict(header)})
@@ -166,9 +171,10 @@ def open_results(
 
 
 def _read(
-    path: Path, data: bytes, kind: type[R]
+    path: Path, data: bytes, kind: type[R], check: Callable[[CampaignHeader], None]
 ) -> tuple[CampaignHeader | None, dict[int, R], int]:
-    """The newest header, the flights, and how many bytes are whole lines."""
+    """The newest header, the flights, and how many bytes are whole lines. `check` is asked about
+    the headers before a flight is read."""
     good = data.rfind(b"\n") + 1
     begin = line_of({"kind": "header", "format": FORMAT})[:-2]
     if not data.startswith(begin[: len(data)]) or (good and not data.startswith(begin)):
@@ -183,6 +189,7 @@ def _read(
             what = record.pop("kind", None)
             if what == "header":
                 header = _header(record)
+                check(header)
             elif what == "flight":
                 result = result_from(record, kind)
                 flights.setdefault(record["seed"], result)
@@ -204,7 +211,8 @@ def _header(record: dict[str, Any]) -> CampaignHeader:
     return from_exact(CampaignHeader, record)
 
 
-def _check_same(path: Path, was: CampaignHeader, now: CampaignHeader, force: bool) -> None:
+def _check_campaign(path: Path, now: CampaignHeader, was: CampaignHeader) -> None:
+    """Before a flight is read: what is of another campaign is not damaged."""
     if was.faults != now.faults:
         names = [", ".join(h.faults) if h.faults else "no faults" for h in (was, now)]
         raise InvalidValue(
@@ -215,9 +223,4 @@ def _check_same(path: Path, was: CampaignHeader, now: CampaignHeader, force: boo
         raise InvalidValue(
             f"{path} was flown with another profile ({was.profile} {was.profile_sha256[:8]}, now "
             f"{now.profile} {now.profile_sha256[:8]}): take that one, or name another file"
-        )
-    if was.program != now.program and not force:
-        raise InvalidValue(
-            f"{path} was flown by another program ({was.program}; this is {now.program}): take "
-            f"that one, name another file, or add --force to go on all the same"
         )

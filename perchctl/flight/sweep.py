@@ -175,6 +175,8 @@ def _lines(found: Swept) -> Iterator[str]:
 
 def _verdict(found: Swept) -> str:
     against = found.against_own
+    if not found.figures[0].flights:
+        return "no seed was flown in every cell: nothing can be said"
     if against is None:
         return "the profile's own values are the best"
     if against.all_identical:

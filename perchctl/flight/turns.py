@@ -10,6 +10,7 @@ from perchctl.mission.state import Observation, PlannerState
 from perchctl.mission.turn import Outside, Turn, TurnRole, TurnTiming
 from perchctl.mission.watch import TurnWatcher, Watcher
 from perchctl.positioning.feed import FeedStatus
+from perchctl.values import replace
 from perchctl.vehicle import Command
 
 
@@ -64,7 +65,8 @@ class Turns:
         self._undecided = self._untold = None
         if untold is not None:
             obs, new, command, outside = untold
-            self._tell(self._turn("flown", senses, obs, new, command, told_of(outside)))
+            turn = self._turn("flown", senses, obs, new, command, told_of(outside))
+            self._tell(replace(turn, timing=None))  # by now the rescue's time is in it
         elif obs is not None and isinstance(error, Exception):  # else it was only interrupted
             self._tell(
                 Turn(

@@ -41,7 +41,7 @@ FORMAT = "perchctl-flight-log"
 SCHEMA_VERSION = 4
 FSYNC_PERIOD_S = 1.0
 RETRY_PERIOD_S = 1.0
-CLOSE_TIMEOUT_S = 3.0
+CLOSE_TIMEOUT_S, RECOVERED_S = 3.0, 0.2
 BEHIND_S = 30.0
 """Of a flight may wait for the disk; more is dropped."""
 RECORDS_A_TURN = 2
@@ -182,9 +182,9 @@ class FlightLogWriter:
         self._concluded = True
         if self._behind is None:
             self._summarise(summary)
-        elif not self._behind.wait(partial(self._summarise, summary), CLOSE_TIMEOUT_S):
-            self._hung = True
-            self._remember(NO_ANSWER)
+        else:
+            done = partial(self._summarise, summary)
+            self._hung = not self._behind.wait(done, CLOSE_TIMEOUT_S)
 
     def close(
         self,
@@ -194,8 +194,8 @@ class FlightLogWriter:
         """Append the summary, if there is one, and what became of a recording, and close. Never
         raises; twice is once.
 
-        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most, and not once more where
-        `conclude` did in vain."""
+        Waits for a disk that hangs, but for `CLOSE_TIMEOUT_S` at most, and for a moment only
+        where `conclude` did in vain."""
         if self._closed:
             return
         self._closed = True
@@ -203,7 +203,8 @@ class FlightLogWriter:
         if self._behind is None:
             end()
             return
-        left = self._behind.finish(end, 0.0 if self._hung else CLOSE_TIMEOUT_S, self._let_go)
+        once_more_s = RECOVERED_S if self._hung else CLOSE_TIMEOUT_S
+        left = self._behind.finish(end, once_more_s, self._let_go)
         if left:
             self._drop(left)
             self._remember(NO_ANSWER)

@@ -11,11 +11,13 @@ from perchctl.errors import InvalidValue, UsageError
 from perchctl.profile.load import first_fault
 from perchctl.profile.plain_yaml import clipped, parse_yaml
 from perchctl.profile.schema import Profile
+from perchctl.profile.simulation import in_world
 
 
 def changed(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
     """With each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as in a profile's
     file. `option` is where they were given. Errors: UsageError (of another form), InvalidValue."""
+    settings = sorted(settings, key=_is_world, reverse=True)  # keys win over a world, whatever
     values = profile.model_dump(mode="json")
     for setting in settings:
         key, equals, text = setting.partition("=")
@@ -26,6 +28,11 @@ def changed(profile: Profile, settings: Iterable[str], option: str = "--set") ->
             )
         try:
             _put(values, key.strip(), parse_yaml(text))
+            if _is_world(setting):
+                world = in_world(profile.simulation, str(parse_yaml(text)))
+                values["simulation"] = world.model_dump(mode="json")
+        except ValidationError as error:
+            raise InvalidValue(f"{option} {clipped(setting)}: {first_fault(error)[1]}") from None
         except ValueError as error:
             raise InvalidValue(f"{option} {clipped(setting)}: {error}") from None
     try:
@@ -33,6 +40,10 @@ def changed(profile: Profile, settings: Iterable[str], option: str = "--set") ->
     except ValidationError as error:
         key, text = first_fault(error)
         raise InvalidValue(f"{option}: {key or 'profile'}: {text}") from None
+
+
+def _is_world(setting: str) -> bool:
+    return setting.partition("=")[0].strip() == "simulation.set"
 
 
 def value_of(profile: Profile, dotted: str) -> Any:

@@ -25,8 +25,7 @@ from perchctl.vehicle import Command
 class Decided:
     """One turn, decided again: `state` and `command` are the replay's, what was flown is in
     `turn`. `tick` counts the turns that were flown, from 0. `error`: the name of what the planner
-    raised, where it had raised in flight, too: then the state is the one before, None at the first
-    turn, and there is no command."""
+    raised: then the state is the one before, None at the first turn, and there is no command."""
 
     tick: int
     turn: Turn
@@ -44,7 +43,7 @@ class Decided:
         """The first field in which it does. Of a turn on which the planner raised that is what it
         raised; a log of before version 4 does not tell whether it did, and has none."""
         turn, state = self.turn, self.state
-        if turn.role == "failed":
+        if turn.role == "failed" or self.error is not None:
             return first_differing("error", turn.error, self.error)
         if turn.command is None or state is None:
             return None
@@ -100,7 +99,8 @@ def decide(
 ) -> Iterator[Decided]:
     """Each turn of the planner, in order, with the observation that `seen` gives for it: by
     default the recorded one. A turn that was decided anew is decided, but does not count; on one
-    on which the planner raised it may raise again."""
+    on which the planner raised it may raise again. Where it raises on another one, that is the
+    last."""
     state: PlannerState | None = None
     tick = 0
     for turn in turns:
@@ -110,7 +110,11 @@ def decide(
         if turn.command is None:
             yield _failed_again(tick, turn, obs, state, profile)
             continue
-        new, command = planner.step(state or planner.start(obs), obs, profile)
+        try:
+            new, command = planner.step(state or planner.start(obs), obs, profile)
+        except Exception as error:  # what came after it cannot be decided
+            yield Decided(tick, turn, obs, state, None, type(error).__name__)
+            return
         yield Decided(tick, turn, obs, new, command)
         if turn.role == "flown":
             state, tick = new, tick + 1

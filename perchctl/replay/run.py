@@ -27,7 +27,7 @@ from perchctl.replay.sense import (
     one_thread,
     sense,
 )
-from perchctl.replay.shown import shown
+from perchctl.replay.shown import older, placed_later_s, shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Replay:
     ticks: how many were flown; `differences`, how many of them were decided otherwise; `first`
         may be of one that was not sent.
     seen: None without pictures.
-    shown: None where pictures were looked at.
+    shown: None where pictures were looked at to the end.
     changed: the keys in which the profile is another than the flown one's.
     gap: which turn is the first that the log has lost, or empty.
     notes: what limits the replay, in sentences.
@@ -124,11 +124,13 @@ def replay(
         pipeline = pipeline or pipeline_of(log, used, changed)
         # A source takes the latency off the time at which a picture came.
         later_s = flown.camera.start_latency_s - used.camera.start_latency_s
-        seen = _seen(log, turns, used, pictures, pipeline, later_s)
+        placed_s = placed_later_s(turns, flown, used)
+        seen = _seen(log, turns, used, pictures, pipeline, later_s, placed_s)
     by_telemetry = None
-    if seen is None or (seen.unreadable and not seen.frames):
+    unseen = seen is None or not (seen.frames or seen.another)
+    if unseen or (seen is not None and seen.ended):
         by_telemetry = _shown(log, turns, flown, used)
-    again, ended = by_telemetry or seen, "" if seen is None else seen.ended
+    again, ended = by_telemetry if unseen else seen, "" if seen is None else seen.ended
     observations: dict[int, Observation | None] = {}
     if again is not None and changed:
         observations = {each.turn.number: each.observation for each in again.turns}
@@ -148,7 +150,7 @@ def replay(
         changed=changed,
         gap=whole.gap,
         notes=(
-            *notes_of(log, whole.gap, ended, changed, pictures=by_telemetry is None),
+            *notes_of(log, whole.gap, ended, changed, pictures=not unseen),
             *_failures(decided),
         ),
     )
@@ -202,13 +204,14 @@ def _seen(
     pictures: Iterable[Picture],
     pipeline: Pipeline,
     later_s: float,
+    placed_later_s: float,
 ) -> Seen:
     found: list[Sensed] = []
     missing: PictureMissing | None = None
     with one_thread():
         try:
             for each in sense(turns, profile, pipeline, pictures, later_s):
-                found.append(each)
+                found.append(older(each, placed_later_s))
         except PictureMissing as error:
             missing = error
     return Seen(
@@ -243,7 +246,8 @@ def _differing(
 def _failures(decided: Sequence[Decided]) -> Iterator[str]:
     for each in decided:
         if each.error is not None:
-            yield f"the planner breaks down on turn {each.turn.number}, as in flight: {each.error}"
+            as_flown = ", as in flight" if each.error == each.turn.error else ""
+            yield f"the planner breaks down on turn {each.turn.number}{as_flown}: {each.error}"
 
 
 def _frames_of(turns: Iterable[Turn]) -> int:

@@ -40,8 +40,7 @@ def shown(turns: Sequence[Turn], flown: Profile, profile: Profile) -> Iterator[S
     flown by, `profile` the one whose `safety` and `positioning` count. With the same one twice
     the observations are the recorded ones, to the bit."""
     history, camera = History(), _Camera()
-    later_s = profile.positioning.latency_s - flown.positioning.latency_s
-    by_capture = any(turn.outside is not None for turn in turns)
+    later_s = placed_later_s(turns, flown, profile)
     for turn in turns:
         history = extended(history, list(turn.taken.samples), profile.safety)
         if turn.t_s != turn.began_s:
@@ -59,9 +58,23 @@ def shown(turns: Sequence[Turn], flown: Profile, profile: Profile) -> Iterator[S
             jumped=history.jumped,
             turned_rad=history.turned_rad,
         )
-        if by_capture and later_s:
-            again = replace(again, position_age_s=obs.position_age_s + later_s)
-        yield Sensed(turn, turn.poses, again)
+        yield older(Sensed(turn, turn.poses, again), later_s)
+
+
+def placed_later_s(turns: Sequence[Turn], flown: Profile, profile: Profile) -> float:
+    """How much older positions from outside are by the other profile; 0 of a flight by decks."""
+    if not any(turn.outside is not None for turn in turns):
+        return 0.0
+    return profile.positioning.latency_s - flown.positioning.latency_s
+
+
+def older(sensed: Sensed, later_s: float) -> Sensed:
+    """With positions that are so much older."""
+    obs = sensed.observation
+    if obs is None or not later_s:
+        return sensed
+    aged = replace(obs, position_age_s=obs.position_age_s + later_s)
+    return replace(sensed, observation=aged)
 
 
 def _pictured(

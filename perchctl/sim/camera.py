@@ -119,6 +119,7 @@ class SimCamera:
             frame.picture()
         if self._last is not None:
             self._last()
+        self._receiver.develop()
 
     def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Later:
         """The poses are of now; the picture is made when it is looked at."""

@@ -58,6 +58,11 @@ class Receiver:
         self._first_s = float(rng.random()) / (scenario.camera_receiver_hz or 1.0)
         self._given = 0
 
+    def develop(self) -> None:
+        """As `SimCamera.develop`."""
+        if self._newest is not None:
+            self._newest.picture()
+
     def given_out(self, arrived: list[DeliveredFrame], t_s: float) -> list[DeliveredFrame]:
         """Until `t_s`, of what has arrived since the last call, oldest first."""
         rate_hz = self._scenario.camera_receiver_hz

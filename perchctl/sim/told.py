@@ -72,7 +72,7 @@ class Teller:
         if self._in_burst(t_s):
             assert self._scenario.camera_burst is not None
             return f"{self._scenario.camera_burst[1]} frames lost"
-        return "a lamp is reflected in the glossy print" if self._scenario.gloss else ""
+        return "perhaps a lamp's reflection in the glossy print" if self._scenario.gloss else ""
 
     def _in_burst(self, t_s: float) -> bool:
         burst, rate_hz = self._scenario.camera_burst, self._scenario.camera_rate_hz

@@ -15,7 +15,7 @@ Assumptions of the model, each with its source:
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
   standard deviations of the gusts (`perchctl.sim.wind`).
 - Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
-  thrust at the ceiling itself. With 0.1 it is within 0.5 per cent of the thrust what momentum
+  thrust at the ceiling itself. With 0.1 it is within 0.6 per cent of the thrust what momentum
   theory with a ceiling gives, and benches with rotors of this size (23 mm) measured (Hsiao and
   Chirarattananon, arXiv 1905.04632), for gears of 3 cm and more: 2 per cent in contact.
 - The magnet: `perchctl.sim.magnet`. The gear's tip is a flat disc, so a held vehicle

@@ -51,6 +51,13 @@ def _told(conditions: Conditions, levels: dict[str, float]) -> dict[str, str]:
     return {c.name: c.told(profile, scenario) for c in CONDITIONS if c.told is not None}
 
 
+def test_a_nominal_world_has_no_other_conditions_than_those_with_words() -> None:
+    """What only says when, where to or how much is no condition of its own."""
+    named = {condition.name for condition in CONDITIONS}
+    for seed in range(20):
+        assert set(conditions_of(SIM, seed).names) <= named
+
+
 def test_every_key_of_the_simulation_is_a_condition_or_is_none() -> None:
     """A key that is new is one by itself."""
     named = [key for condition in CONDITIONS for key in condition.keys]

@@ -134,3 +134,10 @@ def test_two_keys_are_a_heat_map(tmp_path: Path, second: str) -> None:
     found = swept(grid, flights(3, None, *([0.002] * (len(grid.cells) - 1))))
     plot_sweep(found, tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_swept_worlds_are_other_worlds() -> None:
+    """A world's values are those of its keys: a profile that has them written out keeps none."""
+    grid = grid_of(load_profile("sim"), ["simulation.set=nominal,rough,extreme"])
+    weights = [cell.profile.simulation.mass_kg for cell in grid.cells]
+    assert weights == [(0.038, 0.042), (0.042, 0.045), (0.044, 0.045)]

@@ -252,11 +252,28 @@ def test_a_log_s_disk_that_hangs_is_waited_for_once(
 
     watcher.writer._behind.finish = waited  # type: ignore[union-attr,method-assign]
     summary = watcher.close(REPORT)
-    assert waits == [0.0]
+    assert waits == [write.RECOVERED_S]
     assert summary is not None
     assert "does not answer" in (summary.log_problem or "")
     gate.set()
     disk.gate.set()
+
+
+def test_a_disk_that_has_recovered_by_the_close_has_lost_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header(), live=True)
+    gate, real = threading.Event(), write.os.write
+    monkeypatch.setattr(write, "CLOSE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(write, "RECOVERED_S", 20.0)
+    monkeypatch.setattr(write.os, "write", lambda fd, data: gate.wait(20.0) and real(fd, data))
+    writer.conclude(synthetic.SUMMARY)
+    gate.set()
+    writer.close(recording={"frames": 3})
+    assert (writer.lost_records, writer.problem) == (0, None)
+    log = read_log(tmp_path / "f.jsonl")
+    assert log.summary is not None
+    assert not log.truncated
 
 
 def test_lockstep_logs_of_one_seed_are_the_same_bytes(tmp_path: Path) -> None:

@@ -384,15 +384,21 @@ def test_both_are_drawn(tmp_path: Path) -> None:
 
 
 def test_a_fault_of_the_planner_is_not_the_file_s(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """It is a difference by itself, and the end: what came after it cannot be decided."""
+
     def fails(*_: Any) -> Any:
         raise ValueError("by the test")
 
     path = log_of(tmp_path, lines_of()[:120])
     monkeypatch.setattr("perchctl.mission.planner.step", fails)
-    with pytest.raises(ValueError, match="by the test"):
-        log_replay.run(ReplayRequest(path))
+    code = log_replay.run(ReplayRequest(path, as_json=True))
+    found = json.loads(capsys.readouterr().out)
+    assert code == 61
+    assert found["first_difference"]["field"] == "error"
+    assert found["first_difference"]["replayed"] == "ValueError"
+    assert (found["ticks"], found["differences"]) == (1, 1)
     monkeypatch.setattr("perchctl.log.plot.plot_flight", fails)
     with pytest.raises(ValueError, match="by the test"):
         log_plot.run(log_plot.PlotRequest(path))

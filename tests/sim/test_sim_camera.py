@@ -202,16 +202,21 @@ def test_pictures_that_nobody_looks_at_are_not_made_and_change_no_other() -> Non
     assert stub.rendered == [frames[30].index]
 
 
-def test_a_picture_shows_the_target_where_it_was() -> None:
+@pytest.mark.parametrize("receiver_hz", [None, 7.0, 15.0])
+def test_a_picture_shows_the_target_where_it_was(receiver_hz: float | None) -> None:
+    """Also one that a receiver still holds."""
     K = np.array([[190.0, 0, 160], [0, 190, 120], [0, 0, 1]])
     model = CameraModel((320, 240), K, np.zeros(5))
-    still, moved = (SimulatedVehicle(Scenario(seed=3), model, TargetConfig()) for _ in range(2))
+    still, moved = (
+        SimulatedVehicle(Scenario(seed=3, camera_receiver_hz=receiver_hz), model, TargetConfig())
+        for _ in range(2)
+    )
     pictures = []
     for vehicle in (still, moved):
         vehicle.advance_to(0.5)
         if vehicle is moved:
             vehicle.move_target((0.3, 0.0))
-        vehicle.advance_to(0.7)
+        vehicle.advance_to(0.9)
         assert vehicle.camera is not None
         pictures.append([(f.t_exposure_s, f.image) for f in vehicle.camera.take()])
     same = [(t_s, np.array_equal(a, b)) for (t_s, a), (_, b) in zip(*pictures, strict=True)]

@@ -197,6 +197,7 @@ class _PictureFeed:
     def _run(self) -> None:
         while (t_s := self._next_time()) is not None:
             self._camera.advance(t_s, self._state_at)
+            self._camera.develop()  # while it is under way: its latency is the whole way's
             arrived = self._camera.take()
             if arrived:
                 self._stream.publish(arrived[-1].image)
