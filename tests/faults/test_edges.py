@@ -230,7 +230,9 @@ def test_killed() -> None:
     for _ in range(2):  # its rescue is dead as well
         with pytest.raises(ProgramKilled):
             clock.wait_until(1.02)
-    assert clock.now() == 1.02
+    with pytest.raises(ProgramKilled):  # nor does it learn what time it is
+        clock.now()
+    assert clock.killed_s == 1.02
     assert cut == [True]
 
 

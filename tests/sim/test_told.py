@@ -96,7 +96,10 @@ def test_what_cannot_see_the_vehicle_is_told() -> None:
 
 def test_what_the_print_is_like_is_told() -> None:
     glossy = Scenario(gloss=0.5, target_tilt_rad=(math.radians(3.0), 0.0))
-    assert Teller(glossy)(phase("ascend-lost"), 9.0) == "a lamp is reflected in the glossy print"
+    assert (
+        Teller(glossy)(phase("ascend-lost"), 9.0)
+        == "perhaps a lamp's reflection in the glossy print"
+    )
     assert Teller(glossy)(phase("no-contact"), 9.0) == "the target is tilted by 3.0 deg"
     assert Teller(Scenario())(phase("no-contact"), 9.0) == ""
 
