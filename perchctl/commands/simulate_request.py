@@ -150,7 +150,7 @@ class SimulateRequest:
         header = campaign_header(profile, faults)
         file = open_results(self.out, header, kind, self.resume, self.force)
         try:
-            yield Kept(self.seeds, file.earlier, keep, file.append)
+            yield Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
         finally:
             file.close()
 

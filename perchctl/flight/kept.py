@@ -65,7 +65,8 @@ def _remove(log: Path | None) -> None:
 
 
 class Kept(Generic[R]):
-    """A campaign's results: those of a file of results, and those that come."""
+    """A campaign's results: those of a file of results, and those that come. Of earlier ones only
+    logs in `folder` are judged: others may be another campaign's by now."""
 
     def __init__(
         self,
@@ -73,10 +74,15 @@ class Kept(Generic[R]):
         earlier: Mapping[int, R],
         keep_log: Callable[[R], None],
         append: Callable[[R], None] = lambda result: None,
+        folder: Path | None = None,
     ) -> None:
         self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
         self.left = [seed for seed in seeds if seed not in earlier]
         self._keep_log, self._append = keep_log, append
+        own = None if folder is None else folder.resolve()
+        for result in self.earlier:
+            if result.log is not None and result.log.resolve().parent == own:
+                keep_log(result)
 
     def note(self, result: R) -> None:
         """As a flight ends."""

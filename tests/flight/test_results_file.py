@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.flight.kept import log_keeper
+from perchctl.flight.kept import Kept, log_keeper
 from perchctl.flight.results import FlightResult
 from perchctl.flight.results_file import (
     CampaignHeader,
@@ -21,6 +21,7 @@ from perchctl.flight.results_file import (
 )
 from perchctl.log.recording.place import recording_of
 from perchctl.profile import load_profile
+from tests.helpers.results import perched
 
 HEADER = CampaignHeader("1.0", "abc", "sim", "0123456789", None)
 FLOWN = FlightResult(0, "perched", "hanging still", 0.1 / 3, 20.0, 1, False, False, 5.0)
@@ -198,3 +199,18 @@ def test_logs_that_are_not_wanted_go_with_their_recordings(
 def test_other_words_are_refused(keep: str) -> None:
     with pytest.raises(UsageError, match="allowed are all, failed and worst:N"):
         log_keeper(keep)
+
+
+def test_a_campaign_that_goes_on_judges_the_logs_of_its_own_folder(tmp_path: Path) -> None:
+    """Those in another folder may be another campaign's by now."""
+    own, other = tmp_path / "own", tmp_path / "other"
+    earlier = {}
+    for seed, folder in enumerate((own, own, other)):
+        folder.mkdir(exist_ok=True)
+        log = folder / f"flight_seed{seed}.jsonl"
+        log.touch()
+        earlier[seed] = replace(perched(seed, miss_m=0.001 * (seed + 1)), log=log)
+    kept = Kept(range(4), earlier, log_keeper("worst:1"), folder=own)
+    assert kept.left == [3]
+    left = {path.name for path in tmp_path.rglob("*.jsonl")}
+    assert left == {"flight_seed1.jsonl", "flight_seed2.jsonl"}

@@ -46,26 +46,7 @@ class Pid:
         self._limit = limit
 
     def update(self, desired: float, measured: float) -> float:
-        # `respond` once more: seven calls a control period would cost more than their sums.
-        error = desired - measured
-        integral = self._integral + error * self._period
-        bound = self._i_limit
-        if integral > bound:
-            integral = bound
-        elif integral < -bound:
-            integral = -bound
-        self._integral = integral
-        output = self.kp * error + self.ki * integral
-        if self.kd != 0.0:
-            output -= self.kd * (measured - self._measured) / self._period
-        self._measured = measured
-        limit = self._limit
-        if limit > 0.0:
-            if output > limit:
-                return limit
-            if output < -limit:
-                return -limit
-        return output
+        return self.respond(desired - measured, measured - self._measured, measured)
 
     def update_angle(self, desired: float, measured: float) -> float:
         """As `update`, on the circle of 360 degrees."""
