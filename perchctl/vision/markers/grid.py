@@ -63,12 +63,13 @@ def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
 def patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array) -> Patch | None:
     """The part of the picture that the nodes may reach, None where they leave it."""
     h, w = image.shape
-    seen = projected(H, grid.u, grid.v) + lens_px
-    if not (seen.min() >= -1.0 and (seen <= (w, h)).all()):
+    x, y = (projected(H, grid.u, grid.v) + lens_px).T.copy()  # in rows: a tenth of the time
+    least, most = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+    if not (least.min() >= -1.0 and (most <= (w, h)).all()):
         return None
-    room = 0.15 * float(np.ptp(seen, axis=0).max()) + 3.0
-    low = np.clip(seen.min(axis=0) - room, 0, (w - 2, h - 2)).astype(np.intp)
-    high = np.clip(seen.max(axis=0) + room + 1.0, low + 2, (w, h)).astype(np.intp)
+    room = 0.15 * float((most - least).max()) + 3.0
+    low = np.clip(least - room, 0, (w - 2, h - 2)).astype(np.intp)
+    high = np.clip(most + room + 1.0, low + 2, (w, h)).astype(np.intp)
     return Patch(image[low[1] : high[1], low[0] : high[0]].astype(np.float32), low)
 
 

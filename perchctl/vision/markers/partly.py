@@ -129,24 +129,25 @@ def _stepped(H: Array, seen: SeenEdges, known: EdgeShift | None) -> _Fit | None:
         return None
     H = H @ np.array([[1 + p[0], p[1], p[2]], [p[3], 1 + p[4], p[5]], [p[6], p[7], 1.0]])
     moved_px = float(np.abs(p[:6]).max() * seen.scale_px.mean())
-    return _Fit(H / H[2, 2], moved_px, seen, seen.far_px - A @ step, N)
+    return _Fit(H / H[2, 2], moved_px, seen, seen.far_px - (step @ A).reshape(seen.far_px.shape), N)
 
 
 def _equations(seen: SeenEdges, prior: EdgeShift) -> tuple[Array, Array, Array]:
-    """Changes (rows, n, 9) of the edges with the square's increment, in the terms of
+    """Changes (9, rows * n) of the edges with the square's increment, in the terms of
     `corner_jacobian`, and with the shift of all edges, px; and their normal equations (9, 9),
     (9,), per px^2 of an edge's spread."""
     u, v = seen.own[..., 0], seen.own[..., 1]
-    nx, ny = OUT[seen.side].T[..., None]
-    across = nx * u + ny * v
-    columns = [nx * u, nx * v, nx + 0 * u, ny * u, ny * v, ny + 0 * u, -u * across, -v * across]
-    J = np.stack(columns, axis=-1) * seen.scale_px[:, None, None]
+    nx, ny = OUT[seen.side].T[..., None] * seen.scale_px[:, None]
+    A = np.empty((9, *u.shape))
+    A[0], A[1], A[2] = nx * u, nx * v, nx
+    A[3], A[4], A[5] = ny * u, ny * v, ny
+    across = A[0] + A[4]
+    A[6], A[7] = -u * across, -v * across
     # The model's edge moves with the square, the seen one by the shift.
-    shift = np.broadcast_to(-seen.inwards[:, None], u.shape)
-    A = np.concatenate([J, shift[..., None]], axis=-1)
-    w = seen.weight * _worth(seen)[:, None]
-    N = np.einsum("rni,rn,rnj->ij", A, w, A)
-    g = np.einsum("rni,rn->i", A, w * seen.far_px)
+    A[8] = -seen.inwards[:, None]
+    A = A.reshape(9, -1)
+    weighted = A * (seen.weight * _worth(seen)[:, None]).ravel()
+    N, g = weighted.dot(A.T), weighted.dot(seen.far_px.ravel())
     # An edge's spread is about a tenth of a pixel while it is not known.
     certain = (0.1 / prior.sigma_px) ** 2
     N[8, 8] += certain

@@ -34,6 +34,7 @@ _TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # of the contrast: of black inside, of white 
 _MIN_CONTRAST = 10.0
 _MIN_WEIGHT = 3.0  # of a side's profiles
 _FAR_PX = 1e6
+_REACH: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,12 +174,12 @@ def _in_view(
 ) -> NDArray[np.bool_]:
     """Which profiles (rows, n) are in the picture, and not hidden, as far as they count."""
     h, w = shape[:2]
-    reach = near_px[:, None, None, None] * np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
-    at = origin[:, :, None] + reach * normal[:, :, None]
-    low, high = at.min(axis=2), at.max(axis=2)
-    last = (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
-    seen = (low >= ROOM_PX).all(axis=2) & (high <= last).all(axis=2)
+    # A profile is as far in the picture as both its ends are.
+    reach, last = near_px[:, None, None] * np.abs(normal), (w - 1 - ROOM_PX, h - 1 - ROOM_PX)
+    x_and_y = (origin - reach >= ROOM_PX) & (origin + reach <= last)
+    seen = x_and_y[..., 0] & x_and_y[..., 1]
     if hidden is not None and seen.any():
+        at = origin[:, :, None] + near_px[:, None, None, None] * _REACH * normal[:, :, None]
         pixel = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
         seen &= ~hidden[pixel[..., 1], pixel[..., 0]].any(axis=2)
     return np.asarray(seen)
