@@ -89,7 +89,7 @@ def unsettled(telemetry: Telemetry, profile: Profile) -> Problem | None:
 def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
     """Nothing tells the vehicle where it is: it would fly by a sum of accelerations."""
     config = profile.positioning
-    if config.by == "mocap" or by.placed_by(config.decks) or by.external:
+    if config.by != "deck" or by.placed_by(config.decks) or by.external:
         return None
     if by.external is None:
         found = "no positioning deck; whether positions come from outside is not told"

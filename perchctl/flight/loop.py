@@ -10,6 +10,9 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from perchctl.geometry import rot_z
 from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
@@ -48,9 +51,11 @@ from perchctl.mission.watch import (
 )
 from perchctl.pipeline import Pipeline
 from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning.sight import SightFeed
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, Idle
+from perchctl.vision.tracks import surest_of
 from perchctl.vision.consistency import Consistency
 
 HUNG_S = 0.25
@@ -73,6 +78,7 @@ class FlightParts:
     simulated: Callable[[Event], str] = lambda event: ""
     positions: Callable[[float], FeedStatus] | None = None
     remarks: Callable[[], Sequence[str]] = tuple
+    sight: SightFeed | None = None
 
 
 def fly(parts: FlightParts) -> FlightReport:
@@ -142,6 +148,7 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
         if parts.operator() is not Operator.NONE:
             raise Interrupted("interrupted before take-off: nothing was started")
         senses.take_in(now_s)
+        _sight(parts, senses, None, now_s)
         newest = senses.history.newest
         refuse(newest, parts.profile)
         outside = None if parts.positions is None else parts.positions(now_s)
@@ -175,6 +182,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         turns.begin(now_s)
         senses.take_in(now_s, look=not _is_blind(state))
         now_s = _present(parts, senses, now_s)
+        _sight(parts, senses, state, now_s)
         late_s = max(0.0, now_s - due_s)
         outside = None if parts.positions is None else parts.positions(now_s)
         obs = _observe(parts, senses, now_s, late_s, outside)
@@ -222,6 +230,21 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         if due_s < now_s:
             due_s = now_s + period_s  # never try to catch up with a burst of old ticks
         clock.wait_until(due_s)
+
+
+def _sight(parts: FlightParts, senses: Senses, state: PlannerState | None, now_s: float) -> None:
+    feed = parts.sight
+    if feed is None:
+        return
+    newest = senses.history.newest
+    if state is not None and state.phase is Phase.COMPLETE and state.contact_z_m is not None:
+        if feed.target is not None and newest is not None and newest.acc_z_g > 0.7:
+            x, y, z = feed.target.position_m - rot_z(newest.yaw_rad) @ np.asarray(parts.profile.vehicle.gear_body_m)
+            feed.known((float(x), float(y), float(z)), now_s)
+        return
+    pose = surest_of(senses.state.measured) if senses.output is not None else None
+    feed.see(pose, senses.history, now_s)
+    senses.place = feed.target
 
 
 def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:

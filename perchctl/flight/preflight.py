@@ -34,7 +34,7 @@ def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
 def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
     """Raises SafetyAbort where nothing would tell the vehicle its position. `positions`: those
     of the profile's motion capture are being sent."""
-    if profile.positioning.by != "mocap":
+    if profile.positioning.by == "deck":
         _refuse(unmeasured(link.measured_by(), profile))
     elif not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")

@@ -21,6 +21,7 @@ from perchctl.flight.noticed import Noticed, noticed
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
+from perchctl.positioning.place import TargetPlace, held_at
 from perchctl.profile import Profile, SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
@@ -68,6 +69,7 @@ class Senses:
     camera_problem: str | None = None
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
+    place: TargetPlace | None = None  # of a target that is the vehicle's positioning system
     noticed: Noticed = field(default_factory=Noticed)
     refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
@@ -201,6 +203,8 @@ class Senses:
         newest = self.history.newest
         attitude = None if newest is None else attitude_of(newest)
         target = estimate(self.state, now_s, attitude, self.pipeline)
+        if target is not None and self.place is not None and newest is not None:
+            target = held_at(target, self.place, newest, self.pipeline.pose.gear_body_m)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.blind or stale):
             return replace(target, tracked=False)

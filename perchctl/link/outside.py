@@ -46,7 +46,7 @@ class Feed(Protocol):
 
 def parameters_of(config: PositioningConfig) -> dict[str, float]:
     """What the firmware has to be set to for positions from outside; none with decks."""
-    if config.by != "mocap":
+    if config.by == "deck":
         return {}
     return {
         ESTIMATOR: KALMAN,

@@ -85,7 +85,7 @@ def is_astray(c: Context) -> bool:
     Positions from outside in other axes than the vehicle's do that: those that a vehicle at rest
     does not tell from true ones (fault 11)."""
     setpoint = c.state.setpoint
-    if c.profile.positioning.by != "mocap" or setpoint is None or not c.placed:
+    if c.profile.positioning.by == "deck" or setpoint is None or not c.placed:
         return False
     touched = c.state.contact_z_m is not None or c.state.stopped_s is not None
     if c.state.phase is Phase.LANDING and touched:

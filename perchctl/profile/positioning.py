@@ -36,7 +36,7 @@ class PositioningConfig(Section):
     `body_position_m`, both in the vehicle's body axes.
     """
 
-    by: Literal["deck", "mocap"] = Field("deck", description="what measures the position")
+    by: Literal["deck", "mocap", "target"] = Field("deck", description="what measures the position")
     system: Literal["vicon", "optitrack", "qualisys", "vrpn"] = Field(
         "vicon", description="kind of motion capture"
     )
@@ -65,7 +65,7 @@ class PositioningConfig(Section):
         0.05, gt=0, le=1, description="what the vehicle takes it for: `locSrv.extQuatStdDev`"
     )
     hold_s: float = Field(
-        0.15, gt=0, le=0.5, description="without a fresh position it is held in place"
+        0.15, gt=0, le=1.0, description="without a fresh position it is held in place"
     )
     land_s: float = Field(0.7, gt=0, le=2, description="without a fresh position it is landed")
     connect_timeout_s: float = Field(5.0, gt=0, le=60, description="for the first frame")

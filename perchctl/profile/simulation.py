@@ -96,6 +96,12 @@ class SimulationConfig(Section):
         0.3, ge=0, le=10, description="of the state estimate, at most"
     )
     drift_mps: float = Field(0.01, ge=0, le=0.2, description="of the state estimate")
+    gyro_bias_dps: float = Field(
+        0.0, ge=0, le=5, description="of a vehicle without a deck, level and about z, at most"
+    )
+    acc_bias_g: float = Field(
+        0.0, ge=0, le=0.2, description="of a vehicle without a deck, level, at most"
+    )
     draught_mps: Range = Field((0.0, 0.3), description="wind, with gusts")
     magnet_force_n: float = Field(1.2, ge=0, le=20, description="that the magnet holds")
     first_contact_fails: float = Field(

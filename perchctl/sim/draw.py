@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.geometry import Array, make_T, rotation_from_rpy
+from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
 from perchctl.profile import Profile
 from perchctl.profile.simulation import SimulationConfig
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.draw_more import beyond
 from perchctl.sim.scenario import Neighbour, Scenario
 
-_STREAM = 1  # the scenario's own random stream
+_STREAM, _IMU_STREAM = 1, 22  # the scenario's own random streams
 
 
 def draw_scenario(profile: Profile, seed: int) -> Scenario:
@@ -85,6 +85,7 @@ def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
         drift_mps=_pinned(drift, sim.drift_xyz_mps),
         draught_mps=(wind_mps * math.cos(wind_angle), wind_mps * math.sin(wind_angle), 0.0),
         first_contact_force_n=weak_part * mass_kg * 9.81 if fails else None,
+        **_imu_errors(sim, seed),
         extra=_extra(profile),
         neighbours=_neighbours(sim),
         **beyond(sim, seed, target_xy_m),
@@ -118,6 +119,13 @@ def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
     )
 
 
+def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, tuple[float, float, float]]:
+    rng = np.random.default_rng([seed, _IMU_STREAM])
+    p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
+    x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()
+    return {"gyro_bias_radps": (p, q, r), "acc_bias_mps2": (x, y, 0.0)}
+
+
 def draw_capture(profile: Profile, seed: int) -> CaptureSettings | None:
     """The motion capture of that seed's flight; None where the vehicle's decks do it."""
     config, sim = profile.positioning, profile.simulation
@@ -141,7 +149,7 @@ def _extra(profile: Profile) -> dict[str, float]:
     extra = {}
     if profile.simulation.camera_analogue:
         extra["analogue"] = profile.simulation.camera_analogue
-    if profile.positioning.by == "mocap":
+    if profile.positioning.by != "deck":
         extra["external_position"] = 1.0  # and no deck
     return extra
 

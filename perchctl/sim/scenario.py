@@ -67,6 +67,8 @@ class Scenario:
         cell_knee: the share of its charge below which its voltage falls steeply.
         rssi_dbm: of the radio, at the vehicle.
         parameters: the firmware's, where they differ from its release at boot.
+        gyro_bias_radps, acc_bias_mps2: what the gyroscope and the accelerometer read too much, body
+            axes, of a vehicle without a deck.
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
         gloss: peak of the lamp's reflection in the print, in whites of the paper; `lamp_m` the
@@ -143,4 +145,6 @@ class Scenario:
     radio_loss: float = 0.0
     radio_burst_s: float = 0.1
     capture_holes_s: tuple[tuple[float, float], ...] = ()
+    gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)

@@ -83,7 +83,9 @@ class Estimator:
         self._acc_lag = 1.0 - math.exp(-2 * math.pi * _ACC_CUTOFF_HZ * CONTROL_PERIOD_S)
         self.outside: OutsideFilter | None = None
         if scenario.extra.get("external_position"):
-            self.outside = OutsideFilter(scenario.seed)
+            self.outside = OutsideFilter(
+                scenario.seed, scenario.gyro_bias_radps, scenario.acc_bias_mps2
+            )
         self._flow: FlowDeck | None = None
         if self.outside is None and has_flow_errors(scenario):
             self._flow = FlowDeck(scenario)
@@ -240,7 +242,10 @@ class Estimator:
         if self._reset_due:
             self._reset_due = False
             outside.reset(place, speed, self.gyro)
-        elif not outside.predict(place, speed, spinning=spinning, pressed=pressed):
+        elif not outside.predict(
+            place, speed, self.gyro, (world.fx_mps2, world.fy_mps2),
+            spinning=spinning, pressed=pressed,
+        ):  # fmt: skip
             self._reset_due = True
         now = self.now
         ex, ey, ez = outside.position_error_m
