@@ -245,6 +245,7 @@ def _sight(parts: FlightParts, senses: Senses, state: PlannerState | None, now_s
     pose = surest_of(senses.state.measured) if senses.output is not None else None
     feed.see(pose, senses.history, now_s)
     senses.place = feed.target
+    senses.off = (feed.off_m, feed.off_yaw_rad)
 
 
 def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:

@@ -70,6 +70,7 @@ class Senses:
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     place: TargetPlace | None = None  # of a target that is the vehicle's positioning system
+    off: tuple = ((0.0, 0.0, 0.0), 0.0)
     noticed: Noticed = field(default_factory=Noticed)
     refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
@@ -204,7 +205,7 @@ class Senses:
         attitude = None if newest is None else attitude_of(newest)
         target = estimate(self.state, now_s, attitude, self.pipeline)
         if target is not None and self.place is not None and newest is not None:
-            target = held_at(target, self.place, newest, self.pipeline.pose.gear_body_m)
+            target = held_at(target, self.place, newest, self.pipeline.pose.gear_body_m, *self.off)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.blind or stale):
             return replace(target, tracked=False)

@@ -21,16 +21,17 @@ class TargetPlace:
 
 
 def held_at(
-    target: TargetEstimate, place: TargetPlace, newest: Telemetry, gear_body_m: Array
+    target: TargetEstimate, place: TargetPlace, newest: Telemetry, gear_body_m: Array,
+    off_m: Array, off_yaw_rad: float,
 ) -> TargetEstimate:
     """The same target where it stands, as seen from the estimate."""
     R_level_body = rotation_from_rpy(newest.roll_rad, newest.pitch_rad, 0.0)
     R_level_world = rot_z(newest.yaw_rad).T
-    way_m = place.position_m - np.asarray(newest.position_m)
+    way_m = place.position_m - np.asarray(newest.position_m) - off_m
     return replace(
         target,
         e_m=R_level_world @ way_m - R_level_body @ gear_body_m,
-        e_yaw_rad=wrap_rad(place.yaw_rad - newest.yaw_rad),
+        e_yaw_rad=wrap_rad(place.yaw_rad - newest.yaw_rad - off_yaw_rad),
         velocity_mps=-(R_level_world @ np.asarray(newest.velocity_mps)),
         world_m=place.position_m,
         world_yaw_rad=place.yaw_rad,

@@ -33,6 +33,7 @@ OLDEST_S = 0.25
 GATE_M, GATE_MPS = 0.10, 0.35
 """What estimate and measurement may be apart, and more the longer nothing was sent."""
 GATE_SIGMAS = 5.0
+NEAR_M, FAR_M, TAU_NEAR_S, TAU_FAR_S = 0.3, 1.0, 0.3, 1.0
 WORST_SIGMA_M = 0.05
 
 
@@ -65,6 +66,8 @@ class SightFeed:
         self._times_s: deque[float] = deque()
         self._problem: str | None = "the target has not been seen yet"
         self.refused = 0
+        self.off_m, self.off_yaw_rad = np.zeros(3), 0.0
+        self._off_s = -math.inf
 
     def see(self, pose: MarkerPose | None, history: History, now_s: float) -> None:
         """A pose that this turn's picture gave, `pose.t_s` its exposure."""
@@ -90,6 +93,13 @@ class SightFeed:
             self.refused += 1
             self._problem = f"the target's pose is {np.linalg.norm(off_m):.2f} m beside the estimate"
             return
+        dt_s = min(max(pose.t_s - self._off_s, 0.0), 0.5)
+        self._off_s = pose.t_s
+        near = float(np.clip((np.linalg.norm(pose.e_m) - NEAR_M) / (FAR_M - NEAR_M), 0.0, 1.0))
+        share = 1.0 - math.exp(-dt_s / (TAU_NEAR_S + near * (TAU_FAR_S - TAU_NEAR_S)))
+        self.off_m = self.off_m + share * (off_m - self.off_m)
+        off_yaw = wrap_rad(yaw_rad - then.yaw_rad)
+        self.off_yaw_rad += share * wrap_rad(off_yaw - self.off_yaw_rad)
         if now_s < self._due_s - 1e-6:
             return
         moved_m = np.asarray(now.position_m) - np.asarray(then.position_m)

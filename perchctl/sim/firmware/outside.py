@@ -41,7 +41,7 @@ _GYRO_BIAS_RADPS, _BIAS_UP_MPS2 = 3.5e-4, 0.005
 """What is left of them at best: blind for 12 s of flight, a vehicle touches down 0.9 m aside."""
 _BIAS_PRESSED_MPS2 = 0.03
 """Pressed against a ceiling and blind, the height runs away by 0.1 to 0.2 m/s."""
-_ACC_NOISE_MPS2, _ACC_VIBRATION_MPS2 = 0.03, 0.3
+_ACC_NOISE_MPS2, _ACC_VIBRATION_MPS2 = 0.03, 0.14
 _BATCH = 1536
 _TURN_EVERY = 5  # the gyroscope's bias is summed up at 100 Hz
 _TURN_S = _TURN_EVERY * CONTROL_PERIOD_S
@@ -137,8 +137,9 @@ class OutsideFilter:
         w, x, y, z = gyro
         c, s = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)  # of the heading, near level
         fx, fy = (-level_mps2[0], -level_mps2[1]) if spinning else self._acc_bias_mps2[:2]
-        ex += (c * fx - s * fy) * dt + shake * white.pop()
-        ey += (s * fx + c * fy) * dt + shake * white.pop()
+        aside = 0.0 if spinning else shake
+        ex += (c * fx - s * fy) * dt + aside * white.pop()
+        ey += (s * fx + c * fy) * dt + aside * white.pop()
         ez += (bz + (self._pressed_mps2 if pressed else 0.0)) * dt + shake * white.pop()
         if self._felt_wrongly is not None and self._last_mps is not None:
             lx, ly, lz = self._last_mps
