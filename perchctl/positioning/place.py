@@ -33,7 +33,7 @@ def held_at(
         e_m=R_level_world @ way_m - R_level_body @ gear_body_m,
         e_yaw_rad=wrap_rad(place.yaw_rad - newest.yaw_rad - off_yaw_rad),
         velocity_mps=-(R_level_world @ np.asarray(newest.velocity_mps)),
-        world_m=place.position_m,
-        world_yaw_rad=place.yaw_rad,
+        world_m=place.position_m - off_m,
+        world_yaw_rad=wrap_rad(place.yaw_rad - off_yaw_rad),
         world_velocity_mps=None if target.world_velocity_mps is None else np.zeros(3),
     )
