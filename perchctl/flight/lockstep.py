@@ -176,15 +176,6 @@ def fly_lockstep(
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
     link = MockLink(vehicle, profile.link.telemetry_period_s, radio_of(scenario))
     positions = feed_lockstep(link, profile)
-    sight = None
-    if profile.positioning.by == "target":
-        from perchctl.link.outside import RESET, parameters_of
-        from perchctl.positioning.sight import SightFeed
-        for name, value in (parameters_of(profile.positioning) | {RESET: 1}).items():
-            vehicle.firmware.set_parameter(name, value)
-        vehicle.firmware.set_parameter(RESET, 0)
-        sight = SightFeed(link.external, profile)
-        positions = sight.status
     assert vehicle.camera is not None
     source: FrameSource = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
     truth = Truth(vehicle)
@@ -199,7 +190,7 @@ def fly_lockstep(
     parts = FlightParts(
         link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
         lambda event: tell(event, event.t_s),  # the clock is the simulation's
-        positions, tuple if log is None else log.remarks, sight,
+        positions, tuple if log is None else log.remarks,
     )  # fmt: skip
     link.connect()
     report = fly(parts)

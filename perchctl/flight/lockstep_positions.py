@@ -13,6 +13,7 @@ from perchctl.positioning.feed import FeedStatus, PositionFeed
 from perchctl.positioning.judge import label
 from perchctl.positioning.thread import PERIOD_S
 from perchctl.profile import Profile
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.sim.capture.server import SYSTEM
 from perchctl.sim.capture.system import LockstepCapture
 
@@ -26,12 +27,16 @@ def by_mocap(profile: Profile) -> Profile:
 
 
 def feed_lockstep(link: MockLink, profile: Profile) -> Callable[[float], FeedStatus] | None:
-    """A feed that turns with the link's time, for the flight loop; None with decks.
+    """A feed that turns with the link's time, for the flight loop; None with decks, and where
+    the target is the positioning system: the loop feeds then.
 
     Lets the time pass until the vehicle's body is seen, and starts the estimate there. Errors:
     ConnectionFailed when it is not.
     """
     capture, config = link.vehicle.capture, profile.positioning
+    if config.by == "target":
+        _start_at(link, config, 0.0, 0.0, profile.safety.ground_z_m, 0.0)
+        return None
     if capture is None or config.by != "mocap":
         return None
     config = config.model_copy(update={"system": SYSTEM, "host": "sim"})
@@ -44,9 +49,15 @@ def feed_lockstep(link: MockLink, profile: Profile) -> Callable[[float], FeedSta
             raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")
         link.advance_to(link.now_s + PERIOD_S)
     x, y, z = (float(part) for part in place.position_m)
-    start = {"X": x, "Y": y, "Z": z, "Yaw": yaw_of(place.R)}
+    _start_at(link, config, x, y, z, yaw_of(place.R))
+    return feed.status
+
+
+def _start_at(
+    link: MockLink, config: PositioningConfig, x_m: float, y_m: float, z_m: float, yaw_rad: float
+) -> None:
+    start = {"X": x_m, "Y": y_m, "Z": z_m, "Yaw": yaw_rad}
     initial = {f"kalman.initial{name}": value for name, value in start.items()}
     for name, value in (parameters_of(config) | initial | {RESET: 1}).items():
         link.vehicle.firmware.set_parameter(name, value)
     link.vehicle.firmware.set_parameter(RESET, 0)
-    return feed.status

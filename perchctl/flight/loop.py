@@ -10,9 +10,6 @@ import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from perchctl.geometry import rot_z
 from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
@@ -51,11 +48,9 @@ from perchctl.mission.watch import (
 )
 from perchctl.pipeline import Pipeline
 from perchctl.positioning.feed import FeedStatus
-from perchctl.positioning.sight import SightFeed
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, Idle
-from perchctl.vision.tracks import surest_of
 from perchctl.vision.consistency import Consistency
 
 HUNG_S = 0.25
@@ -78,7 +73,6 @@ class FlightParts:
     simulated: Callable[[Event], str] = lambda event: ""
     positions: Callable[[float], FeedStatus] | None = None
     remarks: Callable[[], Sequence[str]] = tuple
-    sight: SightFeed | None = None
 
 
 def fly(parts: FlightParts) -> FlightReport:
@@ -148,10 +142,9 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
         if parts.operator() is not Operator.NONE:
             raise Interrupted("interrupted before take-off: nothing was started")
         senses.take_in(now_s)
-        _sight(parts, senses, None, now_s)
         newest = senses.history.newest
         refuse(newest, parts.profile)
-        outside = None if parts.positions is None else parts.positions(now_s)
+        outside = _outside(parts, senses, now_s)
         refuse_strange(outside, newest, parts.profile, now_s, at_rest)
         turns.waiting(senses, now_s, outside)
         waiting = still_waiting_for(
@@ -182,9 +175,8 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         turns.begin(now_s)
         senses.take_in(now_s, look=not _is_blind(state))
         now_s = _present(parts, senses, now_s)
-        _sight(parts, senses, state, now_s)
         late_s = max(0.0, now_s - due_s)
-        outside = None if parts.positions is None else parts.positions(now_s)
+        outside = _outside(parts, senses, now_s)
         obs = _observe(parts, senses, now_s, late_s, outside)
         turns.lap()
         turns.observed(obs)
@@ -232,20 +224,11 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         clock.wait_until(due_s)
 
 
-def _sight(parts: FlightParts, senses: Senses, state: PlannerState | None, now_s: float) -> None:
-    feed = parts.sight
-    if feed is None:
-        return
-    newest = senses.history.newest
-    if state is not None and state.phase is Phase.COMPLETE and state.contact_z_m is not None:
-        if feed.target is not None and newest is not None and newest.acc_z_g > 0.7:
-            x, y, z = feed.target.position_m - rot_z(newest.yaw_rad) @ np.asarray(parts.profile.vehicle.gear_body_m)
-            feed.known((float(x), float(y), float(z)), now_s)
-        return
-    pose = surest_of(senses.state.measured) if senses.output is not None else None
-    feed.see(pose, senses.history, now_s)
-    senses.place = feed.target
-    senses.off = (feed.off_m, feed.off_yaw_rad)
+def _outside(parts: FlightParts, senses: Senses, now_s: float) -> FeedStatus | None:
+    """How it goes with positions from outside, or by the target; None where decks measure."""
+    if senses.sights is not None:
+        return senses.sights.status(now_s)
+    return None if parts.positions is None else parts.positions(now_s)
 
 
 def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:

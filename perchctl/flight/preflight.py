@@ -36,7 +36,7 @@ def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
     of the profile's motion capture are being sent."""
     if profile.positioning.by == "deck":
         _refuse(unmeasured(link.measured_by(), profile))
-    elif not positions:
+    elif profile.positioning.by == "mocap" and not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
 

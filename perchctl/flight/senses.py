@@ -18,10 +18,10 @@ from perchctl.flight.history import (
     extended,
 )
 from perchctl.flight.noticed import Noticed, noticed
+from perchctl.flight.sights import Sights
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
-from perchctl.positioning.place import TargetPlace, held_at
 from perchctl.profile import Profile, SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
@@ -69,9 +69,8 @@ class Senses:
     camera_problem: str | None = None
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
-    place: TargetPlace | None = None  # of a target that is the vehicle's positioning system
-    off: tuple = ((0.0, 0.0, 0.0), 0.0)
     noticed: Noticed = field(default_factory=Noticed)
+    sights: Sights | None = None  # of a target that is the vehicle's positioning system
     refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
@@ -80,11 +79,17 @@ class Senses:
     _shown: dict[str, int] = field(default_factory=dict)
     _remarks: list[str] = field(default_factory=list)
 
+    def __post_init__(self) -> None:
+        if self.sights is None and self.profile.positioning.by == "target":
+            self.sights = Sights(self.link, self.pipeline, self.profile)
+
     def take_in(self, now_s: float, *, look: bool = True) -> None:
-        """Telemetry and at most one frame. Without `look` the frame only counts as a sign
-        of the camera's life."""
+        """Telemetry and at most one frame. Without `look`, at the ceiling, the frame only counts
+        as a sign of the camera's life."""
         samples = self.link.telemetry()
         self.history = extended(self.history, samples, self.profile.safety)
+        if self.sights is not None:
+            self.sights.begin(self.history, now_s, touches=not look)
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
@@ -119,6 +124,8 @@ class Senses:
                 self._mirrored = _mirrored_frames(self._mirrored, self.output.detections)
                 self._remark(self.output)
                 self._notice(self.output, used_s)
+                if self.sights is not None:
+                    self.sights.see(self.state.measured, self.history, now_s)
         mirrored = self._mirrored >= MIRRORED_FRAMES
         self.camera_problem = MIRRORED if mirrored else self._note
 
@@ -204,8 +211,8 @@ class Senses:
         newest = self.history.newest
         attitude = None if newest is None else attitude_of(newest)
         target = estimate(self.state, now_s, attitude, self.pipeline)
-        if target is not None and self.place is not None and newest is not None:
-            target = held_at(target, self.place, newest, self.pipeline.pose.gear_body_m, *self.off)
+        if self.sights is not None:
+            target = self.sights.steered(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.blind or stale):
             return replace(target, tracked=False)

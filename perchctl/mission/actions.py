@@ -22,6 +22,7 @@ from perchctl.mission.guidance import (
     unpressed,
     walk,
 )
+from perchctl.mission.hold import sinking
 from perchctl.mission.landing import landing
 from perchctl.mission.release import (
     Acted,
@@ -55,7 +56,7 @@ def act(c: Context) -> Acted:
     falls = c.state.phase is Phase.RECOVER and not c.state.caught
     if c.state.hold and c.state.setpoint is not None and not falls:
         lift = c.state.phase is not Phase.APPROACH or c.height_m > LIFTED_M
-        return _fly_to(c, c.state.setpoint, lift=lift)
+        return _fly_to(c, sinking(c, c.state.setpoint), lift=lift)
     return ACTIONS[c.state.phase](c)
 
 

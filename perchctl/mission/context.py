@@ -68,6 +68,11 @@ class Context:
         stale_s = self.state.stale_s
         return stale_s is None or self.obs.t_s - stale_s > PUT_RIGHT_S
 
+    @property
+    def by_sight(self) -> bool:
+        """Whether the target itself is the positioning system."""
+        return self.profile.positioning.by == "target"
+
     def sinks(self, mps: float) -> bool:
         """Faster than that. A speed that drifts, since no position corrects it, counts only where
         the accelerometer shows, too, that something less than its weight carries the vehicle."""

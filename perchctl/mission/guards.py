@@ -26,6 +26,7 @@ HUNG_WITHIN_M = 0.3
 HIGH_M, STAYED_M = 0.45, 0.15
 BELOW_S = 0.3
 WEAK_S = 2.0
+BLIND_PRESS_S = 1.0
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -174,6 +175,12 @@ def unsure(c: Context) -> str:
     return f"the position's variance is {c.variance_m2:.2g} m^2, at most {limit_m2:g} allowed"
 
 
+def pressed_blindly(c: Context) -> bool:
+    """The last centimetres are flown without a sight of the target; where it is the positioning
+    system, by dead reckoning, and no longer than that may lead aside by millimetres."""
+    return c.by_sight and c.obs.position_age_s > BLIND_PRESS_S
+
+
 def mounted_wrong(c: Context) -> bool:
     """The target moves with the vehicle, or seems to lie below it."""
     return c.state.mount.wrong or c.held(Condition.TARGET_BELOW) >= BELOW_S
@@ -181,6 +188,8 @@ def mounted_wrong(c: Context) -> bool:
 
 def why_contact(c: Context) -> str:
     text = "contact proven by position, acceleration and thrust"
+    if not c.placed:
+        text = f"contact proven by acceleration and thrust, {unplaced(c)}"
     if c.height_m >= CATCHABLE_M:
         return text
     return f"{text}; at {c.height_m:.1f} m, too low for a slip to be caught"
@@ -196,6 +205,8 @@ def why_mounted_wrong(c: Context) -> str:
 
 
 def why_unplaced(c: Context) -> str:
+    if c.by_sight:
+        return f"{unplaced(c)}; down level, by thrust alone"
     return f"{unplaced(c)}; landing by what is left of the estimate"
 
 
@@ -203,6 +214,11 @@ def why_astray(c: Context) -> str:
     x_m, y_m, _ = c.obs.telemetry.position_m
     setpoint = c.state.setpoint
     away_m = 0.0 if setpoint is None else math.hypot(x_m - setpoint.x_m, y_m - setpoint.y_m)
+    if c.by_sight:
+        return (
+            f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: does "
+            f"camera.mount have the camera turned as it is?"
+        )
     return (
         f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: swapped axes "
         f"in the motion capture, or a body that is turned in it; perchctl check --lift tells"

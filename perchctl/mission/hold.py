@@ -6,8 +6,13 @@ import math
 
 from perchctl.mission.context import Context
 from perchctl.mission.state import Phase
+from perchctl.values import replace
+from perchctl.vehicle import PositionSetpoint
 
 NO_PICTURE = "no picture for"
+BLIND_VARIANCE_M2 = 0.02
+"""Passed about 3 s after the last sight (docs/firmware.md, "Target as position")."""
+SINK_MPS, LOWEST_M = 0.2, 0.3
 
 
 def hold_reason(c: Context) -> str:
@@ -34,6 +39,25 @@ def hold_reason(c: Context) -> str:
 def is_unplaced(c: Context) -> bool:
     """No position from outside is fresh (fault 10)."""
     return c.obs.position_age_s > c.profile.positioning.hold_s
+
+
+def is_lost(c: Context) -> bool:
+    """No position has come for so long that none is waited for any more: by the age of the last
+    one, and of the target's, whose loss leaves nothing but the gyroscope, by the estimate's own
+    variance too."""
+    if c.obs.position_age_s > c.profile.positioning.land_s:
+        return True
+    return c.by_sight and is_unplaced(c) and c.variance_m2 > BLIND_VARIANCE_M2
+
+
+def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
+    """The held setpoint, a tick later: without a sight of the target it sinks, since the camera's
+    cone opens upwards, and from lower down the target is soonest seen again."""
+    if not (c.by_sight and is_unplaced(c)) or c.state.ground_m is None:
+        return setpoint
+    lowest_m = min(setpoint.z_m, c.state.ground_m[2] + LOWEST_M)
+    z_m = setpoint.z_m - SINK_MPS * max(0.0, c.obs.t_s - c.state.t_s)
+    return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
 def unplaced(c: Context) -> str:

@@ -84,7 +84,7 @@ def landing(c: Context) -> Acted:
     state = c.state
     if state.stopped_s is not None:
         return _hang_on(c) if state.contact_z_m is not None else stop_motors(c)
-    level = state.heading_lost and can_level(c)
+    level = (state.heading_lost or state.blind) and can_level(c)
     if not level and not state.caught:
         if (caught := catch(c)) is not None:
             return caught

@@ -20,6 +20,8 @@ from perchctl.values import replace
 from perchctl.vehicle import RawThrust
 
 SINK_MPS = 0.3
+BLIND_SINK_MPS, BLIND_SPARE_S = 0.5, 1.0
+"""Aside it goes with the third power of the time, by the gyroscope's bias: 2 m in 4 s."""
 DAMPING_S_PER_M = 0.15
 """Part of the hover thrust for each m/s: full thrust is 7 % over the weight at 42 g."""
 INTEGRAL_PER_M = 0.1
@@ -79,6 +81,12 @@ def _believed_s(c: Context) -> float:
     return min(ASTRAY_S + above_m / ASTRAY_MEAN_MPS, ASTRAY_LONGEST_S)
 
 
+def _blind_s(c: Context) -> float:
+    """By then it has come down, or hangs, or its estimated speed has drifted away."""
+    ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
+    return BLIND_SPARE_S + max(0.0, c.state.entry_m[2] - ground_m) / BLIND_SINK_MPS
+
+
 def astray_down(c: Context) -> Acted:
     """One tick, by what is felt. The hover thrust stays what it was when it began: nothing could
     teach a better one."""
@@ -102,10 +110,11 @@ def level_down(c: Context) -> Acted:
     if state.astray:
         return astray_down(c)
     dt_s, vz = c.obs.t_s - state.t_s, tel.velocity_mps[2]
+    sink_mps = BLIND_SINK_MPS if state.blind else SINK_MPS
     # Learned in a climb, or not at all, the hover thrust is a few per cent beside the true one.
-    hover = state.hover_thrust * (1.0 - INTEGRAL_PER_M * (vz + SINK_MPS) * dt_s)
-    thrust = hover * (1.0 - DAMPING_S_PER_M * (vz + SINK_MPS))
-    if vz > -STILL_MPS:
+    hover = state.hover_thrust * (1.0 - INTEGRAL_PER_M * (vz + sink_mps) * dt_s)
+    thrust = hover * (1.0 - DAMPING_S_PER_M * (vz + sink_mps))
+    if vz > -STILL_MPS or (state.blind and c.in_phase_s > _blind_s(c)):
         before = state.level_thrust or hover
         thrust = min(thrust, before - RAMP_PER_S * hover * dt_s)
     thrust = max(0.4 * hover, min(60000.0, thrust))

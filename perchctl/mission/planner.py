@@ -16,7 +16,7 @@ from perchctl.mission.actions import act
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hovers
 from perchctl.mission.context import PUT_RIGHT_S, Context
 from perchctl.mission.guidance import presses
-from perchctl.mission.hold import hold_reason
+from perchctl.mission.hold import hold_reason, is_lost
 from perchctl.mission.level import felt_climb_mps, is_felt_alone
 from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
@@ -80,6 +80,9 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
         hover = state.hover_thrust or obs.telemetry.thrust
         state = replace(state, heading_lost=True, hover_thrust=hover)
     context = Context(state, obs, profile)
+    if state.phase is Phase.LANDING and not state.blind and context.by_sight and is_lost(context):
+        state = _blinded(state, obs)
+        context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)
     if state.hold:
@@ -92,6 +95,12 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     state = replace(state, last=obs.telemetry, felt_mps=felt_mps, energy=budget.watched(context))
     state = replace(state, battery=budget.outlook(Context(state, obs, profile)))
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
+
+
+def _blinded(state: PlannerState, obs: Observation) -> PlannerState:
+    """Nothing but the gyroscope is left: level, and down by thrust. For good, since each change
+    of the mode costs height."""
+    return replace(state, blind=True, hover_thrust=state.hover_thrust or obs.telemetry.thrust)
 
 
 def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
@@ -207,6 +216,8 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
     )
     if row.name == "position-astray":
         new = replace(new, felt_alone=is_felt_alone(context))
+    if row.to is Phase.LANDING and context.by_sight and is_lost(context):
+        new = _blinded(new, obs)
     return _started_phase(new, state, obs)
 
 

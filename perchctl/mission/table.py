@@ -21,6 +21,7 @@ from perchctl.mission.guards import (
     is_watched,
     left_jump_hold,
     mounted_wrong,
+    pressed_blindly,
     searched_out,
     settling_too_long,
     too_little_left,
@@ -34,6 +35,7 @@ from perchctl.mission.guards import (
     why_not_found,
     why_unplaced,
 )
+from perchctl.mission.hold import is_lost
 from perchctl.mission.row import Row
 from perchctl.mission.state import (
     FLYING_PHASES,
@@ -115,9 +117,8 @@ TABLE: tuple[Row, ...] = (
         O.SAFETY,
     ),
     Row(
-        "position-lost", IN_THE_OPEN | {P.PERCH},
-        lambda c: c.obs.position_age_s > c.profile.positioning.land_s, P.LANDING,
-        why_unplaced, S.LAND, O.SAFETY,
+        "position-lost", IN_THE_OPEN | {P.PERCH}, is_lost, P.LANDING, why_unplaced, S.LAND,
+        O.SAFETY,
     ),
     Row(
         "estimator-jump", BEFORE_CONTACT, left_jump_hold, P.LANDING,
@@ -275,6 +276,11 @@ TABLE: tuple[Row, ...] = (
         "contact", _only(P.PERCH),
         lambda c: c.held(C.CONTACT) >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
         why_contact,
+    ),
+    Row(
+        "pressed-blindly", _only(P.PERCH), pressed_blindly, P.RECOVER,
+        lambda c: f"no contact {c.obs.position_age_s:.1f} s after the last sight of the target",
+        S.BACK_OFF, counts_attempt=True,
     ),
     Row(
         "no-contact", _only(P.PERCH),

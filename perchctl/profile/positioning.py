@@ -28,9 +28,14 @@ def host_fault(host: str) -> str | None:
     return f"host is NAME or NAME:PORT (1 to 65535), found {host!r}"
 
 
+BY_TARGET = {"rate_hz": 30.0, "position_sigma_m": 0.02, "hold_s": 0.5, "land_s": 1.5}
+"""Other defaults, for places that come by pictures, late and with gaps."""
+
+
 class PositioningConfig(Section):
     """`deck`: the vehicle's own decks do it, and nothing is sent. `mocap`: a motion-capture
-    system measures a rigid body on the vehicle, and its place is sent by the link.
+    system measures a rigid body on the vehicle, and its place is sent by the link. `target`: the
+    printed target does, by the camera, and what it says is sent.
 
     The body's frame, as the system defines it, is turned by `body_rpy_deg` and lies at
     `body_position_m`, both in the vehicle's body axes.
@@ -80,7 +85,10 @@ class PositioningConfig(Section):
     @classmethod
     def _one_word(cls, values: Any) -> Any:
         """`positioning: mocap` names what measures, and leaves the rest as it is."""
-        return {"by": values} if isinstance(values, str) else values
+        values = {"by": values} if isinstance(values, str) else values
+        if isinstance(values, dict) and values.get("by") == "target":
+            return {**BY_TARGET, **values}
+        return values
 
     @field_validator("host")
     @classmethod
