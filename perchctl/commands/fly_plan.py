@@ -90,6 +90,8 @@ def plan_text(options: FlyOptions) -> str:
 
 def _positioning_line(options: FlyOptions) -> str:
     config = options.profile.positioning
+    if config.by == "target":
+        return "positioning  the target itself, by the camera: it has to be seen from the ground"
     if config.by != "mocap":
         return "positioning  the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"

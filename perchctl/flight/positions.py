@@ -16,6 +16,7 @@ from perchctl.link.outside import check_parameters
 from perchctl.positioning.capture import check_reachable, open_capture
 from perchctl.positioning.compared import newest, objection
 from perchctl.positioning.feed import FeedStatus, PositionFeed
+from perchctl.positioning.standing import StandingFeed
 from perchctl.positioning.thread import FeedThread
 from perchctl.positioning.types import CaptureSource
 from perchctl.profile import Profile
@@ -28,9 +29,9 @@ STRANGE_S = 0.5
 def check_positioning(profile: Profile, *, simulated: bool) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     config = profile.positioning
+    check_parameters(profile.link.parameters, config)
     if config.by != "mocap":
         return
-    check_parameters(profile.link.parameters, config)
     if not simulated:
         check_reachable(config)
     elif find_spec("motioncapture") is None:  # its room has a capture of its own
@@ -78,8 +79,12 @@ def started_feed(
 ) -> Callable[[float], FeedStatus] | None:
     """The vehicle's estimate settled on what the capture says, and positions on their way until
     `stack` ends: the link is closed before that, since a vehicle that lands still needs them.
+    None with decks, and where the target is the positioning system.
 
     Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
+    if config.by == "target":
+        _settle_standing(link, clock, profile)
+        return None  # what follows is seen, and sent, by the loop
     if capture is None:
         return None
     feed = PositionFeed(capture, link.external, config)
@@ -89,6 +94,17 @@ def started_feed(
     _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
     return feed.status
+
+
+def _settle_standing(link: CflibLink, clock: Clock, profile: Profile) -> None:
+    """On the ground, which is the world's origin: the estimate is settled there."""
+    feed = StandingFeed(link.external, profile.safety.ground_z_m)
+    thread = FeedThread(feed, clock.now, 1.0 / profile.positioning.rate_hz)
+    thread.start()
+    try:
+        link.settle(feed)
+    finally:
+        thread.close()
 
 
 def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:

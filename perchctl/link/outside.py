@@ -61,8 +61,8 @@ def check_parameters(own: Mapping[str, float], config: PositioningConfig) -> Non
     for name, wanted in parameters_of(config).items():
         if name in own and not math.isclose(own[name], wanted, rel_tol=1e-6):
             raise InvalidValue(
-                f"link.parameters sets {name} to {own[name]:g}, but with positioning by motion "
-                f"capture it is {wanted:g}: take it out of link.parameters"
+                f"link.parameters sets {name} to {own[name]:g}, but with positioning: {config.by} "
+                f"it is {wanted:g}: take it out of link.parameters"
             )
 
 
@@ -95,6 +95,11 @@ class Settling:
             found = self._agreement(feed, start)
             if not found:
                 return
+        if self._config.by == "target":
+            raise TimedOut(
+                f"the estimate of {self._uri} does not come to the origin, where the vehicle is "
+                f"told that it stands: {found}; do positions arrive?"
+            )
         raise TimedOut(
             f"the estimate of {self._uri} does not come to where {label(self._config)} sees the "
             f"vehicle: {found}; do positions arrive, and is this its rigid body?"

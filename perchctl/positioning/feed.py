@@ -24,6 +24,7 @@ among good ones is none of the pilot's business."""
 HANGS_S = 0.2
 """The turns come every 10 ms, or as often as a simulated flight's loop turns."""
 RATE_OVER_S = 1.0
+BUSY = "the link is busy with something else, and a position does not wait"
 
 Send = Callable[[ExternalPosition], object]
 """`Link.external`; False: it did not go out."""
@@ -107,7 +108,7 @@ class PositionFeed:
             return trouble or self._judge.problem
         place = placed.external(pose=self._config.send == "pose")
         if self._send(place) is False:
-            return "the link is busy with something else, and a position does not wait"
+            return BUSY
         # A turn that comes late must not slow the next ones down, and none makes up for it.
         self._due_s = max(self._due_s + self._period_s, now_s)
         with self._lock:

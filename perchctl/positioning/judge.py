@@ -149,7 +149,9 @@ class Judge:
 
 
 def label(config: PositioningConfig) -> str:
-    """For a sentence: which motion capture."""
+    """For a sentence: which motion capture, or what else knows where the vehicle is."""
+    if config.by == "target":
+        return "the sight of the target"
     return f"motion capture at {config.system}:{config.host}"
 
 

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-
-from perchctl.positioning.feed import PositionFeed
+from typing import Protocol
 
 PERIOD_S = 0.01
 END_TIMEOUT_S = 1.0
+
+
+class Turned(Protocol):
+    """What is told the time, and raises nothing."""
+
+    def turn(self, now_s: float) -> None: ...
 
 
 class FeedThread:
@@ -19,7 +24,7 @@ class FeedThread:
     """
 
     def __init__(
-        self, feed: PositionFeed, clock: Callable[[], float], period_s: float = PERIOD_S
+        self, feed: Turned, clock: Callable[[], float], period_s: float = PERIOD_S
     ) -> None:
         self._feed, self._clock, self._period_s = feed, clock, period_s
         self._ended = threading.Event()
