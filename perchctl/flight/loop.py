@@ -82,7 +82,9 @@ def fly(parts: FlightParts) -> FlightReport:
     `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted` before take-off, and
     anything unforeseen after the rescue.
     """
-    senses = Senses(parts.link, parts.source, parts.pipeline, parts.profile)
+    senses = Senses(
+        parts.link, parts.source, parts.pipeline, parts.profile, send=parts.link.external
+    )
     turns = Turns(parts.clock, parts.watchers)
     _wait_until_ready(parts, senses, turns)  # nothing is started before it returns
     if senses.history.newest is not None:

@@ -22,6 +22,7 @@ from perchctl.flight.sights import Sights
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
+from perchctl.positioning.feed import Send
 from perchctl.profile import Profile, SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
@@ -52,7 +53,8 @@ class Senses:
     """The loop's working memory of what it sees.
 
     `output` is what this turn's frame gave, None where there was none to look at; `repeated`: it
-    was the one before once more.
+    was the one before once more. `sights`: where the target is the vehicle's positioning system,
+    what hands its places to `send`; else None.
     """
 
     link: GivesTelemetry
@@ -70,7 +72,8 @@ class Senses:
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     noticed: Noticed = field(default_factory=Noticed)
-    sights: Sights | None = None  # of a target that is the vehicle's positioning system
+    send: Send = lambda place: True
+    sights: Sights | None = field(init=False, default=None)
     refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
@@ -80,8 +83,8 @@ class Senses:
     _remarks: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        if self.sights is None and self.profile.positioning.by == "target":
-            self.sights = Sights(self.link, self.pipeline, self.profile)
+        if self.profile.positioning.by == "target":
+            self.sights = Sights(self.send, self.pipeline, self.profile)
 
     def take_in(self, now_s: float, *, look: bool = True) -> None:
         """Telemetry and at most one frame. Without `look`, at the ceiling, the frame only counts

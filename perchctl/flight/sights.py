@@ -8,9 +8,8 @@ is told that it hangs would look as if it hung, so the first sample that says ot
 from __future__ import annotations
 
 from perchctl.flight.history import History, attitude_at, attitude_of
-from perchctl.link.protocol import Link
 from perchctl.pipeline import Pipeline
-from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning.feed import FeedStatus, Send
 from perchctl.positioning.place import steered, touching
 from perchctl.positioning.sight import SightFeed
 from perchctl.profile import Profile
@@ -28,10 +27,9 @@ SINKING_MPS = -0.15
 class Sights:
     """Of one flight. `status` goes to the planner as that of a motion capture does."""
 
-    def __init__(self, link: Link, pipeline: Pipeline, profile: Profile) -> None:
-        self._pipeline, self._profile = pipeline, profile
-        self._gear_m = pipeline.pose.gear_body_m
-        self.feed = SightFeed(link.external, profile, pipeline.pose)
+    def __init__(self, send: Send, pipeline: Pipeline, profile: Profile) -> None:
+        self._setup = pipeline.pose
+        self.feed = SightFeed(send, profile, pipeline.pose)
         self._touches = False
 
     def status(self, now_s: float) -> FeedStatus:
@@ -48,7 +46,7 @@ class Sights:
             self.feed.stand(now_s)
         elif touches:
             yaw_rad = newest.yaw_rad + self.feed.off.yaw_rad
-            self.feed.known(touching(target, yaw_rad, self._gear_m), now_s)
+            self.feed.known(touching(target, yaw_rad, self._setup.gear_body_m), now_s)
 
     def see(self, measured: Measured, history: History, now_s: float) -> None:
         """A picture. What is pressed or hangs needs none, and the last ones were of before."""
@@ -64,8 +62,7 @@ class Sights:
         newest = history.newest
         if target is None or newest is None or self.feed.target is None:
             return target
-        now = attitude_of(newest)
-        return steered(target, self.feed.target, self.feed.off, now, self._pipeline.pose)
+        return steered(target, self.feed.target, self.feed.off, attitude_of(newest), self._setup)
 
 
 def is_carried(history: History, now_s: float) -> bool:

@@ -53,6 +53,4 @@ def steered(
     world_m = target.position_m - off.position_m
     world_yaw_rad = wrap_rad(target.yaw_rad - off.yaw_rad)
     e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, now, setup)
-    return replace(
-        seen, e_m=e_m, e_yaw_rad=e_yaw_rad, world_m=world_m, world_yaw_rad=world_yaw_rad
-    )
+    return replace(seen, e_m=e_m, e_yaw_rad=e_yaw_rad, world_m=world_m, world_yaw_rad=world_yaw_rad)

@@ -158,5 +158,3 @@ class SightFeed:
         self._times_s.append(now_s)
         while now_s - self._times_s[0] > RATE_OVER_S:
             self._times_s.popleft()
-
-
