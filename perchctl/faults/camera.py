@@ -15,6 +15,9 @@ from perchctl.vision.types import Frame
 SNOW_STREAM = 512
 SNOW_SIGMA = 60.0
 DARK_GAIN = 0.06
+SHEET_SIGMA = 6.0
+"""The camera's own noise."""
+LOST = 0.2
 
 
 class FaultyCamera:
@@ -66,12 +69,17 @@ class FaultyCamera:
             return self._swapped(frame)
         if frame is None or fault.kind == "silent":
             return None
+        if fault.kind == "lossy" and self._rng.random() < LOST:
+            return None
         match fault.kind:
             case "frozen":
                 return replace(frame, image=(self._last or frame).image, encoded=None)
             case "snow":
                 noise = self._rng.normal(120.0, SNOW_SIGMA, frame.image.shape)
                 return replace(frame, image=np.clip(noise, 0, 255).astype(np.uint8), encoded=None)
+            case "covered":  # by a sheet of the ceiling's grey, under the target
+                sheet = self._rng.normal(frame.image.mean(), SHEET_SIGMA, frame.image.shape)
+                return replace(frame, image=np.clip(sheet, 0, 255).astype(np.uint8), encoded=None)
             case "dark":
                 dark = cv2.convertScaleAbs(frame.image, alpha=DARK_GAIN)
                 return replace(frame, image=np.asarray(dark, np.uint8), encoded=None)

@@ -50,7 +50,8 @@ class TelemetryDelayed:
 
 @dataclass(frozen=True)
 class CameraFault:
-    """`kind`: silent, frozen, snow, dark, late, out-of-order or mirrored; `late_s` of late."""
+    """`kind`: silent, frozen, snow, dark, covered, lossy, late, out-of-order or mirrored; `late_s`
+    of late."""
 
     kind: str
     for_s: float

@@ -40,10 +40,10 @@ class Promise:
 
 PROMISES = (
     Promise(
-        "camera silent, frozen, snowing, dark, late",
+        "camera silent, frozen, snowing, dark, late, lossy; target covered",
         "held after 0.5 s, landed after 3 s; in the ascent it backs off down",
         ("camera-silent", "camera-frozen", "camera-snow", "camera-dark", "camera-late",
-         "camera-out-of-order"),
+         "camera-out-of-order", "camera-lossy", "target-covered"),
     ),
     Promise(
         "picture mirrored",
