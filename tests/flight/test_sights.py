@@ -1,0 +1,103 @@
+"""Where the place is known without a picture, and the first sign that it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.calibration.files import camera_of
+from perchctl.flight.history import History, extended
+from perchctl.flight.sights import CARRIED_FOR_S, Sights, is_carried
+from perchctl.pipeline import make_pipeline
+from perchctl.positioning.place import Place, touching
+from perchctl.profile import SafetyConfig
+from perchctl.vehicle import ExternalPosition, Telemetry
+from tests.helpers.mission import telemetry
+from tests.helpers.sights import TARGET_ONLY
+
+TARGET = Place(np.array([0.0, 0.0, 2.0]), 0.0)
+PIPELINE = make_pipeline(TARGET_ONLY, camera_of(TARGET_ONLY.camera))
+SAMPLE_S = 0.01
+
+
+def history(samples: list[Telemetry]) -> History:
+    return extended(History(), samples, SafetyConfig())
+
+
+def at_rest(lasts_s: float = 0.5, **changes: object) -> list[Telemetry]:
+    n = round(lasts_s / SAMPLE_S)
+    return [telemetry(1.0 + SAMPLE_S * i, 1.97, **changes) for i in range(n)]
+
+
+def hung() -> tuple[Sights, list[ExternalPosition]]:
+    sent: list[ExternalPosition] = []
+
+    def send(place: ExternalPosition) -> bool:
+        sent.append(place)
+        return True
+
+    sights = Sights(send, PIPELINE, TARGET_ONLY)
+    sights.feed.target = TARGET
+    return sights, sent
+
+
+def test_what_hangs_is_told_where() -> None:
+    sights, sent = hung()
+    samples = at_rest()
+    sights.begin(history(samples), samples[-1].t_s, touches=True)
+    assert [place.position_m for place in sent] == [
+        touching(TARGET, 0.0, PIPELINE.pose.gear_body_m)
+    ]
+    assert sights.status(samples[-1].t_s).age_s == 0.0
+
+
+def test_what_flies_is_told_nothing_without_a_sight() -> None:
+    sights, sent = hung()
+    samples = at_rest()
+    sights.begin(history(samples), samples[-1].t_s, touches=False)
+    assert not sent
+
+
+@given(felt_g=st.floats(-0.5, 0.7))
+def test_the_first_sample_of_a_fall_ends_it(felt_g: float) -> None:
+    """One that falls must not be told that it hangs: its estimate would say so, too."""
+    sights, sent = hung()
+    samples = at_rest()
+    samples.append(replace(samples[-1], t_s=samples[-1].t_s + SAMPLE_S, acc_z_g=felt_g))
+    sights.begin(history(samples), samples[-1].t_s, touches=True)
+    assert not sent
+
+
+def test_a_slow_slip_ends_it_within_a_tenth_of_a_second() -> None:
+    """On nine tenths of its weight no single sample tells."""
+    samples = at_rest()
+    for _ in range(round(CARRIED_FOR_S / SAMPLE_S) - 1):
+        samples.append(replace(samples[-1], t_s=samples[-1].t_s + SAMPLE_S, acc_z_g=0.9))
+    assert not is_carried(history(samples), samples[-1].t_s)
+
+
+def test_sinking_at_a_steady_speed_is_no_hanging() -> None:
+    samples = at_rest(velocity_mps=(0.0, 0.0, -0.2))
+    assert not is_carried(history(samples), samples[-1].t_s)
+
+
+@pytest.mark.parametrize("age_s", [0.15, 2.0])
+def test_old_samples_prove_nothing(age_s: float) -> None:
+    samples = at_rest()
+    assert is_carried(history(samples), samples[-1].t_s)
+    assert not is_carried(history(samples), samples[-1].t_s + age_s)
+    assert not is_carried(History(), 1.0)
+
+
+def test_the_shaking_of_turning_motors_does_not_end_it() -> None:
+    rng = np.random.default_rng(3)
+    samples = [replace(s, acc_z_g=1.0 + float(rng.normal(0.0, 0.044))) for s in at_rest(20.0)]
+    held = [
+        is_carried(history(samples[max(0, i - 20) : i + 1]), samples[i].t_s)
+        for i in range(20, len(samples))
+    ]
+    assert np.mean(held) > 0.98

@@ -1,0 +1,234 @@
+"""The target as positioning system: what of its sights is sent, and for which moment."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from perchctl.positioning.place import Place, body_place, steered, target_place, touching
+from perchctl.positioning.sight import GROUND_FRAMES, OLDEST_S, SightFeed
+from perchctl.vehicle import ExternalPosition
+from perchctl.vision.types import Attitude, MarkerPose
+from tests.helpers.mission import target_at
+from tests.helpers.sights import SETUP, TARGET_ONLY, attitude, seen
+
+TARGET = Place(np.array([0.3, -0.2, 2.0]), 0.4)
+FRAME_S, LATE_S = 1.0 / 30.0, 0.08
+PERIOD_S = 1.0 / TARGET_ONLY.positioning.rate_hz
+within = st.floats(-1.5, 1.5)
+angle = st.floats(-math.pi, math.pi)
+tilt = st.floats(-0.3, 0.3)
+
+
+class Sent:
+    """A link that takes everything, or nothing."""
+
+    def __init__(self) -> None:
+        self.places: list[ExternalPosition] = []
+        self.busy = False
+
+    def __call__(self, place: ExternalPosition) -> bool:
+        if not self.busy:
+            self.places.append(place)
+        return not self.busy
+
+
+def feed(sent: Sent) -> SightFeed:
+    return SightFeed(sent, TARGET_ONLY, SETUP)
+
+
+def shown(
+    it: SightFeed, at: Attitude, now_s: float, believed: Attitude | None = None,
+    now: Attitude | None = None, pose: MarkerPose | None = None, at_rest: bool = True,
+) -> None:  # fmt: skip
+    """A picture from `at`, which the vehicle's estimate had at `believed`, and has it at `now`."""
+    then = believed or at
+    it.see(pose or seen(TARGET, at), then, now or then, now_s, at_rest=at_rest)
+
+
+def flying(sent: Sent) -> SightFeed:
+    """With the target's place measured from the ground, at the origin."""
+    it = feed(sent)
+    for i in range(GROUND_FRAMES):
+        shown(it, attitude(i * FRAME_S), i * FRAME_S + LATE_S)
+    sent.places.clear()
+    return it
+
+
+# --- geometry ----------------------------------------------------------------------------
+
+
+@given(x=within, y=within, z=within, yaw=angle, roll=tilt, pitch=tilt, seen_yaw=angle)
+def test_a_body_is_where_the_target_is_seen_from(
+    x: float, y: float, z: float, yaw: float, roll: float, pitch: float, seen_yaw: float
+) -> None:
+    """Whatever heading the vehicle believes in: that of the target's place counts."""
+    true = attitude(1.0, (x, y, z), yaw, roll, pitch)
+    pose = seen(TARGET, true)
+    place = body_place(pose, attitude(1.0, (9.0, 9.0, 9.0), seen_yaw, roll, pitch), TARGET, SETUP)
+    np.testing.assert_allclose(place.position_m, (x, y, z), atol=1e-12)
+    assert math.isclose(math.cos(place.yaw_rad - yaw), 1.0, abs_tol=1e-12)
+    back = target_place(pose, true, SETUP)
+    np.testing.assert_allclose(back.position_m, TARGET.position_m, atol=1e-12)
+
+
+@given(yaw=angle)
+def test_a_touching_gear_is_in_the_targets_centre(yaw: float) -> None:
+    place_m = touching(TARGET, yaw, SETUP.gear_body_m)
+    np.testing.assert_allclose(seen(TARGET, attitude(0.0, place_m, yaw)).e_m, 0.0, atol=1e-12)
+
+
+@given(dx=within, dy=within, turned=tilt, yaw=angle)
+def test_what_steers_is_the_true_way_whatever_the_estimate_is_beside(
+    dx: float, dy: float, turned: float, yaw: float
+) -> None:
+    """A steady error of the estimate, in place and in heading, moves the goal with it."""
+    true = attitude(1.0, (0.1, 0.2, 1.0), yaw)
+    believed = attitude(1.0, (0.1 + dx, 0.2 + dy, 1.0), yaw + turned)
+    off = Place(np.array([-dx, -dy, 0.0]), -turned)
+    target = steered(target_at(1.0), TARGET, off, believed, SETUP)
+    assert target.world_m is not None
+    goal_m = np.asarray(target.world_m) - np.array(believed.position_m)
+    np.testing.assert_allclose(goal_m, TARGET.position_m - np.array(true.position_m), atol=1e-9)
+    assert target.e_yaw_rad == pytest.approx(seen(TARGET, true).e_yaw_rad, abs=1e-9)
+
+
+# --- on the ground -----------------------------------------------------------------------
+
+
+def test_standing_it_is_at_the_origin_until_the_target_has_been_seen_often_enough() -> None:
+    sent = Sent()
+    it = feed(sent)
+    for i in range(GROUND_FRAMES):
+        assert it.target is None
+        assert it.status(i * FRAME_S).problem
+        it.stand(i * FRAME_S)
+        shown(it, attitude(i * FRAME_S), i * FRAME_S)
+    assert {place.position_m for place in sent.places} == {(0.0, 0.0, 0.0)}
+    assert it.target is not None
+    np.testing.assert_allclose(it.target.position_m, TARGET.position_m, atol=1e-9)
+    count = len(sent.places)
+    it.stand(2.0)
+    assert len(sent.places) == count  # from now on the sights tell
+
+
+def test_a_vehicle_that_is_carried_about_measures_no_place() -> None:
+    it = feed(Sent())
+    for i in range(3 * GROUND_FRAMES):
+        shown(it, attitude(i * FRAME_S, (0.1 * i, 0.0, 0.0)), i * FRAME_S, at_rest=False)
+    assert it.target is None
+
+
+def test_a_false_sight_among_good_ones_does_not_move_the_place() -> None:
+    it = feed(Sent())
+    wrong = seen(Place(TARGET.position_m + 0.5, 1.0), attitude(0.0))
+    it.see(wrong, attitude(0.0), attitude(0.0), 0.0, at_rest=True)
+    for i in range(1, GROUND_FRAMES):
+        shown(it, attitude(i * FRAME_S), i * FRAME_S)
+    assert it.target is not None
+    np.testing.assert_allclose(it.target.position_m, TARGET.position_m, atol=1e-9)
+
+
+# --- in the air --------------------------------------------------------------------------
+
+
+@given(vx=within, vy=within, late_s=st.floats(0.0, OLDEST_S - 0.01))
+def test_a_place_is_carried_to_now_by_the_estimates_own_motion(
+    vx: float, vy: float, late_s: float
+) -> None:
+    """The estimate is 5 cm beside the truth, and stays so: its motion is true."""
+    sent = Sent()
+    it = flying(sent)
+    then_s, beside = 5.0, 0.05
+    then_m, now_m = (0.1, 0.1, 1.0), (0.1 + vx * late_s, 0.1 + vy * late_s, 1.0)
+    shown(
+        it, attitude(then_s, then_m), then_s + late_s,
+        believed=attitude(then_s, (then_m[0] + beside, *then_m[1:])),
+        now=attitude(then_s + late_s, (now_m[0] + beside, *now_m[1:])),
+    )  # fmt: skip
+    np.testing.assert_allclose(sent.places[-1].position_m, now_m, atol=1e-9)
+    assert it.status(then_s + late_s).age_s == pytest.approx(late_s)
+
+
+@pytest.mark.parametrize("again_s", [5.0, 4.9])
+def test_the_same_exposure_or_an_older_one_is_sent_no_second_time(again_s: float) -> None:
+    sent = Sent()
+    it = flying(sent)
+    shown(it, attitude(5.0, (0.0, 0.0, 1.0)), 5.05)
+    assert len(sent.places) == 1
+    shown(it, attitude(again_s, (0.0, 0.0, 1.0)), 5.05 + 2 * PERIOD_S)
+    assert len(sent.places) == 1
+    assert it.status(5.2).age_s == pytest.approx(0.2)
+
+
+def test_an_old_picture_is_no_place_of_now() -> None:
+    sent = Sent()
+    it = flying(sent)
+    shown(it, attitude(5.0, (0.0, 0.0, 1.0)), 5.0 + OLDEST_S + 0.01)
+    assert not sent.places
+    assert "old" in (it.status(6.0).problem or "")
+
+
+@given(off_m=st.floats(0.0, 3.0), silent_s=st.floats(0.05, 3.0))
+def test_what_estimate_and_blindness_cannot_explain_is_not_sent(
+    off_m: float, silent_s: float
+) -> None:
+    """A hand's breadth at once, a metre after three seconds; never what is beyond that."""
+    sent = Sent()
+    it = flying(sent)
+    shown(it, attitude(5.0, (0.0, 0.0, 1.0)), 5.05)
+    t_s = 5.0 + silent_s
+    shown(it, attitude(t_s, (off_m, 0.0, 1.0)), t_s + 0.05, believed=attitude(t_s, (0, 0, 1.0)))
+    sure, never = 0.10 + 0.35 * silent_s, 0.12 + 0.36 * silent_s
+    if off_m < sure:
+        assert len(sent.places) == 2
+    elif off_m > never:
+        assert len(sent.places) == 1
+        assert "beside its estimate" in (it.status(t_s + 1.0).problem or "")
+
+
+def test_a_vague_or_endless_pose_is_not_sent() -> None:
+    sent = Sent()
+    it = flying(sent)
+    for i, sigma_m in enumerate((0.2, math.nan)):
+        pose = seen(TARGET, attitude(5.0 + i, (0.0, 0.0, 1.0)), sigma_m)
+        shown(it, attitude(5.0 + i, (0.0, 0.0, 1.0)), 5.05 + i, pose=pose)
+    assert not sent.places
+
+
+def test_no_more_are_sent_than_the_rate_allows_and_none_waits() -> None:
+    sent = Sent()
+    it = flying(sent)
+    for i in range(100):  # 100 Hz for a second
+        shown(it, attitude(5.0 + 0.01 * i, (0.001 * i, 0.0, 1.0)), 5.05 + 0.01 * i)
+    assert 0.8 * 30 <= len(sent.places) <= 31
+    assert it.status(6.05).rate_hz == pytest.approx(30.0, abs=5.0)
+
+
+def test_what_the_link_did_not_take_leaves_the_age_growing() -> None:
+    sent = Sent()
+    it = flying(sent)
+    shown(it, attitude(5.0, (0.0, 0.0, 1.0)), 5.05)
+    sent.busy = True
+    shown(it, attitude(5.2, (0.0, 0.0, 1.0)), 5.25)
+    assert it.status(5.3).age_s == pytest.approx(0.3)
+    assert it.status(5.0 + TARGET_ONLY.positioning.hold_s + 0.1).problem
+
+
+def test_a_steady_difference_is_learned_and_noise_is_not() -> None:
+    """A bias of the estimate is known within seconds; noise of 5 mm moves what steers by less
+    than a third of it."""
+    it = flying(Sent())
+    rng, steered_m = np.random.default_rng(4), []
+    for i in range(240):
+        t_s = 5.0 + i * FRAME_S
+        at = attitude(t_s, (0.0, 0.0, 1.0))
+        noisy = attitude(t_s, (0.03 + float(rng.normal(0.0, 0.005)), 0.0, 1.0))
+        shown(it, at, t_s + LATE_S, believed=noisy)
+        steered_m.append(float(it.off.position_m[0]))
+    assert np.mean(steered_m[-90:]) == pytest.approx(-0.03, abs=0.001)
+    assert np.std(steered_m[-90:]) < 0.005 / 3
