@@ -27,6 +27,11 @@ HIGH_M, STAYED_M = 0.45, 0.15
 BELOW_S = 0.3
 WEAK_S = 2.0
 BLIND_PRESS_S = 1.0
+LOOKED_S = 2.0
+HANGS_OR_STANDS = (
+    "motors off; without a sight of the target it is not known whether it hangs or stands: look "
+    "before you touch it"
+)
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -155,6 +160,13 @@ def hangs_in_landing(c: Context) -> bool:
     return stayed or (still_at_contact(c) and c.height_m > LOW_M)
 
 
+def hangs_or_stands(c: Context) -> bool:
+    """It came down blindly from the magnet's reach, or did not: something carries it, which may be
+    either. A target that is seen again, far above, tells that it has come down."""
+    touched = c.state.contact_z_m is not None
+    return c.state.blind and touched and not c.placed and not is_low_by_eye(c)
+
+
 def settling_too_long(c: Context) -> bool:
     ascend = c.profile.planner.ascend
     return c.held(Condition.NEAR_STANDOFF) > ascend.settle_timeout_s
@@ -202,6 +214,10 @@ def why_mounted_wrong(c: Context) -> str:
         f"the target seems to lie {-c.error_z_m:.1f} m below the vehicle: camera.mount does not "
         f"look up"
     )
+
+
+def why_pressed_blindly(c: Context) -> str:
+    return f"no contact {c.obs.position_age_s:.1f} s after the last sight of the target"
 
 
 def why_unplaced(c: Context) -> str:

@@ -99,7 +99,8 @@ def landing(c: Context) -> Acted:
     if c.held(Condition.HANGING) >= HANGING_S and state.orders == 0:
         return let_go(c)
     if level:
-        return level_down(left_contact(c, PEELED_M))
+        # A blind estimate slides away from a ceiling that holds the vehicle.
+        return level_down(left_contact(c, PEELED_M) if c.placed or not state.blind else c)
     state, away = unpressed(c)
     if away is not None and not _doubtful(c):
         return state, away

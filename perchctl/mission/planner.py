@@ -20,6 +20,8 @@ from perchctl.mission.hold import hold_reason, is_lost
 from perchctl.mission.level import felt_climb_mps, is_felt_alone
 from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
+from perchctl.mission.row import Row, risen
+from perchctl.mission.safety import IN_THE_OPEN
 from perchctl.mission.state import (
     TERMINALS,
     Condition,
@@ -27,7 +29,7 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import IN_THE_OPEN, TABLE, Row, first_match, risen
+from perchctl.mission.table import TABLE, first_match
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, PositionSetpoint

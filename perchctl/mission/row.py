@@ -30,3 +30,8 @@ class Row:
 
     def explain(self, c: Context) -> str:
         return self.reason if isinstance(self.reason, str) else self.reason(c)
+
+
+def risen(before: Severity, row: Severity) -> Severity:
+    """The flight's severity after a row: from `LAND` on it only rises."""
+    return max(before, row) if before >= Severity.LAND else row

@@ -8,190 +8,56 @@ from __future__ import annotations
 from perchctl.mission.budget import why_short
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import (
+    HANGS_OR_STANDS,
+    LOOKED_S,
     attempts_used,
-    fence_broken,
     hangs_in_landing,
-    hangs_stopped,
+    hangs_or_stands,
     hangs_where_it_did,
     has_recovered,
     has_slipped,
     is_aligned,
-    is_astray,
     is_blocked,
     is_watched,
-    left_jump_hold,
-    mounted_wrong,
     pressed_blindly,
     searched_out,
     settling_too_long,
     too_little_left,
     too_weak,
-    unsure,
-    why_astray,
     why_contact,
     why_fell_unseen,
     why_landed,
-    why_mounted_wrong,
     why_not_found,
-    why_unplaced,
+    why_pressed_blindly,
 )
-from perchctl.mission.hold import is_lost
 from perchctl.mission.row import Row
+from perchctl.mission.safety import BY_CAMERA, SAFETY, only
 from perchctl.mission.state import (
     FLYING_PHASES,
     Condition,
-    MotorStop,
-    Operator,
     Outcome,
     Phase,
     Severity,
 )
-from perchctl.vehicle import CRASHED, LOCKED, TUMBLED
 
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
 
-AIR = FLYING_PHASES | {P.LANDING}
-BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
-IN_THE_OPEN = BY_CAMERA | {P.APPROACH}
-BEFORE_CONTACT = FLYING_PHASES - {P.COMPLETE}
-
-
-def _only(*phases: Phase) -> frozenset[Phase]:
-    return frozenset(phases)
-
-
 TABLE: tuple[Row, ...] = (
-    # --- safety, gravest first -------------------------------------------
-    Row(
-        "operator-stop", AIR, lambda c: c.obs.operator >= Operator.STOP, P.ABORTED,
-        "second Ctrl-C: emergency stop", S.STOP, O.EMERGENCY,
-        motor_stop=MotorStop.EMERGENCY,
-    ),
-    Row(
-        "hung-but-locked", _only(P.COMPLETE, P.LANDING),
-        lambda c: c.obs.telemetry.has(LOCKED) and hangs_stopped(c), P.PERCHED,
-        "hanging, but the supervisor has locked the vehicle: restart it before the next flight",
-        outcome=O.PERCHED,
-    ),
-    Row(
-        "locked", AIR, lambda c: c.obs.telemetry.has(LOCKED), P.ABORTED,
-        "the supervisor has locked the vehicle: inspect and restart it", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.PLAIN,
-    ),
-    Row(
-        "tumbled", AIR, lambda c: c.obs.telemetry.has(TUMBLED), P.ABORTED,
-        "the vehicle has tumbled: inspect and restart it", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.PLAIN,
-    ),
-    Row(
-        "crashed", AIR, lambda c: c.obs.telemetry.has(CRASHED), P.ABORTED,
-        "the supervisor reports a crash: inspect and restart the vehicle", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.PLAIN,
-    ),
-    Row(
-        "tilted", AIR,
-        lambda c: c.held(C.TILTED) >= c.profile.safety.tilt_debounce_s
-        and c.state.stopped_s is None,
-        P.ABORTED, "tilted beyond the limit: motors cut", S.STOP, O.SAFETY,
-        motor_stop=MotorStop.EMERGENCY,
-    ),
-    Row(
-        "operator-land", FLYING_PHASES, lambda c: c.obs.operator >= Operator.LAND, P.LANDING,
-        "the operator asked to land", S.LAND, O.OPERATOR,
-    ),
-    Row(
-        "link-lost", FLYING_PHASES, lambda c: c.obs.link_problem is not None, P.LANDING,
-        lambda c: f"link lost: {c.obs.link_problem}", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "telemetry-stale", FLYING_PHASES,
-        lambda c: c.telemetry_age_s > c.profile.safety.telemetry_land_s, P.LANDING,
-        lambda c: f"no telemetry for {c.telemetry_age_s:.1f} s", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "heading-lost", BEFORE_CONTACT, lambda c: c.state.heading_lost, P.LANDING,
-        "the estimated heading jumped: down level, by thrust alone", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "position-astray", IN_THE_OPEN | {P.LANDING}, is_astray, P.LANDING, why_astray, S.LAND,
-        O.SAFETY,
-    ),
-    Row(
-        "position-lost", IN_THE_OPEN | {P.PERCH}, is_lost, P.LANDING, why_unplaced, S.LAND,
-        O.SAFETY,
-    ),
-    Row(
-        "estimator-jump", BEFORE_CONTACT, left_jump_hold, P.LANDING,
-        "the state estimate jumped: landing where it is", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "estimate-unsure", IN_THE_OPEN,
-        lambda c: c.held(C.UNSURE) >= c.profile.safety.variance_land_s, P.LANDING,
-        lambda c: f"{unsure(c)}: is the positioning system gone?", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "battery-low", BEFORE_CONTACT,
-        lambda c: c.held(C.BATTERY_LOW) >= c.profile.safety.battery_debounce_s, P.LANDING,
-        lambda c: f"battery at {c.obs.telemetry.battery_v:.2f} V under load", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "battery-unknown", BEFORE_CONTACT,
-        lambda c: c.obs.battery_age_s > c.profile.safety.battery_stale_s, P.LANDING,
-        "the battery's reading stands still", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "mounting", IN_THE_OPEN, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,
-    ),
-    Row(
-        "height-limit", BEFORE_CONTACT,
-        lambda c: c.height_m > c.profile.safety.max_height_m, P.LANDING,
-        lambda c: f"height {c.height_m:.2f} m is above the limit", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "fence", BEFORE_CONTACT, fence_broken, P.LANDING, "outside the fence", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "camera-gone", BY_CAMERA,
-        lambda c: c.obs.camera_age_s > c.profile.safety.camera_land_s, P.LANDING,
-        lambda c: c.obs.camera_problem or f"no picture for {c.obs.camera_age_s:.1f} s",
-        S.LAND, O.SAFETY,
-    ),
-    Row(
-        "loop-late", FLYING_PHASES,
-        lambda c: c.obs.loop_late_s > c.profile.safety.loop_late_land_s, P.LANDING,
-        lambda c: f"the control loop was {c.obs.loop_late_s:.1f} s late", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "markers-disagree", BY_CAMERA,
-        lambda c: c.obs.disagreeing_frames >= c.profile.merge.disagreement_frames, P.LANDING,
-        "large and small marker contradict each other: check the printed sizes in the "
-        "profile and the camera's calibration",
-        S.LAND, O.SAFETY,
-    ),
-    Row(
-        "log-lost", BEFORE_CONTACT,
-        lambda c: c.profile.safety.land_on_log_error and c.obs.log_problem is not None,
-        P.LANDING, lambda c: f"flight log: {c.obs.log_problem}", S.LAND, O.SAFETY,
-    ),
-    Row(
-        "time-over", BEFORE_CONTACT,
-        lambda c: c.obs.t_s - c.state.started_s > c.profile.planner.perching_time_s, P.LANDING,
-        "the perching time is over", S.LAND, O.ATTEMPTS_USED_UP,
-    ),
+    *SAFETY,
     # --- the magnet may catch early ---------------------------------------------
     Row(
-        "caught", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
+        "caught", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
         lambda c: c.held(C.HANGING) >= HANGING_S, P.COMPLETE,
         "hanging on the magnet already",
     ),
     # --- something is in the way -----------------------------------------------
     Row(
-        "cannot-rise", _only(P.APPROACH), lambda c: is_blocked(c) or too_weak(c), P.LANDING,
+        "cannot-rise", only(P.APPROACH), lambda c: is_blocked(c) or too_weak(c), P.LANDING,
         lambda c: f"pressed at {c.height_m:.2f} m: something is above, or the thrust is weak",
         S.LAND, O.SAFETY,
     ),
     Row(
-        "blocked", _only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER), is_blocked,
+        "blocked", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER), is_blocked,
         P.RECOVER,
         lambda c: f"pressed against something at {c.height_m:.2f} m"
         + ("" if c.state.hover_thrust else ", or the thrust is weak"), S.BACK_OFF,
@@ -204,134 +70,138 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- phase 1: approach ---------------------------------------------------
     Row(
-        "approached", _only(P.APPROACH), lambda c: c.held(C.AT_TAKEOFF_HEIGHT) >= 0.3, P.SEARCH,
+        "approached", only(P.APPROACH), lambda c: c.held(C.AT_TAKEOFF_HEIGHT) >= 0.3, P.SEARCH,
         "hovering in the perching area",
     ),
     Row(
-        "approach-timeout", _only(P.APPROACH),
+        "approach-timeout", only(P.APPROACH),
         lambda c: c.in_phase_s > c.profile.planner.approach_timeout_s, P.LANDING,
         lambda c: f"take-off reached only {c.height_m:.2f} m", S.LAND, O.SAFETY,
     ),
     # --- phase 2: search -----------------------------------------------------
     Row(
-        "found", _only(P.SEARCH),
+        "found", only(P.SEARCH),
         lambda c: c.state.confirmed >= c.profile.planner.search.confirm_frames, P.ESTIMATE,
         "target seen",
     ),
     Row(
-        "searched-out", _only(P.SEARCH), searched_out, P.LANDING, why_not_found,
+        "searched-out", only(P.SEARCH), searched_out, P.LANDING, why_not_found,
         S.LAND, O.TARGET_NOT_FOUND,
     ),
     # --- phase 3: estimate ---------------------------------------------------
     Row(
-        "estimate-lost", _only(P.ESTIMATE),
+        "estimate-lost", only(P.ESTIMATE),
         lambda c: c.held(C.UNTRACKED) > 1.0
         or c.in_phase_s > c.profile.planner.estimate.timeout_s,
         P.SEARCH, "the target's pose does not settle", S.HOLD,
     ),
     Row(
-        "estimated", _only(P.ESTIMATE),
+        "estimated", only(P.ESTIMATE),
         lambda c: c.held(C.ESTIMATED) >= c.profile.planner.estimate.dwell_s, P.ALIGN,
         "pose is steady",
     ),
     # --- phase 4: align ------------------------------------------------------
     Row(
-        "align-lost", _only(P.ALIGN), lambda c: not c.tracked, P.SEARCH,
+        "align-lost", only(P.ALIGN), lambda c: not c.tracked, P.SEARCH,
         "target lost in alignment", S.HOLD,
     ),
     Row(
-        "align-timeout", _only(P.ALIGN),
+        "align-timeout", only(P.ALIGN),
         lambda c: c.in_phase_s > c.profile.planner.align.timeout_s, P.RECOVER,
         "alignment took too long", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "too-little-left", _only(P.ALIGN, P.RECOVER), too_little_left, P.LANDING, why_short,
+        "too-little-left", only(P.ALIGN, P.RECOVER), too_little_left, P.LANDING, why_short,
         S.LAND, O.SAFETY,
     ),
     Row(
-        "aligned", _only(P.ALIGN), is_aligned, P.ASCEND, "aligned in position and heading",
+        "aligned", only(P.ALIGN), is_aligned, P.ASCEND, "aligned in position and heading",
     ),
     # --- phase 5: ascend -----------------------------------------------------
     Row(
-        "ascend-lost", _only(P.ASCEND), lambda c: not c.tracked, P.RECOVER,
+        "ascend-lost", only(P.ASCEND), lambda c: not c.tracked, P.RECOVER,
         "target lost in ascent", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "outside-cone", _only(P.ASCEND),
+        "outside-cone", only(P.ASCEND),
         lambda c: c.error_xy_m > c.cone_m, P.ALIGN,
         "drifted out of the cone", S.HOLD,
     ),
     Row(
-        "ascend-timeout", _only(P.ASCEND),
+        "ascend-timeout", only(P.ASCEND),
         lambda c: c.in_phase_s > c.profile.planner.ascend.timeout_s or settling_too_long(c),
         P.RECOVER, "does not settle under the target", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "settled", _only(P.ASCEND),
+        "settled", only(P.ASCEND),
         lambda c: c.held(C.SETTLED) >= c.profile.planner.ascend.settle_dwell_s, P.PERCH,
         "settled at the stand-off",
     ),
     # --- phase 6: perch ------------------------------------------------------
     Row(
-        "contact", _only(P.PERCH),
+        "contact", only(P.PERCH),
         lambda c: c.held(C.CONTACT) >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
         why_contact,
     ),
     Row(
-        "pressed-blindly", _only(P.PERCH), pressed_blindly, P.RECOVER,
-        lambda c: f"no contact {c.obs.position_age_s:.1f} s after the last sight of the target",
+        "pressed-blindly", only(P.PERCH), pressed_blindly, P.RECOVER, why_pressed_blindly,
         S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "no-contact", _only(P.PERCH),
+        "no-contact", only(P.PERCH),
         lambda c: c.in_phase_s > c.profile.planner.perch.timeout_s, P.RECOVER,
         "no proof of contact", S.BACK_OFF, counts_attempt=True,
     ),
     # --- phase 7: completion -------------------------------------------------
     Row(
-        "slipped", _only(P.COMPLETE), has_slipped, P.RECOVER,
+        "slipped", only(P.COMPLETE), has_slipped, P.RECOVER,
         lambda c: "slipped while hanging" if c.state.stopped_s else "the magnet does not hold",
         S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "not-released", _only(P.COMPLETE),
+        "not-released", only(P.COMPLETE),
         lambda c: c.state.stopped_s is None
         and c.in_phase_s > c.profile.planner.complete.release_timeout_s,
         P.RECOVER, "the thrust could not be released", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "perched", _only(P.COMPLETE), lambda c: is_watched(c) and hangs_where_it_did(c), P.PERCHED,
+        "perched", only(P.COMPLETE), lambda c: is_watched(c) and hangs_where_it_did(c), P.PERCHED,
         "hanging still with the motors off", outcome=O.PERCHED,
     ),
     Row(
-        "fell-unseen", _only(P.COMPLETE), is_watched, P.LANDING, why_fell_unseen, S.LAND, O.SAFETY,
+        "fell-unseen", only(P.COMPLETE), is_watched, P.LANDING, why_fell_unseen, S.LAND, O.SAFETY,
     ),
     # --- the failed attempt --------------------------------------------------
     Row(
-        "attempts-used", _only(P.RECOVER),
+        "attempts-used", only(P.RECOVER),
         lambda c: attempts_used(c) and c.in_phase_s > 0.5, P.LANDING,
         "all perching attempts are used up", S.LAND, O.ATTEMPTS_USED_UP,
     ),
     Row(
-        "recovered", _only(P.RECOVER), has_recovered, P.ESTIMATE,
+        "recovered", only(P.RECOVER), has_recovered, P.ESTIMATE,
         "steady again, trying once more",
     ),
     Row(
-        "recover-timeout", _only(P.RECOVER),
+        "recover-timeout", only(P.RECOVER),
         lambda c: c.in_phase_s > c.profile.planner.recover.timeout_s, P.LANDING,
         "the vehicle does not become steady", S.LAND, O.SAFETY,
     ),
     # --- landing ---------------------------------------------------------------
     Row(
-        "hung", _only(P.LANDING),
+        "hung", only(P.LANDING),
         lambda c: c.held(C.DOWN) >= 0.1 and hangs_in_landing(c), P.PERCHED,
         "the magnet holds: hanging with the motors off",
     ),
     Row(
-        "landed", _only(P.LANDING), lambda c: c.held(C.DOWN) >= 0.1, P.LANDED, why_landed,
+        "landed", only(P.LANDING),
+        lambda c: c.held(C.DOWN) >= 0.1 and not hangs_or_stands(c), P.LANDED, why_landed,
     ),
     Row(
-        "landing-timeout", _only(P.LANDING),
+        "hangs-or-stands", only(P.LANDING), lambda c: c.held(C.DOWN) >= LOOKED_S, P.ABORTED,
+        HANGS_OR_STANDS, S.LAND, O.SAFETY,
+    ),
+    Row(
+        "landing-timeout", only(P.LANDING),
         lambda c: c.in_phase_s > c.profile.planner.landing.timeout_s, P.ABORTED,
         "the landing was not confirmed in time", S.LAND, O.SAFETY,
     ),
@@ -347,8 +217,3 @@ def first_match(c: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
         if c.state.phase in row.phases and not undoes and row.when(c):
             return row
     return None
-
-
-def risen(before: Severity, row: Severity) -> Severity:
-    """The flight's severity after a row: from `LAND` on it only rises."""
-    return max(before, row) if before >= Severity.LAND else row

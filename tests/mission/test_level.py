@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
+from perchctl.mission.safety import BEFORE_CONTACT
 from perchctl.mission.state import Phase, PlannerState
-from perchctl.mission.table import BEFORE_CONTACT
 from perchctl.vehicle import Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import HOVER_THRUST, PROFILE, observation, state_in, telemetry
 

@@ -24,6 +24,7 @@ from perchctl.mission.state import (
     Severity,
 )
 from perchctl.mission.table import TABLE, Row, first_match, risen
+from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
@@ -135,6 +136,12 @@ def blind(look: Look) -> Look:
     return lambda t_s: replace(look(t_s), target=None)
 
 
+def unknown(t_s: float) -> Observation:
+    """Motors off, and neither the target nor a position of late."""
+    return replace(flown(CONTACT_Z_M, **OFF)(t_s), position_age_s=3.0, target=None)
+
+
+BY_TARGET = Profile.model_validate({"positioning": "target"})
 MOCAP = PROFILE.model_copy(
     update={"positioning": PROFILE.positioning.model_copy(update={"by": "mocap"})}
 )
@@ -234,6 +241,9 @@ CASES: dict[str, Case] = {
     "contact": Case(
         P.PERCH, P.COMPLETE, flown(CONTACT_Z_M, thrust=PRESSED), 0.5, z_m=CONTACT_Z_M
     ),
+    "pressed-blindly": Case(
+        P.PERCH, P.RECOVER, seen(position_age_s=1.1), 0.1, profile=BY_TARGET
+    ),
     "no-contact": Case(P.PERCH, P.RECOVER, seen(2.0), 3.2, z_m=2.0),
     "slipped": Case(
         P.COMPLETE, P.RECOVER,
@@ -268,6 +278,11 @@ CASES: dict[str, Case] = {
     "landed": Case(
         P.LANDING, P.LANDED, flown(0.02, **OFF), 0.3, O.OPERATOR,
         state={"outcome": O.OPERATOR, "orders": 1}, z_m=0.02,
+    ),
+    "hangs-or-stands": Case(
+        P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
+        state={"outcome": O.SAFETY, "stopped_s": START_S, "contact_z_m": CONTACT_Z_M, "blind": True},
+        z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),
     "landing-timeout": Case(
         P.LANDING, P.ABORTED, seen(), 0.1, O.SAFETY, Idle,

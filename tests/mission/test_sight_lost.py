@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -67,7 +68,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
             assert state.phase is Phase.LANDING
             assert isinstance(command, RawThrust)
     blind_m = heights[round(HOLD_S / TURN_S) + 1 :]
-    assert all(after <= before for before, after in zip(blind_m, blind_m[1:], strict=False))
+    assert all(after <= before for before, after in pairwise(blind_m))
     assert blind_m[-1] < blind_m[0]
     assert turns[-1][0].row == "position-lost"
     assert "down level" in turns[-1][0].reason
