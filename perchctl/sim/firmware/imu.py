@@ -26,7 +26,7 @@ _BATCH = 1536
 _SAMPLES = 1000.0 * IMU_PERIOD_S  # of a real one, in each mean
 _GYRO_NOISE_RADPS = math.radians(0.1) / math.sqrt(_SAMPLES)
 _ACC_NOISE_MPS2 = 0.01 * GRAVITY_MPS2 / math.sqrt(_SAMPLES)
-_GYRO_LEFT_RADPS = 3.5e-4
+_GYRO_LEFT_RADPS = 5e-4
 """Bias about level axes that a real one has at its best: blind for 12 s of flight, a vehicle
 touched down 0.9 m aside (docs/firmware.md, "Target covered")."""
 _PRESSED_MPS2 = 0.03
