@@ -5,7 +5,7 @@ above it is in `perchctl.sim.flow_deck`. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
-The attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
+A deck's attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
 the filter's other measurements can: a vehicle that is put on its back by hand, faster
 than any gyroscope measures, is still estimated as level.
 """

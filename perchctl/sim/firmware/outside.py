@@ -87,9 +87,10 @@ class OutsideFilter:
             )  # fmt: skip
         self.quaternion = (w, x, y, z)
         self._covariance.grow(t, force)
-        if max(map(abs, self.position_m)) > self.most_m:
-            self.reset()
-        elif max(map(abs, self.velocity_mps)) > self.most_mps:
+        if (
+            max(map(abs, self.position_m)) > self.most_m
+            or max(map(abs, self.velocity_mps)) > self.most_mps
+        ):
             self.reset()
 
     def position(self, measured_m: Vector) -> None:
