@@ -1,5 +1,5 @@
-"""A vehicle that has nothing but its IMU and what it is sent, through the real cflib: the figures of
-docs/firmware.md, "The target as the only positioning system", against where it truly is.
+"""A vehicle that has nothing but its IMU and what it is sent, through the real cflib: the figures
+of docs/firmware.md, "The target as the only positioning system", against where it truly is.
 
 `varPX` to `varPZ` are the variances that those figures are ("Variances").
 """

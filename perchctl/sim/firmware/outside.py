@@ -4,10 +4,10 @@ from outside.
 The firmware's Kalman filter (source: `kalman_core`, `estimator_kalman`). 100 times a second the
 gyroscope turns the attitude and the accelerometer moves the velocity: in flight along the thrust's
 axis alone, so that drag and draught go unfelt; otherwise along all three, and the attitude is
-drawn to the initial one. A position corrects position, velocity and attitude, by what the covariance
-says each has to do with it; so a tilt is learnt from the slide that it makes, and a heading from
-manoeuvres, a little. Nothing here looks at the truth. What leads the estimate astray are
-the sensors' errors (`perchctl.sim.firmware.imu`) and whatever is sent: late, false or in
+drawn to the initial one. A position corrects position, velocity and attitude, by what the
+covariance says each has to do with it; so a tilt is learnt from the slide that it makes, and a
+heading from manoeuvres, a little. Nothing here looks at the truth. What leads the estimate astray
+are the sensors' errors (`perchctl.sim.firmware.imu`) and whatever is sent: late, false or in
 millimetres, it is believed as `locSrv.extPosStdDev` and `locSrv.extQuatStdDev` say. There is no
 gate (source).
 """
@@ -79,18 +79,14 @@ class OutsideFilter:
         turn = (1.0, half * felt.p_radps, half * felt.q_radps, half * felt.r_radps)
         w, x, y, z = normalized(multiplied(self.quaternion, turn))
         if not flying:
-            keep, (a, b, c, d) = 1.0 - _REVERSION, self._initial
-            share = _REVERSION if w * a + x * b + y * c + z * d >= 0.0 else -_REVERSION
-            w, x, y, z = normalized(
-                (keep * w + share * a, keep * x + share * b, keep * y + share * c,
-                 keep * z + share * d)
-            )  # fmt: skip
+            keep, (a, _, _, d) = 1.0 - _REVERSION, self._initial
+            share = _REVERSION if w * a + z * d >= 0.0 else -_REVERSION
+            reverted = (keep * w + share * a, keep * x, keep * y, keep * z + share * d)
+            w, x, y, z = normalized(reverted)
         self.quaternion = (w, x, y, z)
         self._covariance.grow(t, force)
-        if (
-            max(map(abs, self.position_m)) > self.most_m
-            or max(map(abs, self.velocity_mps)) > self.most_mps
-        ):
+        far_m, fast_mps = max(map(abs, self.position_m)), max(map(abs, self.velocity_mps))
+        if 0.0 < self.most_m < far_m or 0.0 < self.most_mps < fast_mps:
             self.reset()
 
     def position(self, measured_m: Vector) -> None:
