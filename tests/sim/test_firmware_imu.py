@@ -36,6 +36,12 @@ def wrong_heading_deg(rig: Rig) -> float:
     return rig.firmware.log_value("stateEstimate.yaw") - math.degrees(true)
 
 
+def wrong_pitch_deg(rig: Rig) -> float:
+    w, x, y, z = rig.world.quaternion
+    true = -math.asin(2 * (w * y - x * z))  # the firmware's is nose up
+    return rig.firmware.log_value("stateEstimate.pitch") - math.degrees(true)
+
+
 def readings(imu: Imu) -> list[tuple[float, ...]]:
     found = []
     for _ in SEVERAL:
@@ -81,11 +87,10 @@ def test_a_bias_across_it_counts_on_the_ground_alone() -> None:
     reset(rested)
     rested.run(1.0)
     assert errors(rested)[0] == pytest.approx(0.1, abs=0.02)  # 0.02 g x t^2 / 2
-    flown = [hovering(outside_rig(acc_bias_mps2=b)) for b in (bias, (0.0, 0.0, 0.0))]
-    for rig in flown:
-        rig.run(2.0, HERE)
-    biased, free = (errors(rig) for rig in flown)
-    assert math.dist(biased, free) < 0.02
+    flown = hovering(outside_rig(acc_bias_mps2=bias))
+    assert wrong_pitch_deg(flown) == pytest.approx(0.0, abs=0.3)  # and not 1.1
+    flown.run(2.0, HERE)
+    assert abs(errors(flown)[0]) < 0.05
 
 
 def test_a_tilt_that_is_wrong_slides() -> None:
@@ -119,7 +124,12 @@ def test_drag_is_not_felt() -> None:
     rig = hovering(outside_rig(draught_mps=(0.3, 0.0, 0.0)))
     fed(rig, 2.0, stream=HERE)
     assert error_m(rig) < 0.03
-    log = rig.firmware.log_value
-    w, x, y, z = rig.world.quaternion
-    true_deg = math.degrees(math.asin(2 * (w * y - x * z)))
-    assert abs(log("stateEstimate.pitch") + true_deg) > 0.1
+    assert abs(wrong_pitch_deg(rig)) > 0.1
+
+
+def test_standing_it_is_drawn_back_to_level_and_to_its_first_heading() -> None:
+    """By 0.001 at each prediction (source): within 5 s 3.9 deg are left of the 5 turned."""
+    rig = outside_rig(gyro_bias_radps=(0.0, 0.0, math.radians(1.0)))
+    reset(rig)
+    fed(rig, 5.0)
+    assert wrong_heading_deg(rig) == pytest.approx(3.9, abs=0.3)
