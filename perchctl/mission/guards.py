@@ -26,7 +26,7 @@ HUNG_WITHIN_M = 0.3
 HIGH_M, STAYED_M = 0.45, 0.15
 BELOW_S = 0.3
 WEAK_S = 2.0
-BLIND_PRESS_S = 1.0
+BLIND_PRESS_S = 1.25
 LOOKED_S = 2.0
 HANGS_OR_STANDS = (
     "motors off; without a sight of the target it is not known whether it hangs or stands: look "

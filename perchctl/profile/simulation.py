@@ -97,10 +97,13 @@ class SimulationConfig(Section):
     )
     drift_mps: float = Field(0.01, ge=0, le=0.2, description="of the state estimate")
     gyro_bias_dps: float = Field(
-        0.0, ge=0, le=5, description="of a vehicle without a deck, level and about z, at most"
+        0.0, ge=0, le=5, description="of the gyroscope, without a deck; each axis, at most"
     )
     acc_bias_g: float = Field(
-        0.0, ge=0, le=0.2, description="of a vehicle without a deck, level, at most"
+        0.0,
+        ge=0,
+        le=0.2,
+        description="of the accelerometer, without a deck; each level axis, at most",
     )
     draught_mps: Range = Field((0.0, 0.3), description="wind, with gusts")
     magnet_force_n: float = Field(1.2, ge=0, le=20, description="that the magnet holds")

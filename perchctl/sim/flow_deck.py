@@ -1,7 +1,7 @@
 """What a flow deck's estimate is off by, as an estimate minus the truth.
 
-A Kalman filter of position and velocity, the same for x and y, in the form of its error, as
-`perchctl.sim.firmware.outside` has it for positions from outside. What leads it astray:
+A Kalman filter of position and velocity, the same for x and y, in the form of its error; for
+positions from outside there is `perchctl.sim.firmware.outside`. What leads it astray:
 
 - The sensor counts motion in tenths of a pixel of 0.717 / 35 rad, each 10 ms (source): rounding
   alone is 0.06 rad/s, of which a part is made up for by the next count. An angular speed is made
@@ -38,8 +38,8 @@ _VIEW_PER_M = math.tan(math.radians(21.0))
 _BIAS_MPS2 = 0.0125
 _ACC_VIBRATION_MPS2 = 0.3  # white, each control period
 _ACCELERATION_DENSITY = 1.9e-3
-"""All three as in `perchctl.sim.firmware.outside`: what the estimate is truly off by, and what the
-filter counts on."""
+"""Of all three: what the estimate is truly off by where it is blind, and what the filter counts
+on."""
 _LEAST_SIGMA_RADPS = 0.06
 _RANGE_SIGMA_M, _RANGE_FROM_M, _RANGE_RATE_PER_M = 0.0025, 2.5, math.log(80.0) / 1.5
 _RANGE_MEMORY_S = 0.1

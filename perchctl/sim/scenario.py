@@ -67,8 +67,9 @@ class Scenario:
         cell_knee: the share of its charge below which its voltage falls steeply.
         rssi_dbm: of the radio, at the vehicle.
         parameters: the firmware's, where they differ from its release at boot.
-        gyro_bias_radps, acc_bias_mps2: what the gyroscope and the accelerometer read too much, body
-            axes, of a vehicle without a deck.
+        gyro_bias_radps, acc_bias_mps2: what the gyroscope, after the firmware has taken out what it
+            found on the ground, and the accelerometer, before the firmware scales it to 1 g, read
+            too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.imu`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
         gloss: peak of the lamp's reflection in the print, in whites of the paper; `lamp_m` the

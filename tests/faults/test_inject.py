@@ -135,7 +135,7 @@ def test_the_estimate_steps_turns_and_slides() -> None:
 @pytest.mark.parametrize("how", sorted(CAPTURE_FAULTS))
 def test_the_motion_capture_goes_wrong_for_its_time(how: str) -> None:
     effect = e.ExternalPositions(how, 1.0, 0.1 if how == "late" else 0.0)
-    scenario = changed_scenario(SCENARIO, (effect,))
+    scenario = changed_scenario(replace(SCENARIO, acc_bias_mps2=(0.1, 0.0, 0.0)), (effect,))
     assert scenario.extra["external_position"] == 1.0
     rig = Rig((effect,), scenario, capture=CaptureSettings())
     capture = rig.vehicle.capture

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import cflib.crtp
+import pytest
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
 from cflib.crtp.crtpstack import CRTPPacket
@@ -222,3 +223,30 @@ class Pilot(Client):
         with self._news:
             arrived = self._news.wait_for(lambda: min(self._stamps) >= due_s, WAIT_S)
         assert arrived, f"no log data up to {due_s} s, only {self._stamps}"
+
+
+def read(pilot: Pilot, name: str) -> float:
+    """From the vehicle, not from cflib's memory of it."""
+    group, _, short = name.partition(".")
+    arrived = threading.Event()
+    values: list[str] = []
+
+    def take(_name: str, value: str) -> None:
+        values.append(value)
+        arrived.set()
+
+    pilot.cf.param.add_update_callback(group, short, take)
+    try:
+        pilot.cf.param.request_param_update(name)
+        assert arrived.wait(WAIT_S)
+    finally:
+        pilot.cf.param.remove_update_callback(group, short, take)
+    return float(values[-1])
+
+
+def kept(pilot: Pilot, name: str, value: float) -> None:
+    """An answer to something before may come first."""
+    for _ in range(10):
+        if read(pilot, name) == pytest.approx(value):
+            return
+    raise AssertionError(f"{name} is not {value:g}")

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.mission import planner
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
+from perchctl.mission.row import Row, risen
 from perchctl.mission.state import (
     FLYING_PHASES,
     TERMINALS,
@@ -23,7 +24,7 @@ from perchctl.mission.state import (
     PlannerState,
     Severity,
 )
-from perchctl.mission.table import TABLE, Row, first_match, risen
+from perchctl.mission.table import TABLE, first_match
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
@@ -242,7 +243,7 @@ CASES: dict[str, Case] = {
         P.PERCH, P.COMPLETE, flown(CONTACT_Z_M, thrust=PRESSED), 0.5, z_m=CONTACT_Z_M
     ),
     "pressed-blindly": Case(
-        P.PERCH, P.RECOVER, seen(position_age_s=1.1), 0.1, profile=BY_TARGET
+        P.PERCH, P.RECOVER, seen(position_age_s=1.3), 0.1, profile=BY_TARGET
     ),
     "no-contact": Case(P.PERCH, P.RECOVER, seen(2.0), 3.2, z_m=2.0),
     "slipped": Case(
@@ -281,7 +282,9 @@ CASES: dict[str, Case] = {
     ),
     "hangs-or-stands": Case(
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
-        state={"outcome": O.SAFETY, "stopped_s": START_S, "contact_z_m": CONTACT_Z_M, "blind": True},
+        state={
+            "outcome": O.SAFETY, "stopped_s": START_S, "contact_z_m": CONTACT_Z_M, "blind": True,
+        },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),
     "landing-timeout": Case(

@@ -171,7 +171,7 @@ def test_a_blind_way_down_whose_speed_has_drifted_ends_on_the_floor_all_the_same
 
 
 def test_a_press_without_a_contact_backs_off_before_dead_reckoning_leads_aside() -> None:
-    turns = flown(state_in(Phase.PERCH, z_m=2.1), 1.2, 2.1)
+    turns = flown(state_in(Phase.PERCH, z_m=2.1), 1.4, 2.1)
     rows = [state.row for state, _ in turns if state.phase is Phase.RECOVER]
     assert rows[0] == "pressed-blindly"
     assert turns[-1][0].attempts == 1
@@ -180,5 +180,5 @@ def test_a_press_without_a_contact_backs_off_before_dead_reckoning_leads_aside()
 
 def test_by_other_means_a_press_has_the_time_that_it_always_had() -> None:
     state = state_in(Phase.PERCH, z_m=2.1)
-    after, _ = planner.step(state, unseen(BEGIN_S + TURN_S, 2.1, 1.2), Profile())
+    after, _ = planner.step(state, unseen(BEGIN_S + TURN_S, 2.1, 1.3), Profile())
     assert after.row != "pressed-blindly"

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 
 import pytest
 
-from tests.helpers.crtp_rig import WAIT_S, Pilot
+from tests.helpers.crtp_rig import Pilot, kept, read
 
 NO_DECK = {"external_position": 1.0}
 PARAMETERS = {
@@ -30,33 +29,6 @@ def send_truth(pilot: Pilot) -> None:
 def fed(pilot: Pilot, seconds: float, send: Callable[[], None]) -> None:
     """At 50 Hz, so that the test takes no minutes."""
     pilot.stream(seconds, send)
-
-
-def read(pilot: Pilot, name: str) -> float:
-    """From the vehicle, not from cflib's memory of it."""
-    group, _, short = name.partition(".")
-    arrived = threading.Event()
-    values: list[str] = []
-
-    def take(_name: str, value: str) -> None:
-        values.append(value)
-        arrived.set()
-
-    pilot.cf.param.add_update_callback(group, short, take)
-    try:
-        pilot.cf.param.request_param_update(name)
-        assert arrived.wait(WAIT_S)
-    finally:
-        pilot.cf.param.remove_update_callback(group, short, take)
-    return float(values[-1])
-
-
-def kept(pilot: Pilot, name: str, value: float) -> None:
-    """An answer to something before may come first."""
-    for _ in range(10):
-        if read(pilot, name) == pytest.approx(value):
-            return
-    raise AssertionError(f"{name} is not {value:g}")
 
 
 def test_parameters_are_kept_and_the_estimate_begins_where_they_say(pilot: Pilot) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import random
 import statistics
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from perchctl.sim.firmware.commands import LowLevelCommand, PositionCommand
+from perchctl.sim.firmware.commands import HlTakeoff, LowLevelCommand, PositionCommand
 from tests.helpers.firmware_rig import Rig, make_rig
 
 Place = tuple[float, float, float]
@@ -64,6 +65,10 @@ def hovering(rig: Rig, send: Sender = send_truth) -> Rig:
     return rig
 
 
+def told_variance(rig: Rig) -> float:
+    return max(rig.firmware.log_value(f"kalman.varP{axis}") for axis in "XYZ")
+
+
 def error_m(rig: Rig) -> float:
     log = rig.firmware.log_value
     x, y, z = place(rig)
@@ -84,7 +89,7 @@ def test_it_flies_by_ideal_positions_as_measured(in_the_air: Rig) -> None:
     assert max(math.hypot(*error) for error in errors) < 0.01
     assert math.hypot(*place(in_the_air)[:2]) < 0.03
     assert place(in_the_air)[2] == pytest.approx(0.8, abs=0.12)  # the integral settles slowly
-    assert in_the_air.firmware.log_value("kalman.varPX") == pytest.approx(2.5e-4, rel=0.1)
+    assert told_variance(in_the_air) == pytest.approx(2.5e-4, rel=0.1)
     assert in_the_air.firmware.get_parameter("deck.bcFlow2") == 0.0
     assert in_the_air.firmware.log_value("range.zrange") == 0.0
     assert make_rig().firmware.get_parameter("deck.bcFlow2") == 1.0
@@ -123,32 +128,34 @@ def test_a_late_position_is_a_lag() -> None:
     assert errors[-1][0] == pytest.approx(-0.05, abs=0.01)
 
 
-def test_silence_is_drift_and_a_variance_that_grows() -> None:
-    """Row "Variance passes 0.05 m^2 4 s after the loss, 0.2 after 7 s"."""
+def test_silence_is_drift_and_a_position_ends_it() -> None:
+    """How much of it, and the variance that is told: tests/sim/test_crtp_blind.py."""
     rig = hovering(outside_rig())
-    variance = lambda: rig.firmware.log_value("kalman.varPX")  # noqa: E731
     rig.run(0.3, HERE)
     assert error_m(rig) < 0.02
-    assert variance() < 1e-3
-    rig.run(3.7, HERE)
-    assert variance() == pytest.approx(0.05, rel=0.2)
-    assert 0.05 < error_m(rig) < 0.4
-    rig.run(3.0, HERE)
-    assert variance() == pytest.approx(0.2, rel=0.25)
+    rig.run(6.7, HERE)
+    assert 0.05 < error_m(rig) < 0.6
+    assert rig.firmware.log_value("kalman.varX") > 1.0
     fed(rig, 2.0, stream=HERE)
     assert error_m(rig) < 0.02
-    assert variance() == pytest.approx(2.5e-4, rel=0.1)
+    assert told_variance(rig) == pytest.approx(2.5e-4, rel=0.15)
+    assert rig.firmware.log_value("kalman.varX") < 2e-5
 
 
-def test_pressed_and_blind_the_height_runs_away() -> None:
-    """Row "pressed and blind, the estimate runs away (z 0.1 to 0.2 m/s)"."""
-    rig = hovering(outside_rig(ceiling_z_m=0.95, no_target=True))
-    fed(rig, 2.0, stream=PositionCommand(0.0, 0.0, 1.6, 0.0))
-    assert rig.world.state().ceiling_force_n > 0.0
-    rig.run(4.0, PositionCommand(0.0, 0.0, 1.6, 0.0))
-    speed = abs(rig.firmware.log_value("stateEstimate.vz"))
-    assert 0.08 < speed < 0.25
-    assert error_m(rig) > 0.15
+def test_blind_for_twelve_seconds_it_slides_by_what_was_measured() -> None:
+    """Row "touched down 0.9 m aside, at 28 g": seeds differ by where they slide to."""
+    aside_m = []
+    for seed in range(3):
+        rig = outside_rig(seed=seed, mass_kg=0.028)
+        numbers = random.Random(seed)
+        noisy = lambda rig: rig.firmware.external_position(  # noqa: E731
+            tuple(value + numbers.gauss(0.0, 0.005) for value in place(rig))  # noqa: B023
+        )
+        rig.firmware.high_level(HlTakeoff(0.8, 2.0))
+        fed(rig, 5.0, noisy)
+        rig.run(12.0)
+        aside_m.append(math.hypot(*place(rig)[:2]))
+    assert statistics.median(aside_m) == pytest.approx(0.9, abs=0.3)
 
 
 def test_the_heading_is_the_initial_one_until_a_pose_comes() -> None:
@@ -188,7 +195,7 @@ def test_millimetres_reset_the_estimate_for_ever() -> None:
 
     fed(rig, 1.0, millimetres)
     assert error_m(rig) == pytest.approx(0.5, abs=0.05)
-    assert rig.firmware.log_value("kalman.varPX") > 1.0
+    assert rig.firmware.log_value("kalman.varX") > 10.0
     rig.world.set_pose((0.03, 0.0, 0.06), hold=True)  # within them it is believed
     fed(rig, 1.0, millimetres)
     assert error_m(rig) == pytest.approx(999.0 * math.hypot(0.03, 0.06), rel=0.05)

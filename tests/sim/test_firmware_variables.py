@@ -212,7 +212,7 @@ def test_variance_falls_after_a_reset() -> None:
 
 
 def test_outside_positions_are_followed_and_their_loss_slides_away() -> None:
-    rig = make_rig(extra={"external_position": 1.0}, drift_mps=(0.05, 0.0, 0.0))
+    rig = make_rig(extra={"external_position": 1.0}, gyro_bias_radps=(0.003, 0.0, 0.0))
     rig.take_off()
     for _ in range(400):
         world = rig.world

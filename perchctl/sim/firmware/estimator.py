@@ -5,7 +5,7 @@ above it is in `perchctl.sim.flow_deck`. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
-The attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
+A deck's attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
 the filter's other measurements can: a vehicle that is put on its back by hand, faster
 than any gyroscope measures, is still estimated as level.
 """
@@ -20,13 +20,9 @@ import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, cap_deg
-from perchctl.sim.firmware.outside import (
-    SETTINGS,
-    OutsideFilter,
-    Quaternion,
-    Vector,
-    multiplied,
-)
+from perchctl.sim.firmware.covariance import POSITION
+from perchctl.sim.firmware.imu import Imu
+from perchctl.sim.firmware.outside import SETTINGS, OutsideFilter, Quaternion, Vector
 from perchctl.sim.flow_deck import FlowDeck, has_flow_errors
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
@@ -41,6 +37,7 @@ _ATTITUDE_MEMORY_S = 2.0
 _ACC_NOISE_G = 0.004
 _ACC_VIBRATION_G = 0.04  # added by turning motors
 _ACC_CUTOFF_HZ = 30.0
+_NO_BIAS = (0.0, 0.0, 0.0)
 _ATTITUDE_GAIN = CONTROL_PERIOD_S / _ATTITUDE_MEMORY_S
 _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
 
@@ -82,10 +79,9 @@ class Estimator:
         self._velocity_keep = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / _VELOCITY_MEMORY_S)
         self._acc_lag = 1.0 - math.exp(-2 * math.pi * _ACC_CUTOFF_HZ * CONTROL_PERIOD_S)
         self.outside: OutsideFilter | None = None
+        self._imu: Imu | None = None
         if scenario.extra.get("external_position"):
-            self.outside = OutsideFilter(
-                scenario.seed, scenario.gyro_bias_radps, scenario.acc_bias_mps2
-            )
+            self.outside, self._imu = OutsideFilter(), Imu(scenario)
         self._flow: FlowDeck | None = None
         if self.outside is None and has_flow_errors(scenario):
             self._flow = FlowDeck(scenario)
@@ -94,7 +90,6 @@ class Estimator:
         self._rng.uniform()  # keeps the flights of all seeds as they were
         self.external_count = 0
         self.hears_outside = True
-        self._true_m: Vector = (0.0, 0.0, 0.0)
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
     def reset(self, t_s: float) -> None:
@@ -109,40 +104,53 @@ class Estimator:
         """One measurement from outside; counted always, used by a vehicle without a deck."""
         self.external_count += 1
         if self.outside is not None and self.hears_outside:
-            self.outside.position(position_m, self._true_m)
+            self._reset_if_due(self.outside)
+            self.outside.position(position_m)
 
     def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
         """The same with an attitude: w, x, y, z, body to world."""
-        if self.outside is not None and self.hears_outside and self.gyro is not None:
-            self.outside.attitude(quaternion, self.gyro)
-        self.external_position(position_m)
+        self.external_count += 1
+        if self.outside is not None and self.hears_outside:
+            self._reset_if_due(self.outside)
+            self.outside.pose(position_m, quaternion)
 
     def set_outside(self, name: str, value: float) -> None:
         """A parameter of `SETTINGS`."""
         if self.outside is not None:
             setattr(self.outside, SETTINGS[name], value)
 
-    def variance(self, t_s: float) -> float:
-        """Position variance in m^2: falls after a reset; grows while nothing comes from outside
-        where there is no deck."""
+    def variance(self, t_s: float, state: int = POSITION) -> float:
+        """Of a state as `perchctl.sim.firmware.covariance` counts them. A deck's is the position's
+        for all of them: it falls after a reset."""
         if self.outside is not None:
-            return self.outside.variance_m2
+            return self.outside.variance(state)
         deck_m2 = _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
             -(t_s - self._reset_s) / _VARIANCE_FALL_S
         )
         return deck_m2 if self._flow is None else deck_m2 + self._flow.variance_m2
 
     def update(
-        self, world: Sensed, t_s: float, *, flown: bool, spinning: bool, pressed: bool = False
+        self,
+        world: Sensed,
+        t_s: float,
+        *,
+        flown: bool,
+        spinning: bool,
+        flying: bool = False,
+        pressed: bool = False,
     ) -> None:
+        """`spinning`: the motors shake the accelerometer; `flying`: the supervisor says so."""
         if self._steps % _NOISE_EVERY == 0:
             self._walk()
         self._steps += 1
-        self.gyro = w, x, y, z = self._integrate(world)
-        if self.outside is not None:
-            self._move_outside(self.outside, world, spinning=spinning, pressed=pressed)
-            w, x, y, z = multiplied(self.outside.turn, self.gyro)
+        gyro_bias, acc_bias, acc_unit = _NO_BIAS, _NO_BIAS, 1.0 / GRAVITY_MPS2
+        if self.outside is not None and self._imu is not None:
+            self._move_outside(self.outside, self._imu, world, flying=flying, pressed=pressed)
+            w, x, y, z = self.outside.quaternion
+            gyro_bias, acc_bias = self._imu.gyro_bias_radps, self._imu.acc_bias_mps2
+            acc_unit /= self._imu.acc_scale
         else:
+            self.gyro = w, x, y, z = self._integrate(world)
             self._move_by_deck(world, flown=flown)
         now = self.now
         bias = self._scenario.estimate_tilt_bias_rad
@@ -157,18 +165,18 @@ class Estimator:
             white = self._white = self._rng.standard_normal(_BATCH).tolist()
         n6, n5, n4, n3, n2, n1 = white[-6:]
         del white[-6:]
-        now.gyro_x_dps = math.degrees(world.p_radps) + _GYRO_NOISE_DPS * n1
-        now.gyro_y_dps = math.degrees(world.q_radps) + _GYRO_NOISE_DPS * n2
-        now.gyro_z_dps = math.degrees(world.r_radps) + _GYRO_NOISE_DPS * n3
+        now.gyro_x_dps = math.degrees(world.p_radps + gyro_bias[0]) + _GYRO_NOISE_DPS * n1
+        now.gyro_y_dps = math.degrees(world.q_radps + gyro_bias[1]) + _GYRO_NOISE_DPS * n2
+        now.gyro_z_dps = math.degrees(world.r_radps + gyro_bias[2]) + _GYRO_NOISE_DPS * n3
         if self.spoil is not None:
             self.spoil(now)
         ax, ay, az = self.acc_g
-        lag, unit = self._acc_lag, 1.0 / GRAVITY_MPS2
+        lag, unit = self._acc_lag, acc_unit
         shake = _ACC_NOISE_G + _ACC_VIBRATION_G if spinning else _ACC_NOISE_G
         self.acc_g = (
-            ax + lag * (world.fx_mps2 * unit + shake * n4 - ax),
-            ay + lag * (world.fy_mps2 * unit + shake * n5 - ay),
-            az + lag * (world.fz_mps2 * unit + shake * n6 - az),
+            ax + lag * ((world.fx_mps2 + acc_bias[0]) * unit + shake * n4 - ax),
+            ay + lag * ((world.fy_mps2 + acc_bias[1]) * unit + shake * n5 - ay),
+            az + lag * ((world.fz_mps2 + acc_bias[2]) * unit + shake * n6 - az),
         )
 
     def _integrate(self, world: Sensed) -> tuple[float, float, float, float]:
@@ -234,21 +242,19 @@ class Estimator:
             now.vx_mps, now.vy_mps = now.vx_mps + ex, now.vy_mps + ey
 
     def _move_outside(
-        self, outside: OutsideFilter, world: Sensed, *, spinning: bool, pressed: bool
+        self, outside: OutsideFilter, imu: Imu, world: Sensed, *, flying: bool, pressed: bool
     ) -> None:
-        assert self.gyro is not None
-        place = self._true_m = (world.x_m, world.y_m, world.z_m)
-        speed = (world.vx_mps, world.vy_mps, world.vz_mps)
+        self._reset_if_due(outside)
+        if imu.feel(
+            (world.fx_mps2, world.fy_mps2, world.fz_mps2),
+            (world.p_radps, world.q_radps, world.r_radps),
+        ):
+            outside.predict(imu.read(pressed=pressed), flying=flying)
+        now = self.now
+        now.x_m, now.y_m, now.z_m = outside.position_m
+        now.vx_mps, now.vy_mps, now.vz_mps = outside.velocity_mps
+
+    def _reset_if_due(self, outside: OutsideFilter) -> None:
         if self._reset_due:
             self._reset_due = False
-            outside.reset(place, speed, self.gyro)
-        elif not outside.predict(
-            place, speed, self.gyro, (world.fx_mps2, world.fy_mps2),
-            spinning=spinning, pressed=pressed,
-        ):  # fmt: skip
-            self._reset_due = True
-        now = self.now
-        ex, ey, ez = outside.position_error_m
-        now.x_m, now.y_m, now.z_m = place[0] + ex, place[1] + ey, place[2] + ez
-        ex, ey, ez = outside.velocity_error_mps
-        now.vx_mps, now.vy_mps, now.vz_mps = speed[0] + ex, speed[1] + ey, speed[2] + ez
+            outside.reset()

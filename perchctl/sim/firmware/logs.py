@@ -8,6 +8,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Protocol
 
 from perchctl.sim.firmware.controller import Controller
+from perchctl.sim.firmware.covariance import ATTITUDE, POSITION, VELOCITY
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.health import Health
 from perchctl.sim.firmware.motors import MotorDriver
@@ -104,8 +105,8 @@ def _translation(firmware: Logged) -> dict[str, Getter]:
     def acc(axis: int) -> Getter:
         return lambda: estimator.acc_g[axis]
 
-    def variance() -> float:
-        return estimator.variance(firmware.t_s)
+    def variance(state: int) -> Getter:
+        return lambda: estimator.variance(firmware.t_s, state)
 
     getters: dict[str, Getter] = {}
     for i, axis in enumerate(AXES):
@@ -118,8 +119,9 @@ def _translation(firmware: Logged) -> dict[str, Getter]:
             f"kalman.stateP{axis.upper()}": velocity,
             f"stateEstimateZ.{axis}": _field(now, f"{axis}_m", 1000.0),
             f"stateEstimateZ.v{axis}": _field(now, f"v{axis}_mps", 1000.0),
-            f"kalman.var{axis.upper()}": variance,
-            f"kalman.varP{axis.upper()}": variance,
+            f"kalman.var{axis.upper()}": variance(POSITION + i),
+            f"kalman.varP{axis.upper()}": variance(VELOCITY + i),
+            f"kalman.varD{i}": variance(ATTITUDE + i),
             f"acc.{axis}": acc(i),
             f"gyro.{axis}": _field(now, f"gyro_{axis}_dps"),
             f"ctrltarget.{axis}": flown(f"{axis}_m"),

@@ -94,6 +94,7 @@ class Firmware:
             t_s,
             flown=self._flown,
             spinning=self.motors is not MOTORS_OFF,
+            flying=supervisor.is_flying,
             pressed=self._pressed,
         )
         if step % PLANNER_EVERY == 0:
