@@ -26,15 +26,13 @@ from perchctl.profile import TargetConfig
 from perchctl.sim.analogue import spoil
 from perchctl.sim.exposure import line_kernel, path_length_px, sample_count, spread
 from perchctl.sim.gloss import shone_upon
-from perchctl.sim.pixels import Mean, lit, sample, vignetting
+from perchctl.sim.lens import lens_of
+from perchctl.sim.pixels import Mean, lit, sample
 from perchctl.sim.rays import (
     COARSE_PX,
-    FINE_PX,
     LEAST_RISE,
-    RayGrid,
     local_px_per_m,
     plane_map,
-    ray_grid,
     trace,
 )
 from perchctl.sim.scenario import Neighbour, Scenario
@@ -48,7 +46,7 @@ from perchctl.sim.surfaces import (
     Sheet,
     SheetTexture,
 )
-from perchctl.sim.tiles import Tiles, by_tile, fill, reach_of, tile_rays, tiles_of
+from perchctl.sim.tiles import Tiles, by_tile, fill, reach_of, tiles_of
 from perchctl.target.drawing import draw_target
 from perchctl.vision.types import CameraModel
 
@@ -93,13 +91,10 @@ class Renderer:
             self._glossy_half_m = own[0].sheet.drawing.sheet_side_m / 2.0
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
-        self._fine = ray_grid(camera, FINE_PX)
-        self._coarse = ray_grid(camera, COARSE_PX)
-        self._focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
-        self._tiles = tile_rays(self._fine)
-        self.shade = vignetting(self._fine, camera.size_px)
+        lens = lens_of(camera)
+        self._coarse, self._tiles, self.shade = lens.coarse, lens.tiles, lens.shade
+        self._places, self._focal_px = lens.places, lens.focal_px
         self._noise = self._noise_bank()
-        self._places = _five_places(self._coarse)
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
@@ -277,15 +272,6 @@ class Renderer:
 
 def _bytes(grey: NDArray[np.float32]) -> Picture:
     return np.clip(grey, 0.0, 255.0).astype(np.uint8)
-
-
-def _five_places(coarse: RayGrid) -> Array:
-    """Rays (3, 5) to the picture's middle and into its quarters."""
-    rows, cols = coarse.xy.shape[:2]
-    places = [(rows // 2, cols // 2)] + [
-        (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
-    ]
-    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
 
 
 @dataclass(frozen=True, eq=False)
