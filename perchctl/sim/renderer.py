@@ -46,7 +46,7 @@ from perchctl.sim.surfaces import (
     Sheet,
     SheetTexture,
 )
-from perchctl.sim.tiles import Tiles, by_tile, fill, reach_of, tiles_of
+from perchctl.sim.tiles import Box, Tiles, box_of, by_tile, fill, reach_of, tiles_of
 from perchctl.target.drawing import draw_target
 from perchctl.vision.types import CameraModel
 
@@ -149,12 +149,12 @@ class Renderer:
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
         """What falls onto the sensor in one shot, before noise."""
-        rows = [[self._T_target_world @ np.asarray(T) for T in poses] for poses in shot.rows]
+        rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
         length_px = path_length_px(motion_px)
         count = sample_count(length_px)
-        by_row = [[plane_map(T) for T in spread(poses, count)] for poses in rows]
-        maps = by_row[0] if len(rows) == 1 else [np.stack(m) for m in zip(*by_row, strict=True)]
+        by_row = [plane_map(spread(poses, count)) for poses in rows]
+        maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         picture: Any = self._optical(maps, motion_px, length_px)
         if self._glossy_half_m:
             middle = rows[len(rows) // 2]
@@ -173,17 +173,17 @@ class Renderer:
 
     # -- through the lens ---------------------------------------------------
 
-    def _optical(self, maps: list[Array], motion_px: Array, length_px: float) -> Picture:
+    def _optical(self, maps: Array, motion_px: Array, length_px: float) -> Picture:
         """The picture before defocus, at the ray grids' padded size."""
         middle = maps[len(maps) // 2]
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
-        hiding = [view for view in views if view.tiles.inner.all()]
+        rows, cols = (n - 2 for n in nodes.shape[:2])
+        hiding = [view for view in views if view.hides(rows * cols)]
         if hiding:
-            height, width = ((n - 2) * COARSE_PX for n in nodes.shape[:2])
-            picture = np.empty((height, width), np.uint8)
+            picture = np.empty((rows * COARSE_PX, cols * COARSE_PX), np.uint8)
         else:
             picture = self._background(nodes, misses, motion_px)
         for view in hiding or views:
@@ -203,8 +203,7 @@ class Renderer:
         texels = (nodes - tile) * texture.px_per_m + _CENTER_TEXEL
         half = cv2.resize(texels.astype(np.float32), None, fx=COARSE_PX // 2, fy=COARSE_PX // 2)
         crop = COARSE_PX // 2
-        half = np.ascontiguousarray(half[crop:-crop, crop:-crop])
-        picture = sample(texture.image, half, cv2.BORDER_WRAP)
+        picture = sample(texture.image, half[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip
@@ -214,9 +213,10 @@ class Renderer:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
 
-    def _add_sheet(self, picture: Picture, view: _View, maps: list[Array]) -> None:
+    def _add_sheet(self, picture: Picture, view: _View, maps: Array) -> None:
         tiles, texture, plane = view.tiles, view.texture, view.placed.plane
-        into = by_tile(picture)
+        whole = by_tile(picture)
+        into = whole[view.box]
         fill(into, tiles.even, tiles.grey)
         outline = np.flatnonzero(tiles.outline)
         wanted = np.concatenate([outline, np.flatnonzero(tiles.edges)])
@@ -226,14 +226,15 @@ class Renderer:
         to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
         if plane is not None:
             to_texels = to_texels @ plane
-        grid = self._tiles.of(wanted)
+        places = np.divmod(wanted, into.shape[1])
+        top, left = (each.start for each in view.box)
+        grid = self._tiles.of((places[0] + top) * whole.shape[1] + places[1] + left)
         value, alpha = Mean(len(maps)), Mean(len(maps))
         for each in maps:
             texels = trace(grid, to_texels @ each)[0].reshape(-1, COARSE_PX**2, 2)
             value.add(sample(texture.value, texels))
             if len(outline):
                 alpha.add(sample(texture.alpha, texels[: len(outline)]))
-        places = np.divmod(wanted, into.shape[1])
         pixels = value.result()
         if len(outline):
             on = pixels[: len(outline)]
@@ -245,15 +246,16 @@ class Renderer:
 
     # -- motion -------------------------------------------------------------
 
-    def _motion_px(self, poses: list[Array]) -> Array:
-        """Path of the ceiling's image during the exposure at five places, (5, n, 2) px."""
+    def _motion_px(self, poses: Array) -> Array:
+        """Path of the ceiling's image during the exposure at five places, (5, n, 2) px, from
+        poses (n, 4, 4)."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
-        points = plane_map(poses[len(poses) // 2]) @ self._places
+        points = plane_map(poses[len(poses) // 2]).dot(self._places)
         points /= np.maximum(points[2], LEAST_RISE)
         points[2] = 0.0
-        T = np.stack(poses)
-        cam = T[:, :3, :3].transpose(0, 2, 1) @ (points - T[:, :3, 3:])  # (n, 3, 5)
+        R, t = poses[:, :3, :3], poses[:, :3, 3:]
+        cam = R.transpose(0, 2, 1) @ (points - t)  # (n, 3, 5)
         path = cam[:, :2] * (self._focal_px / np.maximum(cam[:, 2:], 1e-3))
         return np.asarray(path.transpose(2, 0, 1))
 
@@ -294,22 +296,26 @@ class _Placed:
         moved = self.seen_from(nodes)
         side_m = self.sheet.drawing.sheet_side_m
         reach = reach_of(moved, length_px)
-        near = reach.near(side_m)
-        rows, cols = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-        if not len(rows):
+        box = box_of(reach.near(side_m))
+        if box is None:
             return None
-        j, i = int(rows.mean()) + 1, int(cols.mean()) + 1
+        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in box)
         texture = self.sheet.texture(local_px_per_m(moved, j, i, COARSE_PX))
-        return _View(self, texture, tiles_of(reach, texture, side_m))
+        return _View(self, texture, box, tiles_of(reach.within(box), texture, side_m))
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A sheet in one exposure."""
+    """A sheet in one exposure, in the picture's `box` of tiles."""
 
     placed: _Placed
     texture: SheetTexture
+    box: Box
     tiles: Tiles
+
+    def hides(self, tiles: int) -> bool:
+        """Whether nothing else is seen in a picture of so many."""
+        return self.tiles.inner.size == tiles and bool(self.tiles.inner.all())
 
 
 def _beside(neighbour: Neighbour, own: TargetConfig) -> _Placed:
