@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
 from typing import Any
 
 import cv2
@@ -28,6 +27,7 @@ from perchctl.sim.exposure import line_kernel, path_length_px, sample_count, spr
 from perchctl.sim.gloss import shone_upon
 from perchctl.sim.lens import lens_of
 from perchctl.sim.pixels import Mean, lit, sample
+from perchctl.sim.placed import Placed, View, beside, printed_sheet
 from perchctl.sim.rays import (
     COARSE_PX,
     LEAST_RISE,
@@ -35,19 +35,17 @@ from perchctl.sim.rays import (
     plane_map,
     trace,
 )
-from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.sim.scenario import Scenario
 from perchctl.sim.shutter import Shot, blended, woven
+from perchctl.sim.still import STILL_PX, Stills, rounded
 from perchctl.sim.surfaces import (
     CEILING_TEXTURE_PX,
     SAMPLING_SIGMA_PX,
     TILE_M,
     Ceiling,
     Picture,
-    Sheet,
-    SheetTexture,
 )
-from perchctl.sim.tiles import Box, Tiles, box_of, by_tile, fill, reach_of, tiles_of
-from perchctl.target.drawing import draw_target
+from perchctl.sim.tiles import by_tile, fill
 from perchctl.vision.types import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
@@ -84,11 +82,12 @@ class Renderer:
             large=target.large.model_copy(update={"side_m": scenario.large_side_m}),
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
-        own = () if scenario.no_target else (_Placed(_printed_sheet(printed.model_dump_json())),)
-        self._sheets = (*own, *(_beside(n, printed) for n in scenario.neighbours))
+        own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
+        self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
         self._glossy_half_m = 0.0
         if own and scenario.gloss > 0.0:
             self._glossy_half_m = own[0].sheet.drawing.sheet_side_m / 2.0
+        self._stills = Stills()
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = lens_of(camera)
@@ -99,6 +98,7 @@ class Renderer:
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
         """The target's centre is there from now on."""
+        self._stills.forget()
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
         turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
@@ -145,13 +145,29 @@ class Renderer:
             picture = np.asarray(cv2.subtract(cv2.add(picture, more), less), np.uint8)
         if self._analogue > 0.0:
             picture = spoil(picture, self._analogue, rng)
-        return np.asarray(picture, np.uint8)
+        return np.array(picture, np.uint8, copy=True if self._noise is None else None)
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
-        """What falls onto the sensor in one shot, before noise."""
+        """What falls onto the sensor in one shot, before noise. Not to be written into."""
         rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
         length_px = path_length_px(motion_px)
+        sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
+        if length_px < STILL_PX and len(rows) == 1:
+            pose = rounded(rows[0][len(rows[0]) // 2])
+            motion_px, still = np.zeros((5, 1, 2)), [pose[None]]
+            make = partial(self._projected, still, motion_px, 0.0, sigma)
+            picture = self._stills.picture(pose, sigma, make)
+        else:
+            picture = self._projected(rows, motion_px, length_px, sigma)
+        return picture if shot.light is None else lit(picture, shot.light)
+
+    # -- through the lens ---------------------------------------------------
+
+    def _projected(
+        self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
+    ) -> Picture:
+        """The picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = sample_count(length_px)
         by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
@@ -162,16 +178,12 @@ class Renderer:
                 picture, self._coarse, middle[len(middle) // 2], self._lamp_m,
                 self.scenario.gloss, self._glossy_half_m,
             )  # fmt: skip
-        sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
-        lens = math.sqrt(max(sigma**2 - SAMPLING_SIGMA_PX**2, 0.0))
+        lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
         if lens > 0.05:
             picture = cv2.GaussianBlur(picture, (0, 0), lens)
         width, height = self.camera.size_px
         picture = cv2.multiply(picture[:height, :width], self.shade, scale=1.0 / 255.0)
-        picture = np.asarray(picture, np.uint8)
-        return picture if shot.light is None else lit(picture, shot.light)
-
-    # -- through the lens ---------------------------------------------------
+        return np.asarray(picture, np.uint8)
 
     def _optical(self, maps: Array, motion_px: Array, length_px: float) -> Picture:
         """The picture before defocus, at the ray grids' padded size."""
@@ -213,7 +225,7 @@ class Renderer:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
 
-    def _add_sheet(self, picture: Picture, view: _View, maps: Array) -> None:
+    def _add_sheet(self, picture: Picture, view: View, maps: Array) -> None:
         tiles, texture, plane = view.tiles, view.texture, view.placed.plane
         whole = by_tile(picture)
         into = whole[view.box]
@@ -274,62 +286,3 @@ class Renderer:
 
 def _bytes(grey: NDArray[np.float32]) -> Picture:
     return np.clip(grey, 0.0, 255.0).astype(np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
-
-    sheet: Sheet
-    plane: Array | None = None
-
-    def seen_from(self, nodes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The coarse nodes (rows, columns, 2) in this sheet's axes, m."""
-        if self.plane is None:
-            return nodes
-        turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
-        return np.asarray(nodes @ turn.astype(np.float32) + shift.astype(np.float32))
-
-    def view(self, nodes: NDArray[np.float32], length_px: float) -> _View | None:
-        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
-        longest way of the picture within the exposure. None where the sheet is out of view."""
-        moved = self.seen_from(nodes)
-        side_m = self.sheet.drawing.sheet_side_m
-        reach = reach_of(moved, length_px)
-        box = box_of(reach.near(side_m))
-        if box is None:
-            return None
-        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in box)
-        texture = self.sheet.texture(local_px_per_m(moved, j, i, COARSE_PX))
-        return _View(self, texture, box, tiles_of(reach.within(box), texture, side_m))
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """A sheet in one exposure, in the picture's `box` of tiles."""
-
-    placed: _Placed
-    texture: SheetTexture
-    box: Box
-    tiles: Tiles
-
-    def hides(self, tiles: int) -> bool:
-        """Whether nothing else is seen in a picture of so many."""
-        return self.tiles.inner.size == tiles and bool(self.tiles.inner.all())
-
-
-def _beside(neighbour: Neighbour, own: TargetConfig) -> _Placed:
-    large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
-    small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
-    target = TargetConfig(
-        large=own.large.model_copy(update=large), small=own.small.model_copy(update=small)
-    )
-    to_own = make_T(rot_z(neighbour.yaw_rad), (*neighbour.xy_m, 0.0))
-    plane = np.delete(np.delete(invert_T(to_own), 2, axis=0), 2, axis=1)
-    return _Placed(_printed_sheet(target.model_dump_json()), plane)
-
-
-@lru_cache(maxsize=4)
-def _printed_sheet(target_json: str) -> Sheet:
-    """The sheet of a target; its textures cost more than a second, and flights share them."""
-    return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))
