@@ -83,7 +83,8 @@ def test_a_rounded_pose_shows_each_place_where_it_is(below_m: float) -> None:
         points = np.array([[*rng.uniform(-0.5, 0.5, 2) * below_m, 0.0] for _ in range(9)])
         seen = [(points - t[:3, 3]) @ t[:3, :3] for t in (T, rounded(T))]
         one, other = (400.0 * cam[:, :2] / cam[:, 2:] for cam in seen)
-        assert np.abs(one - other).max() < 0.01
+        within = (np.abs(one) < (400.0, 300.0)).all(axis=1)
+        assert np.abs(one - other)[within].max(initial=0.0) < 0.01
 
 
 def test_without_noise_a_kept_picture_is_nobody_s_to_spoil() -> None:
