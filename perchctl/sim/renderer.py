@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim.analogue import spoil
-from perchctl.sim.exposure import line_kernel, path_length_px, sample_count, spread
+from perchctl.sim.exposure import SHARP_MOTION_PX, line_kernel, path_length_px, sample_count, spread
 from perchctl.sim.gloss import shone_upon
 from perchctl.sim.lens import lens_of
 from perchctl.sim.pixels import Mean, lit, sample
@@ -108,7 +108,7 @@ class Renderer:
 
     def render(
         self,
-        T_world_cam_samples: Sequence[Array],
+        T_world_cam_samples: Sequence[Array] | Array,
         defocus_px: float | None = None,
         frame_index: int = 0,
     ) -> Picture:
@@ -169,7 +169,10 @@ class Renderer:
     ) -> Picture:
         """The picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = sample_count(length_px)
-        by_row = [plane_map(spread(poses, count)) for poses in rows]
+        if count == 1 and all(len(poses) % 2 for poses in rows):
+            by_row = [plane_map(poses[len(poses) // 2][None]) for poses in rows]
+        else:
+            by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         picture: Any = self._optical(maps, motion_px, length_px)
         if self._glossy_half_m:
@@ -197,13 +200,17 @@ class Renderer:
         if hiding:
             picture = np.empty((rows * COARSE_PX, cols * COARSE_PX), np.uint8)
         else:
-            picture = self._background(nodes, misses, motion_px)
+            picture = self._background(nodes, misses, motion_px, length_px)
         for view in hiding or views:
             self._add_sheet(picture, view, maps)
         return picture
 
     def _background(
-        self, nodes: NDArray[np.float32], misses: NDArray[np.bool_], motion_px: Array
+        self,
+        nodes: NDArray[np.float32],
+        misses: NDArray[np.bool_],
+        motion_px: Array,
+        length_px: float,
     ) -> Picture:
         """The bare ceiling, at half resolution: its texture carries no measurement."""
         rows, cols = nodes.shape[:2]
@@ -220,7 +227,7 @@ class Renderer:
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip
             picture[mask > 0] = FLOOR_GREY
-        kernel = line_kernel(motion_px / 2.0)
+        kernel = line_kernel(motion_px / 2.0) if length_px >= SHARP_MOTION_PX else None
         if kernel is not None:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
