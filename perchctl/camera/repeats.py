@@ -110,7 +110,8 @@ def _unlike(last: Grey, image: Grey) -> float | None:
 def _calm(one: Grey, other: Grey) -> float:
     """Mean difference where it is small, grey levels."""
     counts = cv2.calcHist([cv2.absdiff(one, other)], [0], None, [256], [0.0, 256.0])
-    left = most = max(1, int(_CALM * one.size))
+    left: float = max(1, int(_CALM * one.size))
+    most = left
     total = 0.0
     for level, count in enumerate(counts.ravel().tolist()):
         if count >= left:
