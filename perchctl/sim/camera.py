@@ -98,7 +98,7 @@ class SimCamera:
     def _expose(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> None:
         s = self.scenario
         dropped = float(self._rng.random()) < s.camera_drop_rate
-        jitter = float(np.clip(self._rng.normal(), -JITTER_LIMIT_SIGMAS, JITTER_LIMIT_SIGMAS))
+        jitter = max(-JITTER_LIMIT_SIGMAS, min(JITTER_LIMIT_SIGMAS, float(self._rng.normal())))
         if s.camera_burst is not None and middle_s >= s.camera_burst[0] and self._burst_left > 0:
             self._burst_left -= 1
             dropped = True

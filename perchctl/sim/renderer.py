@@ -142,7 +142,8 @@ class Renderer:
             rows, cols = self._noise[0].shape
             r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
             more, less = (bank[r : r + height, c : c + width] for bank in self._noise)
-            picture = np.asarray(cv2.subtract(cv2.add(picture, more), less), np.uint8)
+            picture = np.asarray(cv2.add(picture, more), np.uint8)
+            cv2.subtract(picture, less, picture)
         if self._analogue > 0.0:
             picture = spoil(picture, self._analogue, rng)
         return np.array(picture, np.uint8, copy=True if self._noise is None else None)
