@@ -12,7 +12,6 @@ import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -69,7 +68,7 @@ def wanted(profiles: Sequence[Profile], folder: Path | None) -> Iterator[Wanted]
     different = {(p.camera.calibration, p.camera.mask): p for p in profiles}
     each = tuple((profile, profile_sha256(profile)) for profile in different.values())
     asked = Wanted(
-        f"perchctl-{secrets.token_hex(8)}", program(), source_sha256(), libraries(), each,
+        f"perchctl-{secrets.token_hex(8)}", program(), SOURCE, libraries(), each,
         None if folder is None else folder.absolute(), secrets.token_hex(16),
     )  # fmt: skip
     if folder is None:
@@ -91,14 +90,17 @@ def program() -> str:
     return f"perchctl {perchctl.__version__}" + (f" ({commit})" if commit else "")
 
 
-@cache
-def source_sha256() -> str:
-    """Of all of perchctl's modules, by name and text."""
+def source_sha256(root: Path) -> str:
+    """Of all modules below, by name and text."""
     whole = hashlib.sha256()
-    for path in sorted(_ROOT.rglob("*.py")):
-        whole.update(f"{path.relative_to(_ROOT).as_posix()}\n".encode())
+    for path in sorted(root.rglob("*.py")):
+        whole.update(f"{path.relative_to(root).as_posix()}\n".encode())
         whole.update(path.read_bytes().replace(b"\r\n", b"\n"))
     return whole.hexdigest()
+
+
+SOURCE = source_sha256(_ROOT)
+"""As it was loaded: a worker that runs on while its files change is none of the new program."""
 
 
 def libraries() -> tuple[tuple[str, str], ...]:
@@ -143,12 +145,11 @@ def answer_to(asked: Wanted, threads: int, name: str = "") -> Answer:
 
 
 def _other_program(asked: Wanted) -> str | None:
-    own = source_sha256()
-    if own == asked.source:
+    if asked.source == SOURCE:
         return None
     return (
-        f"has {program()} with the source {own[:_SHORT]}, and here it is {asked.program} with "
-        f"{asked.source[:_SHORT]}: install the same there"
+        f"has {program()} with the source {SOURCE[:_SHORT]}, and here it is {asked.program} with "
+        f"{asked.source[:_SHORT]}: install the same there, and start its workers again"
     )
 
 
@@ -159,7 +160,9 @@ def _other_libraries(asked: Wanted) -> str | None:
         return None
     there = " and ".join(f"{name} {own.get(name, 'none')}" for name, _ in others)
     here = " and ".join(f"{name} {value}" for name, value in others)
-    return f"has {there}, and here it is {here}: install the same there"
+    return (
+        f"has {there}, and here it is {here}: install the same there, and start its workers again"
+    )
 
 
 def _many_threads(threads: int) -> str | None:
