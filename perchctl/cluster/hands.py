@@ -217,13 +217,13 @@ class ClusterHands(Executor):
             good, answer = pickle.loads(await flight.result())
         except KilledWorker:
             future.set_exception(BrokenExecutor("the worker that flew was lost"))
-        except (CancelledError, asyncio.CancelledError, OSError):
-            if self._client.status == "running" and not self._ended:
+        except (Exception, asyncio.CancelledError) as error:
+            if self._client.status != "running" or self._ended:
+                future.set_exception(self._broken or self._scheduler_lost())
+            elif isinstance(error, CancelledError | asyncio.CancelledError | OSError):
                 future.set_exception(BrokenExecutor("the cluster has dropped the flight"))
             else:
-                future.set_exception(self._broken or self._scheduler_lost())
-        except Exception as error:
-            future.set_exception(InvalidValue(cannot_load("a worker", error)))
+                future.set_exception(InvalidValue(cannot_load("a worker", error)))
         else:
             (future.set_result if good else future.set_exception)(answer)
 

@@ -27,6 +27,7 @@ _NO_PAGES = f"{HOST}:0"
 """dask opens a port for its web pages in any case: on loopback, any that is free, and no page."""
 STARTS = 3
 """A worker that has ended so many times before it was there is not started again."""
+_PARENT_S = 1.0
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _CONTEXT = multiprocessing.get_context("spawn")
 
@@ -112,11 +113,18 @@ class LocalWorkers:
 
 def serve(address: str, folder: str, number: int) -> None:
     """A worker's life."""
-    end_with_parent(partial(shutil.rmtree, folder, ignore_errors=True))
+    tidy = partial(shutil.rmtree, folder, ignore_errors=True)
+    end_with_parent(tidy)
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # before numpy is loaded
     if not os.environ.get("PERCHCTL_DEBUG"):
         logging.disable(logging.CRITICAL)
     asyncio.run(_work(address, folder, number))
+    # The scheduler is gone: so is the parent, or is about to be, and this may be before the above.
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join(_PARENT_S)
+    if not parent.is_alive():
+        tidy()
 
 
 async def _work(address: str, folder: str, number: int) -> None:

@@ -215,8 +215,8 @@ def test_one_without_this_perchctl_is_told(asked: Wanted) -> None:
     with pytest.raises(InvalidValue) as told:
         asked_all(asked, a=ModuleNotFoundError("No module named 'perchctl'"))
     assert str(told.value) == (
-        "worker a cannot load what flies (ModuleNotFoundError: No module named 'perchctl'): install "
-        "this computer's perchctl there, with the extras sim and cluster"
+        "worker a cannot load what flies (ModuleNotFoundError: No module named 'perchctl'): "
+        "install this computer's perchctl there, with the extras sim and cluster"
     )
 
 

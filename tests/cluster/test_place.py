@@ -42,7 +42,7 @@ def test_an_address_is_read(text: str, place: Place) -> None:
     ],
 )  # fmt: skip
 def test_what_is_none_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match="must be .* as in --cluster"):
+    with pytest.raises(UsageError, match=r"must be .* as in --cluster"):
         place_of(text)
 
 
