@@ -39,10 +39,10 @@ ANSWER_S = 10.0
 """A scheduler may take so long to answer."""
 WORKERS_S = 20.0
 """And so long until it has a worker."""
-LOCAL_S = 120.0
-"""The first one here: it has to load all libraries."""
 NOBODY_S = 120.0
 """For so long a campaign waits without any worker."""
+LOCAL_S = 600.0
+"""For so long it waits for one here, which has to load all libraries; one that cannot is seen."""
 _LOOK_S = 0.25
 _CLOSE_S = 0.5
 _END_S = 1.0
@@ -146,7 +146,7 @@ class ClusterHands(Executor):
             self.width = self._place.workers or self._workers
             self._ready.set_result(None)
             while True:
-                await self._look(NOBODY_S)
+                await self._look(NOBODY_S if self.local is None else LOCAL_S)
                 self._hand_over()
 
     @contextlib.asynccontextmanager
@@ -182,6 +182,11 @@ class ClusterHands(Executor):
         if self._workers or not self._nobody_s:
             self._nobody_s = now_s
         elif now_s - self._nobody_s >= nobody_s:
+            if self.local is not None:
+                raise ConnectionFailed(
+                    f"no worker of --cluster {self._place} has come up within {nobody_s:.0f} s: "
+                    f"end what keeps this computer busy, or start fewer"
+                )
             raise ConnectionFailed(
                 f"the scheduler at {self._address} has had no worker for {nobody_s:.0f} s: start "
                 f"some with dask worker {self._address} --nthreads 1"
