@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,23 @@ ANSWERS_S = 60.0
 SEEN_S = 10.0
 """A shared folder may show so late what another computer has written."""
 _LOOK_S = 0.05
+
+
+async def ask_scheduler(client: Any, address: str) -> None:
+    """Errors: InvalidValue, where it is of another distributed; ConnectionFailed."""
+    try:
+        there = await asyncio.wait_for(client.scheduler.versions(), ANSWERS_S)
+    except (OSError, TimeoutError) as error:
+        raise ConnectionFailed(
+            f"the scheduler at {address} does not answer within {ANSWERS_S:.0f} s: look at what it "
+            f"says, and start it again"
+        ) from error
+    found, here = there["packages"]["distributed"], version("distributed")
+    if found != here:
+        raise InvalidValue(
+            f"the scheduler at {address} has distributed {found}, and here it is {here}: install "
+            f"the same there or here, and start it again"
+        )
 
 
 async def ask_all(client: Any, asked: Wanted) -> list[str]:

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 from distributed import Client, KilledWorker
 from distributed.versions import VersionMismatchWarning
 
-from perchctl.cluster.asking import ask_all, cannot_load
+from perchctl.cluster.asking import ask_all, ask_scheduler, cannot_load
 from perchctl.cluster.local import LocalWorkers, local_scheduler
 from perchctl.cluster.place import Place
 from perchctl.cluster.wanted import Wanted, wanted
@@ -37,8 +37,10 @@ R = TypeVar("R")
 
 ANSWER_S = 10.0
 """A scheduler may take so long to answer."""
+HANGS_S = 60.0
+"""One that has answered before, and so long does not, is lost."""
 WORKERS_S = 20.0
-"""And so long until it has a worker."""
+"""It may take so long until it has a worker."""
 NOBODY_S = 120.0
 """For so long a campaign waits without any worker."""
 LOCAL_S = 600.0
@@ -141,6 +143,7 @@ class ClusterHands(Executor):
             if self._place.address is None:
                 self._address = await stack.enter_async_context(self._started())
             self._client = await stack.enter_async_context(_connected(self._address))
+            await ask_scheduler(self._client, self._address)
             await self._first_worker()
             self.notes = await ask_all(self._client, self._asked)
             self.width = self._place.workers or self._workers
@@ -172,7 +175,7 @@ class ClusterHands(Executor):
         try:
             if self._client.status != "running":
                 raise OSError(self._client.status)
-            self._workers = len(await asyncio.wait_for(self._client.nthreads(), ANSWER_S))
+            self._workers = len(await asyncio.wait_for(self._client.nthreads(), HANGS_S))
         except (OSError, TimeoutError) as error:
             raise self._scheduler_lost() from error
         if self.local is not None:

@@ -26,8 +26,9 @@ from perchctl.log.arithmetic import arithmetic
 from perchctl.profile import Profile
 from perchctl.profile.mask import read_mask
 
-_LIBRARIES = ("numpy", "mujoco", "filterpy")
-"""Beside OpenCV, which comes under several names: what a flight's figures are made by."""
+_LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
+"""Beside OpenCV, which comes under several names: what a flight's figures are made by, and what
+carries them, of which two versions may not understand each other."""
 _ROOT = Path(perchctl.__file__).resolve().parent
 _SHORT = 8
 

@@ -78,7 +78,7 @@ def test_another_source_is_seen_whatever_the_version(
 
 def test_other_libraries_are_named_with_both_versions(asked: Wanted) -> None:
     own = dict(asked.libraries)
-    assert set(own) == {"python", "opencv", "numpy", "mujoco", "filterpy"}
+    assert set(own) == {"python", "opencv", "numpy", "mujoco", "filterpy", "distributed"}
     assert "none" not in own.values()
     other = replace(asked, libraries=(*asked.libraries[:2], ("numpy", "1.0"), ("newest", "7")))
     assert answer_to(other, 1).problem == (
@@ -202,6 +202,17 @@ class Client:
 
 def asked_all(asked: Wanted, **answers: Any) -> list[str]:
     return asyncio.run(ask_all(Client(answers), asked))
+
+
+def test_a_scheduler_of_another_version_is_told() -> None:
+    """The two would not understand each other, and say so by none answering."""
+
+    async def versions() -> dict[str, Any]:
+        return {"packages": {"distributed": "1.0"}}
+
+    client = SimpleNamespace(scheduler=SimpleNamespace(versions=versions))
+    with pytest.raises(InvalidValue, match=r"at here has distributed 1\.0, and here it is "):
+        asyncio.run(asking.ask_scheduler(client, "here"))
 
 
 def test_the_first_that_must_not_fly_is_told_and_how_many_more(asked: Wanted) -> None:
