@@ -13,6 +13,7 @@ import os
 import shutil
 import tempfile
 import threading
+import warnings
 from collections import Counter
 from collections.abc import AsyncIterator, Container
 from contextlib import asynccontextmanager
@@ -43,6 +44,7 @@ async def local_scheduler(folder: str) -> AsyncIterator[Any]:
         "distributed.scheduler.http.routes": [],
         "temporary-directory": folder,
     }
+    warnings.filterwarnings("ignore", message="Creating scratch")  # slow on a busy computer
     with dask.config.set(settings):
         async with Scheduler(
             host=HOST, port=0, protocol="tcp://", dashboard=False, dashboard_address=_NO_PAGES
@@ -118,6 +120,7 @@ def serve(address: str, folder: str, number: int) -> None:
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))  # before numpy is loaded
     if not os.environ.get("PERCHCTL_DEBUG"):
         logging.disable(logging.CRITICAL)
+        warnings.simplefilter("ignore")
     asyncio.run(_work(address, folder, number))
     # The scheduler is gone: so is the parent, or is about to be, and this may be before the above.
     parent = multiprocessing.parent_process()
