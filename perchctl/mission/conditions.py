@@ -48,10 +48,18 @@ def _settled(c: Context) -> bool:
         c.fresh
         and c.small_is_fresh
         and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
-        and c.error_xy_m <= ascend.settle_xy_m
+        and c.error_xy_m <= settled_within_m(c)
         and abs(c.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and c.speed_mps <= ascend.settle_speed_mps
     )
+
+
+def settled_within_m(c: Context) -> float:
+    """Distance from the axis that counts as settled: it grows with the wait at the stand-off."""
+    ascend = c.profile.planner.ascend
+    waited = c.held(Condition.NEAR_STANDOFF) / ascend.settle_timeout_s
+    growth_m = max(0.0, ascend.settle_last_xy_m - ascend.settle_xy_m)
+    return ascend.settle_xy_m + growth_m * min(max(0.0, 2.0 * waited - 1.0), 1.0)
 
 
 def _near_standoff(c: Context) -> bool:
