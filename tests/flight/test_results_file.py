@@ -233,3 +233,21 @@ def test_a_campaign_that_goes_on_judges_the_logs_of_its_own_folder(tmp_path: Pat
     assert kept.left == [3]
     left = {path.name for path in tmp_path.rglob("*.jsonl")}
     assert left == {"flight_seed1.jsonl", "flight_seed2.jsonl"}
+
+
+def test_the_logs_of_flights_that_were_broken_off_go(tmp_path: Path) -> None:
+    logs = [tmp_path / f"flight_seed{seed}.jsonl" for seed in range(3)]
+    logs[0].touch()  # another campaign's
+    kept: Kept[FlightResult] = Kept(range(3), {}, log_keeper("failed"))
+
+    def stopped() -> None:
+        with kept.without_torn(logs):
+            for log in logs[1:]:
+                log.touch()
+                recording_of(log).touch()
+            kept.note(replace(FLOWN, seed=1, outcome="landed", miss_m=None, log=logs[1]))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped()
+    assert set(tmp_path.iterdir()) == {logs[0], logs[1], recording_of(logs[1])}
