@@ -144,15 +144,18 @@ class SimulateRequest:
     ) -> Iterator[Kept[R]]:
         """What becomes of each result: `--out`, `--resume`, `--keep`. Errors: InvalidValue."""
         keep = log_keeper(self.keep or "all")
-        if self.out is None:
-            yield Kept(self.seeds, {}, keep)
-            return
-        header = campaign_header(profile, faults)
-        file = open_results(self.out, header, kind, self.resume, self.force)
-        try:
-            yield Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
-        finally:
-            file.close()
+        with contextlib.ExitStack() as stack:
+            kept: Kept[R] = Kept(self.seeds, {}, keep)
+            if self.out is not None:
+                header = campaign_header(profile, faults)
+                file = open_results(self.out, header, kind, self.resume, self.force)
+                stack.callback(file.close)
+                kept = Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
+            if self.log_dir is not None and self.keep not in (None, "all"):
+                from perchctl.flight.campaign import log_of
+
+                stack.enter_context(kept.without_torn([log_of(s, self.log_dir) for s in kept.left]))
+            yield kept
 
 
 def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) -> None:
@@ -170,13 +173,15 @@ def fly_each(
     report: Callable[[list[R], PerchError | None], None],
     kept: Kept[R] | None = None,
     flights: int | None = None,
+    expected: Callable[[], int] | None = None,
 ) -> int:
     """Flies the request's seeds in processes of their own, and reports those that were flown,
     however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
 
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
     were flown. `kept`: those that were flown before, which count, too, and where each goes.
-    `flights`: how many it flies, by default one a seed. Errors: PerchError where none was.
+    `flights`: how many it flies, by default one a seed; `expected`: how many of them it may
+    come to. Errors: PerchError where none was.
     """
     from perchctl.flight.hands import job_processes
 
@@ -189,7 +194,7 @@ def fly_each(
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            progress_bar(total, earlier=kept.earlier) as advance,
+            progress_bar(total, earlier=kept.earlier, expected=expected) as advance,
             job_processes(jobs) as executor,
         ):
             campaign(executor, noting(results, kept.note, advance))

@@ -56,7 +56,7 @@ def run_until(request: SimulateRequest) -> int:
         tell_logs(enough.counted, request.log_dir, request.keep)
 
     with request.results(profile, FlightResult) as kept:
-        return fly_each(campaign, request, report, kept)
+        return fly_each(campaign, request, report, kept, expected=enough.expected)
 
 
 def verdict(enough: Enough, width: float) -> str:
