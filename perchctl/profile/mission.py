@@ -52,8 +52,8 @@ class AscendConfig(Section):
     `standoff_m` is between gear and target; the small marker must be in view there.
     Settled is a gear within `settle_xy_m` of the axis, not more than `settle_z_m` below
     the stand-off. Where the estimate walks by more than that in the time from a picture to
-    the next, as a flow deck's two metres up, it never is: so from half of `settle_timeout_s`
-    on the distance grows, and is `settle_last_xy_m` at its end.
+    the next, as a flow deck's two metres up, it never is: so from 0.7 to 0.8 of
+    `settle_timeout_s` the distance grows to `settle_last_xy_m`.
     """
 
     speed_mps: float = Field(0.25, gt=0, le=1, description="climb, far below")
@@ -71,7 +71,7 @@ class AscendConfig(Section):
         0.012,
         gt=0,
         le=0.1,
-        description="what `settle_xy_m` grows to in the second half of `settle_timeout_s`; "
+        description="what `settle_xy_m` grows to from 0.7 to 0.8 of `settle_timeout_s`; "
         "less: it does not grow",
     )
     settle_z_m: float = Field(

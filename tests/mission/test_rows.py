@@ -288,9 +288,9 @@ def beside(aside_m: float) -> Look:
 
 
 @pytest.mark.parametrize(
-    ("aside_m", "waits_s"), [(0.003, 0.3), (0.006, 6.25), (0.011, 9.375), (0.02, None)]
+    ("aside_m", "waits_s"), [(0.003, 0.3), (0.006, 7.25), (0.011, 7.875), (0.02, None)]
 )
-def test_what_cannot_settle_is_let_in_farther_in_the_second_half(
+def test_what_does_not_settle_is_let_in_farther_in_the_end(
     aside_m: float, waits_s: float | None
 ) -> None:
     state, look = state_in(P.ASCEND, z_m=STANDOFF_Z_M), beside(aside_m)
