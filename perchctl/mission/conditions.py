@@ -28,8 +28,6 @@ LITTLE_LEFT = 0.93
 """A hover thrust above this part of the largest: full thrust is no sign of pressing then."""
 PROVABLE = 0.99
 """Of the thrust that presses: so much at most is asked of a contact."""
-GROWS = (0.7, 0.8)
-"""Between these parts of the time to settle the distance grows within which it counts."""
 STILL_MOTORS_THRUST = 5000
 """At and below it the motors stand still (docs/firmware.md, "Release in raw mode")."""
 
@@ -50,19 +48,10 @@ def _settled(c: Context) -> bool:
         c.fresh
         and c.small_is_fresh
         and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
-        and c.error_xy_m <= settled_within_m(c)
+        and c.error_xy_m <= ascend.settle_xy_m
         and abs(c.error_yaw_rad) <= math.radians(ascend.settle_yaw_deg)
         and c.speed_mps <= ascend.settle_speed_mps
     )
-
-
-def settled_within_m(c: Context) -> float:
-    """Distance from the axis that counts as settled: it grows with the wait at the stand-off."""
-    ascend = c.profile.planner.ascend
-    waited = c.held(Condition.NEAR_STANDOFF) / ascend.settle_timeout_s
-    growth_m = max(0.0, ascend.settle_last_xy_m - ascend.settle_xy_m)
-    begin, end = GROWS
-    return ascend.settle_xy_m + growth_m * min(max(0.0, (waited - begin) / (end - begin)), 1.0)
 
 
 def _near_standoff(c: Context) -> bool:

@@ -51,9 +51,7 @@ class AscendConfig(Section):
     Falls back to ALIGN outside the cone `cone_base_m + cone_slope * distance`.
     `standoff_m` is between gear and target; the small marker must be in view there.
     Settled is a gear within `settle_xy_m` of the axis, not more than `settle_z_m` below
-    the stand-off. Where the estimate walks by more than that in the time from a picture to
-    the next, as a flow deck's two metres up, it never is: so from 0.7 to 0.8 of
-    `settle_timeout_s` the distance grows to `settle_last_xy_m`.
+    the stand-off.
     """
 
     speed_mps: float = Field(0.25, gt=0, le=1, description="climb, far below")
@@ -67,13 +65,6 @@ class AscendConfig(Section):
         0.08, gt=0.01, le=0.5, description="between gear and target where it settles"
     )
     settle_xy_m: float = Field(0.004, gt=0, le=0.1, description="settled: distance from the axis")
-    settle_last_xy_m: float = Field(
-        0.012,
-        gt=0,
-        le=0.1,
-        description="what `settle_xy_m` grows to from 0.7 to 0.8 of `settle_timeout_s`; "
-        "less: it does not grow",
-    )
     settle_z_m: float = Field(
         0.02, gt=0, le=0.1, description="settled: at most so far below the stand-off"
     )

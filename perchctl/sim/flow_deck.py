@@ -40,8 +40,8 @@ _LEAST_HEIGHT_M = 0.1
 _VIEW_PER_M = math.tan(math.radians(21.0))
 """Half the width of what the sensor sees, a metre of height."""
 _BIAS_MPS2 = 0.0125
-_ACC_VIBRATION_MPS2 = 0.3  # white, each control period
-"""Both as in `perchctl.sim.firmware.outside`: what the estimate is truly off by."""
+"""What an attitude that is a little off feigns. Level accelerations are not looked at in flight:
+vibration is nothing to the speed in x and y (source)."""
 _SIGMA_RADPS = 2 * 0.1 * (0.71674 / 35) / _DT_S
 _SPEED_DENSITY = 0.5**2 * 1e-3
 _TURN_DENSITY = (GRAVITY_MPS2 * 0.1) ** 2 * 1e-3
@@ -113,19 +113,18 @@ class FlowDeck:
         self._steps += 1
         if self._steps % _EVERY:
             return
-        if len(self._white) < 5:
+        if len(self._white) < 3:
             self._white = self._rng.standard_normal(_BATCH).tolist()
         take = self._white.pop
-        self._predict(take(), take())
+        self._predict()
         if self.sees(world):
             self._measure(world.z_m, take(), take())
         self._range(world.z_m, take())
 
-    def _predict(self, white_x: float, white_y: float) -> None:
-        shake = _ACC_VIBRATION_MPS2 * CONTROL_PERIOD_S * math.sqrt(_EVERY)
+    def _predict(self) -> None:
         (px, py, pz), (ex, ey) = self.position_error_m, self.velocity_error_mps
         ax, ay = self._felt_mps2
-        ex, ey = ex + ax * _DT_S + shake * white_x, ey + ay * _DT_S + shake * white_y
+        ex, ey = ex + ax * _DT_S, ey + ay * _DT_S
         self.position_error_m = (px + ex * _DT_S, py + ey * _DT_S, pz)
         self.velocity_error_mps = (ex, ey)
         self._pv += _DT_S * (self._vv + self._pa)

@@ -276,32 +276,6 @@ CASES: dict[str, Case] = {
 }  # fmt: skip
 
 
-def beside(aside_m: float) -> Look:
-    """At the stand-off and so far beside the target's axis."""
-
-    def look(t_s: float) -> Observation:
-        body_m = (aside_m, 0.0, STANDOFF_Z_M)
-        tel = telemetry(t_s, position_m=body_m)
-        return observation(t_s, telemetry=tel, target=target_at(t_s, body_m=body_m))
-
-    return look
-
-
-@pytest.mark.parametrize(
-    ("aside_m", "waits_s"), [(0.003, 0.3), (0.006, 7.25), (0.011, 7.875), (0.02, None)]
-)
-def test_what_does_not_settle_is_let_in_farther_in_the_end(
-    aside_m: float, waits_s: float | None
-) -> None:
-    state, look = state_in(P.ASCEND, z_m=STANDOFF_Z_M), beside(aside_m)
-    while state.phase is P.ASCEND:
-        state, _ = planner.step(state, look(state.t_s + 0.02), PROFILE)
-    assert state.phase is (P.RECOVER if waits_s is None else P.PERCH)
-    if waits_s is not None:
-        dwell_s = PROFILE.planner.ascend.settle_dwell_s
-        assert -0.05 <= state.t_s - START_S - waits_s - dwell_s * (waits_s > 1.0) <= 0.1
-
-
 def test_every_row_has_its_case() -> None:
     assert list(CASES) == [row.name for row in TABLE]
 
