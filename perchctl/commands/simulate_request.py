@@ -154,15 +154,18 @@ class SimulateRequest:
     ) -> Iterator[Kept[R]]:
         """What becomes of each result: `--out`, `--resume`, `--keep`. Errors: InvalidValue."""
         keep = log_keeper(self.keep or "all")
-        if self.out is None:
-            yield Kept(self.seeds, {}, keep)
-            return
-        header = campaign_header(profile, faults)
-        file = open_results(self.out, header, kind, self.resume, self.force)
-        try:
-            yield Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
-        finally:
-            file.close()
+        with contextlib.ExitStack() as stack:
+            kept: Kept[R] = Kept(self.seeds, {}, keep)
+            if self.out is not None:
+                header = campaign_header(profile, faults)
+                file = open_results(self.out, header, kind, self.resume, self.force)
+                stack.callback(file.close)
+                kept = Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
+            if self.log_dir is not None and self.keep not in (None, "all"):
+                from perchctl.flight.campaign import log_of
+
+                stack.enter_context(kept.without_torn([log_of(s, self.log_dir) for s in kept.left]))
+            yield kept
 
 
 def _refuse(asked: str, options: Mapping[str, int | str | Path | None], instead: str) -> None:
@@ -181,14 +184,15 @@ def fly_each(
     kept: Kept[R] | None = None,
     flights: int | None = None,
     profiles: Sequence[Profile] = (),
+    expected: Callable[[], int] | None = None,
 ) -> int:
     """Flies the request's seeds in processes of their own or on its cluster, and reports those that
     were flown, however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
 
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
     were flown. `kept`: those that were flown before, which count, too, and where each goes.
-    `flights`: how many it flies, by default one a seed; `profiles`: by which. Errors: PerchError
-    where none was.
+    `flights`: how many it flies, by default one a seed; `profiles`: by which; `expected`: how many
+    of them it may come to. Errors: PerchError where none was.
     """
     from perchctl.commands.simulate_hands import hands_of
 
@@ -204,7 +208,7 @@ def fly_each(
         with (
             contextlib.suppress(KeyboardInterrupt),
             hands_of(cluster, jobs, profiles, request.log_dir) as (executor, _),
-            progress_bar(total, earlier=kept.earlier) as advance,
+            progress_bar(total, earlier=kept.earlier, expected=expected) as advance,
         ):
             begun = True
             campaign(executor, noting(results, kept.note, advance))

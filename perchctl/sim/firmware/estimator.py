@@ -129,7 +129,7 @@ class Estimator:
         deck_m2 = _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
             -(t_s - self._reset_s) / _VARIANCE_FALL_S
         )
-        return deck_m2 if self._flow is None else deck_m2 + self._flow.variance_m2
+        return deck_m2 if self._flow is None else deck_m2 + self._flow.variance
 
     def update(
         self, world: Sensed, t_s: float, *, flown: bool, spinning: bool, pressed: bool = False
