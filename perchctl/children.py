@@ -132,15 +132,18 @@ def connect_back() -> Channel:
     return Channel(connection)
 
 
-def end_with_parent() -> None:
+def end_with_parent(last: Callable[[], object] = lambda: None) -> None:
     """In a process of `multiprocessing`: end as soon as its parent is gone, killed or not; work
-    that nobody waits for would go on. It is here since this module loads at once: asked for by
-    one that loads the whole program, a process of a busy computer would first do that."""
+    that nobody waits for would go on. `last` is done before. It is here since this module loads at
+    once: asked for by one that loads the whole program, a process of a busy computer would first
+    do that."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def watch() -> None:
         parent.join()
+        with contextlib.suppress(Exception):
+            last()
         os._exit(1)
 
     threading.Thread(target=watch, name="parent", daemon=True).start()

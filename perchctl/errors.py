@@ -54,9 +54,17 @@ def no_parquet() -> UsageError:
     )
 
 
+def no_cluster(why: str = "it is missing") -> UsageError:
+    """Where the extra ``cluster`` is not installed, or cannot be loaded."""
+    return UsageError(
+        f"--cluster needs the library distributed ({why}); install it with: "
+        f"{sys.executable} -m pip install 'perchctl[cluster]'"
+    )
+
+
 class ConnectionFailed(PerchError):
     exit_code = 10
-    meaning = "no connection to the vehicle or the motion capture"
+    meaning = "no connection to the vehicle, the motion capture or the cluster"
 
 
 class NotFound(PerchError):

@@ -26,13 +26,13 @@ else:
         if not names:
             return _by_init(value, **changes)
         now = value.__dict__
-        held = now.copy() if len(now) == len(names) else {name: now[name] for name in names}
+        new = object.__new__(kind)
+        held = new.__dict__
+        held.update(now if len(now) == len(names) else {name: now[name] for name in names})
         held.update(changes)
         if len(held) != len(names):
             unknown = ", ".join(sorted(changes.keys() - set(names)))
             raise TypeError(f"{kind.__name__} has no field {unknown}")
-        new = object.__new__(kind)
-        object.__setattr__(new, "__dict__", held)
         return new
 
     def _copied(kind: type) -> tuple[str, ...]:

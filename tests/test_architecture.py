@@ -27,6 +27,8 @@ HOMES: dict[str, tuple[str, ...]] = {
     "mcap_protobuf": ("perchctl.log.recording",),
     "foxglove_schemas_protobuf": ("perchctl.log.recording",),
     "google": ("perchctl.log.recording",),
+    "distributed": ("perchctl.cluster",),
+    "dask": ("perchctl.cluster",),
     "pyarrow": ("perchctl.log.export.as_parquet",),
     "av": ("perchctl.track.files", "perchctl.camera.rtsp"),
 }
@@ -65,6 +67,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     (
         "perchctl.weights",
         "perchctl.faults",
+        "perchctl.cluster",
         "perchctl.check",
         "perchctl.replay",
         "perchctl.report",

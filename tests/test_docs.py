@@ -22,6 +22,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration.files import load_calibration
 from perchctl.calibration.mounting.recording import write_recordings
 from perchctl.cli import app
+from perchctl.cluster.place import place_of
 from perchctl.flight.lockstep import fly_lockstep
 from perchctl.log.jsonl import decode
 from perchctl.mission.table import TABLE
@@ -64,6 +65,7 @@ WITHOUT_A_CAMERA = {
     AIDECK: "video:flight.mp4",
     "calib/aideck_324x244.yaml": "camera.yaml",
 }
+DASK = {"scheduler": "dask_scheduler", "worker": "dask_worker", "ssh": "dask_ssh"}
 SET_UP = ("python3 -m venv ", ". .venv/", "pip install ", "git clone ", "cd ")
 
 
@@ -100,6 +102,10 @@ def cheap(line: str) -> list[str]:
         case ["perchctl", "simulate"] if "--minimise" in words or words.count("--sweep") > 1:
             words.append("--help")  # a seed that fails, and many flights; tests have both
         case ["perchctl", "simulate"]:
+            if "--cluster" in words:  # the form is looked at; a cluster of one is this computer's
+                at = words.index("--cluster")
+                place = place_of(words[at + 1])
+                words[at : at + 2] = [] if place.address else ["--cluster", "local:1"]
             if "--compare" in words:
                 words[words.index("--compare") + 1] = "quick.yaml"
             words += ["-p", "quick.yaml"]
@@ -223,7 +229,13 @@ def test_every_command_line_runs(
         shutil.copy(request.getfixturevalue("short_log"), tmp_path / "perchctl-logs")
     before = set(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
-    if words[0] == "python":
+    if "--cluster" in words:
+        pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
+    if words[0] == "dask":  # of another program the options are looked at
+        module = f"distributed.cli.{DASK[words[1]]}"
+        command = pytest.importorskip(module, reason="clusters need the extra [cluster]").main
+        said = str(command.make_context(words[1], words[2:]).params)
+    elif words[0] == "python":
         run_python(words, monkeypatch)
         said = capsys.readouterr().out
     else:
@@ -236,7 +248,9 @@ def test_every_command_line_runs(
 def test_there_are_commands_to_run() -> None:
     lines = command_lines()
     assert len(lines) > 20
-    assert {line.split()[0] for line in lines} <= {"perchctl", "python", "pytest", "ruff", "mypy"}
+    assert {line.split()[0] for line in lines} <= {
+        "perchctl", "python", "pytest", "ruff", "mypy", "dask",
+    }  # fmt: skip
 
 
 # --- examples -------------------------------------------------------------------------

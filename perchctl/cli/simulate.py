@@ -32,6 +32,15 @@ def simulate(
         int | None,
         typer.Option("--jobs", "-j", min=1, help="Flights at a time; 1 by default."),
     ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            "--cluster",
+            metavar="ADDRESS|local:N",
+            help="Fly on the workers of this dask scheduler, as tcp://10.0.0.5:8786, or of one "
+            "here with N workers.",
+        ),
+    ] = None,
     only: Annotated[
         int | None,
         typer.Option("--only", min=0, help="One flight, of this seed, told in full and logged."),
@@ -123,6 +132,7 @@ def simulate(
             flights=flights,
             seed=seed,
             jobs=jobs,
+            cluster=cluster,
             only=only,
             log_dir=log_dir,
             record=record,

@@ -53,8 +53,15 @@ class Ended(Protocol):
 class _Count:
     """What has been flown so far, and how fast."""
 
-    def __init__(self, total: int, earlier: Iterable[Ended], clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        total: int,
+        earlier: Iterable[Ended],
+        clock: Callable[[], float],
+        expected: Callable[[], int] | None = None,
+    ) -> None:
         self.total, self._clock = total, clock
+        self._expected = expected or (lambda: total)
         self._ends = Counter(result.outcome for result in earlier)
         self._before, self._began_s = self._ends.total(), clock()
         self.said_s = self._began_s
@@ -76,7 +83,7 @@ class _Count:
         elapsed_s, now = self._clock() - self._began_s, self.flown - self._before
         if not now or elapsed_s <= 0.0:
             return ""
-        left_s = elapsed_s / now * (self.total - self.flown)
+        left_s = elapsed_s / now * max(0, self._expected() - self.flown)
         return f"{60.0 * now / elapsed_s:.1f}/min {_clock_text(left_s)} left"
 
     def line(self) -> str | None:
@@ -93,10 +100,12 @@ def progress_bar(
     stream: TextIO | None = None,
     earlier: Iterable[Ended] = (),
     clock: Callable[[], float] = time.monotonic,
+    expected: Callable[[], int] | None = None,
 ) -> Iterator[Callable[[Ended], None]]:
     """Yields the function to call with each finished flight: a line of 80 columns that changes
-    on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before."""
-    count = _Count(total, earlier, clock)
+    on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before;
+    `expected`: how many it may come to, where that is less than `total`."""
+    count = _Count(total, earlier, clock, expected)
     stream = stream or sys.stderr
     text = TextColumn("{task.description}")
     with _bar("flights", text, total=total, stream=stream, width=8) as update:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 
 from perchctl.commands.interrupt import signals_to
@@ -40,6 +41,8 @@ def run(request: SimulateRequest) -> int:
         loaded()
     if request.log_dir is not None:
         make_log_folder(request.log_dir)
+        if request.cluster is not None:  # whose workers are started in other folders
+            request = replace(request, log_dir=request.log_dir.absolute())
     with signals_to(stop_once()):
         if request.faults is not None:
             return run_faults(request)
@@ -93,4 +96,5 @@ def _campaign(request: SimulateRequest) -> int:
             request,
             report,
             kept,
+            profiles=[profile],
         )

@@ -46,4 +46,5 @@ def run_compare(request: SimulateRequest) -> int:
         request,
         report,
         flights=len(profiles) * len(request.seeds),
+        profiles=profiles,
     )

@@ -52,6 +52,7 @@ def run_faults(request: SimulateRequest) -> int:
             request,
             report,
             kept,
+            profiles=[profile],
         )
 
 

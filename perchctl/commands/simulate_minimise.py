@@ -11,13 +11,13 @@ from typing import Any
 
 from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
+from perchctl.commands.simulate_hands import hands_of
 from perchctl.commands.simulate_request import SimulateRequest
 from perchctl.errors import Interrupted, InvalidValue, PerchError
 from perchctl.files import write_files
 from perchctl.flight.campaign import fly_all
 from perchctl.flight.conditions import Condition, Conditions, conditions_of
 from perchctl.flight.failure import Ended, fly_to_its_end, minimised_failure
-from perchctl.flight.hands import job_processes
 from perchctl.log.jsonl import to_plain
 from perchctl.profile.load import is_path
 from perchctl.profile.written import scalar_text
@@ -43,11 +43,10 @@ def run_minimise(request: SimulateRequest) -> int:
     conditions = conditions_of(profile, seed)
     found: Minimised | None = None
     problem: PerchError | None = None
-    jobs = request.jobs or 1
     with (
         contextlib.suppress(KeyboardInterrupt),
+        hands_of(request.cluster, request.jobs or 1, [profile]) as (executor, jobs),
         count_bar("flights", None) as advance,
-        job_processes(jobs) as executor,
     ):
         [whole] = fly_all(partial(fly_to_its_end, profile), [seed], executor)
         advance()

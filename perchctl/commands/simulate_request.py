@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol, TypeVar
 
+from perchctl.cluster.place import place_of
 from perchctl.commands.output import say
 from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import Ended, progress_bar
@@ -65,6 +66,7 @@ class SimulateRequest:
     until: str | None = None
     minimise: int | None = None
     output: Path | None = None
+    cluster: str | None = None
 
     def loaded(self) -> Profile:
         """The profile with the command line on top. Errors: NotFound, InvalidValue."""
@@ -112,10 +114,11 @@ class SimulateRequest:
             )
         if self.record and self.only is None and self.log_dir is None:
             raise UsageError("--record writes beside the logs: name their folder with --log-dir")
-        many: dict[str, int | Path | None] = {
+        many: dict[str, int | str | Path | None] = {
             "-n": self.flights,
             "--seed": self.seed,
             "--jobs": self.jobs,
+            "--cluster": self.cluster,
             "--heat-map": self.heat_map,
             "--out": self.out,
         }
@@ -131,6 +134,13 @@ class SimulateRequest:
         elif self.only is not None:
             one = f"--only {self.only} repeats the one flight of seed {self.only}"
             _refuse(one, many, ", or --only")
+        if self.cluster is not None:
+            place_of(self.cluster)
+            if self.jobs is not None:
+                raise UsageError(
+                    f"--cluster {self.cluster} flies as many at a time as it has workers: "
+                    f"--jobs {self.jobs} does not apply; leave it out, or --cluster"
+                )
         if self.heat_map is not None:
             check_output(self.heat_map, (".png",), self.force)
         if self.out is not None and self.out.suffix != ".jsonl":
@@ -144,18 +154,21 @@ class SimulateRequest:
     ) -> Iterator[Kept[R]]:
         """What becomes of each result: `--out`, `--resume`, `--keep`. Errors: InvalidValue."""
         keep = log_keeper(self.keep or "all")
-        if self.out is None:
-            yield Kept(self.seeds, {}, keep)
-            return
-        header = campaign_header(profile, faults)
-        file = open_results(self.out, header, kind, self.resume, self.force)
-        try:
-            yield Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
-        finally:
-            file.close()
+        with contextlib.ExitStack() as stack:
+            kept: Kept[R] = Kept(self.seeds, {}, keep)
+            if self.out is not None:
+                header = campaign_header(profile, faults)
+                file = open_results(self.out, header, kind, self.resume, self.force)
+                stack.callback(file.close)
+                kept = Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
+            if self.log_dir is not None and self.keep not in (None, "all"):
+                from perchctl.flight.campaign import log_of
+
+                stack.enter_context(kept.without_torn([log_of(s, self.log_dir) for s in kept.left]))
+            yield kept
 
 
-def _refuse(asked: str, options: Mapping[str, int | Path | None], instead: str) -> None:
+def _refuse(asked: str, options: Mapping[str, int | str | Path | None], instead: str) -> None:
     given = [f"{name} {value}" for name, value in options.items() if value is not None]
     if given:
         does, it = ("does", "it") if len(given) == 1 else ("do", "them")
@@ -170,30 +183,38 @@ def fly_each(
     report: Callable[[list[R], PerchError | None], None],
     kept: Kept[R] | None = None,
     flights: int | None = None,
+    profiles: Sequence[Profile] = (),
+    expected: Callable[[], int] | None = None,
 ) -> int:
-    """Flies the request's seeds in processes of their own, and reports those that were flown,
-    however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
+    """Flies the request's seeds in processes of their own or on its cluster, and reports those that
+    were flown, however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
 
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
     were flown. `kept`: those that were flown before, which count, too, and where each goes.
-    `flights`: how many it flies, by default one a seed. Errors: PerchError where none was.
+    `flights`: how many it flies, by default one a seed; `profiles`: by which; `expected`: how many
+    of them it may come to. Errors: PerchError where none was.
     """
-    from perchctl.flight.hands import job_processes
+    from perchctl.commands.simulate_hands import hands_of
 
     total = len(request.seeds) if flights is None else flights
     kept = kept or Kept(request.seeds, {}, lambda result: None)
     results: list[R] = list(kept.earlier)
-    jobs = max(1, min(request.jobs or 1, total - len(results)))
+    left = total - len(results)
+    jobs = max(1, min(request.jobs or 1, left))
+    cluster = request.cluster if left > 0 else None
     problem: PerchError | None = None
-    enough = False
+    begun = enough = False
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
-            progress_bar(total, earlier=kept.earlier) as advance,
-            job_processes(jobs) as executor,
+            hands_of(cluster, jobs, profiles, request.log_dir) as (executor, _),
+            progress_bar(total, earlier=kept.earlier, expected=expected) as advance,
         ):
+            begun = True
             campaign(executor, noting(results, kept.note, advance))
     except PerchError as error:
+        if not begun:
+            raise
         problem = error
     except EnoughFlown:
         enough = True

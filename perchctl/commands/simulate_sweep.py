@@ -33,4 +33,5 @@ def run_sweep(request: SimulateRequest) -> int:
         request,
         report,
         flights=flights,
+        profiles=profiles,
     )

@@ -56,7 +56,9 @@ def run_until(request: SimulateRequest) -> int:
         tell_logs(enough.counted, request.log_dir, request.keep)
 
     with request.results(profile, FlightResult) as kept:
-        return fly_each(campaign, request, report, kept)
+        return fly_each(
+            campaign, request, report, kept, profiles=[profile], expected=enough.expected
+        )
 
 
 def verdict(enough: Enough, width: float) -> str:

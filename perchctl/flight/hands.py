@@ -93,7 +93,7 @@ class Hands(Executor):
                 continue
             try:
                 hand = hand or self._started()
-                hand[1].send_bytes(pickle.dumps((fn, args)))
+                hand[1].send_bytes(order_of(fn, args))
                 good, answer = pickle.loads(hand[1].recv_bytes())
             except (EOFError, OSError):
                 self._let_go(hand)
@@ -134,12 +134,21 @@ def _serve(connection: Connection) -> None:
     end_with_parent()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            answer = _answer(connection.recv_bytes())
-            try:
-                form = pickle.dumps(answer)
-            except Exception as error:
-                form = pickle.dumps((False, RuntimeError(f"a result without a form: {error}")))
-            connection.send_bytes(form)
+            connection.send_bytes(answered(connection.recv_bytes()))
+
+
+def order_of(fn: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
+    """A flight in the form in which it is sent."""
+    return pickle.dumps((fn, args))
+
+
+def answered(order: bytes) -> bytes:
+    """What became of it, as sent back: whether it is good, and its result or its error."""
+    answer = _answer(order)
+    try:
+        return pickle.dumps(answer)
+    except Exception as error:
+        return pickle.dumps((False, RuntimeError(f"a result without a form: {error}")))
 
 
 def _answer(order: bytes) -> tuple[bool, Any]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import heapq
 import re
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -79,6 +79,7 @@ class Kept(Generic[R]):
         self.earlier = [earlier[seed] for seed in seeds if seed in earlier]
         self.left = [seed for seed in seeds if seed not in earlier]
         self._keep_log, self._append = keep_log, append
+        self._ended: set[Path] = set()
         own = None if folder is None else folder.resolve()
         for result in self.earlier:
             if result.log is not None and result.log.resolve().parent == own:
@@ -86,5 +87,19 @@ class Kept(Generic[R]):
 
     def note(self, result: R) -> None:
         """As a flight ends."""
+        if result.log is not None:
+            self._ended.add(result.log)
         self._append(result)
         self._keep_log(result)
+
+    @contextmanager
+    def without_torn(self, logs: Sequence[Path]) -> Iterator[None]:
+        """At the end those of the campaign's new `logs` go whose flights did not end: nobody has
+        judged whether they are worth keeping. What was there before stays."""
+        new = [log for log in logs if not log.exists()]
+        try:
+            yield
+        finally:
+            for log in new:
+                if log not in self._ended:
+                    _remove(log)

@@ -108,18 +108,19 @@ class Truth:
         return None
 
     def tick(self, tick: Tick) -> None:
-        state = self._vehicle.world.state()
+        world = self._vehicle.world
         on_purpose = tick.state.phase in MAY_TOUCH_THE_FLOOR
-        if state.floor_contact and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
+        is_down = world.on_floor()
+        if is_down and (not on_purpose or self._sink_mps > HARD_LANDING_MPS):
             self.fell = True
-        if state.floor_contact and not self._was_down:
+        if is_down and not self._was_down:
             self.touchdown_mps = max(self.touchdown_mps, self._sink_mps)
-        self._was_down = state.floor_contact
-        self._sink_mps = -float(state.velocity_mps[2])
+        self._was_down = is_down
+        self._sink_mps = -world.vz_mps
 
     def for_log(self) -> tuple[tuple[float, float, float], float]:
-        x, y, z = (float(v) for v in self._vehicle.world.state().position_m)
-        return (x, y, z), self._vehicle.world.gear_miss_m()
+        world = self._vehicle.world
+        return (world.x_m, world.y_m, world.z_m), world.gear_miss_m()
 
 
 @dataclass(frozen=True)

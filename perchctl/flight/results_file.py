@@ -33,6 +33,8 @@ R = TypeVar("R")
 FORMAT = "perchctl-campaign"
 VERSION = 1
 _GIT_S = 10.0
+_FLOWN = ("perchctl", "profiles", "calib")
+"""What of a checkout a flight depends on."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +43,8 @@ class CampaignHeader:
 
     Attributes:
         perchctl: the version.
-        commit: of the checkout that runs, with ``+changed`` where files differ from it; None for
-            an installed package.
+        commit: of the checkout that runs, with ``+changed-`` and a digest of what differs where
+            files differ from it; None for an installed package.
         profile: its name; `profile_sha256` is of all its values but name and description, and of
             the calibration.
         faults: the names that a fault is drawn from; None without.
@@ -82,18 +84,22 @@ def commit_of(root: Path) -> str | None:
     if not (root / ".git").exists():
         return None
 
-    def git(*words: str) -> str:
+    def git(*words: str) -> bytes:
         return subprocess.run(
             ["git", "-C", str(root), *words],
-            capture_output=True, text=True, check=True, timeout=_GIT_S, stdin=subprocess.DEVNULL,
-        ).stdout.strip()  # fmt: skip
+            capture_output=True, check=True, timeout=_GIT_S, stdin=subprocess.DEVNULL,
+        ).stdout  # fmt: skip
 
     try:
-        commit = git("rev-parse", "HEAD")
-        changed = git("status", "--porcelain", "--", "perchctl", "profiles", "calib")
-    except (OSError, subprocess.SubprocessError):
+        commit = git("rev-parse", "HEAD").decode().strip()
+        changed = git("diff", "--binary", "--no-ext-diff", "--no-textconv", "HEAD", "--", *_FLOWN)
+        new = git("ls-files", "-z", "--others", "--exclude-standard", "--", *_FLOWN)
+        digest = hashlib.sha256(changed)
+        for name in filter(None, new.split(b"\0")):
+            digest.update(b"\0" + name + b"\0" + (root / os.fsdecode(name)).read_bytes())
+    except (OSError, ValueError, subprocess.SubprocessError):
         return None
-    return f"{commit}+changed" if changed else commit
+    return f"{commit}+changed-{digest.hexdigest()[:8]}" if changed or new else commit
 
 
 class ResultsFile(Generic[R]):
@@ -105,7 +111,7 @@ class ResultsFile(Generic[R]):
         self._fd = fd
 
     def append(self, result: R) -> None:
-        """One line, the operating system's when this returns. Errors: InvalidValue."""
+        """One line, on the disk when this returns. Errors: InvalidValue."""
         self._write({"kind": "flight", **result_record(result)})
 
     def _write(self, record: dict[str, Any]) -> None:
@@ -114,6 +120,7 @@ class ResultsFile(Generic[R]):
         try:
             while done < len(line):
                 done += os.write(self._fd, line[done:])
+            os.fsync(self._fd)
         except OSError as error:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, good)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable
 
 from perchctl.flight.rates import rate_interval
@@ -32,6 +33,18 @@ class Enough:
     def met(self) -> bool:
         low, high = self.interval
         return high - low < self._width
+
+    def expected(self) -> int:
+        """Flights in all, if the rate stays what it is: at most the seeds that there are."""
+        flown, most = len(self.counted), len(self.counted) + len(self._coming)
+        if self.met or not flown:
+            return flown if self.met else most
+
+        def wide(n: int) -> bool:
+            low, high = rate_interval(round(self._good * n / flown), n)
+            return high - low >= self._width
+
+        return flown + 1 + bisect_left(range(flown + 1, most), True, key=lambda n: not wide(n))
 
     def note(self, result: FlightResult) -> bool:
         """Takes a flight; returns whether enough are flown. What comes then does not count."""

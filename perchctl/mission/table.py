@@ -212,8 +212,9 @@ _ROWS_OF = {phase: tuple(row for row in TABLE if phase in row.phases) for phase 
 def first_match(c: Context, table: tuple[Row, ...] = TABLE) -> Row | None:
     """The first row that applies to the phase, or None to stay. Whatever the table says, one that
     would lead from a landing to a flying phase is passed over."""
+    landing = c.state.severity >= Severity.LAND
     for row in _ROWS_OF[c.state.phase] if table is TABLE else table:
-        undoes = c.state.severity >= Severity.LAND and row.to in FLYING_PHASES
-        if c.state.phase in row.phases and not undoes and row.when(c):
+        undoes = landing and row.to in FLYING_PHASES
+        if not undoes and c.state.phase in row.phases and row.when(c):
             return row
     return None

@@ -98,7 +98,7 @@ class SimCamera:
     def _expose(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> None:
         s = self.scenario
         dropped = float(self._rng.random()) < s.camera_drop_rate
-        jitter = float(np.clip(self._rng.normal(), -JITTER_LIMIT_SIGMAS, JITTER_LIMIT_SIGMAS))
+        jitter = max(-JITTER_LIMIT_SIGMAS, min(JITTER_LIMIT_SIGMAS, float(self._rng.normal())))
         if s.camera_burst is not None and middle_s >= s.camera_burst[0] and self._burst_left > 0:
             self._burst_left -= 1
             dropped = True
@@ -129,10 +129,20 @@ class SimCamera:
 
         index, renderer = self._index, self.renderer
         if self._shutter.plain:
-            samples = [T_world_cam_at(t) for t in self._shutter.exposure_times(middle_s)]
+            samples = self._T_world_cams(
+                [pose_at(t) for t in self._shutter.exposure_times(middle_s)]
+            )
             return Later(lambda: renderer.render(samples, frame_index=index))
         shots = self._shutter.shots(middle_s, T_world_cam_at, renderer.camera.size_px[1])
         return Later(lambda: renderer.expose(shots, frame_index=index))
 
     def _T_world_cam(self, state: BodyState) -> Array:
         return make_T(state.R_world_body, state.position_m) @ self._T_body_cam
+
+    def _T_world_cams(self, states: list[BodyState]) -> Array:
+        """Of several, (n, 4, 4)."""
+        T = np.zeros((len(states), 4, 4))
+        T[:, 3, 3] = 1.0
+        for each, state in zip(T, states, strict=True):
+            each[:3, :3], each[:3, 3] = state.R_world_body, state.position_m
+        return T @ self._T_body_cam

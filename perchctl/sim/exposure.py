@@ -31,19 +31,19 @@ def sample_count(length_px: float) -> int:
     return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)
 
 
-def spread(poses: list[Array], count: int) -> list[Array]:
-    """`count` poses at the middles of equal parts of the exposure.
+def spread(poses: Array, count: int) -> Array:
+    """`count` poses (count, 4, 4) at the middles of equal parts of the exposure.
 
-    Linear in the matrices: within an exposure the turn is so small (< 0.05 rad)
-    that the loss of orthogonality is below 1e-3 of a pixel.
+    Linear in the matrices of `poses` (n, 4, 4): within an exposure the turn is so small
+    (< 0.05 rad) that the loss of orthogonality is below 1e-3 of a pixel.
     """
-    at = (np.arange(count) + 0.5) / count * (len(poses) - 1)
-    low = np.minimum(at.astype(int), max(len(poses) - 2, 0))
-    out = []
-    for a, i in zip(at, low, strict=True):
-        f = float(a) - int(i)
-        out.append(poses[i] if len(poses) == 1 else (1.0 - f) * poses[i] + f * poses[i + 1])
-    return out
+    if len(poses) == 1:
+        return np.broadcast_to(poses, (count, 4, 4))
+    last = len(poses) - 1
+    places = [(i + 0.5) / count * last for i in range(count)]
+    low = [min(int(place), last - 1) for place in places]
+    part = np.array([p - i for p, i in zip(places, low, strict=True)])[:, None, None]
+    return np.asarray((1.0 - part) * poses[low] + part * poses[[i + 1 for i in low]])
 
 
 def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:

@@ -19,6 +19,7 @@ FAR_AWAY_M = 1e4
 """The coordinates given to rays that miss the plane."""
 LEAST_RISE = 0.02
 """z of a ray (target axes, depth 1 in the view) that still meets the plane."""
+_NOTHING = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +67,17 @@ def ray_grid(camera: CameraModel, stride: int) -> RayGrid:
 
 
 def plane_map(T_target_cam: Array) -> Array:
-    """Maps a ray (x, y, 1) to (X w, Y w, w), where it meets the target's plane, (3, 3).
+    """Maps a ray (x, y, 1) to (X w, Y w, w), where it meets the target's plane, (..., 3, 3) of
+    poses (..., 4, 4).
 
     From X = t + s R r with X_z = 0. A camera above the plane sees nothing of it
     (w is made negative).
     """
-    R, t = T_target_cam[:3, :3], T_target_cam[:3, 3]
-    H = np.empty((3, 3))
-    H[:2] = t[:2, None] * R[2] - t[2] * R[:2]
-    H[2] = R[2] if t[2] < 0.0 else (0.0, 0.0, -1.0)
+    R, t = T_target_cam[..., :3, :3], T_target_cam[..., :3, 3:]
+    H = np.empty(R.shape)
+    H[..., :2, :] = t[..., :2, :] * R[..., 2:, :] - t[..., 2:, :] * R[..., :2, :]
+    above = t[..., 2, :] >= 0.0
+    H[..., 2, :] = np.where(above, _NOTHING, R[..., 2, :]) if above.any() else R[..., 2, :]
     return H
 
 

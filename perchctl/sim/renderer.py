@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
 from typing import Any
 
 import cv2
@@ -24,32 +23,29 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim.analogue import spoil
-from perchctl.sim.exposure import line_kernel, path_length_px, sample_count, spread
+from perchctl.sim.exposure import SHARP_MOTION_PX, line_kernel, path_length_px, sample_count, spread
 from perchctl.sim.gloss import shone_upon
-from perchctl.sim.pixels import Mean, lit, sample, vignetting
+from perchctl.sim.lens import lens_of
+from perchctl.sim.pixels import Mean, lit, sample
+from perchctl.sim.placed import Placed, View, beside, printed_sheet
 from perchctl.sim.rays import (
     COARSE_PX,
-    FINE_PX,
     LEAST_RISE,
-    RayGrid,
     local_px_per_m,
     plane_map,
-    ray_grid,
     trace,
 )
-from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.sim.scenario import Scenario
 from perchctl.sim.shutter import Shot, blended, woven
+from perchctl.sim.still import STILL_PX, Stills, rounded
 from perchctl.sim.surfaces import (
     CEILING_TEXTURE_PX,
     SAMPLING_SIGMA_PX,
     TILE_M,
     Ceiling,
     Picture,
-    Sheet,
-    SheetTexture,
 )
-from perchctl.sim.tiles import Tiles, by_tile, fill, reach_of, tile_rays, tiles_of
-from perchctl.target.drawing import draw_target
+from perchctl.sim.tiles import by_tile, fill
 from perchctl.vision.types import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
@@ -86,24 +82,23 @@ class Renderer:
             large=target.large.model_copy(update={"side_m": scenario.large_side_m}),
             small=target.small.model_copy(update={"side_m": scenario.small_side_m}),
         )
-        own = () if scenario.no_target else (_Placed(_printed_sheet(printed.model_dump_json())),)
-        self._sheets = (*own, *(_beside(n, printed) for n in scenario.neighbours))
+        own = () if scenario.no_target else (Placed(printed_sheet(printed.model_dump_json())),)
+        self._sheets = (*own, *(beside(n, printed) for n in scenario.neighbours))
         self._glossy_half_m = 0.0
         if own and scenario.gloss > 0.0:
             self._glossy_half_m = own[0].sheet.drawing.sheet_side_m / 2.0
+        self._stills = Stills()
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
-        self._fine = ray_grid(camera, FINE_PX)
-        self._coarse = ray_grid(camera, COARSE_PX)
-        self._focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
-        self._tiles = tile_rays(self._fine)
-        self.shade = vignetting(self._fine, camera.size_px)
+        lens = lens_of(camera)
+        self._coarse, self._tiles, self.shade = lens.coarse, lens.tiles, lens.shade
+        self._places, self._focal_px = lens.places, lens.focal_px
         self._noise = self._noise_bank()
-        self._places = _five_places(self._coarse)
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
         """The target's centre is there from now on."""
+        self._stills.forget()
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
         turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
@@ -113,7 +108,7 @@ class Renderer:
 
     def render(
         self,
-        T_world_cam_samples: Sequence[Array],
+        T_world_cam_samples: Sequence[Array] | Array,
         defocus_px: float | None = None,
         frame_index: int = 0,
     ) -> Picture:
@@ -147,19 +142,39 @@ class Renderer:
             rows, cols = self._noise[0].shape
             r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
             more, less = (bank[r : r + height, c : c + width] for bank in self._noise)
-            picture = np.asarray(cv2.subtract(cv2.add(picture, more), less), np.uint8)
+            picture = np.asarray(cv2.add(picture, more), np.uint8)
+            cv2.subtract(picture, less, picture)
         if self._analogue > 0.0:
             picture = spoil(picture, self._analogue, rng)
-        return np.asarray(picture, np.uint8)
+        return np.array(picture, np.uint8, copy=True if self._noise is None else None)
 
     def _exposed(self, shot: Shot, defocus_px: float | None) -> Picture:
-        """What falls onto the sensor in one shot, before noise."""
-        rows = [[self._T_target_world @ np.asarray(T) for T in poses] for poses in shot.rows]
+        """What falls onto the sensor in one shot, before noise. Not to be written into."""
+        rows = [self._T_target_world @ np.array(poses) for poses in shot.rows]
         motion_px = self._motion_px(rows[len(rows) // 2])
         length_px = path_length_px(motion_px)
+        sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
+        if length_px < STILL_PX and len(rows) == 1:
+            pose = rounded(rows[0][len(rows[0]) // 2])
+            motion_px, still = np.zeros((5, 1, 2)), [pose[None]]
+            make = partial(self._projected, still, motion_px, 0.0, sigma)
+            picture = self._stills.picture(pose, sigma, make)
+        else:
+            picture = self._projected(rows, motion_px, length_px, sigma)
+        return picture if shot.light is None else lit(picture, shot.light)
+
+    # -- through the lens ---------------------------------------------------
+
+    def _projected(
+        self, rows: list[Array], motion_px: Array, length_px: float, sigma_px: float
+    ) -> Picture:
+        """The picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = sample_count(length_px)
-        by_row = [[plane_map(T) for T in spread(poses, count)] for poses in rows]
-        maps = by_row[0] if len(rows) == 1 else [np.stack(m) for m in zip(*by_row, strict=True)]
+        if count == 1 and all(len(poses) % 2 for poses in rows):
+            by_row = [plane_map(poses[len(poses) // 2][None]) for poses in rows]
+        else:
+            by_row = [plane_map(spread(poses, count)) for poses in rows]
+        maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         picture: Any = self._optical(maps, motion_px, length_px)
         if self._glossy_half_m:
             middle = rows[len(rows) // 2]
@@ -167,36 +182,36 @@ class Renderer:
                 picture, self._coarse, middle[len(middle) // 2], self._lamp_m,
                 self.scenario.gloss, self._glossy_half_m,
             )  # fmt: skip
-        sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
-        lens = math.sqrt(max(sigma**2 - SAMPLING_SIGMA_PX**2, 0.0))
+        lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
         if lens > 0.05:
             picture = cv2.GaussianBlur(picture, (0, 0), lens)
         width, height = self.camera.size_px
         picture = cv2.multiply(picture[:height, :width], self.shade, scale=1.0 / 255.0)
-        picture = np.asarray(picture, np.uint8)
-        return picture if shot.light is None else lit(picture, shot.light)
+        return np.asarray(picture, np.uint8)
 
-    # -- through the lens ---------------------------------------------------
-
-    def _optical(self, maps: list[Array], motion_px: Array, length_px: float) -> Picture:
+    def _optical(self, maps: Array, motion_px: Array, length_px: float) -> Picture:
         """The picture before defocus, at the ray grids' padded size."""
         middle = maps[len(maps) // 2]
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
         nodes, misses = trace(self._coarse, middle)
         views = [view for s in self._sheets if (view := s.view(nodes, length_px)) is not None]
-        hiding = [view for view in views if view.tiles.inner.all()]
+        rows, cols = (n - 2 for n in nodes.shape[:2])
+        hiding = [view for view in views if view.hides(rows * cols)]
         if hiding:
-            height, width = ((n - 2) * COARSE_PX for n in nodes.shape[:2])
-            picture = np.empty((height, width), np.uint8)
+            picture = np.empty((rows * COARSE_PX, cols * COARSE_PX), np.uint8)
         else:
-            picture = self._background(nodes, misses, motion_px)
+            picture = self._background(nodes, misses, motion_px, length_px)
         for view in hiding or views:
             self._add_sheet(picture, view, maps)
         return picture
 
     def _background(
-        self, nodes: NDArray[np.float32], misses: NDArray[np.bool_], motion_px: Array
+        self,
+        nodes: NDArray[np.float32],
+        misses: NDArray[np.bool_],
+        motion_px: Array,
+        length_px: float,
     ) -> Picture:
         """The bare ceiling, at half resolution: its texture carries no measurement."""
         rows, cols = nodes.shape[:2]
@@ -208,20 +223,20 @@ class Renderer:
         texels = (nodes - tile) * texture.px_per_m + _CENTER_TEXEL
         half = cv2.resize(texels.astype(np.float32), None, fx=COARSE_PX // 2, fy=COARSE_PX // 2)
         crop = COARSE_PX // 2
-        half = np.ascontiguousarray(half[crop:-crop, crop:-crop])
-        picture = sample(texture.image, half, cv2.BORDER_WRAP)
+        picture = sample(texture.image, half[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip
             picture[mask > 0] = FLOOR_GREY
-        kernel = line_kernel(motion_px / 2.0)
+        kernel = line_kernel(motion_px / 2.0) if length_px >= SHARP_MOTION_PX else None
         if kernel is not None:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
         return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
 
-    def _add_sheet(self, picture: Picture, view: _View, maps: list[Array]) -> None:
+    def _add_sheet(self, picture: Picture, view: View, maps: Array) -> None:
         tiles, texture, plane = view.tiles, view.texture, view.placed.plane
-        into = by_tile(picture)
+        whole = by_tile(picture)
+        into = whole[view.box]
         fill(into, tiles.even, tiles.grey)
         outline = np.flatnonzero(tiles.outline)
         wanted = np.concatenate([outline, np.flatnonzero(tiles.edges)])
@@ -231,14 +246,15 @@ class Renderer:
         to_texels = np.array([[scale, 0.0, centre], [0.0, scale, centre], [0.0, 0.0, 1.0]])
         if plane is not None:
             to_texels = to_texels @ plane
-        grid = self._tiles.of(wanted)
+        places = np.divmod(wanted, into.shape[1])
+        top, left = (each.start for each in view.box)
+        grid = self._tiles.of((places[0] + top) * whole.shape[1] + places[1] + left)
         value, alpha = Mean(len(maps)), Mean(len(maps))
         for each in maps:
             texels = trace(grid, to_texels @ each)[0].reshape(-1, COARSE_PX**2, 2)
             value.add(sample(texture.value, texels))
             if len(outline):
                 alpha.add(sample(texture.alpha, texels[: len(outline)]))
-        places = np.divmod(wanted, into.shape[1])
         pixels = value.result()
         if len(outline):
             on = pixels[: len(outline)]
@@ -250,15 +266,16 @@ class Renderer:
 
     # -- motion -------------------------------------------------------------
 
-    def _motion_px(self, poses: list[Array]) -> Array:
-        """Path of the ceiling's image during the exposure at five places, (5, n, 2) px."""
+    def _motion_px(self, poses: Array) -> Array:
+        """Path of the ceiling's image during the exposure at five places, (5, n, 2) px, from
+        poses (n, 4, 4)."""
         if len(poses) == 1:
             return np.zeros((5, 1, 2))
-        points = plane_map(poses[len(poses) // 2]) @ self._places
+        points = plane_map(poses[len(poses) // 2]).dot(self._places)
         points /= np.maximum(points[2], LEAST_RISE)
         points[2] = 0.0
-        T = np.stack(poses)
-        cam = T[:, :3, :3].transpose(0, 2, 1) @ (points - T[:, :3, 3:])  # (n, 3, 5)
+        R, t = poses[:, :3, :3], poses[:, :3, 3:]
+        cam = R.transpose(0, 2, 1) @ (points - t)  # (n, 3, 5)
         path = cam[:, :2] * (self._focal_px / np.maximum(cam[:, 2:], 1e-3))
         return np.asarray(path.transpose(2, 0, 1))
 
@@ -277,67 +294,3 @@ class Renderer:
 
 def _bytes(grey: NDArray[np.float32]) -> Picture:
     return np.clip(grey, 0.0, 255.0).astype(np.uint8)
-
-
-def _five_places(coarse: RayGrid) -> Array:
-    """Rays (3, 5) to the picture's middle and into its quarters."""
-    rows, cols = coarse.xy.shape[:2]
-    places = [(rows // 2, cols // 2)] + [
-        (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
-    ]
-    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
-
-    sheet: Sheet
-    plane: Array | None = None
-
-    def seen_from(self, nodes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The coarse nodes (rows, columns, 2) in this sheet's axes, m."""
-        if self.plane is None:
-            return nodes
-        turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
-        return np.asarray(nodes @ turn.astype(np.float32) + shift.astype(np.float32))
-
-    def view(self, nodes: NDArray[np.float32], length_px: float) -> _View | None:
-        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
-        longest way of the picture within the exposure. None where the sheet is out of view."""
-        moved = self.seen_from(nodes)
-        side_m = self.sheet.drawing.sheet_side_m
-        reach = reach_of(moved, length_px)
-        near = reach.near(side_m)
-        rows, cols = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-        if not len(rows):
-            return None
-        j, i = int(rows.mean()) + 1, int(cols.mean()) + 1
-        texture = self.sheet.texture(local_px_per_m(moved, j, i, COARSE_PX))
-        return _View(self, texture, tiles_of(reach, texture, side_m))
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """A sheet in one exposure."""
-
-    placed: _Placed
-    texture: SheetTexture
-    tiles: Tiles
-
-
-def _beside(neighbour: Neighbour, own: TargetConfig) -> _Placed:
-    large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
-    small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
-    target = TargetConfig(
-        large=own.large.model_copy(update=large), small=own.small.model_copy(update=small)
-    )
-    to_own = make_T(rot_z(neighbour.yaw_rad), (*neighbour.xy_m, 0.0))
-    plane = np.delete(np.delete(invert_T(to_own), 2, axis=0), 2, axis=1)
-    return _Placed(_printed_sheet(target.model_dump_json()), plane)
-
-
-@lru_cache(maxsize=4)
-def _printed_sheet(target_json: str) -> Sheet:
-    """The sheet of a target; its textures cost more than a second, and flights share them."""
-    return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))

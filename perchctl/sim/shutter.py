@@ -54,6 +54,10 @@ class Shutter:
         self._s = scenario
         exposure_s = max(scenario.camera_exposure_s, 0.0)
         self._half_exposure_s = exposure_s / 2.0
+        self._steps_s = (0.0,)  # of one row's exposure, from its middle
+        if self._half_exposure_s:
+            ends_s = -self._half_exposure_s, self._half_exposure_s
+            self._steps_s = tuple(np.linspace(*ends_s, POSES_PER_EXPOSURE).tolist())
         self._apart_s = 0.0
         if scenario.camera_fields != "progressive":
             self._apart_s = 0.5 / scenario.camera_rate_hz
@@ -82,10 +86,7 @@ class Shutter:
 
     def exposure_times(self, middle_s: float) -> list[float]:
         """Moments of one row's exposure."""
-        if self._half_exposure_s == 0.0:
-            return [middle_s]
-        steps = np.linspace(-self._half_exposure_s, self._half_exposure_s, POSES_PER_EXPOSURE)
-        return [middle_s + float(step) for step in steps]
+        return [middle_s + step_s for step_s in self._steps_s]
 
     def _shot(self, middle_s: float, T_world_cam_at: Callable[[float], Array], height: int) -> Shot:
         readout_s = self._s.camera_readout_s

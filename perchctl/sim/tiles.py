@@ -22,7 +22,11 @@ TILE_PX = COARSE_PX
 _ROOM_TEXELS = 1.5
 """For the neighbours that a bilinear look-up reads, and the centre's rounding."""
 _EVERY_BYTE = np.uint64(0x0101010101010101)
+_MOST = 0.4
+"""Of a picture's tiles, from which on filling goes along its rows."""
 Mask = NDArray[np.bool_]
+Box = tuple[slice, slice]
+"""Rows and columns of tiles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +39,8 @@ class TileRays:
 
     def of(self, tiles: NDArray[np.intp]) -> RayGrid:
         """Eight rows of eight rays for each of these tiles."""
-        xy = self.xy[tiles].reshape(-1, TILE_PX, 2)
-        return RayGrid(1, xy, self.down[tiles].ravel(), self.outline)
+        xy = self.xy.take(tiles, axis=0).reshape(-1, TILE_PX, 2)
+        return RayGrid(1, xy, self.down.take(tiles, axis=0).ravel(), self.outline)
 
 
 def tile_rays(fine: RayGrid) -> TileRays:
@@ -66,6 +70,10 @@ class Reach:
     def near(self, side_m: float) -> Mask:
         """Tiles that may show a sheet of that side."""
         return np.asarray(self.off_m - np.minimum(self.reach_m, 1.0) < side_m / 2.0)
+
+    def within(self, box: Box) -> Reach:
+        """Of these tiles alone."""
+        return Reach(self.centres_m[box], self.off_m[box], self.reach_m[box])
 
 
 def reach_of(nodes: NDArray[np.float32], length_px: float) -> Reach:
@@ -107,6 +115,14 @@ def tiles_of(reach: Reach, texture: SheetTexture, side_m: float) -> Tiles:
     return Tiles(plain & (grey > 0), inner & ~plain, ~inner & ~plain, inner, grey)
 
 
+def box_of(near: Mask) -> Box | None:
+    """What holds all tiles that are `near`; None where there are none."""
+    rows, cols = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
+    if not len(rows):
+        return None
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
 def by_tile(picture: Picture) -> NDArray[np.uint64]:
     """A view of a picture of whole tiles: (rows, columns, 8), each number a row of 8 pixels."""
     height, width = picture.shape
@@ -116,7 +132,11 @@ def by_tile(picture: Picture) -> NDArray[np.uint64]:
 
 def fill(picture: NDArray[np.uint64], which: Mask, grey: Picture) -> None:
     """Tiles of a picture `by_tile` become even."""
-    picture[which] = (grey[which] * _EVERY_BYTE)[:, None]
+    if np.count_nonzero(which) > _MOST * which.size:
+        words = (grey * _EVERY_BYTE)[:, None]
+        np.copyto(picture.transpose(0, 2, 1), words, where=which[:, None])
+    else:
+        picture[which] = (grey[which] * _EVERY_BYTE)[:, None]
 
 
 def _span(x: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -53,6 +53,11 @@ DRAG_LEVEL_NSPM = 0.009
 DRAG_VERTICAL_NSPM = 0.009
 SUCTION_LENGTH_M = 0.02
 CLEAR_M = 0.05  # 25 m/s through a control period
+_BIT = mujoco.mjtDisableBit
+_UNUSED_IN_THE_OPEN = int(
+    _BIT.mjDSBL_CONTACT | _BIT.mjDSBL_CONSTRAINT | _BIT.mjDSBL_ACTUATION | _BIT.mjDSBL_EULERDAMP
+)
+"""Of a step's parts: what a body that touches nothing does not need."""
 _SIX = struct.Struct("6d")
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
@@ -94,7 +99,7 @@ class World:
         # Farther than this from floor and ceiling nothing can touch them within a step.
         self._clear_m = extent_m(scenario) + CLEAR_M
         self._on_contact = self._model.opt.disableflags
-        self._off_contact = self._on_contact | mujoco.mjtDisableBit.mjDSBL_CONTACT
+        self._off_contact = self._on_contact | _UNUSED_IN_THE_OPEN
         self._clear = False
         self._floor, self._ceiling = (self._model.geom(n).id for n in ("floor", "ceiling"))
         # Farther than this below the ceiling the gear cannot touch it.
@@ -302,6 +307,12 @@ class World:
         self.fx_mps2 = (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y + w * z) * ay + r20 * az
         self.fy_mps2 = 2 * (x * y - w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + r21 * az
         self.fz_mps2 = r02 * ax + r12 * ay + r22 * az
+
+    def on_floor(self) -> bool:
+        """Whether the floor is touched."""
+        if not self._data.ncon:
+            return False
+        return any(self._floor in pair for pair in self._data.contact.geom.tolist())
 
     def contacts(self) -> tuple[float, bool]:
         """The push between vehicle and ceiling, N, and whether the floor is touched."""

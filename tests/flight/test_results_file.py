@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -163,8 +164,26 @@ def test_a_commit_is_the_checkouts_own(tmp_path: Path) -> None:
     assert commit is not None
     assert len(commit) == 40
     assert commit_of(tmp_path / "perchctl") is None
-    (tmp_path / "perchctl" / "a.py").write_text("b")
-    assert commit_of(tmp_path) == f"{commit}+changed"
+    found = {commit}
+    for name, text in (("a.py", "b"), ("a.py", "c"), ("new.py", "a"), ("new.py", "b")):
+        (tmp_path / "perchctl" / name).write_text(text)
+        changed = commit_of(tmp_path)
+        assert changed == commit_of(tmp_path)
+        assert str(changed).startswith(f"{commit}+changed-")
+        found.add(changed)
+    assert len(found) == 5  # each change has a name of its own
+
+
+def test_a_result_is_on_the_disk_before_the_next_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power cut costs the flights that were in the air, and none that had ended."""
+    path, on_disk = tmp_path / "flown.jsonl", []
+    monkeypatch.setattr(os, "fsync", lambda fd: on_disk.append(os.fstat(fd).st_size))
+    results = open_results(path, HEADER, FlightResult)
+    results.append(FLOWN)
+    assert on_disk[-1] == path.stat().st_size
+    results.close()
 
 
 def _logs(folder: Path) -> list[FlightResult]:
@@ -214,3 +233,21 @@ def test_a_campaign_that_goes_on_judges_the_logs_of_its_own_folder(tmp_path: Pat
     assert kept.left == [3]
     left = {path.name for path in tmp_path.rglob("*.jsonl")}
     assert left == {"flight_seed1.jsonl", "flight_seed2.jsonl"}
+
+
+def test_the_logs_of_flights_that_were_broken_off_go(tmp_path: Path) -> None:
+    logs = [tmp_path / f"flight_seed{seed}.jsonl" for seed in range(3)]
+    logs[0].touch()  # another campaign's
+    kept: Kept[FlightResult] = Kept(range(3), {}, log_keeper("failed"))
+
+    def stopped() -> None:
+        with kept.without_torn(logs):
+            for log in logs[1:]:
+                log.touch()
+                recording_of(log).touch()
+            kept.note(replace(FLOWN, seed=1, outcome="landed", miss_m=None, log=logs[1]))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stopped()
+    assert set(tmp_path.iterdir()) == {logs[0], logs[1], recording_of(logs[1])}

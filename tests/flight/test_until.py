@@ -75,3 +75,20 @@ def test_a_rate_of_one_takes_as_many_as_its_interval_says() -> None:
     enough = Enough(range(1000), 0.005)
     last = next(seed for seed in range(1000) if enough.note(perched(seed)))
     assert last + 1 == 736
+
+
+def test_what_it_may_come_to_is_what_the_present_rate_needs() -> None:
+    """When all perch, 0.5 % take 736 flights; once one has not, more than there are."""
+    enough = Enough(range(1000), 0.005)
+    assert enough.expected() == 1000
+    for seed in range(10):
+        enough.note(perched(seed))
+        assert enough.expected() == 736
+    enough.note(landed(10))
+    assert enough.expected() == 1000
+    met = Enough(range(1000), 0.5)
+    for seed in range(100):
+        if met.note(perched(seed)):
+            break
+    assert met.met
+    assert met.expected() == len(met.counted)

@@ -1,5 +1,5 @@
 """A campaign of flights that are none; run as a program, one that says when its first is done,
-and then waits for a signal."""
+and then waits for a signal. Its argument is a cluster; without one, two processes fly."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ def campaign(
 
 
 if __name__ == "__main__":
+    WHERE = sys.argv[1] if sys.argv[1:] else None
     say = partial(print, flush=True)
     sys.exit(
         campaign(
             ends_first_only,
-            SimulateRequest(flights=6, jobs=2),
+            SimulateRequest(flights=6, jobs=None if WHERE else 2, cluster=WHERE),
             lambda flown, problem: say("report", len(flown), problem),
             lambda result: say(result.pid),
         )

@@ -71,20 +71,46 @@ def test_blind_it_sums_up_the_accelerometer(at: At) -> None:
     # Half of 0.0125 m/s^2 times the square of the time.
     assert float(np.median(away)) == pytest.approx(0.4, rel=0.3)
     assert math.hypot(*seen.position_error_m[:2]) < 0.1
-    assert min(deck.variance_m2 for deck in blind) > 0.2 > 0.01 > seen.variance_m2
+    assert min(deck.variance for deck in blind) > 0.2 > 0.01 > seen.variance
 
 
-def test_when_it_sees_again_the_speed_is_right_and_the_place_stays_off() -> None:
+def test_a_good_floor_keeps_it_within_five_centimetres_for_half_a_minute() -> None:
+    decks = [flown(At(), 30.0, seed=seed, flow_noise_radps=0.05) for seed in range(6)]
+    assert rms([p for deck in decks for p in deck.position_error_m[:2]]) < 0.05
+
+
+def test_it_trusts_flow_as_little_as_the_firmware() -> None:
+    """Two counts are 0.41 rad/s: a speed that is wrong is taken over within a second, not at
+    once, and the attitude learns what keeps making it wrong."""
+    deck = FlowDeck(Scenario(seed=1, flow_bias_radps=(0.05, 0.0)))
+    speeds = {}
+    for step in range(1, 5001):
+        deck.step(At())
+        speeds[round(step * CONTROL_PERIOD_S, 3)] = deck.velocity_error_mps[0]
+    assert speeds[0.1] < 0.01 < 0.04 < speeds[10.0] < 0.06
+
+
+def test_blind_the_reported_variance_grows_as_it_was_measured() -> None:
+    """0.05 after 4 s and 0.2 after 7 s (docs/firmware.md)."""
+    deck = flown(At(z_m=0.5), 10.0, **GOOD, flow_reach_m=1.5)
+    grown = []
+    for seconds in (4, 3):
+        for _ in range(round(seconds / CONTROL_PERIOD_S)):
+            deck.step(At(z_m=1.6))
+        grown.append(deck.variance)
+    assert grown == pytest.approx([0.05, 0.2], rel=0.35)
+
+
+def test_when_it_sees_again_the_speed_is_right_and_the_place_goes_no_farther() -> None:
     deck = flown(At(z_m=2.6), 8.0, flow_reach_m=2.5, **GOOD)
     assert math.hypot(*deck.velocity_error_mps) > 0.05
     places = []
     for _ in range(2):
-        for _ in range(1000):
+        for _ in range(2000):
             deck.step(At(z_m=1.0))
         places.append(deck.position_error_m[:2])
         assert math.hypot(*deck.velocity_error_mps) < 0.03
-    assert math.hypot(*places[0]) > 0.03 > math.dist(*places)
-    assert deck.variance_m2 > 0.01  # and it knows
+    assert math.dist(*places) < 0.03
 
 
 def test_a_patch_blinds_as_long_as_it_is_all_that_is_in_view() -> None:
@@ -117,9 +143,9 @@ def test_the_estimate_has_the_decks_errors_once_it_has_flown() -> None:
     for step in range(1000):
         estimator.update(world, step * CONTROL_PERIOD_S, flown=False, spinning=False)
     assert estimator.now.x_m == 0.0
-    for step in range(1000):
+    for step in range(4000):
         estimator.update(world, step * CONTROL_PERIOD_S, flown=True, spinning=True)
-    assert estimator.now.x_m == pytest.approx(0.2, rel=0.2)
+    assert estimator.now.x_m == pytest.approx(0.8, rel=0.2)
     assert estimator.now.vx_mps == pytest.approx(0.1, rel=0.2)
     estimator.reset(2.0)
     estimator.update(world, 2.0, flown=False, spinning=False)

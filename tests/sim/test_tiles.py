@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import perchctl.sim.renderer as rendering
+import perchctl.sim.placed as placed
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim.renderer import Renderer
@@ -56,7 +56,8 @@ def test_even_tiles_are_what_their_pixels_are(
     renderer: Renderer, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quick = renderer.render(EXPOSURES[name])
-    monkeypatch.setattr(rendering, "tiles_of", each_pixel)
+    monkeypatch.setattr(placed, "tiles_of", each_pixel)
+    renderer.move_target(SCENE.target_xy_m)  # no picture of before is kept
     assert np.array_equal(quick, renderer.render(EXPOSURES[name]))
 
 
@@ -65,7 +66,8 @@ def test_so_they_are_with_a_rolling_shutter(
 ) -> None:
     rows = tuple((pose(0.25, 0.01 * k, 0.0, 0.02 * k),) for k in range(5))
     quick = renderer.expose([Shot(rows)])
-    monkeypatch.setattr(rendering, "tiles_of", each_pixel)
+    monkeypatch.setattr(placed, "tiles_of", each_pixel)
+    renderer.move_target(SCENE.target_xy_m)  # no picture of before is kept
     assert np.array_equal(quick, renderer.expose([Shot(rows)]))
 
 
@@ -77,7 +79,8 @@ def test_most_of_a_near_sheet_is_even(renderer: Renderer, monkeypatch: pytest.Mo
         shares.append(float(found.even.mean()))
         return found
 
-    monkeypatch.setattr(rendering, "tiles_of", watched)
+    monkeypatch.setattr(placed, "tiles_of", watched)
+    renderer.move_target(SCENE.target_xy_m)
     renderer.render(EXPOSURES["nothing but paper"])
     assert max(shares) > 0.6
 

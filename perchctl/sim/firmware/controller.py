@@ -45,15 +45,11 @@ class Pid:
     def set_limit(self, limit: float) -> None:
         self._limit = limit
 
-    def update(self, desired: float, measured: float) -> float:
-        return self.respond(desired - measured, measured - self._measured, measured)
-
-    def update_angle(self, desired: float, measured: float) -> float:
-        """As `update`, on the circle of 360 degrees."""
-        error = cap_deg(desired - measured)
-        return self.respond(error, cap_deg(measured - self._measured), measured)
-
-    def respond(self, error: float, change: float, measured: float) -> float:
+    def update(self, desired: float, measured: float, turning: bool = False) -> float:
+        """`turning`: on the circle of 360 degrees."""
+        error, change = desired - measured, measured - self._measured
+        if turning:
+            error, change = cap_deg(error), cap_deg(change)
         integral = self._integral + error * self._period
         bound = self._i_limit
         if integral > bound:
@@ -192,7 +188,7 @@ class Controller:
         )
         yaw = -_saturated(
             self.yaw_rate.update(
-                self.yaw.update_angle(self.desired_yaw_deg, now.yaw_deg), now.gyro_z_dps
+                self.yaw.update(self.desired_yaw_deg, now.yaw_deg, True), now.gyro_z_dps
             )
         )
         self.outputs = (roll, pitch, yaw)

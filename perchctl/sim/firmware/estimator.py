@@ -27,6 +27,7 @@ from perchctl.sim.flow_deck import FlowDeck, has_flow_errors
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 _STREAM = 2
+_DEG = 180.0 / math.pi
 _BATCH = 2048
 _NOISE_EVERY = 5  # coloured noise advances at 100 Hz
 _POSITION_MEMORY_S = 0.3
@@ -127,7 +128,7 @@ class Estimator:
         deck_m2 = _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
             -(t_s - self._reset_s) / _VARIANCE_FALL_S
         )
-        return deck_m2 if self._flow is None else deck_m2 + self._flow.variance_m2
+        return deck_m2 if self._flow is None else deck_m2 + self._flow.variance
 
     def update(
         self,
@@ -157,17 +158,17 @@ class Estimator:
         roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         lift = 2 * (w * y - x * z)
         pitch = math.asin(lift if -1.0 <= lift <= 1.0 else math.copysign(1.0, lift))
-        now.roll_deg = cap_deg(math.degrees(roll + bias[0]))
-        now.pitch_deg = -math.degrees(pitch + bias[1])  # the firmware's pitch is nose up
-        now.yaw_deg = math.degrees(math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
+        now.roll_deg = cap_deg(_DEG * (roll + bias[0]))
+        now.pitch_deg = -_DEG * (pitch + bias[1])  # the firmware's pitch is nose up
+        now.yaw_deg = _DEG * math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
         white = self._white
         if len(white) < 12:
             white = self._white = self._rng.standard_normal(_BATCH).tolist()
         n6, n5, n4, n3, n2, n1 = white[-6:]
         del white[-6:]
-        now.gyro_x_dps = math.degrees(world.p_radps + gyro_bias[0]) + _GYRO_NOISE_DPS * n1
-        now.gyro_y_dps = math.degrees(world.q_radps + gyro_bias[1]) + _GYRO_NOISE_DPS * n2
-        now.gyro_z_dps = math.degrees(world.r_radps + gyro_bias[2]) + _GYRO_NOISE_DPS * n3
+        now.gyro_x_dps = _DEG * (world.p_radps + gyro_bias[0]) + _GYRO_NOISE_DPS * n1
+        now.gyro_y_dps = _DEG * (world.q_radps + gyro_bias[1]) + _GYRO_NOISE_DPS * n2
+        now.gyro_z_dps = _DEG * (world.r_radps + gyro_bias[2]) + _GYRO_NOISE_DPS * n3
         if self.spoil is not None:
             self.spoil(now)
         ax, ay, az = self.acc_g

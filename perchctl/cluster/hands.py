@@ -1,0 +1,289 @@
+"""The workers of a dask cluster as an executor: flights in, futures of `concurrent.futures` out.
+
+All that is dask's runs in one event loop, in a thread that never sees a signal. A worker is handed
+one flight at a time; the rest wait here, where they cost the scheduler nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import pickle
+import threading
+import warnings
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from multiprocessing import resource_tracker
+from pathlib import Path
+from typing import Any, TypeVar
+
+from distributed import Client, KilledWorker
+from distributed.versions import VersionMismatchWarning
+
+from perchctl.cluster.asking import ask_all, ask_scheduler, cannot_load
+from perchctl.cluster.local import LocalWorkers, local_scheduler
+from perchctl.cluster.place import Place
+from perchctl.cluster.wanted import Wanted, wanted
+from perchctl.cluster.worker import fly_order
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
+from perchctl.flight.hands import order_of
+from perchctl.flight.uninterrupted import uninterrupted
+from perchctl.profile import Profile
+
+R = TypeVar("R")
+
+ANSWER_S = 10.0
+"""A scheduler may take so long to answer."""
+HANGS_S = 60.0
+"""One that has answered before, and so long does not, is lost."""
+WORKERS_S = 20.0
+"""It may take so long until it has a worker."""
+NOBODY_S = 120.0
+"""For so long a campaign waits without any worker."""
+LOCAL_S = 600.0
+"""For so long it waits for one here, which has to load all libraries; one that cannot is seen."""
+_LOOK_S = 0.25
+_CLOSE_S = 0.5
+_END_S = 1.0
+_QUIET = ("distributed", "tornado", "asyncio")
+
+
+class ClusterHands(Executor):
+    """`width`: workers at the start. `notes`: what is worth saying, a sentence each."""
+
+    def __init__(self, place: Place, asked: Wanted) -> None:
+        self.width, self.notes = place.workers, list[str]()
+        self.local = None if place.address else LocalWorkers(place.workers)
+        self._place, self._asked = place, asked
+        self._orders: deque[tuple[Future[Any], Callable[..., Any], tuple[Any, ...]]] = deque()
+        self._flying: set[asyncio.Task[None]] = set()
+        self._lock = threading.Lock()
+        self._broken: PerchError | None = None
+        self._ended = False
+        self._address = place.address or ""
+        self._workers = self._number = 0
+        self._nobody_s = 0.0
+        self._ready: Future[None] = Future()
+        self._task: asyncio.Task[None] | None = None
+        self._thread = threading.Thread(target=self._live, name="perchctl-cluster", daemon=True)
+
+    def start(self) -> None:
+        """Returns as flights can be handed over. Errors: PerchError."""
+        resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
+        with uninterrupted():  # threads and processes have the mask of who starts them
+            self._thread.start()
+        self._ready.result()
+
+    def submit(self, fn: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
+        """The future fails with `BrokenExecutor` where the worker that flew was lost, and with
+        PerchError where it must not fly, or none is left that could."""
+        if kwargs:
+            raise TypeError("a flight has no arguments by name")
+        if self._ended:
+            raise RuntimeError("no flight can be handed to a cluster that was left")
+        future: Future[R] = Future()
+        with self._lock:
+            if self._broken is not None:
+                future.set_exception(self._broken)
+                return future
+            self._orders.append((future, fn, args))
+        self._call(self._hand_over)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Leaves the cluster; what it is flying is dropped."""
+        self._ended = True
+        self._call(self._leave)
+        if wait and self._thread.ident is not None:
+            self._thread.join(_END_S)
+        if self.local is not None:
+            self.local.kill()
+
+    def _call(self, what: Callable[[], object]) -> None:
+        if self._task is not None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._task.get_loop().call_soon_threadsafe(what)
+
+    def _live(self) -> None:
+        """The thread's life."""
+        try:
+            asyncio.run(self._work())
+        except asyncio.CancelledError:
+            self._fail(PerchError("the cluster was left"))
+        except PerchError as error:
+            self._fail(error)
+        except Exception as error:
+            self._fail(self._unforeseen(error))
+
+    def _fail(self, why: PerchError) -> None:
+        """All flights fail that were handed over and are not flown."""
+        with self._lock:
+            self._broken = why
+            orders = list(self._orders)
+            self._orders.clear()
+        for future, _, _ in orders:
+            future.set_exception(why)
+        if not self._ready.done():
+            self._ready.set_exception(why)
+
+    # --- in the event loop ----------------------------------------------------------------
+
+    def _leave(self) -> None:
+        assert self._task is not None
+        self._task.cancel()
+
+    async def _work(self) -> None:
+        self._task = asyncio.current_task()
+        if self._ended:
+            return
+        async with contextlib.AsyncExitStack() as stack:
+            if self._place.address is None:
+                self._address = await stack.enter_async_context(self._started())
+            self._client = await stack.enter_async_context(_connected(self._address))
+            await ask_scheduler(self._client, self._address)
+            await self._first_worker()
+            self.notes = await ask_all(self._client, self._asked)
+            self.width = self._place.workers or self._workers
+            self._ready.set_result(None)
+            while True:
+                await self._look(NOBODY_S if self.local is None else LOCAL_S)
+                self._hand_over()
+
+    @contextlib.asynccontextmanager
+    async def _started(self) -> AsyncIterator[str]:
+        """The scheduler and the workers of this computer; yields the address."""
+        assert self.local is not None
+        async with local_scheduler(self.local.folder) as scheduler:
+            try:
+                self._scheduler = scheduler
+                await self.local.start(scheduler.address)
+                yield str(scheduler.address)
+            finally:
+                self.local.kill()
+
+    async def _first_worker(self) -> None:
+        while not self._workers:
+            await self._look(WORKERS_S if self.local is None else LOCAL_S)
+
+    async def _look(self, nobody_s: float) -> None:
+        """Who is there, a moment from now. Errors: ConnectionFailed, where the scheduler is not,
+        or for `nobody_s` no worker; PerchError."""
+        await asyncio.sleep(_LOOK_S)
+        try:
+            if self._client.status != "running":
+                raise OSError(self._client.status)
+            self._workers = len(await asyncio.wait_for(self._client.nthreads(), HANGS_S))
+        except (OSError, TimeoutError) as error:
+            raise self._scheduler_lost() from error
+        if self.local is not None:
+            there = {worker.name for worker in self._scheduler.workers.values()}
+            self.local.look_after(self._address, there)
+        now_s = asyncio.get_running_loop().time()
+        if self._workers or not self._nobody_s:
+            self._nobody_s = now_s
+        elif now_s - self._nobody_s >= nobody_s:
+            if self.local is not None:
+                raise ConnectionFailed(
+                    f"no worker of --cluster {self._place} has come up within {nobody_s:.0f} s: "
+                    f"end what keeps this computer busy, or start fewer"
+                )
+            raise ConnectionFailed(
+                f"the scheduler at {self._address} has had no worker for {nobody_s:.0f} s: start "
+                f"some with dask worker {self._address} --nthreads 1"
+            )
+
+    def _hand_over(self) -> None:
+        """One flight a worker."""
+        while self._orders and len(self._flying) < max(1, self._workers):
+            with self._lock:
+                order = self._orders.popleft()
+            if not order[0].set_running_or_notify_cancel():
+                continue
+            task = asyncio.create_task(self._fly(*order))
+            self._flying.add(task)
+            task.add_done_callback(self._landed)
+
+    def _landed(self, task: asyncio.Task[None]) -> None:
+        self._flying.discard(task)
+        self._hand_over()
+
+    async def _fly(
+        self, future: Future[Any], fn: Callable[..., Any], args: tuple[Any, ...]
+    ) -> None:
+        try:
+            order = order_of(fn, args)
+        except Exception as error:  # nothing that can be sent
+            future.set_exception(error)
+            return
+        self._number += 1
+        key = f"{self._asked.campaign}-{self._number}"
+        try:
+            flight = self._client.submit(fly_order, order, self._asked, key=key, pure=False)
+            good, answer = pickle.loads(await flight.result())
+        except KilledWorker:
+            future.set_exception(BrokenExecutor("the worker that flew was lost"))
+        except (Exception, asyncio.CancelledError) as error:
+            if self._client.status != "running" or self._ended:
+                future.set_exception(self._broken or self._scheduler_lost())
+            elif isinstance(error, CancelledError | asyncio.CancelledError | OSError):
+                future.set_exception(BrokenExecutor("the cluster has dropped the flight"))
+            else:
+                future.set_exception(InvalidValue(cannot_load("a worker", error)))
+        else:
+            (future.set_result if good else future.set_exception)(answer)
+
+    def _scheduler_lost(self) -> ConnectionFailed:
+        return ConnectionFailed(
+            f"the scheduler of --cluster {self._place} does not answer any more: start it again, "
+            f"and go on with what was written to --out by --resume"
+        )
+
+    def _unforeseen(self, error: Exception) -> PerchError:
+        if os.environ.get("PERCHCTL_DEBUG"):
+            logging.getLogger("perchctl").exception("the cluster failed")
+        return ConnectionFailed(
+            f"--cluster {self._place} failed ({type(error).__name__}: {error}): look at what its "
+            f"scheduler says (PERCHCTL_DEBUG=1 shows more)"
+        )
+
+
+@contextlib.asynccontextmanager
+async def _connected(address: str) -> AsyncIterator[Any]:
+    """Errors: ConnectionFailed."""
+    # Versions that matter are asked for.
+    warnings.filterwarnings("ignore", category=VersionMismatchWarning)
+    client = Client(address, asynchronous=True, set_as_default=False, timeout=ANSWER_S)
+    try:
+        try:
+            await asyncio.wait_for(client, ANSWER_S + 1.0)
+        except Exception as error:
+            raise ConnectionFailed(
+                f"no dask scheduler answers at {address} within {ANSWER_S:.0f} s "
+                f"({type(error).__name__}): start dask scheduler there, or mend the address"
+            ) from error
+        yield client
+    finally:
+        with contextlib.suppress(Exception):
+            await client.close(timeout=_CLOSE_S)
+
+
+@contextlib.contextmanager
+def cluster_hands(
+    place: Place, profiles: Sequence[Profile], folder: Path | None = None
+) -> Iterator[ClusterHands]:
+    """The workers there, which have this computer's program and data for these profiles, and where
+    it is given, its `folder`. Errors: ConnectionFailed, InvalidValue, PerchError."""
+    if not os.environ.get("PERCHCTL_DEBUG"):
+        for name in (*_QUIET, *logging.root.manager.loggerDict):
+            if name.startswith(_QUIET):
+                logging.getLogger(name).setLevel(logging.CRITICAL)
+    with wanted(profiles, folder) as asked:
+        hands = ClusterHands(place, asked)
+        try:
+            hands.start()
+            yield hands
+        finally:
+            hands.shutdown()

@@ -1,0 +1,222 @@
+"""A real scheduler, and workers that are killed, must not fly, or never come."""
+
+from __future__ import annotations
+
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
+
+from perchctl.cluster import hands as cluster
+from perchctl.cluster.hands import ClusterHands, cluster_hands
+from perchctl.cluster.place import place_of
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
+from perchctl.flight.campaign import FLOWN_AGAIN, fly_all, run_campaign
+from perchctl.flight.record import flown_record
+from perchctl.profile import load_profile
+from tests.helpers.cluster import dies_in_flight, scheduler, worker
+from tests.helpers.flights import ROOT, SEED, SHORT
+from tests.helpers.seeds import (
+    Ended,
+    ends_at_once,
+    ends_badly,
+    ends_first_only,
+    fails_later,
+    is_lost,
+    no_form,
+)
+
+pytestmark = pytest.mark.long
+
+AT_ONCE_S = 20.0
+"""Beside the time for which the flights would go on; on a busy machine, too."""
+
+
+# --- workers of this computer ----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterHands]:
+    with cluster_hands(place_of("local:2"), [load_profile(SHORT)]) as hands:
+        yield hands
+
+
+def folder_of(hands: ClusterHands) -> Path:
+    assert hands.local is not None
+    return Path(hands.local.folder)
+
+
+def test_each_flight_is_flown_in_a_process_that_is_deaf_to_signals(local: ClusterHands) -> None:
+    told: list[int] = []
+    flown = fly_all(ends_at_once, [3, 0, 1, 3, 2], local, lambda result: told.append(result.seed))
+    assert [flight.seed for flight in flown] == [3, 0, 1, 2]
+    assert sorted(told) == [0, 1, 2, 3]
+    assert all(flight.deaf for flight in flown)
+    assert local.local is not None
+    assert {flight.pid for flight in flown} <= set(local.local.pids)
+    assert local.width == 2
+    assert local.notes == []
+
+
+def test_what_fails_is_told_as_in_processes(local: ClusterHands) -> None:
+    with pytest.raises(PerchError, match="unforeseen ZeroDivisionError in the flight of seed 1"):
+        fly_all(fails_later, [0, 1], local)
+    assert isinstance(local.submit(no_form).exception(), RuntimeError)
+    assert local.submit(lambda: None).exception() is not None
+    assert local.submit(len, (1, 2)).result() == 2
+
+
+def test_a_lost_worker_is_replaced_and_its_flight_flown_again(
+    local: ClusterHands, tmp_path: Path
+) -> None:
+    """What dask gives up, here after the first time, is the campaign's to hand over again."""
+    fly = partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN)
+    assert isinstance(local.submit(fly, 1).exception(AT_ONCE_S), BrokenExecutor)
+    flown = fly_all(fly, [0, 1, 2, 3], local)
+    assert [flight.seed for flight in flown] == [0, 1, 2, 3]
+    marks = Counter(path.name[0] for path in tmp_path.iterdir())
+    assert marks == {"0": 1, "1": 1 + FLOWN_AGAIN, "2": 1, "3": 1}
+
+
+def test_a_real_flight_survives_a_worker_that_is_killed_in_the_middle(
+    local: ClusterHands, tmp_path: Path
+) -> None:
+    """They end as in one process. (40 whole ones: `test_identical.py`.)"""
+    profile = load_profile(SHORT)
+    fly = partial(dies_in_flight, profile, tmp_path, (SEED,))
+    flown = fly_all(fly, [SEED], local)
+    assert [path.name for path in tmp_path.iterdir()] == [str(SEED)]
+    alone = run_campaign(profile, [SEED])
+    assert [flown_record(flight) for flight in flown] == [flown_record(flight) for flight in alone]
+
+
+def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No process, no folder, and no page's port of dask's."""
+    monkeypatch.chdir(tmp_path)
+    with cluster_hands(place_of("local:1"), []) as hands:
+        assert hands.local is not None
+        (pid,) = hands.local.pids
+        folder = folder_of(hands)
+        assert fly_all(ends_at_once, [1], hands)[0].pid == pid
+        assert folder.is_dir()
+    assert not folder.exists()
+    assert not Path(f"/proc/{pid}").exists()
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(RuntimeError):
+        hands.submit(ends_at_once, 1)
+
+
+def test_a_worker_that_cannot_start_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not started again for ever."""
+    monkeypatch.setattr("perchctl.cluster.local.serve", ends_badly)
+    with (
+        pytest.raises(PerchError, match=r"worker 0 of .* local:1 ends at its start \(exit 3"),
+        cluster_hands(place_of("local:1"), []),
+    ):
+        raise AssertionError
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_program_that_is_ended_leaves_nothing_behind(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    """A terminal sends its signals to all; what was flown is told."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.helpers.jobs", "local:1"],
+        env=os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)},
+        cwd=ROOT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as program:
+        assert program.stdout is not None
+        child = os.pidfd_open(int(program.stdout.readline()))
+        if number == signal.SIGKILL:
+            program.kill()
+        else:
+            os.killpg(program.pid, number)
+        ended, _, _ = select.select([child], [], [], AT_ONCE_S)
+        os.close(child)
+        out, err = program.communicate(timeout=AT_ONCE_S)
+    assert ended
+    if number != signal.SIGKILL:
+        assert program.returncode == 130
+        assert out == "report 1 stopped: 1 of 6 flights were flown\n"
+        assert err == "perchctl: stopped: 1 of 6 flights were flown\n"
+    end_s = time.monotonic() + AT_ONCE_S
+    while list(tmp_path.glob("perchctl-cluster-*")):
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+# --- a scheduler that is there, with workers as users start them ------------------------------
+
+
+def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
+    """dask hands its flight to the other; each seed counts once. Then the scheduler is lost."""
+    marks, logs = tmp_path / "marks", tmp_path / "logs"
+    marks.mkdir()
+    logs.mkdir()
+    with scheduler(tmp_path) as (address, process), ExitStack() as stack:
+        workers = [stack.enter_context(worker(address, tmp_path)) for _ in range(2)]
+        hands = stack.enter_context(cluster_hands(place_of(address), [load_profile("sim")], logs))
+        flown = fly_all(partial(is_lost, folder=marks, times=1), [0, 1, 2, 3], hands)
+        assert [flight.seed for flight in flown] == [0, 1, 2, 3]
+        assert {flight.pid for flight in flown} <= {each.pid for each in workers}
+        assert Counter(path.name[0] for path in marks.iterdir()) == {"0": 1, "1": 2, "2": 1, "3": 1}
+        assert len(list(logs.iterdir())) == 1  # the mark of this campaign
+
+        told: list[Ended] = []
+
+        def lose(result: Ended) -> None:
+            told.append(result)
+            process.kill()
+
+        with pytest.raises(ConnectionFailed, match="does not answer any more: start it again, and"):
+            fly_all(ends_first_only, [0, 1, 2], hands, lose)
+        assert [flight.seed for flight in told] == [0]
+        error = hands.submit(ends_at_once, 1).exception(AT_ONCE_S)
+        assert isinstance(error, ConnectionFailed)
+    assert list(logs.iterdir()) == []
+
+
+def test_workers_that_must_not_fly_and_none_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(ROOT / "perchctl", other / "perchctl")
+    with (other / "perchctl" / "geometry.py").open("a") as file:
+        file.write("# another\n")
+    with scheduler(tmp_path) as (address, _process):
+        monkeypatch.setattr(cluster, "WORKERS_S", 0.3)
+        with (
+            pytest.raises(ConnectionFailed, match=r"has had no worker for .* dask worker tcp://"),
+            cluster_hands(place_of(address), []),
+        ):
+            raise AssertionError
+        monkeypatch.setattr(cluster, "WORKERS_S", 60.0)
+        unfit = partial(pytest.raises, InvalidValue, match=r"^worker tcp://127.* the source ")
+        with worker(address, tmp_path), cluster_hands(place_of(address), []) as hands:
+            assert fly_all(ends_at_once, [1], hands)
+            hands.submit(ends_first_only, 1)
+            with worker(address, tmp_path, root=other):  # comes later
+                with unfit():
+                    fly_all(ends_at_once, range(2, 4), hands)
+                with unfit(), cluster_hands(place_of(address), []):
+                    raise AssertionError

@@ -1,0 +1,90 @@
+"""`--cluster ADDRESS`: its forms, and what it goes together with."""
+
+from __future__ import annotations
+
+import importlib.util
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.cluster.place import Place, place_of
+from perchctl.commands.simulate_request import SimulateRequest
+from perchctl.errors import UsageError
+from tests.helpers.commands import elsewhere, run  # noqa: F401
+from tests.helpers.flights import SHORT
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("local:1", Place(None, 1)),
+        ("local:64", Place(None, 64)),
+        ("tcp://10.0.0.5:8786", Place("tcp://10.0.0.5:8786")),
+        ("node7.lab:8786", Place("tcp://node7.lab:8786")),
+        ("tls://[::1]:8786", Place("tls://[::1]:8786")),
+    ],
+)
+def test_an_address_is_read(text: str, place: Place) -> None:
+    assert place_of(text) == place
+    assert place_of(str(place)) == place
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "local", "local:", "local:0", "local:1025", "local:-1", "local:2.5", "local:\u00b2",
+        "localhost", "10.0.0.5", "tcp://10.0.0.5", "http://10.0.0.5:8786", "10.0.0.5:0",
+        "10.0.0.5:65536", "a b:8786", "local:" + 5000 * "9",
+    ],
+)  # fmt: skip
+def test_what_is_none_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"must be .* as in --cluster"):
+        place_of(text)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"jobs": 2}, "--jobs 2 does not apply"),
+        ({"only": 3}, "--cluster local:2 does not apply; leave it out, or --only"),
+        ({"faults": "list"}, "--cluster local:2 does not apply"),
+        ({"minimise": 3, "jobs": 1}, "--jobs 1 does not apply"),
+    ],
+)
+def test_what_does_not_go_with_it_is_refused(options: dict[str, Any], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        SimulateRequest(cluster="local:2", **options).check()
+
+
+def test_without_the_library_one_sentence_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    there = importlib.util.find_spec
+    hide = lambda name, *rest: None if name == "distributed" else there(name, *rest)  # noqa: E731
+    monkeypatch.setattr("perchctl.commands.simulate_hands.find_spec", hide)
+    said = run("simulate", "-p", SHORT, "-n", "2", "--cluster", "local:2")
+    assert said.code == 2
+    assert said.complaint.startswith("--cluster needs the library distributed (it is missing)")
+    assert said.complaint.endswith("-m pip install 'perchctl[cluster]'")
+
+
+def test_an_address_that_nobody_answers_is_told_in_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
+    monkeypatch.setattr("perchctl.cluster.hands.ANSWER_S", 0.3)
+    with socket.socket() as deaf:  # is bound, and takes no call
+        deaf.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{deaf.getsockname()[1]}"
+        said = run(
+            "simulate", "-p", SHORT, "-n", "2", "--cluster", address, "--log-dir", str(tmp_path)
+        )
+    assert said.code == 10
+    assert said.stdout == ""
+    assert said.complaint.startswith(f"no dask scheduler answers at tcp://{address} within")
+    assert said.complaint.endswith("start dask scheduler there, or mend the address")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,93 @@
+"""A dask scheduler and workers as a user starts them, on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from perchctl.flight.campaign import fly_seed
+from perchctl.flight.lockstep import fly_lockstep
+from perchctl.flight.results import FlightResult
+from perchctl.mission.state import Phase
+from perchctl.mission.watch import Event, Tick
+from perchctl.profile import Profile
+from tests.helpers.flights import ROOT
+
+UP_S = 60.0
+
+
+@contextlib.contextmanager
+def scheduler(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Its address and its process. `folder`: for what it writes."""
+    file = folder / "scheduler.json"
+    words = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    with started(folder, *words, "--dashboard-address", ":0", "--scheduler-file", file) as process:
+        end_s = time.monotonic() + UP_S
+        while True:
+            with contextlib.suppress(OSError, ValueError):
+                address = json.loads(file.read_text())["address"]
+                break
+            assert process.poll() is None, "the scheduler has ended"
+            assert time.monotonic() < end_s
+            time.sleep(0.02)
+        yield address, process
+
+
+@contextlib.contextmanager
+def worker(
+    address: str, folder: Path, *options: str, root: Path = ROOT
+) -> Iterator[subprocess.Popen[bytes]]:
+    """One process without a nanny. `root`: where its perchctl is."""
+    words = ["worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    with started(folder, *words, "--memory-limit", "0", *options, root=root) as process:
+        yield process
+
+
+@contextlib.contextmanager
+def started(
+    folder: Path, *words: str | Path, root: Path = ROOT
+) -> Iterator[subprocess.Popen[bytes]]:
+    place = {"PYTHONPATH": str(root), "DASK_TEMPORARY_DIRECTORY": str(folder)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dask", *words],
+        env=os.environ | place,
+        cwd=folder,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+class _Killer:
+    problem: str | None = None
+
+    def tick(self, tick: Tick) -> None:
+        return None
+
+    def event(self, event: Event) -> None:
+        if event.phase is Phase.ASCEND:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def dies_in_flight(
+    profile: Profile, folder: Path, seeds: tuple[int, ...], seed: int
+) -> FlightResult:
+    """The flight of the seed; of `seeds` each loses its process at the first time, on the way up,
+    and leaves a mark."""
+    mark = folder / str(seed)
+    if seed in seeds and not mark.exists():
+        mark.touch()
+        fly_lockstep(profile, seed, watchers=(_Killer(),))
+    return fly_seed(profile, seed)
