@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
-from perchctl.mission.state import FLYING_PHASES, Phase
 from perchctl.mission.row import Row
 from perchctl.mission.safety import AIR, BEFORE_CONTACT, BY_CAMERA, IN_THE_OPEN
+from perchctl.mission.state import FLYING_PHASES, Phase
 from perchctl.mission.table import TABLE
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
