@@ -208,6 +208,8 @@ def why_contact(c: Context) -> str:
 
 
 def why_mounted_wrong(c: Context) -> str:
+    if c.state.mount.wrong and c.profile.positioning.by == "mocap":
+        return f"{explained(c.state.mount)}; or swapped axes in the motion capture"
     if c.state.mount.wrong:
         return explained(c.state.mount)
     return (
