@@ -96,7 +96,10 @@ def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
         found = "no positioning deck; whether positions come from outside is not told"
     else:
         found = "no positioning deck, and no position comes from outside"
-    advice = "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or target"
+    advice = (
+        "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or "
+        "positioning: target"
+    )
     others = [deck for deck in by.decks if deck not in POSITION_DECKS]
     if others:
         advice += f"; if {' or '.join(others)} measures it, name that one in positioning.decks"

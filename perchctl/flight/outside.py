@@ -70,8 +70,8 @@ def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
         return None
     if profile.positioning.by == "target":
         return Problem(
-            f"the target is expected {away_m:.1f} m from where the vehicle stands, and the fence is "
-            f"{profile.safety.fence_radius_m:g} m",
+            f"the target is expected {away_m:.1f} m from where the vehicle stands, and the fence "
+            f"is {profile.safety.fence_radius_m:g} m",
             "with positioning: target the world's zero is where it stands: correct "
             "target.expected_xy_m",
         )

@@ -55,8 +55,8 @@ def out_of_view(
         f"the target is the positioning system, and from planner.approach_xy_m (x {to_x:g}, "
         f"y {to_y:g} m) the vehicle would not see it: {_too_far(there, profile, camera)}, and "
         f"without it nothing brings the vehicle back",
-        f"it is in view from where the vehicle stands: leave planner.approach_xy_m out, or set it "
-        f"near the target's x {u:.2f}, y {v:.2f} m",
+        f"leave planner.approach_xy_m out, since the target is in view from where it stands, or "
+        f"set it near the target's x {u:.2f}, y {v:.2f} m",
     )
 
 
