@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from perchctl.check import sight
 from perchctl.check.row import Row, by_limits, failed, passed, skipped, warned, worse
 from perchctl.flight import criteria
 from perchctl.flight.criteria import Problem
@@ -252,7 +253,7 @@ def _supervisor(t: Telemetry) -> Row:
 
 def _decks(vehicle: Vehicle, profile: Profile) -> Row:
     decks = vehicle.measured_by.decks
-    if not decks and profile.positioning.by == "mocap":
+    if not decks and profile.positioning.by != "deck":
         return passed("decks", "none, and none is needed")
     if not decks:
         return warned("decks", "none", "mounted ones: take them off and put them on again")
@@ -270,15 +271,18 @@ def _positioning(vehicle: Vehicle, profile: Profile) -> Row:
         return failed("positioning", problem.found, problem.advice)
     if profile.positioning.by == "mocap":
         return passed("positioning", f"by {label(profile.positioning)}, see its rows")
+    if profile.positioning.by == "target":
+        return passed("positioning", f"by the target, see {' and '.join(sight.NAMES)}")
     decks = _position_decks(vehicle, profile)
     return passed("positioning", f"by {', '.join(decks)}" if decks else "by positions from outside")
 
 
 BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
+"""By a motion capture, or by the target."""
 
 
 def _estimator(vehicle: Vehicle, t: Telemetry, profile: Profile) -> Row:
-    if profile.positioning.by == "mocap" and not _position_decks(vehicle, profile):
+    if profile.positioning.by != "deck" and not _position_decks(vehicle, profile):
         return skipped("estimator", BY_FLY)
     problem = criteria.unsettled(t, profile)
     if problem is not None:
@@ -297,7 +301,7 @@ def _estimator(vehicle: Vehicle, t: Telemetry, profile: Profile) -> Row:
 
 
 def _ground(t: Telemetry, profile: Profile) -> Row:
-    if profile.positioning.by == "mocap":
+    if profile.positioning.by != "deck":
         return skipped("ground", BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
         return failed("ground", "the position is no number", "restart the vehicle")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from perchctl.calibration.files import camera_of
 from perchctl.camera.credentials import without_password
+from perchctl.check import sight
 from perchctl.check.limits import DOUBTFUL
 from perchctl.check.row import Row, Verdict
 from perchctl.errors import PerchError
@@ -51,6 +52,7 @@ def rows(profile: Profile, *, uri: str | None = None, source: str | None = None)
         _standoff(profile),
         *(_limits(name, limits, profile) for name, limits in DOUBTFUL.items()),
         _way(profile, simulated=uri.startswith("sim://")),
+        *_sight(profile, simulated=uri.startswith("sim://")),
     )
 
 
@@ -190,6 +192,15 @@ def _limits(name: str, limits: Sequence[Limit], profile: Profile) -> Row:
         "; ".join(limit.sentence(profile) for limit in broken),
         f"change {' or '.join(keys)}",
     )
+
+
+def _sight(profile: Profile, simulated: bool) -> list[Row]:
+    """Where the target is the positioning system."""
+    try:
+        camera = camera_of(profile.camera)
+    except PerchError:
+        camera = None
+    return sight.of_profile(profile, camera, simulated)
 
 
 def _way(profile: Profile, simulated: bool) -> Row:

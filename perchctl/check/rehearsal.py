@@ -18,6 +18,7 @@ from perchctl.link.protocol import Guard, ToldSent, tell_nobody
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.target.print_check import PrintCheck, PrintVerdict
+from perchctl.values import replace
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 from perchctl.vision.types import Detections, Frame, TargetEstimate
 
@@ -128,7 +129,7 @@ def rehearse(
     move.
     """
     noted = _Noted(source)
-    senses = Senses(_only_heard(link), noted, pipeline, profile)
+    senses = Senses(_only_heard(link, profile), noted, pipeline, profile)
     done = Rehearsal(source.live)
     prints = PrintCheck(pipeline.camera, profile.target)
     period_s = 1.0 / profile.link.loop_hz
@@ -187,6 +188,22 @@ class _OnlyHeard(Silent):
         return self._link.telemetry()
 
 
-def _only_heard(link: Listened) -> Silent:
+class _Stands(_OnlyHeard):
+    """A vehicle that nobody tells its position here: its estimate runs away, and it stands."""
+
+    def __init__(self, link: Listened, ground_z_m: float) -> None:
+        super().__init__(link)
+        self._feet_m = (0.0, 0.0, ground_z_m)
+
+    def telemetry(self) -> list[Telemetry]:
+        return [
+            replace(sample, position_m=self._feet_m, velocity_mps=(0.0, 0.0, 0.0))
+            for sample in super().telemetry()
+        ]
+
+
+def _only_heard(link: Listened, profile: Profile) -> Silent:
     """So that nothing here can send."""
+    if profile.positioning.by == "target":
+        return _Stands(link, profile.safety.ground_z_m)
     return _OnlyHeard(link)

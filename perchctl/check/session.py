@@ -25,6 +25,7 @@ from perchctl.check import (
     link,
     quick,
     scan,
+    sight,
 )
 from perchctl.check.lift import WITHIN_S as LIFT_S
 from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
@@ -107,6 +108,7 @@ def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
             source = _source(spec, options, stack, remarks)
         except PerchError as error:
             yield from camera.refused(error, device_listing())
+            yield from sight.unseen("no picture comes", profile)
         else:
             yield camera.opened_row(shown, device_listing(), remarks)
             rehearsal = yield from _camera(heard, source, pipeline, options, wanted)
@@ -172,6 +174,8 @@ def _room(
 
 def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> Row:
     """By its own position, or by a motion capture against its attitude."""
+    if profile.positioning.by == "target":
+        return skipped(lift.NAME, "only in flight it is told its position, by the target")
     if room is None:
         wanted.tell(f"now, within {wanted.lift_s:g} s: {lift.HOW}")
         return lift.row(lift.lift_of(lift.watch(probe, time.sleep, wanted.lift_s)))
@@ -256,7 +260,9 @@ def _camera(
     """Yields the rows; returns the rehearsal, None where there could be none."""
     size = camera.size_row(source.size_px, pipeline.camera.size_px)
     if size.verdict != "pass":
-        yield from camera.unseen("pictures of another size cannot be looked at", size)
+        why = "pictures of another size cannot be looked at"
+        yield from camera.unseen(why, size)
+        yield from sight.unseen(why, options.profile)
         return None
     yield size
     wanted.tell(f"rehearsing on live pictures for {wanted.rehearse_s:g} s")
@@ -265,4 +271,6 @@ def _camera(
     optical = camera.optical_of(done, pipeline)
     design = camera.design_of(done, optical, pipeline, profile)
     yield from camera.rows(done, optical, design, profile)
+    measured = optical.blur is not None
+    yield from sight.rows(done, design, measured, profile, pipeline.camera)
     return done

@@ -92,7 +92,7 @@ PositioningOption = Annotated[
     str | None,
     typer.Option(
         "--positioning",
-        help="What measures the position: deck or mocap; by default the profile's.",
+        help="What measures the position: deck, mocap or target; by default the profile's.",
         autocompletion=complete_positioning,
     ),
 ]

@@ -48,6 +48,12 @@ def make_target(
     magnet: Annotated[
         str, typer.Option("--magnet", help="Diameter of the magnet behind the sheet.")
     ] = "50mm",
+    tile: Annotated[
+        str | None,
+        typer.Option(
+            "--tile", help="Print it on several sheets of this size, to be glued: a4, a3."
+        ),
+    ] = None,
     png: Annotated[
         int | None, typer.Option("--png", metavar="DPI", help="Also as PNG, at that resolution.")
     ] = None,
@@ -110,6 +116,7 @@ def make_target(
             small_id=small_id,
             small_dict=small_dict,
             magnet=magnet,
+            tile=tile,
             png_dpi=png,
             svg=svg,
             board=board,

@@ -6,6 +6,7 @@ import dataclasses
 import textwrap
 from typing import Any
 
+from perchctl.calibration.files import camera_of
 from perchctl.camera.credentials import profile_record, without_password
 from perchctl.check import compared
 from perchctl.check.profile import rows
@@ -16,6 +17,7 @@ from perchctl.profile import Profile, find_calibration, find_weights, read_weigh
 from perchctl.profile.mask import find_mask
 from perchctl.profile.picture import edges_of
 from perchctl.target.lengths import millimetres
+from perchctl.target.overhead import overhead
 
 _COLUMN, _WIDTH = 13, 80
 
@@ -91,7 +93,14 @@ def plan_text(options: FlyOptions) -> str:
 def _positioning_line(options: FlyOptions) -> str:
     config = options.profile.positioning
     if config.by == "target":
-        return "positioning  the target itself, by the camera: it has to be seen from the ground"
+        return "\n".join(
+            textwrap.wrap(
+                f"positioning  the target itself, by the camera, from the ground on: "
+                f"{_overhead(options.profile)}",
+                _WIDTH,
+                subsequent_indent=" " * _COLUMN,
+            )
+        )
     if config.by != "mocap":
         return "positioning  the vehicle's own deck"
     where = "the simulated room's" if options.simulated else f"{config.system}:{config.host}"
@@ -99,6 +108,11 @@ def _positioning_line(options: FlyOptions) -> str:
         f"positioning  motion capture {where}, body {config.body!r}, {config.send} at most "
         f"{config.rate_hz:g} Hz"
     )
+
+
+def _overhead(profile: Profile) -> str:
+    """Where it has to be."""
+    return overhead(profile.target, camera_of(profile.camera), profile.camera.mount).words
 
 
 def _compared_lines(options: FlyOptions) -> list[str]:

@@ -33,6 +33,7 @@ from perchctl.target.png import png_bytes
 from perchctl.target.sheets import board_page, target_pages
 from perchctl.target.suggest import suggest
 from perchctl.target.svg import svg_bytes
+from perchctl.target.tiles import tiles
 
 __all__ = ["TargetRequest", "run"]
 
@@ -134,7 +135,11 @@ def _sheet_files(
         raise UsageError(
             f"-o {pdf}: the file must end in .pdf; --svg and --png DPI write pictures beside it"
         )
-    files = {pdf: pdf_bytes(pages, title, date)}
+    printed = list(pages)
+    if request.tile is not None:
+        sheet = parse_page(request.tile)
+        printed = [tile for page in pages for tile in tiles(page, sheet)]
+    files = {pdf: pdf_bytes(printed, title, date)}
     for number, page in enumerate(pages):
         side = "" if number == 0 else "_back"
         if request.svg:

@@ -22,6 +22,10 @@ def positioned(profile: Profile, by: str | None) -> Profile:
     config = PositioningConfig(
         by="deck", decks=profile.positioning.decks
     )  # a capture's keys would be of no use, and puzzle
-    if by != "deck":
+    if by == profile.positioning.by:
+        config = profile.positioning
+    elif "target" in (by, profile.positioning.by):  # whose limits are its own
+        config = PositioningConfig.model_validate({"by": by, "decks": config.decks})
+    elif by != "deck":
         config = profile.positioning.model_copy(update={"by": by})
     return profile.model_copy(update={"positioning": config})

@@ -81,9 +81,10 @@ def unsettled(telemetry: Telemetry, profile: Profile) -> Problem | None:
     variance, most = telemetry.position_variance_m2, profile.safety.estimator_variance_m2
     if variance is None or variance <= most:
         return None
-    return Problem(
-        f"variance {variance:.3g} m^2, at most {most:g} allowed", "is there a positioning system?"
-    )
+    advice = "is there a positioning system?"
+    if profile.positioning.by == "target":
+        advice = "do the positions arrive, and does the target stay in view?"
+    return Problem(f"variance {variance:.3g} m^2, at most {most:g} allowed", advice)
 
 
 def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
@@ -95,7 +96,10 @@ def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
         found = "no positioning deck; whether positions come from outside is not told"
     else:
         found = "no positioning deck, and no position comes from outside"
-    advice = "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap"
+    advice = (
+        "mount a positioning deck (flow, lighthouse, loco), or set positioning: mocap or "
+        "positioning: target"
+    )
     others = [deck for deck in by.decks if deck not in POSITION_DECKS]
     if others:
         advice += f"; if {' or '.join(others)} measures it, name that one in positioning.decks"

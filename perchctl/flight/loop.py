@@ -16,6 +16,7 @@ from perchctl.flight.clock import Clock
 from perchctl.flight.outside import AtRest
 from perchctl.flight.preflight import (
     refuse,
+    refuse_out_of_view,
     refuse_strange,
     refuse_unmeasured,
     still_waiting_for,
@@ -150,9 +151,10 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
         refuse_strange(outside, newest, parts.profile, now_s, at_rest)
         turns.waiting(senses, now_s, outside)
         waiting = still_waiting_for(
-            newest, senses.frames > 0, senses.camera_problem, now_s - started_s, parts.profile,
+            newest, senses.frames > 0, senses.camera_problem or senses.refused,
+            now_s - started_s, parts.profile,
             senses.target(now_s), 0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
-            outside,
+            outside, parts.pipeline.camera,
         )  # fmt: skip
         if parts.source.finished:
             raise NotFound(
@@ -160,6 +162,9 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
                 f"go on, from a camera or a longer recording"
             )
         if not waiting:
+            if newest is not None and senses.sights is not None:
+                target = senses.sights.feed.target
+                refuse_out_of_view(target, newest, parts.profile, parts.pipeline.camera)
             return
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 

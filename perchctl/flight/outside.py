@@ -40,8 +40,17 @@ AGREE_M, AGREE_DEG = 0.1, 15.0
 """Estimate and capture, once positions are fused and the heading was set by them."""
 
 
+def measurer(profile: Profile) -> str:
+    """What the positions come from."""
+    by_sight = profile.positioning.by == "target"
+    return "the sight of the target" if by_sight else "the motion capture"
+
+
 def strange(place: ExternalPosition, telemetry: Telemetry, profile: Profile) -> Problem | None:
-    """What waiting will not mend: another unit, another axis up, another place."""
+    """What waiting will not mend: another unit, another axis up, another place. The world that
+    the target measures in is the vehicle's own, from where it stands: there is no other."""
+    if profile.positioning.by == "target":
+        return unreachable(place, profile)
     return (
         in_millimetres(place, profile)
         or with_another_up(place, telemetry)
@@ -59,6 +68,13 @@ def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
     away_m = math.dist((x, y), target.expected_xy_m)
     if not away_m > profile.safety.fence_radius_m + target.expected_within_m:
         return None
+    if profile.positioning.by == "target":
+        return Problem(
+            f"the target is expected {away_m:.1f} m from where the vehicle stands, and the fence "
+            f"is {profile.safety.fence_radius_m:g} m",
+            "with positioning: target the world's zero is where it stands: correct "
+            "target.expected_xy_m",
+        )
     return Problem(
         f"the motion capture has the vehicle at x {x:.2f}, y {y:.2f} m, {away_m:.1f} m from where "
         f"its target is expected, and the fence is {profile.safety.fence_radius_m:g} m",
@@ -154,6 +170,11 @@ class AtRest:
         way_m = math.dist(self._from.position_m, place.position_m)
         if not way_m > WANDERED_M:
             return None
+        if profile.positioning.by == "target":
+            return Problem(
+                f"by the target the vehicle has moved by {way_m:.2f} m, and it stands still",
+                "the target has moved: let it hang still, then start anew",
+            )
         body = profile.positioning.body
         return Problem(
             f"the rigid body {body!r} has moved by {way_m:.2f} m in the motion capture, and the "

@@ -15,12 +15,15 @@ from perchctl.flight.criteria import (
     unsettled,
     within_reach,
 )
-from perchctl.flight.outside import AtRest, apart, missing, strange
+from perchctl.flight.outside import AtRest, apart, measurer, missing, strange
+from perchctl.flight.view import not_in_view, out_of_view
 from perchctl.link.protocol import Link
 from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning.place import Place
+from perchctl.positioning.sight import UNSEEN
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision.types import TargetEstimate
+from perchctl.vision.types import CameraModel, TargetEstimate
 
 
 def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
@@ -66,6 +69,16 @@ def refuse_strange(
         _refuse(at_rest.strange(place, profile))
 
 
+def refuse_out_of_view(
+    target: Place | None, telemetry: Telemetry, profile: Profile, camera: CameraModel
+) -> None:
+    """Raises SafetyAbort where the way up leads out of sight of a target that is the positioning
+    system. `target`: its place in the estimate's world, None where something else measures."""
+    if target is not None:
+        start_m = telemetry.position_m
+        _refuse(out_of_view(target, start_m, telemetry.yaw_rad, profile, camera))
+
+
 def still_waiting_for(
     telemetry: Telemetry | None,
     has_frame: bool,
@@ -75,22 +88,23 @@ def still_waiting_for(
     target: TargetEstimate | None = None,
     age_s: float = 0.0,
     outside: FeedStatus | None = None,
+    camera: CameraModel | None = None,
 ) -> str:
     """What is missing yet, or empty when ready. Errors: TimedOut past the bound, and
     SafetyAbort off the ground."""
-    limit_s = profile.safety.estimator_wait_s
+    limit_s, by_sight = profile.safety.estimator_wait_s, profile.positioning.by == "target"
     if telemetry is None:
         return _bounded("telemetry", waited_s, limit_s)
     if age_s > profile.safety.telemetry_hold_s:
         return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
-    if outside is not None and (problem := missing(outside, profile)):
+    if outside is not None and not by_sight and (problem := missing(outside, profile)):
         return _bounded(f"positions of the motion capture ({problem.sentence})", waited_s, limit_s)
     if problem := unsettled(telemetry, profile):
         what = f"the state estimate to settle ({problem.found}; {problem.advice})"
         return _bounded(what, waited_s, limit_s)
     seen = None if outside is None else outside.measured
     if seen is not None and (problem := apart(seen, telemetry)):
-        what = f"the state estimate to agree with the motion capture ({problem.sentence})"
+        what = f"the state estimate to agree with {measurer(profile)} ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)
     _refuse(off_the_ground(telemetry, profile))
     if problem := tilted(telemetry, profile):
@@ -102,6 +116,11 @@ def still_waiting_for(
     if not has_frame:
         what = f"a good picture ({camera_problem or 'none has come'})"
         return _bounded(what, waited_s, profile.camera.start_timeout_s)
+    if outside is not None and by_sight and (problem := missing(outside, profile)):
+        if waited_s > limit_s and problem.found == UNSEEN:
+            problem = not_in_view(target, camera_problem, telemetry, profile, camera)
+        what = f"a sight of the target, which measures the position ({problem.sentence})"
+        return _bounded(what, waited_s, limit_s)
     _refuse(within_reach(target))
     return ""
 

@@ -18,6 +18,7 @@ from perchctl.profile import Profile, TargetConfig
 from perchctl.target.blind import Mounted, mounted
 from perchctl.target.bound import PoseBound, pose_bound
 from perchctl.target.limits import TRIALS, Optics, smallest_side_px
+from perchctl.target.overhead import least_side_px
 from perchctl.target.visible import FieldOfView, square_outline, turned_outline
 from perchctl.vision.types import CameraModel
 
@@ -131,6 +132,11 @@ def gear_ranges(target: TargetConfig, camera: CameraModel, profile: Profile) -> 
     )
 
 
+def is_seen_from_ground(profile: Profile) -> bool:
+    """It has to be where the target is the positioning system."""
+    return profile.positioning.by == "target"
+
+
 def make_design(
     target: TargetConfig,
     camera: CameraModel,
@@ -144,7 +150,7 @@ def make_design(
     ranges = ranges or design_ranges(target, camera, optics)
     gear = gear_ranges(target, camera, profile)
     standoff = profile.planner.ascend.standoff_m
-    height = profile.planner.search.max_height_m
+    height = 0.0 if is_seen_from_ground(profile) else profile.planner.search.max_height_m
     search = None
     if ceiling_m is not None:
         search = ceiling_m - height - profile.camera.mount.position_m[2]
@@ -175,12 +181,19 @@ def _warnings(
     found: list[str] = []
     if ranges.z1_m is None or ranges.z2_m is None or ranges.z3_m is None:
         return ["a marker is never read through this blur and noise: a sharper picture is needed"]
-    if search_m is not None and search_m > ranges.z1_m:
+    if search_m is not None and height_m == 0.0:
+        sure_m = ranges.focal_px * target.large.side_m / least_side_px(ranges.large_px)
+        if search_m > sure_m:
+            found.append(
+                f"gap on the ground: under a ceiling of {ceiling_m:g} m the target is "
+                f"{search_m:.2f} m from the camera, and is surely found up to {sure_m:.2f} m"
+            )
+    elif search_m is not None and search_m > ranges.z1_m:
         found.append(
             f"gap at the search height: from {height_m:g} m the target under a ceiling of "
             f"{ceiling_m:g} m is {search_m:.2f} m away, and is seen from {ranges.z1_m:.2f} m on"
         )
-    if search_m is not None and search_m < 0.3:
+    if search_m is not None and search_m < 0.3 and height_m > 0.0:
         found.append(
             f"the ceiling ({ceiling_m:g} m) is hardly above the search height ({height_m:g} m): "
             f"lower planner.search.max_height_m"

@@ -43,10 +43,10 @@ def design_text(design: Design, curve: ErrorCurve, camera_name: str) -> str:
     blind, *advice = blind_lines(design.mount)
     lines += [f"mounting  {blind}", *(f"advice    {text}" for text in advice)]
     if design.search_range_m is not None:
-        lines.append(
-            f"search    target {_cm(design.search_range_m)} away at the highest search position "
-            f"({design.search_height_m:g} m)"
-        )
+        where = f"at the highest search position ({design.search_height_m:g} m)"
+        if design.search_height_m == 0.0:
+            where = "on the ground, from where it has to be seen"
+        lines.append(f"search    target {_cm(design.search_range_m)} away {where}")
     lines += ["", *_table(curve), ""]
     lines += [f"warning: {text}" for text in design.warnings] or ["no gap from search to stand-off"]
     lines += _against_paper(design)

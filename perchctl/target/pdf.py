@@ -30,7 +30,7 @@ def pdf_bytes(pages: Sequence[Page], title: str, date: datetime.date | None = No
     # Portrait pages turn about their long edge, which is the upright one.
     duplex = "DuplexFlipLongEdge" if first.height >= first.width else "DuplexFlipShortEdge"
     pdf.viewer_preferences = ViewerPreferences(
-        print_scaling="None", duplex=duplex if len(pages) > 1 else None
+        print_scaling="None", duplex=duplex if len(pages) == 2 else None
     )
     for page in pages:
         pdf.add_page(orientation="portrait", format=(page.width, page.height))

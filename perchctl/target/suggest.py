@@ -13,20 +13,25 @@ from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, Profile, TargetConfig
 from perchctl.target.checks import check_target
-from perchctl.target.design import Design, focal_px, make_design
+from perchctl.target.design import Design, focal_px, is_seen_from_ground, make_design
 from perchctl.target.lengths import millimetres
 from perchctl.target.limits import Optics, smallest_side_px
-from perchctl.target.page import parse_page
+from perchctl.target.overhead import least_side_px
+from perchctl.target.page import PAGES_MM, parse_page
 from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.visible import FieldOfView, turned_outline
 from perchctl.vision.types import CameraModel
 
 DEFAULT_SEARCH_M = 1.15
 """Range to cover where no ceiling is named: the paper's z1."""
+DEFAULT_CEILING_M = 2.5
+"""Of a room, where none is named and the target has to be seen from the ground."""
 FAR_MARGIN, OVERLAP_MARGIN, NEAR_MARGIN = 1.10, 1.20, 0.95
 SMALL_RANGE = (0.08, 0.19)
 """Side of the small marker per side of the large one: up to 0.19 the large one is read as far
 as around a smaller one, by trial (from 13 px on at a blur of 0.6 px; at 0.21 from 36 px on)."""
+TILE = "a3"
+"""Sheets for a page that is larger than the named ones."""
 _LARGE = ("DICT_4X4_1000", 997)
 _SMALL = ("DICT_ARUCO_ORIGINAL", 5)
 _LARGE_STEP_M, _SMALL_STEP_M = 0.005, 0.0005
@@ -49,6 +54,7 @@ class Suggestion:
             f"perchctl make-target --large {large.side_m * 1e3:g}mm --large-id {large.id} "
             f"--large-dict {large.dictionary} --small {small.side_m * 1e3:g}mm "
             f"--small-id {small.id} --small-dict {small.dictionary} --page {self.page}"
+            + ("" if self.page in PAGES_MM else f" --tile {TILE}")
         )
 
 
@@ -87,7 +93,10 @@ def suggest(
         )
     f, notes = focal_px(camera), []
     bridging = partial(_smalls, FieldOfView(camera), profile, magnet_m, small_px / f)
-    needed_m = math.ceil(FAR_MARGIN * search_m * large_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
+    far_px = FAR_MARGIN * large_px
+    if is_seen_from_ground(profile):
+        far_px = least_side_px(large_px)
+    needed_m = math.ceil(search_m * far_px / f / _LARGE_STEP_M) * _LARGE_STEP_M
     if not _LARGE_LIMITS_M[0] <= needed_m <= _LARGE_LIMITS_M[1]:
         notes.append(f"a large marker of {1e3 * needed_m:.0f} mm would be needed")
     needed_m = min(max(needed_m, _LARGE_LIMITS_M[0]), _LARGE_LIMITS_M[1])
@@ -119,7 +128,10 @@ def suggest(
 
 
 def _search_range_m(profile: Profile, ceiling_m: float | None) -> float:
-    """Camera to target at the highest search position."""
+    """Camera to target at the highest search position, or on the ground where it has to be seen
+    from there."""
+    if is_seen_from_ground(profile):
+        return (ceiling_m or DEFAULT_CEILING_M) - profile.camera.mount.position_m[2]
     if ceiling_m is None:
         return DEFAULT_SEARCH_M
     range_m = ceiling_m - profile.planner.search.max_height_m

@@ -13,9 +13,11 @@ from typer.testing import CliRunner, Result
 
 from perchctl.cli import app
 from perchctl.commands.complete import positionings
+from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
 from perchctl.positioning.capture import open_named
 from perchctl.profile import Profile
+from perchctl.profile.positioning import PositioningConfig
 from perchctl.startup import failure_record
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
@@ -70,9 +72,24 @@ def test_the_deck_over_a_capture_leaves_a_record_that_can_be_read_again(tmp_path
 def test_other_words_are_refused() -> None:
     done = fly("--positioning", "gps", "--dry-run")
     assert done.exit_code == 30
-    assert "'gps' is unknown; allowed are deck, mocap" in done.stderr
+    assert "'gps' is unknown; allowed are deck, mocap, target" in done.stderr
     assert positionings("m") == ["mocap"]
-    assert positionings("") == ["deck", "mocap"]
+    assert positionings("") == ["deck", "mocap", "target"]
+
+
+def test_the_target_brings_its_own_limits_and_leaves_none_behind() -> None:
+    """Its places come late and with gaps; a capture's, or a deck's, flight keeps its own."""
+    own = PositioningConfig.model_validate({"by": "target"})
+    deck, mocap = Profile(), Profile.model_validate({"positioning": {"by": "mocap", "host": "lab"}})
+    for profile in (deck, mocap):
+        assert positioned(profile, "target").positioning == own
+    back = positioned(positioned(deck, "target"), "mocap").positioning
+    assert back == PositioningConfig.model_validate({"by": "mocap"})
+    assert positioned(mocap, "mocap").positioning.host == "lab"
+    text = fly("-p", "target_only", "--dry-run").stdout
+    assert "positioning  the target itself" in text
+    assert "at most 3.2 m above the camera" in " ".join(text.split())
+    json.loads(fly("-p", "target_only", "--dry-run", "--json").stdout)
 
 
 def test_a_real_vehicle_needs_the_computer_of_its_capture() -> None:

@@ -97,7 +97,7 @@ REFUSALS = [
     (["--noise", "3"], 2, "--noise needs --camera"),
     (["--plot", "d.png"], 2, "--plot needs --camera"),
     (["--board", "chessboard:9x6:25mm", "--large", "15cm"], 2, "--large does not go with --board"),
-    (["--board", "chessboard:9x6:25mm", "-p", "sim"], 2, "takes -o, --page, --png, --svg"),
+    (["--board", "chessboard:9x6:25mm", "-p", "sim"], 2, "takes -o, --page, --tile, --png, --svg"),
     (["--board", "chessboard:9x6:25mm", "--blur", "3"], 2, "--blur does not go with --board"),
     (["--camera", CAMERA, "--page", "a3"], 2, "--page is for the sheet"),
     (["--camera", CAMERA, "--magnet", "6cm"], 2, "prints with -o only"),

@@ -1,0 +1,110 @@
+"""Whether the target stays in view on the way up, where it is the positioning system. Pure.
+
+On the ground the way up is known: straight, then to `planner.approach_xy_m`. The higher the
+vehicle, the less of the ceiling is in its picture; without the target it has no position.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from perchctl.flight.criteria import Problem
+from perchctl.positioning.place import Place
+from perchctl.profile import Profile
+from perchctl.target.overhead import (
+    Sight,
+    aside_words,
+    overhead,
+    reach_at,
+    sight_from,
+)
+from perchctl.target.visible import FieldOfView
+from perchctl.vehicle import Telemetry
+from perchctl.vision.types import CameraModel, TargetEstimate
+
+Start = tuple[float, float, float]
+"""Where it stands, in the world that the target's place is in."""
+
+
+def out_of_view(
+    target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
+) -> Problem | None:
+    """From the take-off height over the start, or from `planner.approach_xy_m`, no marker would be
+    wholly in the picture of a level vehicle. `yaw_rad`: its heading at the start."""
+    planner, (x, y, z) = profile.planner, start_m
+    top_m = z + planner.takeoff_height_m
+    over = seen_at((x, y, top_m), yaw_rad, target, profile, camera)
+    if not over.whole:
+        return Problem(
+            f"the target is the positioning system, and would leave the picture as the vehicle "
+            f"takes off: {_too_far(over, profile, camera)} at {planner.takeoff_height_m:g} m of "
+            f"height",
+            f"put the vehicle {aside_words(over.aside_m)} from where it stands, or lower "
+            f"planner.takeoff_height_m",
+        )
+    if planner.approach_xy_m is None:
+        return None
+    there = seen_at((*planner.approach_xy_m, top_m), yaw_rad, target, profile, camera)
+    if there.whole:
+        return None
+    to_x, to_y = planner.approach_xy_m
+    u, v = (float(part) for part in target.position_m[:2])
+    return Problem(
+        f"the target is the positioning system, and from planner.approach_xy_m (x {to_x:g}, "
+        f"y {to_y:g} m) the vehicle would not see it: {_too_far(there, profile, camera)}, and "
+        f"without it nothing brings the vehicle back",
+        f"leave planner.approach_xy_m out, since the target is in view from where it stands, or "
+        f"set it near the target's x {u:.2f}, y {v:.2f} m",
+    )
+
+
+def seen_at(
+    body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
+) -> Sight:
+    """The target from a place in its world, the vehicle level."""
+    return sight_from(
+        np.array(body_m), yaw_rad, target.position_m, target.yaw_rad,
+        profile.target, camera, profile.camera.mount,
+    )  # fmt: skip
+
+
+def place_seen(target: TargetEstimate, profile: Profile) -> Place:
+    """Of a target that a level vehicle sees: in the world in which it stands at the origin, at the
+    ground's height, with its front along x."""
+    feet_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
+    return Place(feet_m + target.e_m + np.asarray(profile.vehicle.gear_body_m), target.e_yaw_rad)
+
+
+def _too_far(sight: Sight, profile: Profile, camera: CameraModel) -> str:
+    """How far aside it would be, and how far it might be."""
+    if not sight.height_m > 0.0:
+        return "it would be no higher than the camera"
+    aside = f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis"
+    side_m, mount = profile.target.large.side_m, profile.camera.mount
+    reach = reach_at(side_m, FieldOfView(camera), mount, sight.height_m)
+    most = "" if reach is None else f", {reach.radius_m:.2f} m at most,"
+    return f"{aside}{most} {sight.height_m:.2f} m over the camera"
+
+
+def not_in_view(
+    seen: TargetEstimate | None,
+    note: str | None,
+    telemetry: Telemetry,
+    profile: Profile,
+    camera: CameraModel | None,
+) -> Problem:
+    """What is said of a target that has not been measured from the ground. `note`: what is
+    remarkable about the pictures."""
+    if seen is not None and seen.tracked:
+        return Problem(
+            f"it is seen, and was not measured at rest yet (the accelerometer reads "
+            f"{telemetry.acc_z_g:.2f} g)",
+            "let the vehicle stand still, and the target hang still",
+        )
+    found = "it is not in view" if note is None else f"it is not in view; {note}"
+    if camera is None:
+        return Problem(found, "put the vehicle under it")
+    where = overhead(profile.target, camera, profile.camera.mount)
+    return Problem(found, f"put the vehicle under it: {where.words}")

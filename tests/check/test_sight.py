@@ -1,0 +1,146 @@
+"""The rows of a target that is the positioning system: what `fly` refuses fails here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from perchctl.check import link, sight
+from perchctl.check.profile import rows as profile_rows
+from perchctl.check.rehearsal import Looked, Rehearsal, _only_heard
+from perchctl.check.row import Row, Verdict
+from perchctl.profile import Profile, load_profile
+from perchctl.target.design import GearRanges, Ranges, make_design
+from perchctl.target.limits import Optics
+from perchctl.vehicle import Telemetry
+from perchctl.vision.types import CameraModel, Detection, Detections, Frame
+from tests.helpers.checks import AT_REST, PROFILE
+from tests.helpers.flights import short_profile
+from tests.helpers.mission import target_at
+
+TARGET = short_profile({"positioning": "target"}, base="sim")
+CAMERA = CameraModel(
+    (640, 480), np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]]), np.zeros(5)
+)
+RANGES = Ranges(3.4, 0.5, 0.16, 0.12, 0.03, 16.6, 17.0, 380.0)
+NOTHING = Detections(frame_index=1, t_s=0.0)
+PICTURE = Frame(1, 0.0, np.zeros((480, 640), np.uint8), 0.0)
+
+
+def shown(left_px: float) -> Looked:
+    """A picture with the large marker so far from its left edge."""
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    corners = 30.0 * unit + np.array([left_px, 200.0])
+    return Looked(PICTURE, replace(NOTHING, large=Detection("large", corners, 0.1, True)))
+
+
+def rehearsed(x: float = 0.1, y: float = 0.0, z: float = 2.0, **changes: Any) -> Rehearsal:
+    """Under a target that is there from where the vehicle stands."""
+    target = target_at(1.0, (x, y, z), (0.0, 0.0, 0.0))
+    made = Rehearsal(live=True, pictures=60, found=60, target=target, height_m=0.0)
+    made.looked = [shown(300.0)]
+    return replace(made, **changes)
+
+
+def rows_of(
+    done: Rehearsal, profile: Profile = TARGET, measured: bool = True, **ranges: Any
+) -> dict[str, Row]:
+    given = replace(RANGES, **ranges)
+    design = make_design(profile.target, CAMERA, Optics(), profile, ranges=given)
+    assert isinstance(design.gear, GearRanges)
+    return {row.name: row for row in sight.rows(done, design, measured, profile, CAMERA)}
+
+
+def test_under_the_target_both_rows_pass_and_say_from_how_far() -> None:
+    rows = rows_of(rehearsed())
+    assert list(rows) == list(sight.NAMES)
+    assert {row.verdict for row in rows.values()} == {Verdict.PASS}
+    assert "at most 3.0 m above the camera" in rows["sight range"].found
+    assert "0.07 m aside of the camera's axis 2.00 m above it" in rows["in view"].found
+
+
+@pytest.mark.parametrize(("name", "verdict", "words", "done"), [
+    ("in view", "fail", "no, and fly refuses", rehearsed(found=0, target=None)),
+    ("in view", "fail", "as the vehicle takes off", rehearsed(1.3)),
+    ("in view", "warn", "in 33 % of the pictures", rehearsed(found=20)),
+    ("in view", "warn", "not at the end", rehearsed(target=None)),
+    ("in view", "warn", "only 1 % of the picture's width", rehearsed(looked=[shown(5.0)])),
+    ("in view", "skipped", "no picture came", rehearsed(pictures=0)),
+    ("sight range", "warn", "it is 3.4 m above it", rehearsed(z=3.4)),
+    ("sight range", "skipped", "no picture came", rehearsed(pictures=0)),
+])  # fmt: skip
+def test_a_sight_makes_its_row(name: str, verdict: str, words: str, done: Rehearsal) -> None:
+    row = rows_of(done)[name]
+    assert (row.verdict, words in row.found) == (verdict, True), row
+    assert row.advice or verdict == "skipped"
+
+
+def test_where_to_put_it_is_told() -> None:
+    absent = rows_of(rehearsed(found=0, target=None))["in view"]
+    assert "at most 3.2 m above the camera" in absent.advice
+    assert "forward" in rows_of(rehearsed(1.3))["in view"].advice
+    assert "--suggest" in rows_of(rehearsed(z=3.4))["sight range"].advice
+
+
+def test_a_range_by_a_guessed_blur_is_no_pass() -> None:
+    row = rows_of(rehearsed(), measured=False)["sight range"]
+    assert row.verdict is Verdict.SKIPPED
+    assert "at most 3.2 m" in row.found
+    blind = rows_of(rehearsed(), large_px=None, z1_m=None)["sight range"]
+    assert blind.verdict is Verdict.FAIL
+
+
+def test_what_measures_otherwise_has_no_such_rows() -> None:
+    assert rows_of(rehearsed(), PROFILE) == {}
+    assert sight.unseen("no picture comes", PROFILE) == []
+    assert [row.name for row in sight.unseen("no picture comes", TARGET)] == list(sight.NAMES)
+    names = {row.name for row in profile_rows(PROFILE)}
+    assert {row.name for row in profile_rows(TARGET)} - names == {"latency", "marker size"}
+
+
+def test_a_latency_that_is_written_down_is_doubted() -> None:
+    rows = {row.name: row for row in profile_rows(TARGET)}
+    assert rows["latency"].verdict is Verdict.WARN
+    assert "camera.latency_s: measured" in rows["latency"].advice
+    shipped = profile_rows(load_profile("target_only"))
+    assert {row.verdict for row in shipped} == {Verdict.PASS}
+
+
+def test_a_simulated_ceiling_out_of_sight_is_doubted() -> None:
+    high = short_profile(
+        {"positioning": "target", "simulation.ceiling_z_m": [2.0, 3.5], "safety.max_height_m": 5.0},
+        base="sim",
+    )  # fmt: skip
+    for uri, verdict in (("sim://", Verdict.WARN), ("radio://0/80/2M", Verdict.PASS)):
+        (row,) = (row for row in profile_rows(high, uri=uri) if row.name == "marker size")
+        assert row.verdict is verdict, row
+
+
+def test_decks_and_an_estimate_are_not_asked_for() -> None:
+    """Its estimate runs away while nothing is sent, and says nothing against it."""
+    away = replace(AT_REST, position_m=(3.0, -2.0, 9.0), position_variance_m2=50.0)
+    vehicle = link.Vehicle("radio://0/80/2M", telemetry=away, external=False)
+    rows = {row.name: row for row in link.rows(vehicle, TARGET)}
+    assert rows["decks"].verdict is Verdict.PASS
+    assert rows["positioning"].found == "by the target, see sight range and in view"
+    assert rows["estimator"].verdict is rows["ground"].verdict is Verdict.SKIPPED
+    assert rows["estimator"].found == link.BY_FLY
+
+
+class Runaway:
+    """A link to a vehicle at rest whose estimate has left."""
+
+    def telemetry(self) -> list[Telemetry]:
+        return [replace(AT_REST, position_m=(3.0, -2.0, 9.0), velocity_mps=(1.0, 2.0, 3.0))]
+
+
+def test_pictures_are_rehearsed_on_a_vehicle_that_stands() -> None:
+    (sample,) = _only_heard(Runaway(), TARGET).telemetry()
+    assert sample.position_m == (0.0, 0.0, TARGET.safety.ground_z_m)
+    assert sample.velocity_mps == (0.0, 0.0, 0.0)
+    assert sample.acc_z_g == AT_REST.acc_z_g
+    (sample,) = _only_heard(Runaway(), PROFILE).telemetry()
+    assert sample.position_m == (3.0, -2.0, 9.0)

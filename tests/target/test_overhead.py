@@ -1,0 +1,155 @@
+"""From where on the ground a target is seen: the words hold for the camera's own picture."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.geometry import Array, rot_z
+from perchctl.profile import Mounting, TargetConfig
+from perchctl.target.overhead import (
+    SURE_PX,
+    aside_words,
+    edge_room,
+    least_side_px,
+    overhead,
+    reach_at,
+    sight_from,
+)
+from perchctl.target.visible import FieldOfView
+from perchctl.vision.camera_model import project
+from perchctl.vision.pose import square
+from perchctl.vision.types import CameraModel
+
+TARGET = TargetConfig()
+SIDE_M = TARGET.large.side_m
+F = 380.0
+CAMERA = CameraModel(
+    (640, 480), np.array([[F, 0.0, 319.5], [0.0, F, 239.5], [0.0, 0.0, 1.0]]),
+    np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
+)  # fmt: skip
+FIELD = FieldOfView(CAMERA)
+angles = st.floats(-math.pi, math.pi)
+leans = st.floats(-25.0, 25.0)
+mounts = st.builds(
+    lambda roll, pitch, yaw: Mounting(position_m=(0.03, -0.01, 0.01), rpy_deg=(roll, pitch, yaw)),
+    leans, leans, st.sampled_from([0.0, 90.0, 180.0, -37.0]),
+)  # fmt: skip
+
+
+def in_picture(mount: Mounting, centre_m: Array, yaw_rad: float) -> bool:
+    """By the lens itself: all corners of the large marker at least 3 px inside. `centre_m` from
+    the camera, body axes."""
+    corners = (square(SIDE_M) @ rot_z(yaw_rad).T + centre_m) @ mount.T_body_cam[:3, :3]
+    if (corners[:, 2] <= 0.0).any():
+        return False
+    px = project(corners, np.zeros(3), np.zeros(3), CAMERA)
+    return bool((px >= 2.5).all() and (px <= np.array(CAMERA.size_px) - 3.5).all())
+
+
+@settings(max_examples=60, deadline=None)
+@given(mounts, st.floats(0.6, 3.0), angles, angles, st.floats(0.0, 0.97))
+def test_within_the_reach_the_marker_is_whole_at_any_turn(
+    mount: Mounting, height_m: float, towards: float, yaw_rad: float, share: float
+) -> None:
+    reach = reach_at(SIDE_M, FIELD, mount, height_m)
+    if reach is None:
+        return
+    away_m = share * reach.radius_m
+    x, y = reach.axis_xy_m
+    centre = np.array([x + away_m * math.cos(towards), y + away_m * math.sin(towards), height_m])
+    assert in_picture(mount, centre, yaw_rad)
+
+
+@settings(max_examples=30, deadline=None)
+@given(mounts, st.floats(0.6, 3.0))
+def test_beyond_the_reach_some_marker_is_cut(mount: Mounting, height_m: float) -> None:
+    reach = reach_at(SIDE_M, FIELD, mount, height_m)
+    if reach is None:
+        return
+    x, y = reach.axis_xy_m
+    away_m = 1.05 * reach.radius_m + 0.01
+    around = np.linspace(0.0, 2.0 * math.pi, 48)
+    turned = (
+        (towards, towards + math.pi / 4.0)  # a corner ahead
+        for towards in around
+    )
+    assert not all(
+        in_picture(
+            mount, np.array([x + away_m * math.cos(a), y + away_m * math.sin(a), height_m]), yaw
+        )
+        for a, yaw in turned
+    )
+
+
+@settings(max_examples=60, deadline=None)
+@given(mounts, angles, angles, st.floats(-0.9, 0.9), st.floats(-0.9, 0.9), st.floats(0.8, 2.5))
+def test_a_sight_is_the_lens_s_wherever_the_body_stands(
+    mount: Mounting, yaw_rad: float, target_yaw: float, x: float, y: float, height_m: float
+) -> None:
+    """Far enough that the small marker is too small to count."""
+    body_m, camera_m = np.array([0.4, -1.2, 0.02]), np.array(mount.position_m)
+    way = np.array([x, y, height_m])
+    target_m = body_m + rot_z(yaw_rad) @ (camera_m + way)
+    seen = sight_from(body_m, yaw_rad, target_m, target_yaw, TARGET, CAMERA, mount)
+    assert abs(seen.height_m - height_m) < 1e-9
+    near = [in_picture(mount, way + d, target_yaw - yaw_rad) for d in (
+        np.array([dx, dy, 0.0]) for dx in (-0.01, 0.01) for dy in (-0.01, 0.01))]  # fmt: skip
+    if all(near) or not any(near):  # else it is at the very edge
+        assert seen.whole is all(near)
+    # Walking so far brings the target onto the camera's axis.
+    there = body_m + rot_z(yaw_rad) @ np.array([*seen.aside_m, 0.0])
+    moved = sight_from(there, yaw_rad, target_m, target_yaw, TARGET, CAMERA, mount)
+    assert math.hypot(*moved.aside_m) < 1e-9
+    on_axis = rot_z(yaw_rad).T @ (target_m - there) - camera_m
+    assert np.linalg.norm(np.cross(on_axis, mount.T_body_cam[:3, 2])) < 1e-9
+
+
+def test_so_far_the_large_marker_has_the_least_side() -> None:
+    where = overhead(TARGET, CAMERA, Mounting())
+    assert abs(F * SIDE_M / where.highest_m - SURE_PX) < 1e-9
+    assert least_side_px(10.0) == SURE_PX, "a sharper picture promises no more"
+    assert least_side_px(30.0) > 30.0
+    blurred = overhead(TARGET, CAMERA, Mounting(), plain_px=30.0)
+    assert blurred.highest_m < where.highest_m * SURE_PX / 30.0
+    assert [r.height_m for r in where.reaches] == [1.0, 2.0]
+    assert "the axis points straight up" in where.words
+    assert "than 0.53 m at 1 m above it" in where.words
+
+
+def test_a_lean_is_told_by_the_vehicle_s_own_sides() -> None:
+    """`rpy_deg` of pitch is nose down: the view goes forward."""
+    leans = {
+        (0.0, 12.0, 0.0): "leans 12 deg forward",
+        (0.0, -12.0, 0.0): "leans 12 deg back",
+        (0.0, -12.0, 90.0): "leans 12 deg to the right",
+        (10.0, 0.0, 0.0): "leans 10 deg to the right",
+        (-10.0, 0.0, 0.0): "leans 10 deg to the left",
+        (0.0, 17.0, 45.0): "leans 12 deg forward and 12 deg to the left",
+        (1.0, -1.0, 0.0): "points straight up",
+    }
+    for rpy_deg, words in leans.items():
+        assert words in overhead(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg)).words, rpy_deg
+
+
+def test_a_camera_that_looks_aside_sees_nothing_overhead() -> None:
+    for rpy_deg in ((180.0, 0.0, 0.0), (0.0, -90.0, 0.0)):
+        where = overhead(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
+        assert where.reaches == ()
+        assert "camera that looks up" in where.words
+
+
+def test_a_way_is_named_by_the_vehicle_s_sides() -> None:
+    assert aside_words((0.31, -0.12)) == "0.31 m forward and 0.12 m to the right"
+    assert aside_words((-0.5, 0.004)) == "0.50 m back"
+    assert aside_words((0.0, 0.2)) == "0.20 m to the left"
+
+
+def test_the_room_is_that_to_the_nearest_edge() -> None:
+    box = np.array([[100.0, 100.0], [200.0, 100.0], [200.0, 200.0], [100.0, 200.0]])
+    assert edge_room(box, (640, 480)) == (100.5) / 640
+    assert edge_room(box + np.array([0.0, 275.0]), (640, 480)) == 4.5 / 640
+    assert edge_room(box - 150.0, (640, 480)) < 0.0
