@@ -36,10 +36,16 @@ def test_a_set_gives_the_defaults_and_written_keys_win(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["rough", "extreme"])
 def test_the_shipped_profile_is_sim_in_that_world(name: str) -> None:
+    """It settles less exactly there, and is sim in all else."""
     sim, world = load_profile("sim"), load_profile(name)
     assert world.simulation == simulated(set=name)
+    ascend = world.planner.ascend.model_copy(
+        update={"settle_xy_m": sim.planner.ascend.settle_xy_m}
+    )
+    assert world.planner.model_copy(update={"ascend": ascend}) == sim.planner
+    assert world.planner.ascend.settle_xy_m > sim.planner.ascend.settle_xy_m
     assert sim == world.model_copy(
-        update={key: getattr(sim, key) for key in ("name", "description", "simulation")}
+        update={key: getattr(sim, key) for key in ("name", "description", "simulation", "planner")}
     )
 
 
