@@ -39,9 +39,7 @@ def test_the_shipped_profile_is_sim_in_that_world(name: str) -> None:
     """It settles less exactly there, and is sim in all else."""
     sim, world = load_profile("sim"), load_profile(name)
     assert world.simulation == simulated(set=name)
-    ascend = world.planner.ascend.model_copy(
-        update={"settle_xy_m": sim.planner.ascend.settle_xy_m}
-    )
+    ascend = world.planner.ascend.model_copy(update={"settle_xy_m": sim.planner.ascend.settle_xy_m})
     assert world.planner.model_copy(update={"ascend": ascend}) == sim.planner
     assert world.planner.ascend.settle_xy_m > sim.planner.ascend.settle_xy_m
     assert sim == world.model_copy(
