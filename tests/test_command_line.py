@@ -127,7 +127,8 @@ def test_tab_offers_profiles_and_sources(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     (tmp_path / "pictures").mkdir()
     assert offered("fly", "--profile", "") == [
-        "aideck", "crazyflie", "extreme", "fpv", "paper", "rough", "sim", "mine.yaml", "pictures/",
+        "aideck", "crazyflie", "extreme", "fpv", "paper", "rough", "sim", "target_only",
+        "mine.yaml", "pictures/",
     ]  # fmt: skip
     assert offered("make-target", "-p", "cr") == ["crazyflie"]
     assert offered("track", "im") == ["images:"]

@@ -12,6 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.outside import AtRest, strange
 from perchctl.flight.preflight import refuse_out_of_view, refuse_strange, still_waiting_for
@@ -23,7 +25,7 @@ from perchctl.positioning.sight import UNSEEN
 from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition
 from perchctl.vision.types import CameraModel
-from tests.helpers.flights import short_profile
+from tests.helpers.flights import fly_short, short_profile
 from tests.helpers.mission import READY, target_at, telemetry
 
 CAMERA = CameraModel(
@@ -163,3 +165,20 @@ def test_what_is_refused_speaks_of_the_target() -> None:
     status = FeedStatus(0.05, None, 20, None, 30.0, ExternalPosition(FEET))
     with pytest.raises(SafetyAbort, match=r"expected 4\.0 m from where the vehicle stands"):
         refuse_strange(status, REST, far, REST.t_s)
+
+
+# --- The loop -------------------------------------------------------------------------------
+
+
+def refused(changes: dict[str, object], **scenario: object) -> str:
+    with pytest.raises((SafetyAbort, TimedOut)) as found:
+        fly_short({"positioning": "target"} | changes, **scenario)
+    return str(found.value)
+
+
+def test_a_simulated_vehicle_stays_on_the_ground() -> None:
+    """The senses' own place of the target, and the pipeline's own camera."""
+    assert "the vehicle would not see it" in refused({"planner.approach_xy_m": [1.9, 0.0]})
+    told = refused({"safety.estimator_wait_s": 0.6}, no_target=True)
+    assert "not in view" in told
+    assert "at most 3.2 m above the camera" in told
