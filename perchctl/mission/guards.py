@@ -163,8 +163,7 @@ def hangs_in_landing(c: Context) -> bool:
 def hangs_or_stands(c: Context) -> bool:
     """It came down blindly from the magnet's reach, or did not: something carries it, which may be
     either. A target that is seen again, far above, tells that it has come down."""
-    touched = c.state.contact_z_m is not None
-    return c.state.blind and touched and not c.placed and not is_low_by_eye(c)
+    return c.state.blind_in_reach and not c.placed and not is_low_by_eye(c)
 
 
 def settling_too_long(c: Context) -> bool:

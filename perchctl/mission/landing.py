@@ -84,7 +84,7 @@ def landing(c: Context) -> Acted:
     state = c.state
     if state.stopped_s is not None:
         return _hang_on(c) if state.contact_z_m is not None else stop_motors(c)
-    level = (state.heading_lost or state.blind) and can_level(c)
+    level = (state.heading_lost or state.blind_s is not None) and can_level(c)
     if not level and not state.caught:
         if (caught := catch(c)) is not None:
             return caught
@@ -100,7 +100,7 @@ def landing(c: Context) -> Acted:
         return let_go(c)
     if level:
         # A blind estimate slides away from a ceiling that holds the vehicle.
-        return level_down(left_contact(c, PEELED_M) if c.placed or not state.blind else c)
+        return level_down(left_contact(c, PEELED_M) if c.placed or state.blind_s is None else c)
     state, away = unpressed(c)
     if away is not None and not _doubtful(c):
         return state, away

@@ -81,10 +81,13 @@ def _believed_s(c: Context) -> float:
     return min(ASTRAY_S + above_m / ASTRAY_MEAN_MPS, ASTRAY_LONGEST_S)
 
 
-def _blind_s(c: Context) -> float:
-    """By then it has come down, or hangs, or its estimated speed has drifted away."""
+def _is_overdue(c: Context) -> bool:
+    """Blind for so long, it has come down, or hangs, or its estimated speed has drifted away."""
+    if c.state.blind_s is None:
+        return False
     ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
-    return BLIND_SPARE_S + max(0.0, c.state.entry_m[2] - ground_m) / BLIND_SINK_MPS
+    lasts_s = BLIND_SPARE_S + max(0.0, c.state.entry_m[2] - ground_m) / BLIND_SINK_MPS
+    return c.obs.t_s - c.state.blind_s > lasts_s
 
 
 def astray_down(c: Context) -> Acted:
@@ -110,11 +113,11 @@ def level_down(c: Context) -> Acted:
     if state.astray:
         return astray_down(c)
     dt_s, vz = c.obs.t_s - state.t_s, tel.velocity_mps[2]
-    sink_mps = BLIND_SINK_MPS if state.blind else SINK_MPS
+    sink_mps = SINK_MPS if state.blind_s is None else BLIND_SINK_MPS
     # Learned in a climb, or not at all, the hover thrust is a few per cent beside the true one.
     hover = state.hover_thrust * (1.0 - INTEGRAL_PER_M * (vz + sink_mps) * dt_s)
     thrust = hover * (1.0 - DAMPING_S_PER_M * (vz + sink_mps))
-    if vz > -STILL_MPS or (state.blind and c.in_phase_s > _blind_s(c)):
+    if vz > -STILL_MPS or _is_overdue(c):
         before = state.level_thrust or hover
         thrust = min(thrust, before - RAMP_PER_S * hover * dt_s)
     thrust = max(0.4 * hover, min(60000.0, thrust))

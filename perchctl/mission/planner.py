@@ -82,8 +82,10 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
         hover = state.hover_thrust or obs.telemetry.thrust
         state = replace(state, heading_lost=True, hover_thrust=hover)
     context = Context(state, obs, profile)
-    if state.phase is Phase.LANDING and not state.blind and context.by_sight and is_lost(context):
-        state = _blinded(state, obs)
+    # A landing of the vehicle's own is near its end, and goes on by the height, which is good yet.
+    sets_down = state.phase is Phase.LANDING and state.blind_s is None and not state.orders
+    if sets_down and context.by_sight and is_lost(context):
+        state = _blinded(state, obs, in_reach=state.contact_z_m is not None)
         context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)
@@ -99,10 +101,11 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
 
 
-def _blinded(state: PlannerState, obs: Observation) -> PlannerState:
+def _blinded(state: PlannerState, obs: Observation, *, in_reach: bool) -> PlannerState:
     """Nothing but the gyroscope is left: level, and down by thrust. For good, since each change
     of the mode costs height."""
-    return replace(state, blind=True, hover_thrust=state.hover_thrust or obs.telemetry.thrust)
+    hover = state.hover_thrust or obs.telemetry.thrust
+    return replace(state, blind_s=obs.t_s, blind_in_reach=in_reach, hover_thrust=hover)
 
 
 def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
@@ -219,7 +222,8 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
     if row.name == "position-astray":
         new = replace(new, felt_alone=is_felt_alone(context))
     if row.to is Phase.LANDING and context.by_sight and is_lost(context):
-        new = _blinded(new, obs)
+        touched = state.contact_z_m is not None or state.phase in (Phase.PERCH, Phase.COMPLETE)
+        new = _blinded(new, obs, in_reach=touched)
     return _started_phase(new, state, obs)
 
 

@@ -214,6 +214,7 @@ class PlannerState:
     felt_mps: float = 0.0  # how fast it climbs, by its accelerometer
     felt_alone: bool = False  # astray, and its vertical speed with it
     heading_lost: bool = False  # position control would lead away from its setpoint
-    blind: bool = False  # down by thrust alone: the target was the positioning system, and is lost
+    blind_s: float | None = None  # down by thrust alone since: the target that measured is lost
+    blind_in_reach: bool = False  # of the magnet, as that began
     level_thrust: float = 0.0  # raw thrust of a level way down
     hold: str = ""  # why the vehicle is held in place, empty when it is not

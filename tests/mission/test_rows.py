@@ -283,7 +283,8 @@ CASES: dict[str, Case] = {
     "hangs-or-stands": Case(
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={
-            "outcome": O.SAFETY, "stopped_s": START_S, "contact_z_m": CONTACT_Z_M, "blind": True,
+            "outcome": O.SAFETY, "stopped_s": START_S, "contact_z_m": CONTACT_Z_M,
+            "blind_in_reach": True,
         },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),

@@ -127,10 +127,35 @@ def test_a_landing_that_loses_it_goes_on_blindly() -> None:
         state_in(Phase.ALIGN), observation(BEGIN_S + TURN_S, operator=Operator.LAND), PROFILE
     )
     assert state.phase is Phase.LANDING
-    assert not state.blind
+    assert state.blind_s is None
     state, command = planner.step(state, unseen(BEGIN_S + 2.0, 0.9, LAND_S + 0.1), PROFILE)
-    assert state.blind
+    assert state.blind_s is not None
     assert isinstance(command, RawThrust)
+
+
+def test_a_landing_of_its_own_near_the_floor_is_left_to_its_end() -> None:
+    """A change of the mode a hand above the floor would drop it."""
+    state = replace(
+        state_in(Phase.LANDING, z_m=0.3), entered_s=BEGIN_S - 6.0, orders=1, ordered_s=BEGIN_S
+    )
+    for i in range(1, 40):
+        obs = unseen(BEGIN_S + TURN_S * i, 0.25, LAND_S + TURN_S * i)
+        state, command = planner.step(state, obs, PROFILE)
+        assert not isinstance(command, RawThrust)
+    assert state.blind_s is None
+
+
+def test_how_long_it_may_take_counts_from_the_loss_and_not_from_the_landing() -> None:
+    state = replace(
+        state_in(Phase.LANDING),
+        entered_s=BEGIN_S - 20.0,
+        blind_s=BEGIN_S,
+        level_thrust=HOVER_THRUST,
+    )
+    tel = telemetry(BEGIN_S + 1.0, 0.8, velocity_mps=(0.0, 0.0, -BLIND_SINK_MPS))
+    _, command = planner.step(state, unseen(BEGIN_S + 1.0, 0.8, 2.5, telemetry=tel), PROFILE)
+    assert isinstance(command, RawThrust)
+    assert command.thrust > 0.97 * HOVER_THRUST
 
 
 @pytest.mark.parametrize("hover", [0.0, HOVER_THRUST])
@@ -144,7 +169,7 @@ def test_blind_from_the_take_off_it_has_a_thrust_to_come_down_on(hover: float) -
 
 @given(speed_mps=st.floats(-1.2, 0.3))
 def test_blind_it_brakes_what_sinks_faster_than_it_should(speed_mps: float) -> None:
-    state = replace(state_in(Phase.LANDING), blind=True)
+    state = replace(state_in(Phase.LANDING), blind_s=BEGIN_S)
     tel = telemetry(BEGIN_S + TURN_S, 1.0, velocity_mps=(0.0, 0.0, speed_mps))
     _, command = planner.step(state, unseen(BEGIN_S + TURN_S, 1.0, 2.0, telemetry=tel), PROFILE)
     assert isinstance(command, RawThrust)
@@ -154,7 +179,7 @@ def test_blind_it_brakes_what_sinks_faster_than_it_should(speed_mps: float) -> N
 
 def test_a_blind_way_down_whose_speed_has_drifted_ends_on_the_floor_all_the_same() -> None:
     """By its estimate it sinks for ever, at the speed that is wanted; it has stood for long."""
-    state = replace(state_in(Phase.LANDING), blind=True)
+    state = replace(state_in(Phase.LANDING), blind_s=BEGIN_S)
     thrust, command = HOVER_THRUST, None
     for i in range(1, 800):
         t_s = BEGIN_S + TURN_S * i
