@@ -32,7 +32,7 @@ from perchctl.mission.state import (
 from perchctl.mission.table import TABLE, first_match
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Command, PositionSetpoint
+from perchctl.vehicle import Command, PositionSetpoint, Telemetry
 
 HOVER_WITHIN = 0.2
 UNSEEN_S = 0.15
@@ -104,7 +104,7 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
 def _blinded(state: PlannerState, obs: Observation, *, in_reach: bool) -> PlannerState:
     """Nothing but the gyroscope is left: level, and down by thrust. For good, since each change
     of the mode costs height."""
-    hover = state.hover_thrust or obs.telemetry.thrust
+    hover = state.hover_thrust or _felt_hover_thrust(obs.telemetry)
     return replace(state, blind_s=obs.t_s, blind_in_reach=in_reach, hover_thrust=hover)
 
 
@@ -182,6 +182,12 @@ def _mount_watched(c: Context) -> MountWatch:
     return watched(mount, sight_of(c.obs.t_s, c.obs.telemetry, target.world_m))
 
 
+def _felt_hover_thrust(tel: Telemetry) -> float:
+    """In a climb, or sinking, the accelerometer tells by how much the thrust is beside the
+    weight."""
+    return tel.thrust / min(1.5, max(0.75, tel.acc_z_g))
+
+
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     """Slow mean of the thrust in quiet flight: the reference of the contact proof."""
     thrust = obs.telemetry.thrust
@@ -250,9 +256,7 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
             # It may be in the magnet's reach: it has to be seen below before it counts as free.
             return replace(new, contact_z_m=obs.telemetry.position_m[2])
         case Phase.LANDING if new.row == "position-astray":
-            # In a climb the accelerometer tells by how much the thrust is above the weight.
-            g = min(1.5, max(0.75, obs.telemetry.acc_z_g))
-            hover = old.hover_thrust or obs.telemetry.thrust / g
+            hover = old.hover_thrust or _felt_hover_thrust(obs.telemetry)
             return replace(new, heading_lost=True, astray=True, hover_thrust=hover)
         case Phase.LANDING if new.row == "mounting":
             # The setpoint is ahead, and every centimetre there is one in a wrong direction.

@@ -167,6 +167,18 @@ def test_blind_from_the_take_off_it_has_a_thrust_to_come_down_on(hover: float) -
     assert isinstance(command, RawThrust | Land)
 
 
+@given(felt_g=st.floats(0.8, 1.2))
+def test_a_hover_thrust_that_was_not_learned_yet_is_felt(felt_g: float) -> None:
+    """What just sinks is carried by less than its weight; flown on that it would fall."""
+    state = replace(state_in(Phase.APPROACH, z_m=0.3), hover_thrust=0.0)
+    tel = telemetry(BEGIN_S + TURN_S, 0.3, thrust=felt_g * HOVER_THRUST, acc_z_g=felt_g)
+    after, _ = planner.step(
+        state, unseen(BEGIN_S + TURN_S, 0.3, LAND_S + 0.1, telemetry=tel), PROFILE
+    )
+    assert after.blind_s is not None
+    assert after.hover_thrust == pytest.approx(HOVER_THRUST, rel=0.1)
+
+
 @given(speed_mps=st.floats(-1.2, 0.3))
 def test_blind_it_brakes_what_sinks_faster_than_it_should(speed_mps: float) -> None:
     state = replace(state_in(Phase.LANDING), blind_s=BEGIN_S)
