@@ -79,7 +79,8 @@ class SightFeed:
         position at its exposure."""
         if pose.t_s <= self._seen_s:
             return
-        silent_s = min(pose.t_s - max(self._seen_s, self._placed_s), GATE_LONGEST_S)
+        # A known place may be newer than a picture that is still on its way.
+        silent_s = max(0.0, min(pose.t_s - max(self._seen_s, self._placed_s), GATE_LONGEST_S))
         if self.target is None:
             self._seen_s = pose.t_s
             if at_rest:

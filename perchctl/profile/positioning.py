@@ -70,7 +70,7 @@ class PositioningConfig(Section):
         0.05, gt=0, le=1, description="what the vehicle takes it for: `locSrv.extQuatStdDev`"
     )
     hold_s: float = Field(
-        0.15, gt=0, le=1.0, description="without a fresh position it is held in place"
+        0.15, gt=0, le=0.5, description="without a fresh position it is held in place"
     )
     land_s: float = Field(0.7, gt=0, le=2, description="without a fresh position it is landed")
     connect_timeout_s: float = Field(5.0, gt=0, le=60, description="for the first frame")

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import select
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -34,7 +31,7 @@ from perchctl.errors import Interrupted, PerchError
 from perchctl.flight.campaign import FLOWN_AGAIN, fly_all
 from perchctl.flight.hands import job_processes
 from perchctl.flight.uninterrupted import uninterrupted
-from tests.helpers.flights import ROOT
+from tests.helpers.ended import ended
 from tests.helpers.jobs import campaign
 from tests.helpers.seeds import (
     Ended,
@@ -225,29 +222,12 @@ def test_what_has_no_form_is_told_and_ends_no_process() -> None:
 def test_a_program_that_is_ended_leaves_nothing_behind(number: signal.Signals) -> None:
     """No process that flies on, and, where it could, no warning of semaphores; a terminal
     sends its signals to the children, too."""
-    with subprocess.Popen(
-        [sys.executable, "-m", "tests.helpers.jobs"],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    ) as program:
-        assert program.stdout is not None
-        child = os.pidfd_open(int(program.stdout.readline()))
-        if number == signal.SIGKILL:
-            program.kill()
-        else:
-            os.killpg(program.pid, number)
-        ended, _, _ = select.select([child], [], [], AT_ONCE_S)
-        os.close(child)
-        out, err = program.communicate(timeout=AT_ONCE_S)
-    assert ended
+    it = ended(number, AT_ONCE_S)
+    assert it.child
     if number == signal.SIGTERM:
-        assert program.returncode == 130
-        assert out == "report 1 stopped: 1 of 6 flights were flown\n"
-        assert err == "perchctl: stopped: 1 of 6 flights were flown\n"
+        assert it.code == 130
+        assert it.out == "report 1 stopped: 1 of 6 flights were flown\n"
+        assert it.err == "perchctl: stopped: 1 of 6 flights were flown\n"
 
 
 def test_logs_that_lack_something_are_counted(
