@@ -32,11 +32,11 @@ from perchctl.vision.markers.lines import refine
 from perchctl.vision.markers.mask import Covered, filled, hidden_in, hides
 from perchctl.vision.markers.motion import predicted_corners, with_motion
 from perchctl.vision.markers.partly import seen_partly, wholly_seen
-from perchctl.vision.markers.pattern import KnownBy
 from perchctl.vision.markers.search import Found, Look, search
 from perchctl.vision.markers.seen_edges import ROOM_PX
 from perchctl.vision.markers.shift import known_from
 from perchctl.vision.markers.square import completed, nested, side_lengths_px, within
+from perchctl.vision.markers.visible_cells import KnownBy
 from perchctl.vision.own import Chooser
 from perchctl.vision.types import (
     MARKERS,

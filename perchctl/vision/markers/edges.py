@@ -64,6 +64,12 @@ class Surroundings:
     outside: Floats
     possible: NDArray[np.bool_]
 
+    def only(self, kept: NDArray[np.intp]) -> Surroundings:
+        """Of some of the rows."""
+        return Surroundings(
+            self.depth_px[kept], self.inside[kept], self.outside[kept], self.possible[kept]
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Edges:

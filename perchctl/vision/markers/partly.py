@@ -18,7 +18,7 @@ from perchctl.geometry import Array
 from perchctl.vision.camera_model import distort, undistort_px
 from perchctl.vision.markers.corners import RefinedCorners
 from perchctl.vision.markers.mask import hides
-from perchctl.vision.markers.pattern import KnownBy, Pattern, visible_cells_agree
+from perchctl.vision.markers.pattern import Pattern
 from perchctl.vision.markers.profiles import PROFILES
 from perchctl.vision.markers.seen_edges import OUT, ROOM_PX, SeenEdges, look
 from perchctl.vision.markers.square import (
@@ -29,6 +29,11 @@ from perchctl.vision.markers.square import (
     mean_side_px,
     side_lengths_px,
     within,
+)
+from perchctl.vision.markers.visible_cells import (
+    KnownBy,
+    may_show_enough,
+    visible_cells_agree,
 )
 from perchctl.vision.types import CameraModel, EdgeShift
 
@@ -41,6 +46,7 @@ _MIN_SIGMA_PX, _LEAST_SHIFT_SIGMA_PX = 0.015, 0.01
 _SHIFT_PRIOR_PX, _CLIPPED_PRIOR_PX, _CLIPPED_GREY = 0.15, 0.4, 248.0
 _TAILS = 1.3  # what robust weights take away from a residual's square
 _MAX_STEP = 0.5
+_MOST_OFF_PX = 20.0  # from its start, three windows on: no edges lead a fit farther
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +74,7 @@ def fit_partly(
     `hidden` (h, w) is where pixels show something else. None where what is seen does not
     determine the corners. Nothing is said about the marker's cells.
     """
-    if not mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX:
+    if not _large_enough(start_px, pattern):
         return None
     start = undistort_px(start_px, camera)
     if not np.isfinite(start).all() or side_lengths_px(start).min() < 1.0:
@@ -96,11 +102,19 @@ def seen_partly(
     known: EdgeShift | None = None,
 ) -> RefinedCorners | None:
     """`fit_partly`, if the cells that are seen are the marker's."""
+    if not _large_enough(start_px, pattern):
+        return None
+    if not may_show_enough(start_px, image.shape, pattern, camera, known_by, _MOST_OFF_PX):
+        return None
     found = fit_partly(image, start_px, pattern, camera, hidden, known)
     if found is None:
         return None
-    agree = visible_cells_agree(image, found.corners_px, pattern, hidden, known_by)
+    agree = visible_cells_agree(image, found.corners_px, pattern, camera, hidden, known_by)
     return found if agree else None
+
+
+def _large_enough(start_px: Array, pattern: Pattern) -> bool:
+    return mean_side_px(start_px) / pattern.rim.cells >= LEAST_CELL_PX
 
 
 def wholly_seen(

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,18 +15,11 @@ from perchctl.geometry import Array
 from perchctl.vision.markers.drawing import Drawing
 from perchctl.vision.markers.square import from_unit, mapped, within
 
-KnownBy = Literal["bits", "track", "other"]
-"""By what it is known which marker it is: by its cells alone, by its place in the picture before,
-or by the target's other marker."""
-
 LEAST_SIDE_PX = 7.0  # below it a marker is a spot
-_MIN_CONTRAST = 10.0  # grey levels
-_MARGIN = 0.1  # of the contrast that a cell must keep from the threshold
-_MOST = 0.8
+MIN_CONTRAST = 10.0  # grey levels
+CELL_MARGIN = 0.1  # of the contrast that a cell must keep from the threshold
+MOST_CELLS = 0.8
 _MIN_RESEMBLANCE = 0.6
-_LEAST_KNOWN = 0.6  # of all cells
-_GLARE, _CLIPPED_GREY = 0.25, 250.0  # over white, of the contrast; as bright as can be
-_UNKNOWN_BITS: dict[KnownBy, int] = {"bits": 1, "track": 4}  # other codewords differ in two
 _COVERED = 1.25  # half sides of a marker in the centre that may hide cells
 _SPOTS: Array = np.array([[-0.22, -0.22], [0.22, -0.22], [0.22, 0.22], [-0.22, 0.22]])
 
@@ -131,11 +123,9 @@ def cells_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -
     high = float(np.partition(white, len(white) // 2)[len(white) // 2])
     low = float(np.partition(black, len(black) // 2)[len(black) // 2])
     contrast = high - low
-    middle, margin = 0.5 * (high + low), _MARGIN * contrast
+    middle, margin = 0.5 * (high + low), CELL_MARGIN * contrast
     return bool(
-        contrast >= _MIN_CONTRAST
-        and white.min() > middle + margin
-        and black.max() < middle - margin
+        contrast >= MIN_CONTRAST and white.min() > middle + margin and black.max() < middle - margin
     )
 
 
@@ -146,52 +136,7 @@ def cells_mostly_agree(image: NDArray[np.uint8], corners_px: Array, pattern: Pat
         return False
     high, low = np.median(means[pattern.white]), np.median(means[~pattern.white])
     right = (means > 0.5 * (high + low)) == pattern.white
-    return bool(high - low >= _MIN_CONTRAST and right.mean() > _MOST)
-
-
-def visible_cells_agree(
-    image: NDArray[np.uint8],
-    corners_px: Array,
-    pattern: Pattern,
-    hidden: NDArray[np.bool_] | None,
-    known_by: KnownBy,
-) -> bool:
-    """Whether the cells that are seen have their colour: not those beyond the picture's edge,
-    behind what is `hidden` (h, w), or in light that glares. How many that must be depends on
-    what else says which marker it is."""
-    h, w = image.shape
-    at = mapped(from_unit(corners_px), pattern.spots)
-    near = np.rint(np.clip(np.nan_to_num(at), 0.0, (w - 1, h - 1))).astype(np.intp)
-    seen = ((at >= 0.0) & (at <= (w - 1, h - 1))).all(axis=1)
-    if hidden is not None:
-        seen &= ~hidden[near[:, 1], near[:, 0]]
-    grey = image[near[:, 1], near[:, 0]].astype(np.float64)
-    white_spots = pattern.white[pattern.owner]
-    if not ((seen & white_spots).any() and (seen & ~white_spots).any()):
-        return False
-    high = float(np.median(grey[seen & white_spots]))
-    low = float(np.median(grey[seen & ~white_spots]))
-    contrast = high - low
-    if contrast < _MIN_CONTRAST:
-        return False
-    seen &= grey <= high + _GLARE * contrast
-    if high < _CLIPPED_GREY - _GLARE * contrast:
-        seen &= grey < _CLIPPED_GREY
-    count = np.bincount(pattern.owner, weights=seen)
-    means = np.bincount(pattern.owner, weights=grey * seen) / np.maximum(count, 1.0)
-    known = count >= 0.5 * pattern.spots_per_cell
-    share = (means - 0.5 * (high + low)) / contrast * np.where(pattern.white, 1.0, -1.0)
-    wrong = np.count_nonzero(known & (share < _MARGIN))
-    if known_by == "other":
-        most_wrong = math.floor((1.0 - _MOST) * np.count_nonzero(known & pattern.inner))
-        most_unknown = len(known)
-    else:
-        most_wrong, most_unknown = 0, _UNKNOWN_BITS[known_by]
-    return bool(
-        wrong <= most_wrong
-        and np.count_nonzero(pattern.inner & ~known) <= most_unknown
-        and np.count_nonzero(known) >= _LEAST_KNOWN * len(known)
-    )
+    return bool(high - low >= MIN_CONTRAST and right.mean() > MOST_CELLS)
 
 
 def resembles(image: NDArray[np.uint8], corners_px: Array, pattern: Pattern) -> bool:
@@ -220,7 +165,7 @@ def _likeness(grey: Array, pattern: Pattern) -> Array:
     spread = np.sqrt((grey * grey).sum(axis=1))[:, None]
     like = grey @ pattern.soft.T / np.maximum(spread, 1e-9)
     # Black and white each on about half of the spots are 2 spreads apart.
-    contrast = spread >= 0.5 * _MIN_CONTRAST * math.sqrt(grey.shape[1])
+    contrast = spread >= 0.5 * MIN_CONTRAST * math.sqrt(grey.shape[1])
     return np.asarray(like * contrast)
 
 

@@ -33,6 +33,7 @@ _INNER_CELL_PX = 6.0  # of a border whose inner edge is seen apart from the oute
 _TOO_BRIGHT, _TOO_DARK = 0.2, 0.5  # of the contrast: of black inside, of white outside
 _MIN_CONTRAST = 10.0
 _MIN_WEIGHT = 3.0  # of a side's profiles
+_LEAST_EDGES = 4  # a square has eight unknowns, and an edge fixes two
 _FAR_PX = 1e6
 _REACH: Array = np.linspace(-1.0, 1.0, STEPS // 2 + 1)[:, None]
 
@@ -52,6 +53,19 @@ class _Rows:
     scale_px: Array
     cell_px: float
     sign: Array
+
+    def only(self, kept: NDArray[np.intp]) -> _Rows:
+        """Some of them."""
+        return _Rows(
+            starts=self.starts[kept],
+            ends=self.ends[kept],
+            side=self.side[kept],
+            at=self.at[kept],
+            lengths_px=self.lengths_px[kept],
+            scale_px=self.scale_px[kept],
+            cell_px=self.cell_px,
+            sign=self.sign[kept],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +101,8 @@ def look(
     camera: CameraModel,
     hidden: NDArray[np.bool_] | None,
 ) -> SeenEdges | None:
-    """The edges near to where the square H has them; None where too few are seen."""
+    """The edges near to where the square H has them; None where too few are seen. Sides of
+    which nothing is seen are left out."""
     rows = _rows(H, pattern, camera)
     if rows is None:
         return None
@@ -98,9 +113,15 @@ def look(
     normal *= rows.sign[:, None, None]
     near_px = np.full(len(rows.at), min(max(0.85 * rows.cell_px, 1.5), 7.0))
     half_px = np.full(len(rows.at), min(max(1.5 * rows.cell_px, 1.75), 7.0))
-    grey = sample(image, origin, normal, half_px)
     around = _surroundings(s, pattern, 2.0 * rows.scale_px / pattern.rim.cells)
     free = around.possible & _in_view(image.shape, hidden, origin, normal, near_px)
+    kept = np.flatnonzero(np.count_nonzero(free, axis=1) >= _MIN_WEIGHT)
+    if len(kept) < _LEAST_EDGES:
+        return None
+    rows, around = rows.only(kept), around.only(kept)
+    origin, normal, free = origin[kept], normal[kept], free[kept]
+    near_px, half_px = near_px[kept], half_px[kept]
+    grey = sample(image, origin, normal, half_px)
     lit = _unspoilt(grey, free, near_px, half_px)
     if lit is None:
         return None
@@ -188,8 +209,6 @@ def _in_view(
 def _unspoilt(grey: Floats, free: NDArray[np.bool_], near_px: Array, half_px: Array) -> _Lit | None:
     """Which of the free profiles (rows, n) begin black and end white, as most do; None without
     contrast. Light that glares makes black bright; what lies on the paper makes white dark."""
-    if np.count_nonzero(free) < 2 * _MIN_WEIGHT:
-        return None
     # At half the window from the edge, blur has ended and no neighbour begins.
     off = max(1, round(0.5 * STEPS * float((0.6 * near_px / half_px)[0])))
     dark, bright = grey[:, :, STEPS // 2 - off], grey[:, :, STEPS // 2 + off]

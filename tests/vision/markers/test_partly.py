@@ -17,9 +17,13 @@ from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
 from perchctl.vision.markers.detect import detect, make_detector
 from perchctl.vision.markers.follow import follow
 from perchctl.vision.markers.partly import fit_partly, seen_partly
-from perchctl.vision.markers.pattern import KnownBy
 from perchctl.vision.markers.search import search
 from perchctl.vision.markers.square import from_unit, mapped
+from perchctl.vision.markers.visible_cells import (
+    KnownBy,
+    may_show_enough,
+    visible_cells_agree,
+)
 from perchctl.vision.types import Detections, Frame, MarkerName, PipelineState
 from tests.helpers.markers import POSE, SETUP, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -262,3 +266,34 @@ def test_nothing_is_fitted_to_no_contrast(grey: int) -> None:
     assert fit_partly(flat, corners("large"), LARGE, CAMERA) is None
     assert fit_partly(flat, np.full((4, 2), np.nan), LARGE, CAMERA) is None
     assert fit_partly(flat, corners("large") + 5000.0, LARGE, CAMERA) is None
+
+
+@pytest.mark.parametrize("z_m", [0.11, 0.12, 0.13])
+def test_a_marker_that_fills_the_picture_is_known_by_its_cells_as_the_lens_bends_them(
+    z_m: float,
+) -> None:
+    # The vehicle's last centimetres: the large marker's corners are beyond the picture, and its
+    # middle is 20 px from where a square with these corners would have it.
+    for x_m, y_m in ((-0.022, 0.0), (-0.02, 0.012), (0.025, -0.01)):
+        pose = pose_of(x_m, y_m, z_m, 0.05)
+        true = corners("large", pose)
+        found = seen_partly(render(*pose, noise=2.0), true + 3.0, LARGE, CAMERA, "track")
+        assert found is not None
+        assert np.abs(found.corners_px - true).max() < 0.5
+
+
+@pytest.mark.parametrize("known_by", ["track", "bits", "other"])
+def test_where_cells_cannot_be_enough_no_fit_is_tried(known_by: KnownBy) -> None:
+    # Of what a fit from 10 px beside would have taken, nothing is turned down beforehand.
+    tried = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        pose = pose_of(*rng.uniform(-0.12, 0.12, 2), rng.uniform(0.1, 0.3), rng.uniform(-3, 3))
+        start = corners("large", pose) + rng.uniform(-10.0, 10.0, 2)
+        agree = visible_cells_agree(
+            render(*pose), corners("large", pose), LARGE, CAMERA, None, known_by
+        )
+        may = may_show_enough(start, (H, W), LARGE, CAMERA, known_by, 20.0)
+        assert may or not agree
+        tried.append(may)
+    assert 0 < sum(tried) < len(tried)
