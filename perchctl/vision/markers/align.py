@@ -22,13 +22,7 @@ from perchctl.geometry import Array
 from perchctl.values import replace
 from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.markers.cells import cells_seen
-from perchctl.vision.markers.drawing import (
-    Drawing,
-    Rendering,
-    blurred,
-    sheets,
-    soft_cells,
-)
+from perchctl.vision.markers.drawing import Drawing
 from perchctl.vision.markers.grid import (
     Grid,
     Patch,
@@ -39,9 +33,10 @@ from perchctl.vision.markers.grid import (
     read,
     through_lens,
 )
-from perchctl.vision.markers.light import BEND, Light, fit_light, lit_jacobian
+from perchctl.vision.markers.light import Light, fit_light, lit_jacobian
 from perchctl.vision.markers.likeness import likeness, pattern_seen, repeated, worst_cell
 from perchctl.vision.markers.products import gram
+from perchctl.vision.markers.rendered import BEND, Rendered, rendered
 from perchctl.vision.markers.square import UNIT, corner_jacobian, from_unit
 from perchctl.vision.types import CameraModel
 
@@ -94,14 +89,14 @@ class Alignment:
 class _Scene:
     """What stays the same through all rounds: the picture, the nodes at which it is read,
     the homography to start with and the lens's shift of the nodes through it, and the
-    drawing there without blur, after it perhaps what is beyond its sheet."""
+    drawing."""
 
     patch: Patch
     grid: Grid
     camera: CameraModel
     H: Array
     lens_px: Array
-    sharp: tuple[NDArray[np.float32], ...]
+    drawing: Drawing
     side_px: float
     node_px: float
     max_blur_px: float
@@ -111,15 +106,13 @@ class _Scene:
 class _Fit:
     """The state of the fit: homography to pinhole pixels, the sum of its increments (8,),
     the offset that the lens makes of it at the nodes and the way since that was computed,
-    the blur with the renderings that have it, and whether it stands still after so many
-    rounds."""
+    the drawing with its blur, and whether it stands still after so many rounds."""
 
     H: Array
     total: Array
     offset_px: Array
     since_lens_px: float
-    blur_px: float
-    renderings: tuple[Rendering, ...]
+    rendered: Rendered
     rounds: int = 0
     still: bool = False
 
@@ -169,7 +162,7 @@ def align(
         fit = _stepped(fit, step, scene)
         if fit.still or fit.rounds == _ROUNDS:
             # What the last round left over, its step being next to nothing.
-            return _alignment(fit, equations, scene, start_px, drawing)
+            return _alignment(fit, equations, scene, start_px)
 
 
 def _scene(
@@ -194,7 +187,7 @@ def _scene(
         camera=camera,
         H=H,
         lens_px=lens_px,
-        sharp=sheets(drawing, n),
+        drawing=drawing,
         side_px=side_px,
         node_px=reach * side_px / n,
         max_blur_px=_MAX_BLUR_CELLS * side_px / len(drawing.cells),
@@ -208,14 +201,12 @@ def _first_fit(blur_px: float, scene: _Scene) -> _Fit:
         total=np.zeros(8),
         offset_px=scene.lens_px - scene.patch.first,
         since_lens_px=0.0,
-        blur_px=blur_px,
-        renderings=_rendered(blur_px, scene),
+        rendered=_rendered(blur_px, scene),
     )
 
 
-def _rendered(blur_px: float, scene: _Scene) -> tuple[Rendering, ...]:
-    sigma = blur_px / scene.node_px
-    return tuple(blurred(each, sigma, scene.grid.axis) for each in scene.sharp)
+def _rendered(blur_px: float, scene: _Scene) -> Rendered:
+    return rendered(scene.drawing, scene.grid.n, blur_px / scene.node_px)
 
 
 def _seen_through_lens(fit: _Fit, scene: _Scene) -> _Fit:
@@ -229,16 +220,16 @@ def _seen_through_lens(fit: _Fit, scene: _Scene) -> _Fit:
 def _equations(fit: _Fit, scene: _Scene) -> _Equations | None:
     """None without contrast. 16 or 17 unknowns: shape, blur and light."""
     grey = read(scene.patch, scene.grid, fit.H, fit.offset_px)
-    light = fit_light(fit.renderings, grey, scene.grid)
+    light = fit_light(fit.rendered, grey)
     gain = light.gain
     if gain < _MIN_GAIN:
         return None
     error = grey - light.grey
-    changes = lit_jacobian(fit.renderings, light, scene.grid)
-    J = np.concatenate([changes, light.columns, error[:, None]], axis=1)
+    changes = lit_jacobian(fit.rendered, light)
+    J = np.concatenate([changes, light.rows, error[None]])
     noise = max(float((error**2).mean()), 1.0)
-    products = gram(J, J) / noise
-    J, N, g = J[:, :-1], products[:-1, :-1], products[:-1, -1]
+    products = gram(J) / noise
+    J, N, g = J[:-1], products[:-1, :-1], products[:-1, -1]
     bend = _LIGHT + BEND
     N[_BLUR, _BLUR] += 1.0  # about a node's width a round
     N[bend, bend] += (_BEND_SIGMA * gain) ** -2.0
@@ -266,34 +257,31 @@ def _stepped(fit: _Fit, step: Array, scene: _Scene) -> _Fit:
     H /= H[2, 2]
     moved_px = 0.5 * scene.side_px * float(np.abs(p[:6]).max())
     since_lens_px = fit.since_lens_px + moved_px
-    squared = (fit.blur_px / scene.node_px) ** 2 + float(np.clip(step[_BLUR], -1.0, 1.0))
+    squared = fit.rendered.sigma**2 + float(np.clip(step[_BLUR], -1.0, 1.0))
     wanted_px = math.sqrt(max(squared, 1e-3)) * scene.node_px
     wanted_px = min(max(wanted_px, _MIN_BLUR_PX), scene.max_blur_px)
-    redraw = abs(wanted_px - fit.blur_px) > _BLUR_STEP * fit.blur_px
+    blur_px = fit.rendered.sigma * scene.node_px
+    redraw = abs(wanted_px - blur_px) > _BLUR_STEP * blur_px
     return replace(
         fit,
         H=H,
         total=fit.total + p,
         since_lens_px=since_lens_px,
-        blur_px=wanted_px if redraw else fit.blur_px,
-        renderings=_rendered(wanted_px, scene) if redraw else fit.renderings,
+        rendered=_rendered(wanted_px, scene) if redraw else fit.rendered,
         rounds=fit.rounds + 1,
         still=not redraw and moved_px < _STILL_PX and since_lens_px <= _LENS_PX,
     )
 
 
-def _alignment(
-    fit: _Fit, equations: _Equations, scene: _Scene, start_px: Array, drawing: Drawing
-) -> Alignment:
-    grid, light, error = scene.grid, equations.light, equations.error
+def _alignment(fit: _Fit, equations: _Equations, scene: _Scene, start_px: Array) -> Alignment:
+    drawing, grid, light, error = scene.drawing, scene.grid, equations.light, equations.error
     corners_px = through_lens(projected(fit.H, *UNIT.T), scene.camera)
-    pattern = pattern_seen(drawing, grid, fit.blur_px / scene.node_px, light, error)
+    pattern = pattern_seen(fit.rendered, equations.grey, light)
     many = repeated(error.reshape(grid.n, grid.n))
     covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE] * many
-    soft = soft_cells(drawing, grid.axis, drawing.reach / grid.n, fit.blur_px / scene.node_px)
     cells = cells_seen(
         drawing.cells,
-        soft,
+        fit.rendered.soft_cells,
         error,
         equations.J,
         equations.N * equations.noise,
@@ -310,7 +298,7 @@ def _alignment(
         worst_cell=worst_cell(error / light.gain, grid, len(drawing.cells)),
         flip=cells.flip,
         flip_sigma=cells.sigma,
-        blur_px=fit.blur_px,
+        blur_px=fit.rendered.sigma * scene.node_px,
         gain=light.gain,
         moved_px=float(np.abs(corners_px - start_px).max()),
     )

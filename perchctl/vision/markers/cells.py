@@ -34,19 +34,17 @@ def cells_seen(
         cells: the drawing's, (m, m), 1 = white.
         soft: share of each row (and column) of cells in each node, blurred, (n, m).
         error: grey values minus the fit, (n * n,).
-        J: changes of the grey values with the fit's unknowns, (n * n, k).
+        J: changes of the grey values with the fit's unknowns, (k, n * n).
         N: the fit's normal matrix with its priors, (k, k), per unit of noise.
         noise: variance of a node's grey value, of nodes that measure on their own.
         gain: grey levels from black to white.
     """
     n, m = soft.shape
     seen = gain * (soft.T @ error.reshape(n, n) @ soft).ravel()
-    k = J.shape[1]
-    by_row = soft.T @ J.reshape(n, n * k)  # (m, n, k)
-    shared = gain * (soft.T @ by_row.reshape(m, n, k)).reshape(m * m, k)
+    shared = gain * (soft.T @ J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
     squared = (soft**2).sum(axis=0)
     energy = gain**2 * np.outer(squared, squared).ravel()
-    taken = np.einsum("ij,ij->i", shared, np.linalg.solve(N, shared.T).T)
+    taken = np.einsum("ij,ij->j", shared, np.linalg.solve(N, shared))
     own = np.maximum(energy - taken, 1e-9 * energy + 1e-12)
     flips = np.where(cells.ravel() > 0.5, -1.0, 1.0) * seen / own
     return CellsSeen(float(flips.max()), math.sqrt(noise / float(own.min())))

@@ -33,15 +33,6 @@ class Drawing:
         return 1.0 + _REACH_CELLS * 2.0 / len(self.cells)
 
 
-@dataclass(frozen=True, eq=False)
-class Rendering:
-    """A drawing at the nodes (n * n,) with its changes (n * n, 9) with the eight terms of
-    a homography's increment and with the blur's square."""
-
-    value: Array
-    jacobian: Array
-
-
 def drawing_of(bits: NDArray[np.uint8], centre: NDArray[np.uint8] | None = None,
                ratio: float = 0.0) -> Drawing:  # fmt: skip
     """From inner bits, 1 = white; with a centre, the target's large marker: its sheet has
@@ -115,25 +106,3 @@ def softened(sharp: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """Nodes, those all around among them, blurred by so many."""
     soft = cv2.GaussianBlur(sharp, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(soft, np.float32)
-
-
-def blurred(sharp: NDArray[np.float32], sigma: float, axis: Array) -> Rendering:
-    """The drawing blurred by sigma nodes, and its changes, per unit of the drawing."""
-    soft = softened(sharp, sigma)
-    step = float(axis[1] - axis[0])
-    e, n = EDGE, len(axis)
-    middle = slice(e, e + n)
-    left, right = soft[middle, e - 1 : e + n - 1], soft[middle, e + 1 : e + n + 1]
-    up, down = soft[e - 1 : e + n - 1, middle], soft[e + 1 : e + n + 1, middle]
-    value = soft[middle, middle]
-    du, dv = np.float32(0.5 / step) * (right - left), np.float32(0.5 / step) * (down - up)
-    laplace = left + right + up + down - 4.0 * value
-    u, v = axis.astype(np.float32), axis.astype(np.float32)[:, None]
-    along = u * du + v * dv
-    flat = np.empty((n, n, 9))
-    for part, one, other in (
-        (0, u, du), (1, v, du), (3, u, dv), (4, v, dv), (6, -u, along), (7, -v, along),
-    ):  # fmt: skip
-        np.multiply(-one, other, out=flat[..., part])
-    flat[..., 2], flat[..., 5], flat[..., 8] = -du, -dv, 0.5 * laplace
-    return Rendering(value.ravel().astype(np.float64), flat.reshape(n * n, 9))

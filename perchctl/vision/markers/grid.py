@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import distort
 from perchctl.vision.types import CameraModel
+
+_FEW = 9  # a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +35,7 @@ class Patch:
     first: NDArray[np.intp]
 
 
+@lru_cache(maxsize=64)
 def make_grid(n: int, reach: float) -> Grid:
     """Nodes in the middle of n by n equal parts of the square from -reach to reach."""
     axis = reach * ((2.0 * np.arange(n) + 1.0) / n - 1.0)
@@ -55,9 +60,25 @@ def through_lens(pin_px: Array, camera: CameraModel) -> Array:
 
 
 def lens_shift_px(grid: Grid, H: Array, camera: CameraModel) -> Array:
-    """How far the lens moves each node that is seen through H, (n * n, 2)."""
-    pin = projected(H, grid.u, grid.v)
-    return through_lens(pin, camera) - pin
+    """How far the lens moves each node that is seen through H, (n * n, 2). A lens moves
+    neighbours alike: it is computed for a few nodes, and the rest by the polynomial through
+    these."""
+    u, v, between = _few(grid)
+    pin = projected(H, u, v)
+    shift = (through_lens(pin, camera) - pin).T.reshape(2, _FEW, _FEW)
+    return np.asarray((between @ shift @ between.T).reshape(2, -1).T)
+
+
+@lru_cache(maxsize=64)
+def _few(grid: Grid) -> tuple[Array, Array, Array]:
+    """Chebyshev's nodes over the grid, u and v (_FEW^2,), and the weights (n, _FEW) that a
+    row's nodes give to its values there."""
+    reach = float(grid.axis[-1])
+    x = chebyshev.chebpts2(_FEW)
+    u, v = np.meshgrid(reach * x, reach * x)
+    degree = _FEW - 1
+    through = np.linalg.inv(chebyshev.chebvander(x, degree))
+    return u.ravel(), v.ravel(), chebyshev.chebvander(grid.axis / reach, degree) @ through
 
 
 def patch_around(image: NDArray[np.uint8], grid: Grid, H: Array, lens_px: Array) -> Patch | None:

@@ -4,6 +4,7 @@ where the other marker puts it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -24,6 +25,7 @@ _REACH = 0.3  # of the side
 # Where the other marker shows that it must be there, it may be vague.
 _MAX_SIGMA_ALONE, _MAX_SIGMA = 0.06, 0.12  # of the side
 _BLUR_PX = 1.5  # to start with, where it is not known
+_ACROSS_PX = 0.37  # sigma: that of sides has a pixel's own width and the reading's in it
 _OTHER: dict[MarkerName, MarkerName] = {"large": "small", "small": "large"}
 
 
@@ -74,7 +76,7 @@ def _blur_px(seen: RefinedCorners | None) -> float:
     """That of the sides, where lines were fitted: the fit of the drawing gets there sooner."""
     if seen is None or not seen.refined or seen.blur_px <= 0.0:
         return _BLUR_PX
-    return min(seen.blur_px, _BLUR_PX)
+    return min(math.sqrt(max(seen.blur_px**2 - _ACROSS_PX**2, 0.0)), _BLUR_PX)
 
 
 def _start(

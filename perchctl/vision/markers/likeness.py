@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.drawing import EDGE, Drawing, softened, square
 from perchctl.vision.markers.grid import Grid
-from perchctl.vision.markers.light import BEYOND, GAIN, Light
-from perchctl.vision.markers.products import gram, mixed
+from perchctl.vision.markers.light import Light
+from perchctl.vision.markers.products import mixed, onto
+from perchctl.vision.markers.rendered import GAIN, Rendered
 
 
 @dataclass(frozen=True)
@@ -22,20 +24,16 @@ class PatternSeen:
     strength: float
 
 
-def pattern_seen(
-    drawing: Drawing, grid: Grid, sigma: float, light: Light, error: Array
-) -> PatternSeen:
-    """With the drawing blurred by `sigma` nodes; `error` (n * n,) is what the fit left over."""
-    plain = softened(square(len(drawing.cells), grid.n), sigma)[EDGE:-EDGE, EDGE:-EDGE]
-    columns = light.columns
-    known: Array = np.column_stack([columns[:, :GAIN], plain.ravel(), columns[:, BEYOND:]])
-    left: Array = np.stack([columns[:, GAIN], light.grey + error], axis=1)
-    both = np.concatenate([known, left], axis=1)
-    count = known.shape[1]
-    products = gram(both, both)[:count]
-    A = products[:, :count] + 1e-9 * np.eye(count)
-    mix = np.asarray(np.linalg.solve(A, products[:, count:]), dtype=np.float64)
-    bits, seen = (left[:, k] - mixed(known, mix[:, k]) for k in (0, 1))
+def pattern_seen(drawing: Rendered, grey: Array, light: Light) -> PatternSeen:
+    """In the picture's grey values (n * n,)."""
+    plain = drawing.plain
+    A = plain.products + 1e-9 * np.eye(len(plain.products))
+
+    def unexplained(values: Array) -> Array:
+        mix = np.asarray(np.linalg.solve(A, onto(plain.rows, values)), dtype=np.float64)
+        return np.asarray(values - mixed(plain.rows, mix))
+
+    bits, seen = unexplained(light.rows[GAIN]), unexplained(grey)
     energy, product = float((bits * bits).sum()), float((bits * seen).sum())
     scale = math.sqrt(energy * float((seen * seen).sum()))
     if scale < 1e-9:
@@ -63,9 +61,18 @@ def repeated(error: Array) -> float:
 
 def worst_cell(error: Array, grid: Grid, n_cells: int) -> float:
     """Largest mean departure over a cell."""
+    index, count = _cells_of(grid, n_cells)
+    total = np.bincount(index, weights=error, minlength=n_cells**2 + 1)[:-1]
+    return float(np.abs(total / count).max())
+
+
+@lru_cache(maxsize=32)
+def _cells_of(grid: Grid, n_cells: int) -> tuple[NDArray[np.intp], Array]:
+    """Of each node the cell's number, behind the last one's around the marker, and how many
+    nodes each cell has."""
     x, y = ((g + 1.0) * 0.5 * n_cells for g in (grid.u, grid.v))
     inside = (x >= 0) & (x < n_cells) & (y >= 0) & (y < n_cells)
-    index = (y[inside].astype(np.intp)) * n_cells + x[inside].astype(np.intp)
-    total = np.bincount(index, weights=error[inside], minlength=n_cells**2)
-    count = np.bincount(index, minlength=n_cells**2)
-    return float(np.abs(total / np.maximum(count, 1)).max())
+    own = y.astype(np.intp) * n_cells + x.astype(np.intp)
+    index = np.where(inside, own, n_cells**2)
+    count = np.bincount(index, minlength=n_cells**2 + 1)[:-1]
+    return index, np.maximum(count, 1.0)
