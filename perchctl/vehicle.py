@@ -93,9 +93,12 @@ class PositionSetpoint:
 
 @dataclass(frozen=True)
 class RawThrust:
-    """Level attitude and a raw thrust 0..65535: stabilised position control off."""
+    """An attitude, level if nothing else is said, and a raw thrust 0..65535: stabilised position
+    control off. Roll to the right and pitch nose down are positive, as in telemetry."""
 
     thrust: int
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
 
 
 @dataclass(frozen=True)

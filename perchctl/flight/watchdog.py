@@ -220,7 +220,7 @@ class Watchdog:
         match turn.command:
             case RawThrust(thrust) if known is not None and self._held is None:
                 if thrust <= THRUST_MIN or abs(known.velocity_mps[2]) < STILL_MPS:
-                    return turn.command
+                    return RawThrust(thrust)  # level: a tilt held on would only speed it up
             case PositionSetpoint(z_m=z_m) if known is not None and self._held is None:
                 if z_m > known.position_m[2] and known.velocity_mps[2] < SINKING_MPS:
                     return turn.command

@@ -58,8 +58,8 @@ def _packets(command: Command) -> tuple[Packet, ...]:
         case PositionSetpoint(x, y, z, yaw):
             data = struct.pack("<Bffff", _POSITION, x, y, z, math.degrees(yaw))
             return (Packet(Port.COMMANDER_GENERIC, _SETPOINT, data),)
-        case RawThrust(thrust):
-            return (_raw(thrust),)
+        case RawThrust(thrust, roll_rad, pitch_rad):
+            return (_raw(thrust, roll_rad, pitch_rad),)
         case Land(height, duration):
             # The order first, and three times: the notify alone cuts the motors at once
             # (docs/firmware.md, "Notify alone"), so the order must not be what is lost. With
@@ -86,9 +86,10 @@ def encode_external(place: ExternalPosition) -> Packet:
         raise InvalidValue(f"{place} does not fit into a packet: {error}") from None
 
 
-def _raw(thrust: int) -> Packet:
-    """Level and not turning; -0.0, since a setpoint's pitch is negated on its way out."""
-    return Packet(Port.COMMANDER, 0, struct.pack("<fffH", 0.0, -0.0, 0.0, thrust))
+def _raw(thrust: int, roll_rad: float = 0.0, pitch_rad: float = 0.0) -> Packet:
+    """Not turning; a setpoint's pitch is negated on its way out."""
+    roll_deg, pitch_deg = math.degrees(roll_rad), math.degrees(pitch_rad)
+    return Packet(Port.COMMANDER, 0, struct.pack("<fffH", roll_deg, -pitch_deg, 0.0, thrust))
 
 
 def _vertical(kind: int, height_m: float, duration_s: float) -> Packet:

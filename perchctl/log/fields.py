@@ -127,6 +127,8 @@ FIELDS: dict[str, str] = {
     "cmd_z_m": "position setpoint, or the height of a landing",
     "cmd_yaw_rad": "setpoint's heading",
     "cmd_thrust": "raw thrust 0..65535",
+    "cmd_roll_rad": "roll to the right that goes with it",
+    "cmd_pitch_rad": "pitch nose down that goes with it",
     "cmd_duration_s": "duration of a landing",
     "late_s": "how late this tick began",
     # simulation only
@@ -328,8 +330,9 @@ def command_values(command: Command | None) -> Mapping[str, Any]:
             return {"cmd": "idle"}
         case PositionSetpoint(x_m, y_m, z_m, yaw_rad):
             return {"cmd": "position", **_xyz("cmd_", (x_m, y_m, z_m)), "cmd_yaw_rad": yaw_rad}
-        case RawThrust(thrust):
-            return {"cmd": "thrust", "cmd_thrust": thrust}
+        case RawThrust(thrust, roll_rad, pitch_rad):
+            tilt = {"cmd_roll_rad": roll_rad, "cmd_pitch_rad": pitch_rad}
+            return {"cmd": "thrust", "cmd_thrust": thrust, **tilt}
         case StopMotors():
             return {"cmd": "stop"}
         case Land(height_m, duration_s):

@@ -27,6 +27,9 @@ DAMPING_S_PER_M = 0.15
 INTEGRAL_PER_M = 0.1
 RAMP_PER_S = 0.25
 STILL_MPS = 0.05
+BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.12, 0.14
+"""Sideways speed goes down by 1/e in 0.85 s, several times the age of what is known of it; so much
+tilt takes 1 % of the thrust."""
 FELT_S = 1.0
 """In so long the estimate draws the felt speed to its own, which takes out the accelerometer's
 offset: without it 0.2 m/s^2 would be 0.4 m/s in two seconds."""
@@ -83,11 +86,12 @@ def _believed_s(c: Context) -> float:
 
 def _is_overdue(c: Context) -> bool:
     """Blind for so long, it has come down, or hangs, or its estimated speed has drifted away."""
-    if c.state.blind_s is None:
+    if c.state.blind_s is None or c.placed:
         return False
     ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
     lasts_s = BLIND_SPARE_S + max(0.0, c.state.entry_m[2] - ground_m) / BLIND_SINK_MPS
-    return c.obs.t_s - c.state.blind_s > lasts_s
+    # What hung on the magnet, and slipped, begins anew.
+    return c.obs.t_s - max(c.state.blind_s, c.state.entered_s) > lasts_s
 
 
 def astray_down(c: Context) -> Acted:
@@ -124,4 +128,21 @@ def level_down(c: Context) -> Acted:
     state = replace(
         state, hover_thrust=hover, level_thrust=thrust, setpoint=None, orders=0, caught=True
     )
-    return state, RawThrust(int(thrust))
+    roll_rad, pitch_rad = _braking(c)
+    return state, RawThrust(int(thrust), roll_rad, pitch_rad)
+
+
+def _braking(c: Context) -> tuple[float, float]:
+    """Roll and pitch against the sideways speed, where that is known: the target is seen again,
+    and the heading is not what was lost. Else level."""
+    tel = c.obs.telemetry
+    if c.state.heading_lost or not (c.placed and c.proves):
+        return 0.0, 0.0
+    cos, sin = math.cos(tel.yaw_rad), math.sin(tel.yaw_rad)
+    x_mps, y_mps, _ = tel.velocity_mps
+    ahead_mps, left_mps = x_mps * cos + y_mps * sin, y_mps * cos - x_mps * sin
+    return _against(-left_mps), _against(ahead_mps)
+
+
+def _against(mps: float) -> float:
+    return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -BRAKE_RAD_PER_MPS * mps))

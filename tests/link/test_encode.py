@@ -34,6 +34,7 @@ from perchctl.vehicle import (
 
 PROTOCOL = 12
 THRUST_MAX = 0xFFFF
+TILTS_RAD = st.floats(-0.5, 0.5)
 
 
 def commands(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[Command]:
@@ -41,7 +42,7 @@ def commands(numbers: st.SearchStrategy[float]) -> st.SearchStrategy[Command]:
     return st.one_of(
         st.just(Idle()),
         st.builds(PositionSetpoint, numbers, numbers, numbers, st.floats(-1e3, 1e3)),
-        st.builds(RawThrust, st.integers(0, THRUST_MAX)),
+        st.builds(RawThrust, st.integers(0, THRUST_MAX), TILTS_RAD, TILTS_RAD),
         st.builds(Land, numbers, numbers),
         st.just(StopMotors()),
         st.just(EmergencyStop()),
@@ -76,8 +77,8 @@ class Recorder:
                 pass
             case PositionSetpoint(x, y, z, yaw):
                 self.commander.send_position_setpoint(x, y, z, math.degrees(yaw))
-            case RawThrust(thrust):
-                self.commander.send_setpoint(0.0, 0.0, 0.0, thrust)
+            case RawThrust(thrust, roll, pitch):
+                self.commander.send_setpoint(math.degrees(roll), math.degrees(pitch), 0.0, thrust)
             case Land(height, duration):
                 for _ in range(LAND_TIMES):
                     self.high_level.land(height, duration, yaw=None)  # keeps the heading
@@ -177,6 +178,10 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
             [("low_level", (PositionCommand(0.25, -0.5, 1.5, 90.0),))],
         ),
         (RawThrust(40000), [("low_level", (RawSetpoint(0.0, 0.0, 0.0, 40000),))]),
+        (
+            RawThrust(40000, math.pi / 8.0, -math.pi / 4.0),
+            [("low_level", (RawSetpoint(22.5, -45.0, 0.0, 40000),))],
+        ),
         (
             Land(-0.25, 3.0),
             [("high_level", (HlLand(-0.25, 3.0, None),))] * LAND_TIMES

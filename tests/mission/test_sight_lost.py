@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
+from perchctl.mission.context import PUT_RIGHT_S
 from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
-from perchctl.mission.level import BLIND_SINK_MPS
+from perchctl.mission.level import BLIND_SINK_MPS, MOST_BRAKE_RAD
 from perchctl.mission.state import Observation, Operator, Phase, PlannerState, Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Land, PositionSetpoint, RawThrust, StopMotors
@@ -120,6 +121,57 @@ def test_once_blind_it_stays_so_though_the_target_is_seen_again() -> None:
     assert state.severity is Severity.LAND
     _, command = planner.step(state, observation(BEGIN_S + 2.0, 0.9), PROFILE)
     assert isinstance(command, RawThrust)
+
+
+@given(
+    vx_mps=st.floats(-1.5, 1.5),
+    vy_mps=st.floats(-1.5, 1.5),
+    yaw_rad=st.floats(-math.pi, math.pi),
+    pushed=st.booleans(),
+)
+def test_seen_again_it_brakes_what_carries_it_aside(
+    vx_mps: float, vy_mps: float, yaw_rad: float, pushed: bool
+) -> None:
+    """A blow may have thrown it, and its attitude been wrong as it hung: level it would fly on
+    aside, 2 m and more until the floor. Without a sight nothing is known of that: level."""
+    state = flown(state_in(Phase.ALIGN), LAND_S + 0.2)[-1][0]
+    for i in range(1, 60):
+        t_s = BEGIN_S + LAND_S + 0.2 + TURN_S * i
+        tel = telemetry(t_s, 1.0, velocity_mps=(vx_mps, vy_mps, -0.5), yaw_rad=yaw_rad)
+        age_s = LAND_S + 0.2 + TURN_S * i if pushed else 0.05
+        obs = observation(t_s, telemetry=tel, position_age_s=age_s)
+        state, command = planner.step(state, obs, PROFILE)
+        assert isinstance(command, RawThrust)
+        if pushed or TURN_S * i < PUT_RIGHT_S:
+            assert command == RawThrust(command.thrust)
+    if pushed:
+        return
+    # Nose down is forwards, roll to the right is to the right (docs/firmware.md).
+    ahead, left = command.pitch_rad, -command.roll_rad
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    x, y = ahead * cos - left * sin, ahead * sin + left * cos
+    speed_mps = math.hypot(vx_mps, vy_mps)
+    assert math.hypot(x, y) <= math.sqrt(2.0) * MOST_BRAKE_RAD + 1e-9
+    assert x * vx_mps + y * vy_mps <= -0.05 * min(speed_mps, 1.0) * speed_mps
+    if speed_mps < 1.0:
+        assert x * vy_mps - y * vx_mps == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_slips_off_the_magnet_has_its_whole_way_down_before_it() -> None:
+    """Blind for long while it hung, it would have less and less thrust at once, and fall."""
+    hung = replace(
+        state_in(Phase.LANDING, z_m=2.0),
+        blind_s=BEGIN_S - 6.0, entered_s=BEGIN_S - 1.0, hover_thrust=HOVER_THRUST, caught=True,
+    )  # fmt: skip
+    thrusts = []
+    for state in (hung, replace(hung, entered_s=BEGIN_S - 6.0)):
+        tel = telemetry(BEGIN_S + TURN_S, 1.5, velocity_mps=(0.0, 0.0, -0.5))
+        obs = unseen(BEGIN_S + TURN_S, 1.5, 6.0, telemetry=tel)
+        _, command = planner.step(replace(state, level_thrust=HOVER_THRUST), obs, PROFILE)
+        assert isinstance(command, RawThrust)
+        thrusts.append(command.thrust)
+    assert thrusts[0] == pytest.approx(HOVER_THRUST, abs=0.02 * HOVER_THRUST)
+    assert thrusts[1] < thrusts[0]
 
 
 def test_a_landing_that_loses_it_goes_on_blindly() -> None:
