@@ -255,7 +255,7 @@ def test_sixty_pairs_find_an_integral_that_is_off_and_nothing_between_a_profile_
 ):
     """The onboard loop takes away a draught's offset by itself. An estimate that drifts is what
     the integral is for: without it the vehicle lags behind the target by more than it may be
-    aside to settle."""
+    aside to settle, and most give up. Too few perch by both for their misses to say anything."""
     short = f"{ROOT}/tests/helpers/short.yaml"
     Path("drifting.yaml").write_text(f"extends: {short}\nsimulation: {{drift_mps: 0.02}}\n")
     Path("without.yaml").write_text("extends: drifting.yaml\nplanner: {integral_per_s: 0}\n")
@@ -264,8 +264,7 @@ def test_sixty_pairs_find_an_integral_that_is_off_and_nothing_between_a_profile_
     record = json.loads(run(*flown, "without.yaml", "--json").stdout)
     assert record["flights"] == 60
     assert record["profile"] == {KEY: {"a": 0.4, "b": 0.0}}
-    assert record["miss_m"]["better"] == "A"
-    assert record["time_s"]["better"] == "A"
+    assert record["success"]["better"] == record["time_s"]["better"] == "A"
     said = run(*flown, "copy.yaml").stdout
     assert "identical in all 60 flights\nthe profiles do not differ\n" in said
     assert "better" not in said
