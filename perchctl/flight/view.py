@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from perchctl.flight.criteria import Problem
+from perchctl.geometry import rot_z
 from perchctl.positioning.place import Place
 from perchctl.profile import Profile
 from perchctl.target.overhead import (
@@ -21,9 +22,12 @@ from perchctl.target.overhead import (
     sight_from,
 )
 from perchctl.target.visible import FieldOfView
+from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import CameraModel, TargetEstimate
 
+LEAN_DEG = 5.0
+"""On its way up, and against a draught: nearer to the picture's edge, the target would leave it."""
 Start = tuple[float, float, float]
 """Where it stands, in the world that the target's place is in."""
 
@@ -32,10 +36,10 @@ def out_of_view(
     target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
 ) -> Problem | None:
     """From the take-off height over the start, or from `planner.approach_xy_m`, no marker would be
-    wholly in the picture of a level vehicle. `yaw_rad`: its heading at the start."""
+    wholly in the picture of a vehicle that leans a little. `yaw_rad`: its heading at the start."""
     planner, (x, y, z) = profile.planner, start_m
     top_m = z + planner.takeoff_height_m
-    over = seen_at((x, y, top_m), yaw_rad, target, profile, camera)
+    over = _seen_leaning((x, y, top_m), yaw_rad, target, profile, camera)
     if not over.whole:
         return Problem(
             f"the target is the positioning system, and would leave the picture as the vehicle "
@@ -46,7 +50,7 @@ def out_of_view(
         )
     if planner.approach_xy_m is None:
         return None
-    there = seen_at((*planner.approach_xy_m, top_m), yaw_rad, target, profile, camera)
+    there = _seen_leaning((*planner.approach_xy_m, top_m), yaw_rad, target, profile, camera)
     if there.whole:
         return None
     to_x, to_y = planner.approach_xy_m
@@ -70,6 +74,25 @@ def seen_at(
     )  # fmt: skip
 
 
+def _seen_leaning(
+    body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
+) -> Sight:
+    """`seen_at` of a vehicle that leans so that the target goes towards the picture's edge: as if
+    it stood farther away."""
+    level = seen_at(body_m, yaw_rad, target, profile, camera)
+    aside_m = math.hypot(*level.aside_m)
+    if not (level.whole and aside_m > 1e-9):
+        return level
+    away = -rot_z(yaw_rad)[:2, :2] @ np.array(level.aside_m) / aside_m
+    x, y = np.array(body_m[:2]) + _leant_m(level) * away
+    leaning = seen_at((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
+    return replace(level, whole=leaning.whole)
+
+
+def _leant_m(sight: Sight) -> float:
+    return sight.height_m * math.tan(math.radians(LEAN_DEG))
+
+
 def place_seen(target: TargetEstimate, profile: Profile) -> Place:
     """Of a target that a level vehicle sees: in the world in which it stands at the origin, at the
     ground's height, with its front along x."""
@@ -84,7 +107,8 @@ def _too_far(sight: Sight, profile: Profile, camera: CameraModel) -> str:
     aside = f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis"
     side_m, mount = profile.target.large.side_m, profile.camera.mount
     reach = reach_at(side_m, FieldOfView(camera), mount, sight.height_m)
-    most = "" if reach is None else f", {reach.radius_m:.2f} m at most,"
+    room_m = 0.0 if reach is None else max(0.0, reach.radius_m - _leant_m(sight))
+    most = "" if reach is None else f", {room_m:.2f} m at most,"
     return f"{aside}{most} {sight.height_m:.2f} m over the camera"
 
 

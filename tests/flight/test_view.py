@@ -17,7 +17,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.outside import AtRest, strange
 from perchctl.flight.preflight import refuse_out_of_view, refuse_strange, still_waiting_for
-from perchctl.flight.view import out_of_view, place_seen, seen_at
+from perchctl.flight.view import LEAN_DEG, out_of_view, place_seen, seen_at
 from perchctl.geometry import rot_z
 from perchctl.positioning.feed import FeedStatus
 from perchctl.positioning.place import Place
@@ -62,7 +62,12 @@ def test_put_where_the_refusal_says_it_flies(
     place = Place(np.array([x, y, z]), target_yaw)
     problem = out_of_view(place, FEET, yaw_rad, TARGET, CAMERA)
     over = seen_at((0.0, 0.0, TOP_M), yaw_rad, place, TARGET, CAMERA)
-    assert (problem is None) is over.whole
+    leant_m = over.height_m * math.tan(math.radians(LEAN_DEG))
+    farther = (1.0 + leant_m / max(math.hypot(*over.aside_m), 1e-6)) * place.position_m[:2]
+    leaning = Place(np.array([*farther, z]), target_yaw)
+    # The camera is on the body's axis here: farther aside is as good as leaning.
+    swayed = seen_at((0.0, 0.0, TOP_M), yaw_rad, leaning, TARGET, CAMERA)
+    assert (problem is None) is (over.whole and swayed.whole)
     if problem is None:
         assert seen_at(FEET, yaw_rad, place, TARGET, CAMERA).whole
         return
