@@ -136,7 +136,8 @@ def hangs_stopped(c: Context) -> bool:
     if stopped_s is None:
         return False
     # A landing without positions puts the weight on whatever carries it: the floor, perhaps.
-    hung = c.state.phase is Phase.COMPLETE and hangs_s is not None and hangs_s <= stopped_s
+    landing = c.state.phase is Phase.LANDING and stopped_s >= c.state.entered_s
+    hung = not landing and hangs_s is not None and hangs_s <= stopped_s
     return hung or still_at_contact(c)
 
 
@@ -152,18 +153,20 @@ def still_at_contact(c: Context) -> bool:
 
 def hangs_in_landing(c: Context) -> bool:
     """With its motors off where the magnet had it, or where the landing began, up there: what
-    has not come down is not on the floor, whether or not a contact was noticed."""
+    has not come down is not on the floor, whether or not a contact was noticed. Or stopped
+    before the landing began, and carried all the time since."""
     z_m, ground = c.obs.telemetry.position_m[2], c.state.ground_m
     began_m = c.state.entry_m[2]
     high = began_m - (ground[2] if ground else 0.0) > HIGH_M
     stayed = c.proves and c.placed and high and not c.far_below_target and began_m - z_m < STAYED_M
-    return stayed or (still_at_contact(c) and c.height_m > LOW_M)
+    return stayed or (hangs_stopped(c) and c.height_m > LOW_M)
 
 
 def hangs_or_stands(c: Context) -> bool:
     """It came down blindly from the magnet's reach, or did not: something carries it, which may be
     either. A target that is seen again, far above, tells that it has come down."""
-    return c.state.blind_in_reach and not c.placed and not is_low_by_eye(c)
+    in_reach = c.state.blind_in_reach or (c.by_sight and c.state.contact_z_m is not None)
+    return in_reach and not c.placed and not is_low_by_eye(c)
 
 
 def settling_too_long(c: Context) -> bool:

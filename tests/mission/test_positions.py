@@ -318,7 +318,7 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     """On the floor a magnet's hold and the ground's look alike; a lock makes no perch of it."""
     state = state_in(Phase.LANDING, z_m=1.0)
     state = replace(
-        state, contact_z_m=0.6, released_s=9.0, stopped_s=9.9, stale_s=BEGIN_S,
+        state, entered_s=8.0, contact_z_m=0.6, released_s=9.0, stopped_s=9.9, stale_s=BEGIN_S,
         since={Condition.WEIGHT_HANGS: 9.5},
     )  # fmt: skip
     locked = telemetry(BEGIN_S, 0.6, thrust=0.0, supervisor=READY | LOCKED)

@@ -14,10 +14,10 @@ from perchctl.mission import planner
 from perchctl.mission.context import PUT_RIGHT_S
 from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
 from perchctl.mission.level import BLIND_SINK_MPS, MOST_BRAKE_RAD
-from perchctl.mission.state import Observation, Operator, Phase, PlannerState, Severity
+from perchctl.mission.state import Condition, Observation, Operator, Phase, PlannerState, Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Land, PositionSetpoint, RawThrust, StopMotors
-from tests.helpers.mission import HOVER_THRUST, observation, state_in, telemetry
+from tests.helpers.mission import HOVER_THRUST, READY, observation, state_in, telemetry
 
 PROFILE = Profile.model_validate({"positioning": "target"})
 HOLD_S, LAND_S = PROFILE.positioning.hold_s, PROFILE.positioning.land_s
@@ -155,6 +155,26 @@ def test_seen_again_it_brakes_what_carries_it_aside(
     assert x * vx_mps + y * vy_mps <= -0.05 * min(speed_mps, 1.0) * speed_mps
     if speed_mps < 1.0:
         assert x * vy_mps - y * vx_mps == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_was_stopped_as_it_hung_and_is_carried_since_hangs() -> None:
+    """The operator lands what is being watched after its stop: nothing is taken from the magnet,
+    and without a position of its own it is no landing. With a gap it may lie on the floor."""
+    for hangs_s, ends in ((BEGIN_S - 3.0, Phase.PERCHED), (BEGIN_S - 0.5, Phase.ABORTED)):
+        state = replace(
+            state_in(Phase.LANDING, z_m=1.9),
+            contact_z_m=1.9, released_s=BEGIN_S - 4.0, stopped_s=BEGIN_S - 1.0,
+            orders=5, since={Condition.WEIGHT_HANGS: hangs_s},
+        )  # fmt: skip
+        for i in range(1, 150):
+            t_s = BEGIN_S + TURN_S * i
+            tel = telemetry(t_s, 1.9, thrust=0.0, supervisor=READY)
+            obs = unseen(t_s, 1.9, 0.6 + TURN_S * i, telemetry=tel)
+            state, command = planner.step(state, obs, PROFILE)
+            if planner.is_over(state):
+                break
+            assert not isinstance(command, Land | PositionSetpoint | RawThrust)
+        assert state.phase is ends, state.reason
 
 
 def test_what_slips_off_the_magnet_has_its_whole_way_down_before_it() -> None:
