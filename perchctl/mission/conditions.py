@@ -23,6 +23,8 @@ HARD_CLIMB_MPS = 0.27
 BELOW_M = 0.3
 """A target on the ceiling that seems so far below the vehicle is not there."""
 SATURATED = 0.98
+KNOCKED_MPS = 0.5
+"""Sideways, under the target: no draught gives a held vehicle so much."""
 """Of the largest thrust: from here on nothing tells how much more it takes."""
 LITTLE_LEFT = 0.93
 """A hover thrust above this part of the largest: full thrust is no sign of pressing then."""
@@ -234,6 +236,11 @@ def _blocked(c: Context) -> bool:
     return pressing and c.height_m > 0.15 and _still(c)
 
 
+def _knocked(c: Context) -> bool:
+    vx, vy, _ = c.obs.telemetry.velocity_mps
+    return c.proves and c.placed and math.hypot(vx, vy) > KNOCKED_MPS
+
+
 def _saturated(c: Context) -> bool:
     """All the thrust there is, and it does not rise (nor is it just being caught)."""
     full = c.obs.telemetry.thrust >= SATURATED * FULL_THRUST
@@ -257,6 +264,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
+    Condition.KNOCKED: _knocked,
     Condition.SATURATED: _saturated,
     Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,

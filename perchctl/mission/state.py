@@ -86,6 +86,7 @@ class Condition(Enum):
     ON_FLOOR = "on the floor"
     WEIGHT_HANGS = "the whole weight hangs"
     BLOCKED = "blocked"
+    KNOCKED = "knocked aside"
     SATURATED = "saturated"
     UNSURE = "unsure"
     TARGET_BELOW = "target below"

@@ -42,6 +42,9 @@ from perchctl.mission.state import (
 
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
 
+KNOCKED_S = 0.04
+"""Two samples of telemetry: at 0.5 m/s a turn at the ceiling takes little longer."""
+
 TABLE: tuple[Row, ...] = (
     *SAFETY,
     # --- the magnet may catch early ---------------------------------------------
@@ -146,6 +149,10 @@ TABLE: tuple[Row, ...] = (
     Row(
         "pressed-blindly", only(P.PERCH), pressed_blindly, P.RECOVER, why_pressed_blindly,
         S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
+        "knocked-aside", only(P.PERCH), lambda c: c.held(C.KNOCKED) >= KNOCKED_S, P.RECOVER,
+        "pushed aside under the target", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
         "no-contact", only(P.PERCH),

@@ -245,6 +245,9 @@ CASES: dict[str, Case] = {
     "pressed-blindly": Case(
         P.PERCH, P.RECOVER, seen(position_age_s=1.3), 0.1, profile=BY_TARGET
     ),
+    "knocked-aside": Case(
+        P.PERCH, P.RECOVER, flown(2.0, velocity_mps=(0.4, -0.4, 0.0)), 0.1, z_m=2.0
+    ),
     "no-contact": Case(P.PERCH, P.RECOVER, seen(2.0), 3.2, z_m=2.0),
     "slipped": Case(
         P.COMPLETE, P.RECOVER,
