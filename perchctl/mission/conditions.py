@@ -22,9 +22,9 @@ PRESSED_M = 0.08
 HARD_CLIMB_MPS = 0.27
 BELOW_M = 0.3
 """A target on the ceiling that seems so far below the vehicle is not there."""
-SATURATED = 0.98
 KNOCKED_MPS = 0.5
 """Sideways, under the target: no draught gives a held vehicle so much."""
+SATURATED = 0.98
 """Of the largest thrust: from here on nothing tells how much more it takes."""
 LITTLE_LEFT = 0.93
 """A hover thrust above this part of the largest: full thrust is no sign of pressing then."""

@@ -135,10 +135,16 @@ def hangs_stopped(c: Context) -> bool:
     stopped_s, hangs_s = c.state.stopped_s, c.state.since.get(Condition.WEIGHT_HANGS)
     if stopped_s is None:
         return False
-    # A landing without positions puts the weight on whatever carries it: the floor, perhaps.
-    landing = c.state.phase is Phase.LANDING and stopped_s >= c.state.entered_s
-    hung = not landing and hangs_s is not None and hangs_s <= stopped_s
+    hung = _stopped_hanging(c) and hangs_s is not None and hangs_s <= stopped_s
     return hung or still_at_contact(c)
+
+
+def _stopped_hanging(c: Context) -> bool:
+    """The motors were stopped at the ceiling: a landing without positions puts the weight on
+    whatever carries it, the floor, perhaps."""
+    stopped_s = c.state.stopped_s
+    landing = c.state.phase is Phase.LANDING
+    return stopped_s is not None and (not landing or stopped_s < c.state.entered_s)
 
 
 def still_at_contact(c: Context) -> bool:
@@ -163,9 +169,10 @@ def hangs_in_landing(c: Context) -> bool:
 
 
 def hangs_or_stands(c: Context) -> bool:
-    """It came down blindly from the magnet's reach, or did not: something carries it, which may be
-    either. A target that is seen again, far above, tells that it has come down."""
-    in_reach = c.state.blind_in_reach or (c.by_sight and c.state.contact_z_m is not None)
+    """It came down blindly from the magnet's reach, or did not, or was stopped there: something
+    carries it, which may be either. A target that is seen again, far above, tells that it has come
+    down."""
+    in_reach = c.state.blind_in_reach or (c.by_sight and _stopped_hanging(c))
     return in_reach and not c.placed and not is_low_by_eye(c)
 
 

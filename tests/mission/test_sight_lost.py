@@ -17,7 +17,7 @@ from perchctl.mission.level import BLIND_SINK_MPS, MOST_BRAKE_RAD
 from perchctl.mission.state import Condition, Observation, Operator, Phase, PlannerState, Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Land, PositionSetpoint, RawThrust, StopMotors
-from tests.helpers.mission import HOVER_THRUST, READY, observation, state_in, telemetry
+from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, observation, state_in, telemetry
 
 PROFILE = Profile.model_validate({"positioning": "target"})
 HOLD_S, LAND_S = PROFILE.positioning.hold_s, PROFILE.positioning.land_s
@@ -261,19 +261,29 @@ def test_blind_it_brakes_what_sinks_faster_than_it_should(speed_mps: float) -> N
     assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -BLIND_SINK_MPS)
 
 
-def test_a_blind_way_down_whose_speed_has_drifted_ends_on_the_floor_all_the_same() -> None:
-    """By its estimate it sinks for ever, at the speed that is wanted; it has stood for long."""
-    state = replace(state_in(Phase.LANDING), blind_s=BEGIN_S)
-    thrust, command = HOVER_THRUST, None
-    for i in range(1, 800):
+@pytest.mark.parametrize(("in_reach", "ends"), [(False, Phase.LANDED), (True, Phase.ABORTED)])
+def test_a_blind_way_down_whose_speed_has_drifted_ends_on_the_floor_all_the_same(
+    in_reach: bool, ends: Phase
+) -> None:
+    """By its estimate it sinks for ever, at the speed that is wanted; it has stood for long. What
+    carries it may be the magnet only where it began in its reach."""
+    state = replace(state_in(Phase.LANDING), blind_s=BEGIN_S, blind_in_reach=in_reach)
+    thrust, stopped = HOVER_THRUST, False
+    for i in range(1, 1000):
         t_s = BEGIN_S + TURN_S * i
-        speed = (0.0, 0.0, -BLIND_SINK_MPS)
-        tel = telemetry(t_s, 1.0 - 0.01 * i, thrust=thrust, velocity_mps=speed)
-        state, command = planner.step(state, unseen(t_s, 1.0, 2.0, telemetry=tel), PROFILE)
-        if isinstance(command, StopMotors):
+        tel = telemetry(
+            t_s, 1.0 - 0.01 * i, thrust=thrust, velocity_mps=(0.0, 0.0, -BLIND_SINK_MPS),
+            supervisor=READY if stopped else AIRBORNE,
+        )  # fmt: skip
+        obs = unseen(t_s, 1.0, 2.0, telemetry=tel, target=None)
+        state, command = planner.step(state, obs, PROFILE)
+        stopped |= isinstance(command, StopMotors)
+        thrust = float(command.thrust) if isinstance(command, RawThrust) else thrust
+        thrust = 0.0 if stopped else thrust
+        if planner.is_over(state):
             break
-        thrust = command.thrust if isinstance(command, RawThrust) else thrust
-    assert isinstance(command, StopMotors)
+    assert stopped
+    assert state.phase is ends
 
 
 # --- the last centimetres ------------------------------------------------------------------
