@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,7 @@ from perchctl.vision.markers.detector import (
     Thresholds,
     strict_detector,
 )
-from perchctl.vision.markers.square import mean_side_px, nested
+from perchctl.vision.markers.square import mean_side_px, nested, within
 from perchctl.vision.own import Chooser
 from perchctl.vision.types import MARKERS, MarkerName
 
@@ -33,6 +34,8 @@ _WINDOW_MARGIN = 0.25  # of the target's size in the picture, on each side
 _WINDOW_MARGIN_PX = 24
 _MIN_WINDOW_PX = 16
 _MAX_WINDOW = 0.8  # of the picture
+_HALVED_SIDE_PX = 60.0
+"""Markers as large as this are found in a quarter of the time in a picture of half the size."""
 _CENTRE_TOLERANCE = 0.35  # of the small marker's side
 
 
@@ -74,11 +77,17 @@ def search(
     own: Chooser | None = None,
 ) -> Found:
     """By the window, if there is one, and by the whole picture where that gave too little; only
-    one of them with a `look` that is "near", "window" or "sharp". `own` chooses among several
-    where none is expected."""
+    one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
+    half the size first: all that may be whole in the picture is enough. `own` chooses among
+    several where none is expected."""
     whole = Box(0, 0, image.shape[1], image.shape[0])
     if setup.window and expected and look != "sharp":
         box = search_window(expected, setup.ratio, image.shape) or whole
+        in_view = [quad for quad in expected.values() if within(quad, image.shape)]
+        if len(expected) == 2 and in_view and min(map(mean_side_px, in_view)) > _HALVED_SIDE_PX:
+            found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own, halved=True)
+            if len(found.corners_px) >= len(in_view):
+                return found
         found = Found({}, mirrored=False, full_frame=False)
         if len(expected) == 2:
             found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own)
@@ -124,11 +133,14 @@ def _pass(
     setup: DetectorSetup,
     thresholds: Thresholds,
     own: Chooser | None,
+    halved: bool = False,
 ) -> Found:
-    """What one pass of OpenCV's detector over the box gives."""
+    """What one pass of OpenCV's detector over the box gives, or over that at half its size."""
     part = image[box.top : box.bottom, box.left : box.right]
     full_frame = part.shape == image.shape
-    detector = strict_detector(setup, (box.width, box.height), thresholds)
+    if halved:
+        part = np.asarray(cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    detector = strict_detector(setup, (part.shape[1], part.shape[0]), thresholds)
     corners, ids, _, which = detector.detectMarkersMultiDict(part)
     if ids is None or len(corners) == 0:
         return Found({}, False, full_frame)
@@ -140,7 +152,9 @@ def _pass(
             mirrored = True
             continue
         name = MARKERS[int(dictionary)]
-        candidates[name].append(np.asarray(quad, dtype=np.float64).reshape(4, 2) + first)
+        at = np.asarray(quad, dtype=np.float64).reshape(4, 2)
+        # A pixel of half the size has its centre between two.
+        candidates[name].append((2.0 * at + 0.5 if halved else at) + first)
     targets = len(_wholes(candidates, setup.ratio))
     chosen = choose(candidates, expected, setup.ratio, own)
     return Found(chosen, mirrored, full_frame, targets)

@@ -1,10 +1,16 @@
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import pytest
 
-from perchctl.vision.markers.search import choose, search_window
-from tests.helpers.markers import SETUP, box
+from perchctl.vision.markers.detector import DetectorSetup, Thresholds, strict_detector
+from perchctl.vision.markers.search import choose, search, search_window
+from tests.helpers.markers import SETUP, both, box
+from tests.helpers.markers import corners as corners_of
+from tests.helpers.target_picture import pose_of, render
 
 RATIO = SETUP.ratio
 
@@ -66,3 +72,31 @@ def test_choice_among_candidates(large, small, expected, result) -> None:  # typ
     assert set(chosen) == set(result)
     for name, index in result.items():
         assert chosen[name] is pools[name][index]  # type: ignore[index]
+
+
+@pytest.mark.parametrize(("z_m", "found"), [(0.1, {"small"}), (0.16, {"large", "small"})])
+def test_large_markers_are_found_at_half_the_size_at_their_place(
+    z_m: float, found: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the last centimetres the prediction may be off by more than lines are looked for. A search
+    of the whole picture takes eight times as long."""
+    widths: list[int] = []
+
+    def noting(setup: DetectorSetup, size_px: tuple[int, int], thresholds: Thresholds) -> Any:
+        widths.append(size_px[0])
+        return strict_detector(setup, size_px, thresholds)
+
+    monkeypatch.setattr("perchctl.vision.markers.search.strict_detector", noting)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        x_m, y_m = rng.uniform(-0.02, 0.02, 2) * z_m
+        pose = pose_of(x_m, y_m, z_m, 0.5 * math.pi * seed + rng.uniform(-0.1, 0.1))
+        off = {name: corners + rng.uniform(-25.0, 25.0, 2) for name, corners in both(pose).items()}
+        seen = search(render(*pose, noise=4.0, seed=seed), off, SETUP, "near").corners_px
+        assert seen.keys() == found
+        for name, quad in seen.items():
+            assert (
+                np.abs(quad - corners_of(name, pose)).max() < 4.0
+            )  # lines are looked for within 7
+    assert len(widths) == 8
+    assert max(widths) <= 320
