@@ -43,7 +43,7 @@ from perchctl.mission.state import (
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
 
 KNOCKED_S = 0.04
-"""Two samples of telemetry: at 0.5 m/s a turn at the ceiling takes little longer."""
+"""More than one sample of telemetry."""
 
 TABLE: tuple[Row, ...] = (
     *SAFETY,

@@ -82,8 +82,8 @@ def may_show_enough(
 
 def _spots_px(corners_px: Array, pattern: Pattern, camera: CameraModel) -> Array:
     """The spots of a marker at corners (4, 2) as the lens shows them, (n, 2); NaN where it does
-    not reach. A marker that fills the picture is no square in it: its middle is half a cell from
-    where its corners alone put it."""
+    not reach. A marker that fills the picture is no square in it: its middle is a third of a cell
+    from where its corners alone put it."""
     rays = undistort(corners_px, camera)
     if not np.isfinite(rays).all():
         return np.full((len(pattern.spots), 2), np.nan)

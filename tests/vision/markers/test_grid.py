@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from perchctl.geometry import Array
 from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.markers.grid import lens_shift_px, make_grid, projected, through_lens
 from perchctl.vision.markers.square import from_unit
@@ -27,6 +28,6 @@ def test_a_large_marker_aslant(z_m: float) -> None:
     assert np.abs(_exact(grid.u, grid.v, H) - lens_shift_px(grid, H, CAMERA)).max() < 0.01
 
 
-def _exact(u: np.ndarray, v: np.ndarray, H: np.ndarray) -> np.ndarray:
+def _exact(u: Array, v: Array, H: Array) -> Array:
     pin = projected(H, u, v)
     return np.asarray(through_lens(pin, CAMERA) - pin)

@@ -94,9 +94,7 @@ def test_large_markers_are_found_at_half_the_size_at_their_place(
         off = {name: corners + rng.uniform(-25.0, 25.0, 2) for name, corners in both(pose).items()}
         seen = search(render(*pose, noise=4.0, seed=seed), off, SETUP, "near").corners_px
         assert seen.keys() == found
-        for name, quad in seen.items():
-            assert (
-                np.abs(quad - corners_of(name, pose)).max() < 4.0
-            )  # lines are looked for within 7
+        for name, quad in seen.items():  # lines are looked for within 7 px
+            assert np.abs(quad - corners_of(name, pose)).max() < 4.0
     assert len(widths) == 8
     assert max(widths) <= 320
