@@ -6,7 +6,6 @@ gives no measurement; the detector need not search it.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.camera.repeats import same_bytes
 from perchctl.vision.types import Frame
 
 Kind = Literal["ok", "repeated", "frozen", "snow", "uniform", "dark"]
@@ -51,11 +51,11 @@ class HealthLimits:
     snow_grain: float = 0.3
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HealthState:
     """Memory of the last picture; `HealthState()` is a fresh start."""
 
-    checksum: int | None = None
+    picture: NDArray[np.uint8] | None = None
     changed_at_s: float = 0.0
     repeats: int = 0
 
@@ -89,16 +89,16 @@ def assess(
     recordings (`live` false) equal pictures are taken as they are.
     """
     limits = limits or HealthLimits()
-    checksum = zlib.crc32(np.ascontiguousarray(frame.image).data)
-    if live and checksum == state.checksum:
-        state = HealthState(checksum, state.changed_at_s, state.repeats + 1)
+    image = frame.image
+    if live and state.picture is not None and same_bytes(state.picture, image):
+        state = HealthState(state.picture, state.changed_at_s, state.repeats + 1)
         unchanged_s = frame.t_s - state.changed_at_s
         frozen = unchanged_s >= limits.frozen_after_s
         return state, Verdict("frozen" if frozen else "repeated", state.repeats, unchanged_s)
     if live and frame.repeated:
         repeats = state.repeats + 1
-        return HealthState(checksum, state.changed_at_s, repeats), Verdict("repeated", repeats)
-    return HealthState(checksum, frame.t_s, 0), Verdict(content(frame.image, limits))
+        return HealthState(image, state.changed_at_s, repeats), Verdict("repeated", repeats)
+    return HealthState(image, frame.t_s, 0), Verdict(content(image, limits))
 
 
 def content(image: NDArray[np.uint8], limits: HealthLimits) -> Kind:

@@ -83,10 +83,11 @@ def fly(parts: FlightParts) -> FlightReport:
     `SafetyAbort`, `TimedOut`, `NotFound` and `Interrupted` before take-off, and
     anything unforeseen after the rescue.
     """
-    senses = Senses(
-        parts.link, parts.source, parts.pipeline, parts.profile, send=parts.link.external
-    )
     turns = Turns(parts.clock, parts.watchers)
+    senses = Senses(
+        parts.link, parts.source, parts.pipeline, parts.profile, send=parts.link.external,
+        checksums=turns.are_told,
+    )  # fmt: skip
     _wait_until_ready(parts, senses, turns)  # nothing is started before it returns
     if senses.history.newest is not None:
         senses.ground_z_m = senses.history.newest.position_m[2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -73,6 +74,7 @@ class Senses:
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     noticed: Noticed = field(default_factory=Noticed)
     send: Send = lambda place: True
+    checksums: bool = False  # of the pictures, for who records the turns
     sights: Sights | None = field(init=False, default=None)
     refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
@@ -229,8 +231,8 @@ class Senses:
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
         self._health, verdict = assess(self._health, frame, live)
-        if self.taken.frame is not None:
-            seen = replace(self.taken.frame, checksum=self._health.checksum)
+        if self.checksums and self.taken.frame is not None:
+            seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen:
         # such pictures are searched all the same, but the user is shown why.

@@ -26,6 +26,11 @@ class Turns:
         self._undecided: Observation | None = None
         self._untold: tuple[Observation, PlannerState, Command, FeedStatus | None] | None = None
 
+    @property
+    def are_told(self) -> bool:
+        """Whether somebody records them."""
+        return bool(self._told)
+
     def begin(self, now_s: float) -> None:
         self._began_s, self._laps_s = now_s, [now_s]
 
