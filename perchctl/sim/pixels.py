@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from perchctl.sim.rays import FINE_PX, RayGrid
 from perchctl.sim.surfaces import Picture
+from perchctl.sim.tiles import Box, pixels_of
 
 VIGNETTING_EXPONENT = 0.6
 """Relative light is (1 + tan^2(angle))^-exponent; 2 would be the cos^4 law of a
@@ -42,6 +44,16 @@ def sample(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> 
     """Bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
     remap: Any = cv2.remap  # its stub denies that the second map may be None
     return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
+
+
+def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
+    """Blurs the tiles of `box`, and what is so near to them that it shows a part of their blur."""
+    reach = math.ceil(3.0 * sigma_px) + 1
+    near, far = pixels_of(box, reach), pixels_of(box, 2 * reach)
+    blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)
+    top, left = (a.start - b.start for a, b in zip(near, far, strict=True))
+    into = picture[near]
+    into[:] = blurred[top : top + into.shape[0], left : left + into.shape[1]]
 
 
 def vignetting(fine: RayGrid, size_px: tuple[int, int]) -> Picture:

@@ -26,7 +26,7 @@ from perchctl.sim.analogue import spoil
 from perchctl.sim.exposure import SHARP_MOTION_PX, line_kernel, path_length_px, sample_count, spread
 from perchctl.sim.gloss import shone_upon
 from perchctl.sim.lens import lens_of
-from perchctl.sim.pixels import Mean, lit, sample
+from perchctl.sim.pixels import Mean, defocused, lit, sample
 from perchctl.sim.placed import Placed, View, beside, printed_sheet
 from perchctl.sim.rays import (
     COARSE_PX,
@@ -45,7 +45,7 @@ from perchctl.sim.surfaces import (
     Ceiling,
     Picture,
 )
-from perchctl.sim.tiles import by_tile, fill
+from perchctl.sim.tiles import Box, around, by_tile, fill
 from perchctl.vision.types import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
@@ -53,6 +53,8 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_BANK_PX = 1024
+_PLAIN_PX = 1.5
+"""Blur of the lens that the bare ceiling, drawn at half the size, does not show."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
 
@@ -175,7 +177,7 @@ class Renderer:
         else:
             by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
-        picture: Any = self._optical(maps, motion_px, length_px)
+        picture, box = self._optical(maps, motion_px, length_px)
         if self._glossy_half_m:
             middle = rows[len(rows) // 2]
             picture = shone_upon(
@@ -183,14 +185,19 @@ class Renderer:
                 self.scenario.gloss, self._glossy_half_m,
             )  # fmt: skip
         lens = math.sqrt(max(sigma_px**2 - SAMPLING_SIGMA_PX**2, 0.0))
-        if lens > 0.05:
-            picture = cv2.GaussianBlur(picture, (0, 0), lens)
+        if lens > _PLAIN_PX:
+            picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), lens), np.uint8)
+        elif lens > 0.05 and box is not None:
+            defocused(picture, lens, box)
         width, height = self.camera.size_px
-        picture = cv2.multiply(picture[:height, :width], self.shade, scale=1.0 / 255.0)
-        return np.asarray(picture, np.uint8)
+        shaded = cv2.multiply(picture[:height, :width], self.shade, scale=1.0 / 255.0)
+        return np.asarray(shaded, np.uint8)
 
-    def _optical(self, maps: Array, motion_px: Array, length_px: float) -> Picture:
-        """The picture before defocus, at the ray grids' padded size."""
+    def _optical(
+        self, maps: Array, motion_px: Array, length_px: float
+    ) -> tuple[Picture, Box | None]:
+        """The picture before defocus, at the ray grids' padded size, and the tiles among which
+        there is a sheet, None without one."""
         middle = maps[len(maps) // 2]
         if len(maps) % 2 == 0:
             middle = (maps[len(maps) // 2 - 1] + middle) / 2.0
@@ -204,7 +211,7 @@ class Renderer:
             picture = self._background(nodes, misses, motion_px, length_px)
         for view in hiding or views:
             self._add_sheet(picture, view, maps)
-        return picture
+        return picture, around([view.box for view in hiding or views])
 
     def _background(
         self,

@@ -7,6 +7,7 @@ exposure, look up equal texels needs no look-up at each of them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,6 +122,27 @@ def box_of(near: Mask) -> Box | None:
     if not len(rows):
         return None
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
+
+
+def around(boxes: Sequence[Box]) -> Box | None:
+    """What holds all of them; None where there are none."""
+    if not boxes:
+        return None
+    rows, cols = zip(*boxes, strict=True)
+    return _both(rows), _both(cols)
+
+
+def _both(spans: Sequence[slice]) -> slice:
+    return slice(min(each.start for each in spans), max(each.stop for each in spans))
+
+
+def pixels_of(box: Box, margin_px: int) -> Box:
+    """The rows and columns of pixels in a box, and so many around it."""
+    rows, cols = (
+        slice(max(TILE_PX * each.start - margin_px, 0), TILE_PX * each.stop + margin_px)
+        for each in box
+    )
+    return rows, cols
 
 
 def by_tile(picture: Picture) -> NDArray[np.uint64]:
