@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -12,7 +13,10 @@ from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, TargetConfig
 from perchctl.profile.dictionaries import predefined
 from perchctl.vision.camera_model import project
+from perchctl.vision.markers.corners import RefinedCorners
 from perchctl.vision.markers.detect import make_detector
+from perchctl.vision.markers.follow import follow, follow_partly
+from perchctl.vision.markers.pattern import Pattern
 from perchctl.vision.pose import square
 from perchctl.vision.types import MARKERS, Frame, MarkerName
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -33,6 +37,17 @@ def both(pose: tuple[Array, Array] = POSE, shift_px: float = 0.0) -> dict[Marker
 
 def frame(image: NDArray[np.uint8], index: int = 0) -> Frame:
     return Frame(index, index / 30.0, image)
+
+
+def followed(
+    image: NDArray[np.uint8],
+    expected: Mapping[MarkerName, Array],
+    patterns: Mapping[MarkerName, Pattern] = SETUP.patterns,
+    hidden: NDArray[np.bool_] | None = None,
+) -> dict[MarkerName, RefinedCorners]:
+    """What is where it is expected, wholly or partly."""
+    seen = follow(image, expected, patterns, CAMERA, hidden=hidden)
+    return follow_partly(image, expected, seen, patterns, CAMERA, hidden=hidden)
 
 
 def box(cx: float, cy: float, side: float) -> Array:

@@ -45,7 +45,7 @@ _GRID_PX = 0.8  # picture pixels from node to node
 _ROUNDS = 12
 _HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
 """A marker's likeness is above 0.9 after two rounds; what is still far from it is none."""
-_STILL_PX = 0.02
+_STILL_PX = 0.05  # what the round after such a step moves is less than 0.01
 _LENS_PX = 0.3  # what the lens does is computed anew after this way
 _MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
 # How far shape may leave its start, as standard deviations, per unit of the marker's
@@ -53,7 +53,7 @@ _MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
 _SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
 _BEND_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
-_BLUR_STEP = 0.03  # a smaller change of blur draws nothing anew
+_BLUR_STEP = 0.05  # a smaller change of blur draws nothing anew
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 _SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # unknowns: the increment, blur, those of light

@@ -73,6 +73,14 @@ def is_cut(
     return bool(expected) and all(hides(hidden, c) for c in whole)
 
 
+def may_be_whole(expected: Mapping[MarkerName, Array], shape: tuple[int, ...]) -> bool:
+    """Whether one of the markers expected at corners (4, 2) px is wholly in the picture, or may
+    be if the prediction is a little off: a search finds no others."""
+    h, w = shape[:2]
+    outer = (h + 2 * _EDGE_PX, w + 2 * _EDGE_PX)
+    return any(within(corners + _EDGE_PX, outer) for corners in expected.values())
+
+
 def measured_lately(previous: Detections | None, t_s: float) -> bool:
     """Whether the target was measured so short a time ago that a part of it is known again."""
     if previous is None or (previous.large is None and previous.small is None):

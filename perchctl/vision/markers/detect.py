@@ -23,16 +23,16 @@ from perchctl.vision.fields import halves, interpolated_sigma_px
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.cut import cut_markers, is_cut, measured_lately
+from perchctl.vision.markers.cut import cut_markers, is_cut, may_be_whole, measured_lately
 from perchctl.vision.markers.detector import DetectorSetup, make_detector
-from perchctl.vision.markers.follow import follow
+from perchctl.vision.markers.follow import follow, follow_partly
 from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.improve import improved, lines_suffice
 from perchctl.vision.markers.lines import refine
 from perchctl.vision.markers.mask import Covered, filled, hidden_in, hides
 from perchctl.vision.markers.motion import predicted_corners, with_motion
 from perchctl.vision.markers.partly import seen_partly, wholly_seen
-from perchctl.vision.markers.search import Found, Look, search
+from perchctl.vision.markers.search import Found, Look, search, search_halved
 from perchctl.vision.markers.seen_edges import ROOM_PX
 from perchctl.vision.markers.shift import known_from
 from perchctl.vision.markers.square import completed, nested, side_lengths_px, within
@@ -131,13 +131,17 @@ def _looked(
     whether the target was measured a moment ago, `turn` of the fits to a blurred one."""
     image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
-    seen = {} if look == "fits" else _followed(image, hidden, expected, setup, camera, shift)
+    both = completed(expected, setup.ratio, camera)
+    seen: _Seen = {}
+    if look != "fits" and setup.window and both and setup.by_lines:
+        seen, found = _followed(image, hidden, both, setup, camera, shift)
+    whole = True
     if not seen and lately and setup.cut:
-        both = completed(expected, setup.ratio, camera)
+        whole = may_be_whole(both, image.shape)
         if is_cut(both, image.shape, hidden):
             seen = cut_markers(image, expected, setup.patterns, camera, hidden)
     if look not in ("blurred", "fits") and (
-        not seen or _missing(seen, expected, image.shape, hidden)
+        (not seen and whole) or _missing(seen, expected, image.shape, hidden)
     ):
         found = search(image, expected, setup, look, own)
         if len(found.corners_px) >= len(seen):
@@ -163,15 +167,21 @@ def _followed(
     setup: DetectorSetup,
     camera: CameraModel,
     shift: EdgeShift | None,
-) -> _Seen:
-    """What is where it is expected."""
-    if not (setup.window and expected and setup.by_lines):
-        return {}
-    both = completed(expected, setup.ratio, camera)
-    seen = follow(image, both, setup.patterns, camera, shift, hidden)
-    if any(lines_suffice(r, setup.patterns[name]) for name, r in seen.items()):
-        return seen
-    return improved(image, seen, setup.patterns, camera, hidden=hidden)
+) -> tuple[_Seen, Found]:
+    """What is where both are expected, or nearby: where no side was met, a near target has most
+    often moved on further than a side is looked for, and a look around costs less than to fit
+    what may be seen of it in the old place."""
+    patterns, nothing = setup.patterns, Found({}, mirrored=False, full_frame=False)
+    seen = follow(image, expected, patterns, camera, shift, hidden)
+    if not seen:
+        found = search_halved(image, expected, setup)
+        again = {} if found is None else _refined(image, hidden, found, setup, camera)
+        if found is not None and again:
+            return again, found
+    seen = follow_partly(image, expected, seen, patterns, camera, shift, hidden)
+    if any(lines_suffice(r, patterns[name]) for name, r in seen.items()):
+        return seen, nothing
+    return improved(image, seen, patterns, camera, hidden=hidden), nothing
 
 
 def _missing(

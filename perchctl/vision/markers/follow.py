@@ -39,7 +39,7 @@ def follow(
     shift: EdgeShift | None = None,
     hidden: NDArray[np.bool_] | None = None,
 ) -> dict[MarkerName, RefinedCorners]:
-    """The expected markers (corners (4, 2) px) that are verified by sides and cells; `shift`
+    """The expected markers (corners (4, 2) px) that are verified by all sides and cells; `shift`
     is what was measured of the edges in an earlier picture, `hidden` (h, w) where there is
     something else."""
     names = [
@@ -49,21 +49,39 @@ def follow(
         and within(expected[name], image.shape, ROOM_PX)
         and shortest_side_px(expected[name]) > _LEAST_CELL_PX * patterns[name].rim.cells
     ]
-    seen: dict[MarkerName, RefinedCorners] = {}
-    if names:
-        raw = np.array([expected[name] for name in names])
-        fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
-        for name, result in zip(names, fitted, strict=True):
-            if (
-                result is not None
-                and wholly_seen(result, image.shape, hidden)
-                and cells_agree(image, result.corners_px, patterns[name])
-            ):
-                seen[name] = result
+    if not names:
+        return {}
+    raw = np.array([expected[name] for name in names])
+    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
+    return {
+        name: result
+        for name, result in zip(names, fitted, strict=True)
+        if result is not None
+        and wholly_seen(result, image.shape, hidden)
+        and cells_agree(image, result.corners_px, patterns[name])
+    }
+
+
+def follow_partly(
+    image: NDArray[np.uint8],
+    expected: Mapping[MarkerName, Array],
+    seen: Mapping[MarkerName, RefinedCorners],
+    patterns: Mapping[MarkerName, Pattern],
+    camera: CameraModel,
+    shift: EdgeShift | None = None,
+    hidden: NDArray[np.bool_] | None = None,
+) -> dict[MarkerName, RefinedCorners]:
+    """With those that `follow` did not verify, by what is seen of them. Where the small marker
+    was met, the large one is looked for around it instead of where it was expected."""
+    places, seen = dict(expected), dict(seen)
+    if "small" in seen and "large" not in seen:
+        places["large"] = nested(
+            seen["small"].corners_px, 1.0 / patterns["large"].drawing.ratio, camera
+        )
     for name in MARKERS:
-        if name in expected and name not in seen:
+        if name in places and name not in seen:
             partly = seen_partly(
-                image, expected[name], patterns[name], camera, "track", hidden, shift
+                image, places[name], patterns[name], camera, "track", hidden, shift
             )
             if partly is not None:
                 seen[name] = partly

@@ -80,14 +80,12 @@ def search(
     one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
     half the size first: all that may be whole in the picture is enough. `own` chooses among
     several where none is expected."""
-    whole = Box(0, 0, image.shape[1], image.shape[0])
+    whole = _whole(image)
     if setup.window and expected and look != "sharp":
+        quickly = search_halved(image, expected, setup, own)
+        if quickly is not None:
+            return quickly
         box = search_window(expected, setup.ratio, image.shape) or whole
-        in_view = [quad for quad in expected.values() if within(quad, image.shape)]
-        if len(expected) == 2 and in_view and min(map(mean_side_px, in_view)) > _HALVED_SIDE_PX:
-            found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own, halved=True)
-            if len(found.corners_px) >= len(in_view):
-                return found
         found = Found({}, mirrored=False, full_frame=False)
         if len(expected) == 2:
             found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own)
@@ -98,6 +96,26 @@ def search(
         ):
             return found
     return _pass(image, whole, expected, setup, OPENCV_THRESHOLDS, own)
+
+
+def search_halved(
+    image: NDArray[np.uint8],
+    expected: Mapping[MarkerName, Array],
+    setup: DetectorSetup,
+    own: Chooser | None = None,
+) -> Found | None:
+    """By the window, at half the size: a millisecond. None where that did not show all that should
+    be whole in the picture, or where that is too small for it."""
+    in_view = [quad for quad in expected.values() if within(quad, image.shape)]
+    if len(expected) < 2 or not in_view or min(map(mean_side_px, in_view)) <= _HALVED_SIDE_PX:
+        return None
+    box = search_window(expected, setup.ratio, image.shape) or _whole(image)
+    found = _pass(image, box, expected, setup, QUICK_THRESHOLDS, own, halved=True)
+    return found if len(found.corners_px) >= len(in_view) else None
+
+
+def _whole(image: NDArray[np.uint8]) -> Box:
+    return Box(0, 0, image.shape[1], image.shape[0])
 
 
 def search_window(

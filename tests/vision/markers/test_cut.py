@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +14,12 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import distort, project, undistort, undistort_px
 from perchctl.vision.markers.between import between
-from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut
+from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut, may_be_whole
 from perchctl.vision.markers.detect import detect
 from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.outline import outline_of
 from perchctl.vision.markers.overview import lattice_of
+from perchctl.vision.markers.search import Found, search
 from perchctl.vision.markers.seen_edges import look as look_for_edges
 from perchctl.vision.markers.square import within
 from perchctl.vision.markers.visible import RigidPose, fitted
@@ -102,6 +104,31 @@ def test_it_is_never_a_first_sight() -> None:
 def test_it_needs_a_target_that_was_measured_lately() -> None:
     assert not nothing(look("height", age_s=MOST_AGE_S - 0.01))
     assert nothing(look("height", age_s=MOST_AGE_S + 0.01))
+
+
+@pytest.mark.parametrize(("age_s", "searched"), [(MOST_AGE_S, False), (MOST_AGE_S + 0.01, True)])
+def test_nothing_is_searched_for_where_nothing_can_be_whole(
+    age_s: float, searched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So long as that is known: later the target may be anywhere."""
+    passes = []
+
+    def noting(*args: Any, **keys: Any) -> Found:
+        passes.append(args)
+        return search(*args, **keys)
+
+    monkeypatch.setattr("perchctl.vision.markers.detect.search", noting)
+    empty = np.full(SHAPE, 120, np.uint8)
+    assert nothing(look("under", empty, age_s=age_s))
+    assert bool(passes) is searched
+
+
+def test_what_may_be_whole_if_the_prediction_is_a_little_off_is_searched_for() -> None:
+    square_px = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0]])
+    for out_px, may in ((-1.0, True), (30.0, True), (50.0, False)):
+        aside = square_px + np.array([SHAPE[1] - 60.0 + out_px, 100.0])
+        assert may_be_whole({"small": aside, "large": 6.0 * square_px - 900.0}, SHAPE) is may
+    assert not may_be_whole({"small": np.full((4, 2), np.nan)}, SHAPE)
 
 
 def test_it_can_be_switched_off() -> None:

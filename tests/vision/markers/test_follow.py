@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
+from perchctl.vision.markers.corners import RefinedCorners
 from perchctl.vision.markers.detect import detect, make_detector
 from perchctl.vision.markers.follow import around, follow
-from tests.helpers.markers import POSE, SETUP, both, corners, frame
+from perchctl.vision.markers.partly import seen_partly
+from perchctl.vision.markers.visible_cells import KnownBy
+from tests.helpers.markers import POSE, SETUP, both, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 1.0, 2.5])
 def test_expected_markers_are_verified_and_refined(shift_px: float) -> None:
-    seen = follow(render(*POSE, noise=3.0), both(shift_px=shift_px), SETUP.patterns, CAMERA)
+    seen = followed(render(*POSE, noise=3.0), both(shift_px=shift_px))
     assert set(seen) == {"large", "small"}
     assert seen["large"].refined
     assert np.abs(seen["large"].corners_px - corners("large")).max() < 0.1
@@ -31,24 +37,24 @@ def test_other_cells_other_turns_and_mirror_images_are_not_verified() -> None:
             small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=7, side_m=0.025),
         ),
     )
-    assert follow(image, both(), other.patterns, CAMERA) == {}
+    assert followed(image, both(), other.patterns) == {}
     for k in (1, 2, 3):
         turned = {name: np.roll(quad, k, axis=0) for name, quad in both().items()}
-        assert follow(image, turned, SETUP.patterns, CAMERA) == {}
+        assert followed(image, turned) == {}
     mirrored = {name: quad[::-1] for name, quad in both().items()}
-    assert follow(image, mirrored, SETUP.patterns, CAMERA) == {}
+    assert followed(image, mirrored) == {}
     empty = np.full_like(image, 120)
-    assert follow(empty, both(), SETUP.patterns, CAMERA) == {}
+    assert followed(empty, both()) == {}
 
 
 def test_a_small_marker_too_small_for_lines_is_seen_in_its_place() -> None:
     pose = pose_of(0.05, 0.0, 1.0, 0.4)
     expected = {"large": corners("large", pose)}
-    seen = follow(render(*pose, noise=3.0), expected, SETUP.patterns, CAMERA)
+    seen = followed(render(*pose, noise=3.0), expected)
     assert not seen["small"].refined
     assert np.abs(seen["small"].corners_px - corners("small", pose)).max() < 0.5
     alone = render(*pose, markers=("large",), noise=3.0)
-    assert set(follow(alone, expected, SETUP.patterns, CAMERA)) == {"large"}
+    assert set(followed(alone, expected)) == {"large"}
 
 
 @pytest.mark.parametrize("cover", ["corner", "stripe", "none"])
@@ -79,3 +85,36 @@ def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
     assert found.large is None
     seen = follow(image, {"small": corners("small", pose)}, SETUP.patterns, CAMERA)
     assert around(image, seen["small"], SETUP.patterns, CAMERA) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_large_marker_that_is_cut_off_is_looked_for_around_the_small_one(seed: int) -> None:
+    """As both are expected 6 px aside of where they are, as a vehicle in motion has it."""
+    rng = np.random.default_rng(seed)
+    pose = pose_of(*rng.uniform(-0.004, 0.004, 2), 0.12, rng.uniform(-math.pi, math.pi))
+    image = render(*pose, noise=3.0, seed=seed)
+    turn = rng.uniform(-math.pi, math.pi)
+    off_px = 6.0 * np.array([math.cos(turn), math.sin(turn)])
+    expected = {name: quad + off_px for name, quad in both(pose).items()}
+    seen = followed(image, expected)
+    assert seen["small"].refined
+    assert np.abs(seen["large"].corners_px - corners("large", pose)).max() < 0.5
+
+
+def test_a_near_target_that_has_moved_on_is_looked_for_nearby_before_parts_of_it_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[KnownBy] = []
+
+    def noting(*args: Any) -> RefinedCorners | None:
+        asked.append(args[4])
+        return seen_partly(*args)
+
+    monkeypatch.setattr("perchctl.vision.markers.follow.seen_partly", noting)
+    pose = pose_of(0.0, 0.0, 0.16, 0.4)
+    expected = both(pose, shift_px=25.0)
+    found = detect(frame(render(*pose, noise=3.0)), None, SETUP, CAMERA, expected)
+    for name, one in (("large", found.large), ("small", found.small)):
+        assert one is not None
+        assert np.abs(one.corners_px - corners(name, pose)).max() < 0.2  # type: ignore[arg-type]
+    assert not asked

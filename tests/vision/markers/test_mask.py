@@ -16,11 +16,10 @@ from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile, load_profile
 from perchctl.vision.fields import field_picture
 from perchctl.vision.markers.detect import detect
-from perchctl.vision.markers.follow import follow
 from perchctl.vision.markers.mask import filled, hidden_in, hides, make_mask
 from perchctl.vision.markers.square import from_unit, mapped
 from perchctl.vision.types import Detections, Frame, MarkerName
-from tests.helpers.markers import POSE, SETUP, corners, frame
+from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 W, H = CAMERA.size_px
@@ -75,9 +74,9 @@ def test_where_it_is_expected_a_hidden_cell_is_unknown_and_not_wrong() -> None:
     covered = over((x, y), (x, y), width=40)
     image = filled(behind(render(*POSE, noise=2.0), covered), covered)
     expected: dict[MarkerName, Array] = {"large": TRUE + 1.0}
-    seen = follow(image, expected, SETUP.patterns, CAMERA, hidden=covered)
+    seen = followed(image, expected, hidden=covered)
     assert np.abs(seen["large"].corners_px - TRUE).max() < 0.2
-    assert "large" not in follow(image, expected, SETUP.patterns, CAMERA)
+    assert "large" not in followed(image, expected)
 
 
 @pytest.mark.parametrize("name", sorted(LEGS))

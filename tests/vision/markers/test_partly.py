@@ -15,7 +15,6 @@ from perchctl.geometry import Array
 from perchctl.pipeline import step
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
 from perchctl.vision.markers.detect import detect, make_detector
-from perchctl.vision.markers.follow import follow
 from perchctl.vision.markers.partly import fit_partly, seen_partly
 from perchctl.vision.markers.search import search
 from perchctl.vision.markers.square import from_unit, mapped
@@ -25,7 +24,7 @@ from perchctl.vision.markers.visible_cells import (
     visible_cells_agree,
 )
 from perchctl.vision.types import Detections, Frame, MarkerName, PipelineState
-from tests.helpers.markers import POSE, SETUP, corners, frame
+from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 Grey = NDArray[np.uint8]
@@ -155,10 +154,10 @@ def test_a_cut_marker_is_verified_where_it_is_expected(share: float) -> None:
     pose = cut(share, 2)
     image = render(*pose, noise=2.0)
     near: dict[MarkerName, Array] = {"large": corners("large", pose) + 2.0}
-    seen = follow(image, near, SETUP.patterns, CAMERA)
+    seen = followed(image, near)
     assert np.abs(seen["large"].corners_px - corners("large", pose)).max() < 0.3
     other = render(*pose, markers=(("DICT_4X4_1000", 16, 0.150), "small"))
-    assert "large" not in follow(other, near, SETUP.patterns, CAMERA)
+    assert "large" not in followed(other, near)
 
 
 def test_a_marker_that_leaves_the_picture_is_followed_out_of_it() -> None:
