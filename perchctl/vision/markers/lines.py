@@ -44,6 +44,7 @@ _REACH = 0.0022  # px for a cubed pixel of blur: profiles are too short for wide
 CLIPPED_SIGMA_PX = 0.1  # where white is clipped, edges move, not all alike
 CLIPPED_SHARE = 0.05  # of the profiles
 _WIDE_BLUR_PX, _CENTRED_PX = 2.2, 0.5  # profiles cut off an edge that is wide and not central
+_NEAR_END_PX = 4.0  # of 7: an edge 6 px off, cut off there, was seen up to 0.3 px beside its place
 _LEAST_ROWS = 2.0  # times the other sides' variance shows that rows shake
 _LEAST_ASPECT = 0.05  # variance of the sides' slants (0 to 1), to tell them apart
 _MIN_CONTRAST = 6.0  # grey levels between the flanks
@@ -102,16 +103,17 @@ def refine_lines(
 ) -> list[RefinedCorners | None]:
     """The line fit alone, for m markers (m, 4, 2); None where its residual, inliers,
     contrast, blur or movement show that these are not a marker's sides. The shift of all
-    edges is measured unless it is known. Wide edges are looked at twice, the second time
-    with the profiles centred on them."""
+    edges is measured unless it is known. Wide edges, and those near to the profiles' ends, are
+    looked at twice, the second time with the profiles centred on them."""
     found = _refined_once(image, raw_px, rims, camera, known)
-    wide = {i: r for i, r in enumerate(found) if r is not None and r.blur_px > _WIDE_BLUR_PX}
-    if not wide:
-        return found
     centred = raw_px.copy()
-    for i, each in wide.items():
-        centred[i] = each.corners_px
-    if np.abs(centred - raw_px).max(initial=0.0) < _CENTRED_PX:
+    for i, each in enumerate(found):
+        if each is None:
+            continue
+        off_px = float(np.abs(each.corners_px - raw_px[i]).max())
+        if off_px > (_CENTRED_PX if each.blur_px > _WIDE_BLUR_PX else _NEAR_END_PX):
+            centred[i] = each.corners_px
+    if (centred == raw_px).all():
         return found
     again = _refined_once(image, centred, rims, camera, known)
     return [second or first for first, second in zip(found, again, strict=True)]

@@ -67,6 +67,24 @@ def test_lines_are_calm_in_noise() -> None:
     assert np.sqrt((poses[:, 1:] ** 2).mean()) < 0.08
 
 
+@pytest.mark.parametrize("off_px", [4.0, 6.0, 6.5])
+def test_sides_near_the_ends_of_their_profiles_are_where_they_are(off_px: float) -> None:
+    """As where a vehicle in motion has its target expected, in the last decimetres."""
+    fitted = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        rvec, tvec = pose_of(*rng.uniform(-0.01, 0.01, 2), 0.18, rng.uniform(-3.1, 3.1))
+        image = render(rvec, tvec, noise=3.0, blur_px=0.8, seed=seed)
+        true = true_corners(rvec, tvec, 0.150)
+        turn = rng.uniform(-np.pi, np.pi)
+        raw = true + off_px * np.array([np.cos(turn), np.sin(turn)])
+        result = refine(image, raw[None], [RIMS[6]], CAMERA, "line")[0]
+        if result.refined:
+            fitted += 1
+            assert np.abs(result.corners_px - true).max() < 0.1
+    assert fitted >= 6
+
+
 def test_lines_beat_subpix_tenfold_in_bias() -> None:
     subpix = abs(errors(0.0, 0.7, "subpix", 6, 0.150)[:, 0].mean())
     line = abs(errors(0.0, 0.7, "line", 6, 0.150)[:, 0].mean())
