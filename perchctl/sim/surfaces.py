@@ -82,10 +82,17 @@ class Sheet:
 
     def _build(self, px_per_m: float, window_px: float) -> SheetTexture:
         size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
-        ink = ink_coverage(self.drawing, px_per_m, size, window_px)
+        # In place: at the finest level each array of these has 20 MB, and a campaign's peak of
+        # memory is here.
         sheet = sheet_coverage(self.drawing, px_per_m, size, window_px)
-        grey = np.rint(PAPER_GREY * sheet + (INK_GREY - PAPER_GREY) * ink).astype(np.uint8)
-        alpha = np.rint(255.0 * sheet).astype(np.uint8)
+        alpha = np.multiply(sheet, 255.0)
+        alpha = np.rint(alpha, out=alpha).astype(np.uint8)
+        value = ink_coverage(self.drawing, px_per_m, size, window_px)
+        value *= INK_GREY - PAPER_GREY
+        sheet *= PAPER_GREY
+        value += sheet
+        grey = np.rint(value, out=value).astype(np.uint8)
+        del sheet, value
         return SheetTexture(grey, alpha, px_per_m, (size - 1) / 2.0, _to_edge(grey, alpha))
 
 
