@@ -43,7 +43,7 @@ def test_simulate_prints_one_object(campaign: Said, logs: Path) -> None:
     assert campaign.code == 0
     said = json.loads(campaign.stdout)
     assert set(said) == {
-        "flights", "perched", "landed", "aborted", "locked", "fell",
+        "flights", "perched", "landed", "aborted", "refused", "locked", "fell",
         "miss_m", "rates", "realtime_factor", "peak_memory_mb", "worst_seeds",
     }  # fmt: skip
     assert set(said["miss_m"]) == {"median", "p95", "max"}

@@ -16,7 +16,7 @@ from perchctl.commands.simulate_request import (
     tell_logs,
 )
 from perchctl.errors import PerchError, no_simulator
-from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
+from perchctl.flight.results import FlightResult, campaign_summary, campaign_table, none_took_off
 from perchctl.flight.uninterrupted import uninterrupted
 from perchctl.log.place import make_log_folder
 from perchctl.startup import leave_at_ctrl_c, loaded
@@ -97,4 +97,5 @@ def _campaign(request: SimulateRequest) -> int:
             report,
             kept,
             profiles=[profile],
+            objection=none_took_off,
         )

@@ -185,6 +185,7 @@ def fly_each(
     flights: int | None = None,
     profiles: Sequence[Profile] = (),
     expected: Callable[[], int] | None = None,
+    objection: Callable[[list[R]], PerchError | None] = lambda results: None,
 ) -> int:
     """Flies the request's seeds in processes of their own or on its cluster, and reports those that
     were flown, however it ends: also by Ctrl-C, or when a flight fails. Returns the exit code.
@@ -192,7 +193,8 @@ def fly_each(
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
     were flown. `kept`: those that were flown before, which count, too, and where each goes.
     `flights`: how many it flies, by default one a seed; `profiles`: by which; `expected`: how many
-    of them it may come to. Errors: PerchError where none was.
+    of them it may come to; `objection`: what all of them together amount to. Errors: PerchError
+    where none was.
     """
     from perchctl.commands.simulate_hands import hands_of
 
@@ -225,6 +227,7 @@ def fly_each(
         problem.args = (f"{problem}; {flown}",)
     if problem is not None and not results:
         raise problem
+    problem = problem or objection(results)
     report(sorted(results, key=lambda result: result.seed), problem)
     if problem is None:
         return 0

@@ -16,7 +16,7 @@ from perchctl.commands.simulate_request import (
 )
 from perchctl.errors import PerchError
 from perchctl.flight.campaign import run_campaign
-from perchctl.flight.results import FlightResult, campaign_summary, campaign_table
+from perchctl.flight.results import FlightResult, campaign_summary, campaign_table, none_took_off
 from perchctl.flight.until import Enough
 
 
@@ -57,8 +57,9 @@ def run_until(request: SimulateRequest) -> int:
 
     with request.results(profile, FlightResult) as kept:
         return fly_each(
-            campaign, request, report, kept, profiles=[profile], expected=enough.expected
-        )
+            campaign, request, report, kept, profiles=[profile], expected=enough.expected,
+            objection=none_took_off,
+        )  # fmt: skip
 
 
 def verdict(enough: Enough, width: float) -> str:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import cv2
 
-from perchctl.errors import PerchError
+from perchctl.errors import PerchError, SafetyAbort, TimedOut
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.results import FlightEnd, FlightResult
@@ -25,6 +25,7 @@ from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Phase
 from perchctl.mission.watch import Event, EventKeeper, Watcher
 from perchctl.profile import Profile
+from perchctl.sim.draw import draw_scenario
 
 R = TypeVar("R")
 K = TypeVar("K", bound=Hashable)
@@ -63,10 +64,19 @@ def fly_seed(
 ) -> FlightResult:
     """Fly one seed of the profile's scenario; a function of its own so that any
     executor can carry it to another process or machine. `record`: with the pictures beside
-    the log."""
+    the log. What is refused before take-off is a result, too, and leaves no log."""
     began_s, cpu_began_s = time.perf_counter(), time.process_time()
     log = None if log_path is None else LogWatcher.lockstep(log_path, profile, seed, record)
-    flight, summary = _flown(profile, seed, log)
+    try:
+        flight, summary = _flown(profile, seed, log)
+    except (SafetyAbort, TimedOut) as error:
+        if log is not None:
+            log.abandon(str(error))
+        return FlightResult(
+            seed, "refused", str(error), None, 0.0, 0, False, False, 0.0,
+            cpu_s=time.process_time() - cpu_began_s, peak_memory_mb=peak_memory_mb(),
+            scenario=draw_scenario(profile, seed),
+        )  # fmt: skip
     result = FlightResult(
         seed=seed,
         outcome=_outcome(flight),

@@ -48,11 +48,19 @@ def _perched_miss_m(result: FlightResult) -> float | None:
     return result.miss_m if result.outcome == "perched" else None
 
 
+def _flown_s(result: FlightResult) -> float | None:
+    return result.time_s if result.outcome != "refused" else None
+
+
+def _attempts(result: FlightResult) -> float | None:
+    return float(result.attempts) if result.outcome != "refused" else None
+
+
 MISS = Figure("miss", "miss_m", "mm", 1e3, _perched_miss_m)
 FIGURES = (
     MISS,
-    Figure("flight time", "time_s", "s", 1.0, lambda r: r.time_s),
-    Figure("attempts", "attempts", "", 1.0, lambda r: float(r.attempts)),
+    Figure("flight time", "time_s", "s", 1.0, _flown_s),
+    Figure("attempts", "attempts", "", 1.0, _attempts),
 )
 
 

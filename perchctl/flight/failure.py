@@ -20,8 +20,6 @@ from perchctl.flight.results import FlightEnd
 from perchctl.mission.state import Phase
 from perchctl.profile import Profile
 
-REFUSED = "refused"
-
 
 class Kind(NamedTuple):
     """`row`: of the mission's table, that gave the flight up; empty where none did."""
@@ -56,12 +54,12 @@ class Ended:
 
 
 def fly_to_its_end(profile: Profile, seed: int) -> Ended:
-    """One flight; what the program refuses to fly ends by the row `REFUSED`."""
+    """One flight; what the program refuses to fly has ended, too."""
     cv2.setNumThreads(1)
     try:
         flight = fly_lockstep(profile, seed)
     except PerchError as error:
-        return Ended(seed, Kind("aborted", REFUSED, False, False), str(error))
+        return Ended(seed, Kind("refused", "", False, False), str(error))
     ended = Ended(seed, kind_of(flight), flight.report.reason)
     del flight
     give_back_memory()

@@ -9,12 +9,14 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from perchctl.errors import SafetyAbort
 from perchctl.flight.memory import peak_memory_mb
 from perchctl.flight.rates import rate_record, rate_text
 from perchctl.sim.scenario import Scenario
 
-FlightEnd = Literal["perched", "landed", "aborted"]
+FlightEnd = Literal["perched", "landed", "aborted", "refused"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
+_SEVERITY: tuple[FlightEnd, ...] = ("perched", "refused", "landed", "aborted")
 
 
 class Measured(Protocol):
@@ -29,7 +31,7 @@ class FlightResult:
     """One simulated flight.
 
     Attributes:
-        outcome: the terminal phase, in small letters.
+        outcome: the terminal phase, in small letters, or refused: it never took off.
         miss_m: horizontal distance of the gear from the target's centre in the
             simulation's truth; None when it did not perch.
         time_s: duration of the flight in the loop's time.
@@ -67,7 +69,7 @@ class FlightResult:
     def badness(self) -> tuple[bool, int, bool, float]:
         """The larger the worse: bad ones by their end, then the misses."""
         harmed = self.locked or self.fell
-        return self.is_bad, ENDS.index(self.outcome), harmed, self.miss_m or 0.0
+        return self.is_bad, _SEVERITY.index(self.outcome), harmed, self.miss_m or 0.0
 
 
 def campaign_summary(
@@ -111,9 +113,17 @@ def peak_mb(results: Iterable[Measured]) -> float:
 
 
 def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
-    """The bad flights: aborted before landed before perched, then by seed."""
+    """The bad flights: aborted before landed before refused before perched, then by seed."""
     bad = [r for r in results if r.is_bad]
-    return sorted(bad, key=lambda r: (-ENDS.index(r.outcome), r.seed))
+    return sorted(bad, key=lambda r: (-_SEVERITY.index(r.outcome), r.seed))
+
+
+def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
+    """What a campaign says of which every flight was refused: that is no seed's doing."""
+    if not results or any(r.outcome != "refused" for r in results):
+        return None
+    first = min(results, key=lambda r: r.seed)
+    return SafetyAbort(f"every flight was refused before take-off: {first.reason}")
 
 
 def _miss_m(result: FlightResult) -> float:
@@ -166,16 +176,18 @@ def campaign_rows(
     flights = figures["flights"]
     rows = [("flights", str(flights))]
     for end in ENDS:
-        rows.append((end, rate_text(figures[end], flights)))
+        if end != "refused" or figures[end]:
+            rows.append((end, rate_text(figures[end], flights)))
     rows += [("locked", str(figures["locked"])), ("fell", str(figures["fell"]))]
     miss = figures["miss_m"]
     if miss["max"] is not None:
         text = ", ".join(f"{k} {miss[k] * 1e3:.1f}" for k in ("median", "p95", "max"))
         farthest = max((r for r in results if r.outcome == "perched"), key=_miss_m)
         rows.append(("miss [mm]", f"{text} (seed {farthest.seed})"))
-    if results:
-        times = [r.time_s for r in results]
-        attempts = [r.attempts for r in results]
+    flown = [r for r in results if r.outcome != "refused"]
+    if flown:
+        times = [r.time_s for r in flown]
+        attempts = [r.attempts for r in flown]
         rows.append(("flight time [s]", f"median {np.median(times):.1f}, max {max(times):.1f}"))
         rows.append(("attempts", f"mean {np.mean(attempts):.2f}, max {max(attempts)}"))
     if figures["realtime_factor"] is not None:

@@ -55,7 +55,11 @@ def test_a_campaign_of_three() -> None:
         "perched": 1,
         "landed": 1,
         "aborted": 1,
-        "rates": {end: {"rate": 0.333333, "interval": [0.008404, 0.905701]} for end in ENDS},
+        "refused": 0,
+        "rates": {
+            **{end: {"rate": 0.333333, "interval": [0.008404, 0.905701]} for end in ENDS},
+            "refused": {"rate": 0.0, "interval": [0.0, 0.707598]},
+        },
         "locked": 1,
         "fell": 1,
         "miss_m": {"median": 0.004, "p95": 0.004, "max": 0.004},
@@ -87,7 +91,8 @@ def test_figures_of_any_campaign(results: list[FlightResult]) -> None:
         assert miss["max"] is None
     assert json.loads(json.dumps(figures)) == figures
     order = worst_first(results)
-    ends = [ENDS.index(r.outcome) for r in order]
+    severity = ("perched", "refused", "landed", "aborted")
+    ends = [severity.index(r.outcome) for r in order]
     assert ends == sorted(ends, reverse=True)
     assert all(r.outcome != "perched" or r.locked or r.fell for r in order)
     assert len(order) == sum(r.outcome != "perched" or r.locked or r.fell for r in results)
