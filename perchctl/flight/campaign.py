@@ -73,10 +73,19 @@ def fly_seed(
         if log is not None:
             log.abandon(str(error))
         return FlightResult(
-            seed, "refused", str(error), None, 0.0, 0, False, False, 0.0,
-            cpu_s=time.process_time() - cpu_began_s, peak_memory_mb=peak_memory_mb(),
+            seed=seed,
+            outcome="refused",
+            reason=str(error),
+            miss_m=None,
+            time_s=0.0,
+            attempts=0,
+            locked=False,
+            fell=False,
+            realtime_factor=0.0,
+            cpu_s=time.process_time() - cpu_began_s,
+            peak_memory_mb=peak_memory_mb(),
             scenario=draw_scenario(profile, seed),
-        )  # fmt: skip
+        )
     result = FlightResult(
         seed=seed,
         outcome=_outcome(flight),

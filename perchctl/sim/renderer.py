@@ -45,7 +45,7 @@ from perchctl.sim.surfaces import (
     Ceiling,
     Picture,
 )
-from perchctl.sim.tiles import Box, around, by_tile, fill
+from perchctl.sim.tiles import Box, box_around, by_tile, fill
 from perchctl.vision.types import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
@@ -211,7 +211,7 @@ class Renderer:
             picture = self._background(nodes, misses, motion_px, length_px)
         for view in hiding or views:
             self._add_sheet(picture, view, maps)
-        return picture, around([view.box for view in hiding or views])
+        return picture, box_around([view.box for view in hiding or views])
 
     def _background(
         self,

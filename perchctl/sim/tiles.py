@@ -124,7 +124,7 @@ def box_of(near: Mask) -> Box | None:
     return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(cols[0]), int(cols[-1]) + 1)
 
 
-def around(boxes: Sequence[Box]) -> Box | None:
+def box_around(boxes: Sequence[Box]) -> Box | None:
     """What holds all of them; None where there are none."""
     if not boxes:
         return None

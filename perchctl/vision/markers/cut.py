@@ -88,6 +88,14 @@ def measured_lately(previous: Detections | None, t_s: float) -> bool:
     return 0.0 < t_s - previous.t_s <= MOST_AGE_S
 
 
+def cut_lately(previous: Detections | None, t_s: float, shape: tuple[int, ...]) -> bool:
+    """Whether the target was measured lately, and no marker can have been wholly in the picture."""
+    if previous is None or not measured_lately(previous, t_s):
+        return False
+    seen = {d.marker: d.corners_px for d in (previous.large, previous.small) if d is not None}
+    return not may_be_whole(seen, shape)
+
+
 def cut_markers(
     image: NDArray[np.uint8],
     expected: Mapping[MarkerName, Array],

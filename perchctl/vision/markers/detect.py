@@ -23,7 +23,13 @@ from perchctl.vision.fields import halves, interpolated_sigma_px
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.cut import cut_markers, is_cut, may_be_whole, measured_lately
+from perchctl.vision.markers.cut import (
+    cut_lately,
+    cut_markers,
+    is_cut,
+    may_be_whole,
+    measured_lately,
+)
 from perchctl.vision.markers.detector import DetectorSetup, make_detector
 from perchctl.vision.markers.follow import follow, follow_partly
 from perchctl.vision.markers.ghost import with_ghosts
@@ -80,13 +86,16 @@ def detect(
         (empty_frames + 2) // 4 if empty_frames is not None and look in ("near", "fits") else None
     )
     lately = measured_lately(previous, frame.t_s)
+    was_cut = setup.cut and cut_lately(previous, frame.t_s, frame.image.shape)
     shift = known_from(None if previous is None else previous.edge_shift)
 
     def looked(picture: Frame) -> Detections:
         hidden = hidden_in(picture, setup.mask)
         if hidden is not None:
             picture = replace(picture, image=filled(picture.image, hidden), encoded=None)
-        return _looked(picture, hidden, expected, setup, camera, shift, look, lately, turn, own)
+        return _looked(
+            picture, hidden, expected, setup, camera, shift, look, lately, was_cut, turn, own
+        )
 
     if frame.fields == "woven":
         return with_motion(between(*(looked(field) for field in halves(frame))), previous)
@@ -124,24 +133,24 @@ def _looked(
     shift: EdgeShift | None,
     look: Look,
     lately: bool,
+    was_cut: bool,
     turn: int | None,
     own: Chooser | None,
 ) -> Detections:
     """What is in a picture of one moment; `hidden` (h, w) is where that is not seen, `lately`
-    whether the target was measured a moment ago, `turn` of the fits to a blurred one."""
+    whether the target was measured a moment ago, `was_cut` no marker of it being whole, `turn` of
+    the fits to a blurred one."""
     image = frame.image
     found = Found({}, mirrored=False, full_frame=False)
     both = completed(expected, setup.ratio, camera)
     seen: _Seen = {}
     if look != "fits" and setup.window and both and setup.by_lines:
         seen, found = _followed(image, hidden, both, setup, camera, shift)
-    whole = True
-    if not seen and lately and setup.cut:
-        whole = may_be_whole(both, image.shape)
-        if is_cut(both, image.shape, hidden):
-            seen = cut_markers(image, expected, setup.patterns, camera, hidden)
+    if not seen and lately and setup.cut and is_cut(both, image.shape, hidden):
+        seen = cut_markers(image, expected, setup.patterns, camera, hidden)
+    findable = not was_cut or may_be_whole(both, image.shape)
     if look not in ("blurred", "fits") and (
-        (not seen and whole) or _missing(seen, expected, image.shape, hidden)
+        (not seen and findable) or _missing(seen, expected, image.shape, hidden)
     ):
         found = search(image, expected, setup, look, own)
         if len(found.corners_px) >= len(seen):

@@ -123,6 +123,18 @@ def test_nothing_is_searched_for_where_nothing_can_be_whole(
     assert bool(passes) is searched
 
 
+def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> None:
+    """A prediction by an estimate that has jumped may be anywhere."""
+    whole = pose_of(0.0, 0.0, 0.4, 0.3)
+    at = both(whole)
+    before = Detections(-1, -1 / 30, *(Detection(n, at[n], 0.1, True) for n in ("large", "small")))
+    image = render(*whole, noise=4.0)
+    found = detect(frame(image), before, SETUP, CAMERA, both(POSES["under"]))
+    for name, one in (("large", found.large), ("small", found.small)):
+        assert one is not None
+        assert np.abs(one.corners_px - at[name]).max() < 0.2  # type: ignore[index]
+
+
 def test_what_may_be_whole_if_the_prediction_is_a_little_off_is_searched_for() -> None:
     square_px = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 60.0], [0.0, 60.0]])
     for out_px, may in ((-1.0, True), (30.0, True), (50.0, False)):
