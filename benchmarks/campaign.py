@@ -29,6 +29,7 @@ WORKER = Path(__file__).with_name("campaign_worker.py")
 HERE, THERE = "this code", "--against"
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 SHOWN_MEMORY = 8
+TURN_SEEDS = 4
 
 Flight = dict[str, Any]
 
@@ -89,15 +90,24 @@ def one_at_a_time(workers: dict[str, Worker], seeds: range, passes: int) -> dict
     return flights
 
 
-def two_at_a_time(first: Worker, second: Worker, seeds: range) -> list[Flight]:
-    """Every other seed each, at the same time."""
-    second.fly(seeds[0])
+def two_at_a_time(
+    workers: dict[str, tuple[Worker, Worker]], seeds: range
+) -> dict[str, list[Flight]]:
+    """Every other seed each, at the same time; in turns after every few, so that all meet the
+    same computer."""
+    flights: dict[str, list[Flight]] = {name: [] for name in workers}
+    for _, second in workers.values():
+        second.fly(seeds[0])
     with ThreadPoolExecutor(2) as threads:
-        halves = [
-            threads.submit(lambda w, own: [w.fly(seed) for seed in own], worker, own)
-            for worker, own in ((first, seeds[::2]), (second, seeds[1::2]))
-        ]
-        return [flight for half in halves for flight in half.result()]
+        for first in range(0, len(seeds), TURN_SEEDS):
+            some = seeds[first : first + TURN_SEEDS]
+            for name, both in workers.items():
+                halves = [
+                    threads.submit(lambda w, own: [w.fly(seed) for seed in own], worker, own)
+                    for worker, own in zip(both, (some[::2], some[1::2]), strict=True)
+                ]
+                flights[name] += [flight for half in halves for flight in half.result()]
+    return flights
 
 
 def row(name: str, processes: int, flights: Sequence[Flight]) -> tuple[object, ...]:
@@ -106,6 +116,18 @@ def row(name: str, processes: int, flights: Sequence[Flight]) -> tuple[object, .
         name, processes, statistics.median(cpu), min(cpu), max(cpu), statistics.median(wall),
         statistics.median(f["cpu_s"] for f in flights),
     )  # fmt: skip
+
+
+def show_times_as_fast(flights: dict[str, list[Flight]], processes: int) -> None:
+    """Each seed beside itself: what the computer did meanwhile changes that least."""
+    if THERE not in flights:
+        return
+    cpu_s = {name: {f["seed"]: f["cpu_s"] for f in flown} for name, flown in flights.items()}
+    times = [cpu_s[THERE][seed] / cpu_s[HERE][seed] for seed in cpu_s[HERE]]
+    print(
+        f"  {processes} at a time, {HERE} is {statistics.median(times):.2f} times as fast as "
+        f"{THERE}, seed by seed ({min(times):.2f} to {max(times):.2f})"
+    )
 
 
 def show_outcomes(flights: dict[str, list[Flight]]) -> None:
@@ -171,12 +193,15 @@ def main() -> int:
     workers = {name: Worker(home, options.profile) for name, home in homes.items()}
     flights = one_at_a_time(workers, seeds, max(1, options.passes))
     rows = [row(name, 1, flown) for name, flown in flights.items()]
-    for name, home in homes.items():
-        second = Worker(home, options.profile)
-        rows.append(row(name, 2, two_at_a_time(workers[name], second, seeds)))
+    pairs = {name: (workers[name], Worker(home, options.profile)) for name, home in homes.items()}
+    paired = two_at_a_time(pairs, seeds)
+    rows += [row(name, 2, flown) for name, flown in paired.items()]
+    for _, second in pairs.values():
         second.close()
     head = ("", "processes", "x real time by CPU", "least", "most", "by wall", "CPU s a flight")
     table(f"seeds 0 to {seeds[-1]}, medians, a core", head, rows)
+    show_times_as_fast(flights, 1)
+    show_times_as_fast(paired, 2)
     starts = ", ".join(f"{name} {worker.start_s:.1f} s" for name, worker in workers.items())
     print(f"  start of a process: {starts}")
     show_outcomes(flights)
