@@ -31,7 +31,7 @@ class Outside:
 @dataclass(frozen=True)
 class FrameSeen:
     """A frame as its source gave it, without its picture: a `perchctl.vision.types.Frame`.
-    `checksum`: the picture's, None where nobody looked at it."""
+    `checksum`: the picture's, None where nobody looked at it, or nobody records it."""
 
     index: int
     t_s: float

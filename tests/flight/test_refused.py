@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,10 +23,10 @@ from perchctl.flight.results import (
 )
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import SHORT, short_profile
+from tests.helpers.results import aborted, landed, perched
 
-PERCHED = FlightResult(1, "perched", "hanging still", 0.004, 20.0, 1, False, False, 5.0)
-LANDED = FlightResult(2, "landed", "target not found", None, 30.0, 0, False, False, 5.0)
-ABORTED = FlightResult(3, "aborted", "tilted", None, 10.0, 1, True, True, 2.5)
+PERCHED, ABORTED = perched(1, miss_m=0.004), aborted(3)
+LANDED = replace(landed(2), attempts=0, reason="target not found")
 REFUSED = FlightResult(4, "refused", "the battery is flat", None, 0.0, 0, False, False, 0.0)
 
 

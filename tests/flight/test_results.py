@@ -26,10 +26,11 @@ from perchctl.log.read import PhaseSpan, read_log
 from perchctl.log.summary import FlightSummary, summary_of, summary_text
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
+from tests.helpers.results import aborted, landed, perched
 
-PERCHED = FlightResult(1, "perched", "hanging still", 0.004, 20.0, 1, False, False, 5.0)
-LANDED = FlightResult(2, "landed", "target not found", None, 30.0, 0, False, False, 5.0)
-ABORTED = FlightResult(3, "aborted", "tilted", None, 10.0, 1, True, True, 2.5, peak_memory_mb=5e6)
+PERCHED, ABORTED = perched(1, miss_m=0.004), aborted(3)
+LANDED = replace(landed(2), attempts=0, reason="target not found")
+
 
 results_lists = st.lists(
     st.builds(

@@ -16,3 +16,10 @@ def perched(seed: int, miss_m: float = 0.002, time_s: float = 20.0) -> FlightRes
 
 def landed(seed: int) -> FlightResult:
     return replace(LANDED, seed=seed)
+
+
+def aborted(seed: int) -> FlightResult:
+    """It fell, and its process held more memory than any test's."""
+    return FlightResult(
+        seed, "aborted", "tilted", None, 10.0, 1, True, True, 2.5, peak_memory_mb=5e6
+    )

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import perchctl.sim.placed as placed
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
+from perchctl.sim.pixels import defocused
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Neighbour, Scenario
 from perchctl.sim.shutter import Shot
 from perchctl.sim.surfaces import SheetTexture
-from perchctl.sim.tiles import Reach, Tiles, tiles_of
+from perchctl.sim.tiles import Reach, Tiles, pixels_of, tiles_of
 from perchctl.vision.types import CameraModel
 
 K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])
@@ -98,3 +103,24 @@ def test_noise_has_its_spread_and_no_memory() -> None:
         assert abs((noise[:, 1:] * noise[:, :-1]).mean()) < 0.01 * 36.0
         assert abs((noise[1:] * noise[:-1]).mean()) < 0.01 * 36.0
     assert abs((one * other).mean()) < 0.01 * 36.0
+
+
+SPAN = st.tuples(st.integers(0, 9), st.integers(1, 6))
+"""First tile, and how many."""
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 2**31), st.floats(0.1, 1.5), SPAN, SPAN)
+def test_a_blur_of_some_tiles_is_that_of_the_whole_picture_there(
+    seed: int, sigma_px: float, rows: tuple[int, int], cols: tuple[int, int]
+) -> None:
+    """And as far around as they spread; what is farther off stays as it was."""
+    sharp = np.random.default_rng(seed).integers(0, 256, (128, 128)).astype(np.uint8)
+    box = (slice(rows[0], rows[0] + rows[1]), slice(cols[0], cols[0] + cols[1]))
+    picture = sharp.copy()
+    defocused(picture, sigma_px, box)
+    near = pixels_of(box, math.ceil(3.0 * sigma_px))
+    assert np.array_equal(picture[near], cv2.GaussianBlur(sharp, (0, 0), sigma_px)[near])
+    far = np.ones(sharp.shape, np.bool_)
+    far[pixels_of(box, 8)] = False
+    assert np.array_equal(picture[far], sharp[far])

@@ -45,7 +45,7 @@ _GRID_PX = 0.8  # picture pixels from node to node
 _ROUNDS = 12
 _HOPE_ROUNDS, _LEAST_HOPE = 4, 0.7
 """A marker's likeness is above 0.9 after two rounds; what is still far from it is none."""
-_STILL_PX = 0.05  # what the round after such a step moves is less than 0.01
+_STILL_PX = 0.05  # the round after such a step moves a tenth of that, mostly
 _LENS_PX = 0.3  # what the lens does is computed anew after this way
 _MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
 # How far shape may leave its start, as standard deviations, per unit of the marker's
