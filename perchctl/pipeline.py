@@ -28,7 +28,7 @@ from perchctl.vision.merge import stage_of
 from perchctl.vision.own import Chooser, OwnPlace
 from perchctl.vision.places import seen_from, to_level, to_world
 from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
-from perchctl.vision.predict import expected_corners
+from perchctl.vision.predict import expected_corners, sighted
 from perchctl.vision.solve import Candidate
 from perchctl.vision.strategies import Merged, MergeStrategy, Prior, make_strategy
 from perchctl.vision.tracks import (
@@ -203,7 +203,7 @@ def _followed(
     surest = surest_of(measured)
     sees = surest is not None and taken
     if surest is not None and sees:
-        sighting = Sighting(surest, attitude)
+        sighting = sighted(sighting, surest, attitude, pipeline.pose)
     target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     new = PipelineState(
         tracks=followed.tracks,

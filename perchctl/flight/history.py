@@ -80,7 +80,7 @@ def battery_age_s(history: History, now_s: float) -> float:
 
 
 def attitude_at(history: History, t_s: float) -> Attitude | None:
-    """Attitude and position at `t_s`, linear between samples (yaw on the circle).
+    """Attitude, position and velocity at `t_s`, linear between samples (yaw on the circle).
 
     Before the oldest sample the oldest counts; beyond the newest the newest is
     carried on by its velocity for at most 0.1 s. None without samples.
@@ -105,6 +105,11 @@ def attitude_at(history: History, t_s: float) -> Attitude | None:
             a.position_m[1] + part * (b.position_m[1] - a.position_m[1]),
             a.position_m[2] + part * (b.position_m[2] - a.position_m[2]),
         ),
+        (
+            a.velocity_mps[0] + part * (b.velocity_mps[0] - a.velocity_mps[0]),
+            a.velocity_mps[1] + part * (b.velocity_mps[1] - a.velocity_mps[1]),
+            a.velocity_mps[2] + part * (b.velocity_mps[2] - a.velocity_mps[2]),
+        ),
     )
 
 
@@ -118,7 +123,7 @@ def velocity_at(history: History, t_s: float) -> tuple[float, float, float]:
 
 
 def attitude_of(sample: Telemetry) -> Attitude:
-    """Attitude and position of a sample."""
+    """Attitude, position and velocity of a sample."""
     return _attitude(sample, 0.0)
 
 
@@ -128,7 +133,9 @@ def _time_s(sample: Telemetry) -> float:
 
 def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
     x, y, z = (p + v * ahead_s for p, v in zip(s.position_m, s.velocity_mps, strict=True))
-    return Attitude(s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z))
+    return Attitude(
+        s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z), s.velocity_mps
+    )
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:

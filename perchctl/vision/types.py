@@ -120,7 +120,8 @@ class Detections:
 class Attitude:
     """The vehicle's attitude (and position) at a frame's time, world axes.
 
-    Signs as in `perchctl.geometry`: right-handed, pitch positive nose down.
+    Signs as in `perchctl.geometry`: right-handed, pitch positive nose down. `velocity_mps` is None
+    where nothing tells it.
     """
 
     t_s: float
@@ -128,6 +129,7 @@ class Attitude:
     pitch_rad: float
     yaw_rad: float
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity_mps: tuple[float, float, float] | None = None
 
     @cached_property
     def R_level_body(self) -> Array:
@@ -242,10 +244,15 @@ class TargetEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A pose of the target and the vehicle's attitude at that time, if it was known."""
+    """A pose of the target and the vehicle's attitude at that time, if it was known.
+
+    `off_rad2` is by how much, seen from the camera, the vehicle's own motion was wrong of late about
+    where the target went: mean squares of its places' steps and of its speeds times time.
+    """
 
     pose: MarkerPose
     attitude: Attitude | None
+    off_rad2: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
