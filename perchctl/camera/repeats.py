@@ -39,7 +39,7 @@ WOBBLE_HZ = 10.0
 """No vehicle swings faster by as much as a picture shows; it turns back twice a period."""
 _CALM = 0.7  # of the pixels: what moved, and edges, are no noise
 _LEAST_NOISE = 1.0
-_STEP = 16  # rows
+_STEP = 32  # rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,6 +53,8 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_BANK_PX = 1024
+_NOISE_PLACES = 4096
+"""Of the bank, one for each frame: there are more frames than these only after a minute."""
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size, does not show."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
@@ -95,7 +97,7 @@ class Renderer:
         lens = lens_of(camera)
         self._coarse, self._tiles, self.shade = lens.coarse, lens.tiles, lens.shade
         self._places, self._focal_px = lens.places, lens.focal_px
-        self._noise = self._noise_bank()
+        self._noise, self._noise_at = self._noise_bank()
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
@@ -138,15 +140,14 @@ class Renderer:
         picture = woven([self._exposed(shot, defocus_px) for shot in shots], top_first)
         if len(shots) > 1 and scene.camera_blended:
             picture = blended(picture)
-        rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
         if self._noise is not None:
             width, height = self.camera.size_px
-            rows, cols = self._noise[0].shape
-            r, c = rng.integers(rows - height + 1), rng.integers(cols - width + 1)
+            r, c = self._noise_at[frame_index % len(self._noise_at)]
             more, less = (bank[r : r + height, c : c + width] for bank in self._noise)
             picture = np.asarray(cv2.add(picture, more), np.uint8)
             cv2.subtract(picture, less, picture)
         if self._analogue > 0.0:
+            rng = np.random.default_rng([self.seed, FRAME_STREAM, frame_index])
             picture = spoil(picture, self._analogue, rng)
         return np.array(picture, np.uint8, copy=True if self._noise is None else None)
 
@@ -286,17 +287,20 @@ class Renderer:
         path = cam[:, :2] * (self._focal_px / np.maximum(cam[:, 2:], 1e-3))
         return np.asarray(path.transpose(2, 0, 1))
 
-    def _noise_bank(self) -> tuple[Picture, Picture] | None:
-        """What is added to a picture, and what is taken off: one of them is 0 at each place.
-        Such sums of bytes cost a third of one with signed numbers."""
+    def _noise_bank(self) -> tuple[tuple[Picture, Picture] | None, list[tuple[int, int]]]:
+        """What is added to a picture, and what is taken off, one of them being 0 at each place:
+        such sums of bytes cost a third of one with signed numbers. And from which row and column
+        on for each frame."""
         sigma = self.scenario.camera_noise_sigma
         if sigma <= 0.0:
-            return None
+            return None, []
         width, height = self.camera.size_px
         size = (max(_NOISE_BANK_PX, height + 256), max(_NOISE_BANK_PX, width + 256))
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
-        return _bytes(bank), _bytes(-bank)
+        room = np.subtract(size, (height, width)) + 1
+        places = rng.integers(room, size=(_NOISE_PLACES, 2)).tolist()
+        return (_bytes(bank), _bytes(-bank)), places
 
 
 def _bytes(grey: NDArray[np.float32]) -> Picture:

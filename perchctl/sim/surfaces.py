@@ -118,9 +118,11 @@ class Ceiling:
     """A seeded, seamless grey texture with detail from 2 mm to half a metre."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        tile = np.full((TILE_FINEST_PX, TILE_FINEST_PX), CEILING_GREY, np.float32)
+        # The coarsest first, each sum made finer before the next is added.
+        tile = np.full((1, 1), CEILING_GREY, np.float32)
         for cells, sigma in CEILING_OCTAVES:
-            tile += _periodic_noise(rng, cells, sigma)
+            tile = _finer(tile, cells // len(tile))
+            tile += rng.standard_normal((cells, cells), np.float32) * np.float32(sigma)
         self._tiles = [np.clip(tile, 0.0, 255.0)]
         while len(self._tiles[-1]) > 128:
             half = cv2.resize(self._tiles[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -139,13 +141,9 @@ class Ceiling:
         return self._levels[level]
 
 
-def _periodic_noise(rng: np.random.Generator, cells: int, sigma: float) -> NDArray[np.float32]:
-    """Smooth noise over one tile whose left and right, top and bottom fit together."""
-    grid = rng.normal(0.0, sigma, (cells, cells)).astype(np.float32)
-    if cells == TILE_FINEST_PX:
-        return grid
-    zoom = TILE_FINEST_PX // cells
-    padded = np.pad(grid, 2, mode="wrap")
+def _finer(tile: NDArray[np.float32], zoom: int) -> NDArray[np.float32]:
+    """The same smooth surface with more cells; left and right, top and bottom fit together."""
+    padded = np.pad(tile, 2, mode="wrap")
     # One axis after the other, without what lies around the tile: at the coarsest a third.
     wide = cv2.resize(padded, None, fx=zoom, fy=1, interpolation=cv2.INTER_CUBIC)
     wide = np.ascontiguousarray(wide[:, 2 * zoom : -2 * zoom])
