@@ -56,7 +56,10 @@ _NOISE_BANK_PX = 1024
 _NOISE_PLACES = 4096
 """Of the bank, one for each frame: there are more frames than these only after a minute."""
 _PLAIN_PX = 1.5
-"""Blur of the lens that the bare ceiling, drawn at half the size, does not show."""
+"""Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
+_COVERING_SIGMA = 4.0
+"""Noise, grey levels, under which nobody sees whether the ceiling is drawn at a quarter of the
+size or at half of it: these differ by a spread of 1.1 to 1.3."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
 
 
@@ -97,6 +100,7 @@ class Renderer:
         lens = lens_of(camera)
         self._coarse, self._tiles, self.shade = lens.coarse, lens.tiles, lens.shade
         self._places, self._focal_px = lens.places, lens.focal_px
+        self._ceiling_px = 4 if scenario.camera_noise_sigma >= _COVERING_SIGMA else 2
         self._noise, self._noise_at = self._noise_bank()
         self._analogue = min(max(float(scenario.extra.get("analogue", 0.0)), 0.0), 1.0)
 
@@ -221,25 +225,27 @@ class Renderer:
         motion_px: Array,
         length_px: float,
     ) -> Picture:
-        """The bare ceiling, at half resolution: its texture carries no measurement."""
+        """The bare ceiling, several pixels drawn as one: its texture carries no measurement."""
         rows, cols = nodes.shape[:2]
         mid = nodes[rows // 2, cols // 2]
         px_per_m = local_px_per_m(nodes, rows // 2, cols // 2, COARSE_PX)
-        texture = self._ceiling.texture(px_per_m / 2.0)
+        step = self._ceiling_px
+        texture = self._ceiling.texture(px_per_m / step)
         # Whole tiles, to have the view in the middle of the texture.
         tile = np.clip(np.round(mid / TILE_M), -1e3, 1e3) * TILE_M
-        texels = (nodes - tile) * texture.px_per_m + _CENTER_TEXEL
-        half = cv2.resize(texels.astype(np.float32), None, fx=COARSE_PX // 2, fy=COARSE_PX // 2)
-        crop = COARSE_PX // 2
-        picture = sample(texture.image, half[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
+        texels = nodes * np.float32(texture.px_per_m)
+        texels += (_CENTER_TEXEL - tile * texture.px_per_m).astype(np.float32)
+        crop = COARSE_PX // step
+        texels = cv2.resize(texels, None, fx=crop, fy=crop)[crop:-crop, crop:-crop]
+        picture = sample(texture.image, texels, cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip
             picture[mask > 0] = FLOOR_GREY
-        kernel = line_kernel(motion_px / 2.0) if length_px >= SHARP_MOTION_PX else None
+        kernel = line_kernel(motion_px / step) if length_px >= SHARP_MOTION_PX else None
         if kernel is not None:
             picture = np.asarray(cv2.filter2D(picture, -1, kernel), np.uint8)
-        return np.asarray(cv2.resize(picture, None, fx=2, fy=2), np.uint8)
+        return np.asarray(cv2.resize(picture, None, fx=step, fy=step), np.uint8)
 
     def _add_sheet(self, picture: Picture, view: View, maps: Array) -> None:
         tiles, texture, plane = view.tiles, view.texture, view.placed.plane
