@@ -195,8 +195,8 @@ class Renderer:
         elif lens > 0.05 and box is not None:
             defocused(picture, lens, box)
         width, height = self.camera.size_px
-        shaded = cv2.multiply(picture[:height, :width], self.shade, scale=1.0 / 255.0)
-        return np.asarray(shaded, np.uint8)
+        seen = picture[:height, :width]
+        return np.asarray(cv2.multiply(seen, self.shade, seen, scale=1.0 / 255.0), np.uint8)
 
     def _optical(
         self, maps: Array, motion_px: Array, length_px: float

@@ -80,7 +80,7 @@ class Reach:
 def reach_of(nodes: NDArray[np.float32], length_px: float) -> Reach:
     """`nodes` are the coarse ones in the sheet's axes, `length_px` is the longest way of its
     picture within the exposure."""
-    x, y = (np.asarray(axis, np.float32) for axis in cv2.split(nodes))
+    x, y = np.ascontiguousarray(nodes.transpose(2, 0, 1), np.float32)
     # Half a tile to each side, by the distance of the nodes at both sides; the outermost pixels'
     # centres lie an eighth less far out.
     reach_m = cv2.max(_span(x), _span(y)) * np.float32(0.25 + 0.5 * length_px / TILE_PX)
