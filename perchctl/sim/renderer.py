@@ -52,9 +52,9 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 """Numbers of this part's random streams."""
 
 FLOOR_GREY = 60
-_NOISE_BANK_PX = 1024
-_NOISE_PLACES = 4096
-"""Of the bank, one for each frame: there are more frames than these only after a minute."""
+_NOISE_ROOM_PX = 64
+"""By so much the bank of noise is larger than a picture: each frame has another part of it, in
+another place for minutes, and what is small stays near to the processor."""
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
 _COVERING_SIGMA = 4.0
@@ -301,11 +301,11 @@ class Renderer:
         if sigma <= 0.0:
             return None, []
         width, height = self.camera.size_px
-        size = (max(_NOISE_BANK_PX, height + 256), max(_NOISE_BANK_PX, width + 256))
+        size = (height + _NOISE_ROOM_PX, width + _NOISE_ROOM_PX)
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
-        room = np.subtract(size, (height, width)) + 1
-        places = rng.integers(room, size=(_NOISE_PLACES, 2)).tolist()
+        across = _NOISE_ROOM_PX + 1
+        places = [divmod(each, across) for each in rng.permutation(across**2).tolist()]
         return (_bytes(bank), _bytes(-bank)), places
 
 
