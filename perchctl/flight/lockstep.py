@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 
 from perchctl.calibration.files import camera_of
@@ -15,7 +16,7 @@ from perchctl.link.mock import MockLink
 from perchctl.log.watch import LogWatcher
 from perchctl.mission.state import Operator, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick, Watcher
-from perchctl.pipeline import make_pipeline
+from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture.settings import CaptureSettings
@@ -26,7 +27,7 @@ from perchctl.sim.told import Teller
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision.types import Frame
+from perchctl.vision.types import CameraModel, Frame
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2
@@ -187,7 +188,7 @@ def fly_lockstep(
         source = log.watched(source)
     operator = _OperatorAt(operator_at or {})
     tell = Teller(scenario)
-    pipeline = make_pipeline(profile, camera)
+    pipeline = _pipeline_of(profile, camera)
     parts = FlightParts(
         link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,
         lambda event: tell(event, event.t_s),  # the clock is the simulation's
@@ -199,6 +200,27 @@ def fly_lockstep(
     link.close()
     link.advance_to(link.now_s + 1.0)
     return _flown(report, vehicle, truth)
+
+
+@dataclass(frozen=True)
+class _Seeing:
+    """What a pipeline is made of; those that say the same are equal."""
+
+    told: tuple[object, ...]
+    profile: Profile = field(compare=False)
+    camera: CameraModel = field(compare=False)
+
+
+def _pipeline_of(profile: Profile, camera: CameraModel) -> Pipeline:
+    """A campaign's flights share it: to make one takes as long as 10 pictures."""
+    if profile.camera.mask is not None:
+        return make_pipeline(profile, camera)  # from a file that may have changed
+    return _shared(_Seeing((profile.model_dump_json(), *camera.contents), profile, camera))
+
+
+@lru_cache(maxsize=2)
+def _shared(seeing: _Seeing) -> Pipeline:
+    return make_pipeline(seeing.profile, seeing.camera)
 
 
 def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> LockstepFlight:

@@ -30,8 +30,7 @@ class Lens:
 
 def lens_of(camera: CameraModel) -> Lens:
     """The camera's; flights share it, since its rays take longer than 20 pictures."""
-    K, dist = (np.asarray(each, np.float64) for each in (camera.K, camera.dist))
-    return _lens(camera.size_px, camera.model, K.tobytes(), dist.tobytes())
+    return _lens(*camera.contents)
 
 
 @lru_cache(maxsize=2)

@@ -305,7 +305,7 @@ class Renderer:
         rng = np.random.default_rng([self.seed, NOISE_STREAM])
         bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
         across = _NOISE_ROOM_PX + 1
-        places = [divmod(each, across) for each in rng.permutation(across**2).tolist()]
+        places = np.stack(np.divmod(rng.permutation(across**2), across), axis=1).tolist()
         return (_bytes(bank), _bytes(-bank)), places
 
 

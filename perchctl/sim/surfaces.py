@@ -46,6 +46,10 @@ CEILING_OCTAVES: tuple[tuple[int, float], ...] = (
 )
 
 
+_BYTE_SIGMA = math.sqrt((256.0**2 - 1.0) / 12.0)
+"""Spread of bytes that are all as likely."""
+
+
 @dataclass(frozen=True, eq=False)
 class SheetTexture:
     """The sheet at one resolution: `value` is grey times coverage, `alpha` coverage.
@@ -122,7 +126,9 @@ class Ceiling:
         tile = np.full((1, 1), CEILING_GREY, np.float32)
         for cells, sigma in CEILING_OCTAVES:
             tile = _finer(tile, cells // len(tile))
-            tile += rng.standard_normal((cells, cells), np.float32) * np.float32(sigma)
+            # As wide as a normal distribution, at a tenth of the price.
+            grey = rng.integers(0, 256, (cells, cells), np.uint8)
+            tile += grey * np.float32(sigma / _BYTE_SIGMA) - np.float32(127.5 * sigma / _BYTE_SIGMA)
         self._tiles = [np.clip(tile, 0.0, 255.0)]
         while len(self._tiles[-1]) > 128:
             half = cv2.resize(self._tiles[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

@@ -42,6 +42,12 @@ class CameraModel:
     dist: Array
     model: str = "plumb_bob"
 
+    @property
+    def contents(self) -> tuple[tuple[int, int], str, bytes, bytes]:
+        """The same for two cameras whose numbers are the same."""
+        K, dist = (np.asarray(each, np.float64).tobytes() for each in (self.K, self.dist))
+        return self.size_px, self.model, K, dist
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
