@@ -69,8 +69,12 @@ def repeated(
     ratios = (*state.ratios[1 - _WINDOW :], _unlike(last, image))
     times_s = (*state.times_s[1 - _WINDOW :], t_s)
     again = state.again + 1
-    proven = _by_turns(ratios) and _alike_hz(ratios, times_s) > 2.0 * WOBBLE_HZ
-    if _alike(ratios[-1]) and again <= MOST_AGAIN and proven:
+    if (
+        _alike(ratios[-1])
+        and again <= MOST_AGAIN
+        and _by_turns(ratios)
+        and _alike_hz(ratios, times_s) > 2.0 * WOBBLE_HZ
+    ):
         return RepeatState(last, ratios, times_s, again), True
     return RepeatState(image, ratios, times_s), False
 

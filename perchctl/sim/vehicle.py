@@ -74,14 +74,17 @@ class SimulatedVehicle:
             while self.firmware.t_s < end_s:
                 self.step_blindly()
             return
-        due_s = self.camera.next_s - _TICK_S
-        while self.firmware.t_s < end_s:
+        exposed_s = self.camera.exposed_s + 2.0 * CONTROL_PERIOD_S
+        due_s, t_s = self.camera.next_s - _TICK_S, self.firmware.t_s
+        while t_s < end_s:
             self.step_blindly()
-            self._remember()
-            if self.firmware.t_s >= due_s:
-                self.camera.advance(self.firmware.t_s, self._state_at)
-                due_s = self.camera.next_s - _TICK_S
-        self.camera.advance(self.firmware.t_s, self._state_at)
+            t_s = self.firmware.t_s
+            if t_s >= due_s - exposed_s:
+                self._remember()
+                if t_s >= due_s:
+                    self.camera.advance(t_s, self._state_at)
+                    due_s = self.camera.next_s - _TICK_S
+        self.camera.advance(t_s, self._state_at)
 
     def step(self) -> None:
         """One control period, and the exposures that fall into it."""
