@@ -29,7 +29,6 @@ from perchctl.vision.markers.grid import (
     lens_shift_px,
     make_grid,
     patch_around,
-    projected,
     read,
     through_lens,
 )
@@ -37,7 +36,7 @@ from perchctl.vision.markers.light import Light, fit_light, lit_jacobian
 from perchctl.vision.markers.likeness import likeness, pattern_seen, repeated, worst_cell
 from perchctl.vision.markers.products import gram
 from perchctl.vision.markers.rendered import BEND, Rendered, rendered
-from perchctl.vision.markers.square import UNIT, corner_jacobian, from_unit
+from perchctl.vision.markers.square import UNIT, corner_jacobian, from_unit, mapped
 from perchctl.vision.types import CameraModel
 
 _MAX_GRID, _MIN_GRID = 44, 18
@@ -199,7 +198,7 @@ def _first_fit(blur_px: float, scene: _Scene) -> _Fit:
     return _Fit(
         H=scene.H,
         total=np.zeros(8),
-        offset_px=scene.lens_px - scene.patch.first,
+        offset_px=scene.lens_px - scene.patch.first[:, None],
         since_lens_px=0.0,
         rendered=_rendered(blur_px, scene),
     )
@@ -213,7 +212,7 @@ def _seen_through_lens(fit: _Fit, scene: _Scene) -> _Fit:
     """With the lens computed anew if the fit has moved away from where it was."""
     if fit.since_lens_px <= _LENS_PX:
         return fit
-    offset_px = lens_shift_px(scene.grid, fit.H, scene.camera) - scene.patch.first
+    offset_px = lens_shift_px(scene.grid, fit.H, scene.camera) - scene.patch.first[:, None]
     return replace(fit, offset_px=offset_px, since_lens_px=0.0)
 
 
@@ -275,7 +274,7 @@ def _stepped(fit: _Fit, step: Array, scene: _Scene) -> _Fit:
 
 def _alignment(fit: _Fit, equations: _Equations, scene: _Scene, start_px: Array) -> Alignment:
     drawing, grid, light, error = scene.drawing, scene.grid, equations.light, equations.error
-    corners_px = through_lens(projected(fit.H, *UNIT.T), scene.camera)
+    corners_px = through_lens(mapped(fit.H, UNIT).T, scene.camera).T
     pattern = pattern_seen(fit.rendered, equations.grey, light)
     many = repeated(error.reshape(grid.n, grid.n))
     covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE] * many

@@ -19,6 +19,11 @@ from perchctl.vision.types import CameraModel, MarkerName
 UNIT: Array = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 NEXT, BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])  # corner i's neighbours
 _UNIT32 = UNIT.astype(np.float32)
+_UNIT1: Array = np.column_stack([UNIT, np.ones(4)])
+_INCREMENTS: Array = np.array(
+    [[[u, v, 1, 0, 0, 0, -u * u, -u * v], [0, 0, 0, u, v, 1, -u * v, -v * v]] for u, v in UNIT]
+)
+"""Of each corner, how far an increment's terms move it in the marker's own coordinates."""
 
 
 def from_unit(corners: Array) -> Array:
@@ -42,15 +47,10 @@ def mapped(H: Array, points: Array) -> Array:
 def corner_jacobian(H: Array) -> Array:
     """Change (8, 8) of the four corners that H (3, 3) makes of the unit square with the terms of
     an increment P, H (1 + P): its rows one after the other, without the last term."""
-    rows = []
-    for u, v in UNIT:
-        d = H[2] @ (u, v, 1.0)
-        x, y = H[0] @ (u, v, 1.0) / d, H[1] @ (u, v, 1.0) / d
-        A = np.array([(H[0, :2] - x * H[2, :2]) / d, (H[1, :2] - y * H[2, :2]) / d])
-        du = np.array([u, v, 1, 0, 0, 0, -u * u, -u * v])
-        dv = np.array([0, 0, 0, u, v, 1, -u * v, -v * v])
-        rows.append(A @ np.stack([du, dv]))
-    return np.concatenate(rows)
+    q = _UNIT1.dot(H.T)
+    x, d = q[:, :2] / q[:, 2:], q[:, 2, None, None]
+    A = (H[:2, :2] - x[:, :, None] * H[2, :2]) / d
+    return np.asarray((A @ _INCREMENTS).reshape(8, 8))
 
 
 def side_lengths_px(corners_px: Array) -> Array:
