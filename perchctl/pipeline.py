@@ -46,7 +46,6 @@ from perchctl.vision.types import (
     PictureKind,
     PipelineOutput,
     PipelineState,
-    Sighting,
     Stage,
     TargetEstimate,
 )

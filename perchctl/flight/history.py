@@ -133,9 +133,7 @@ def _time_s(sample: Telemetry) -> float:
 
 def _attitude(s: Telemetry, ahead_s: float) -> Attitude:
     x, y, z = (p + v * ahead_s for p, v in zip(s.position_m, s.velocity_mps, strict=True))
-    return Attitude(
-        s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z), s.velocity_mps
-    )
+    return Attitude(s.t_s + ahead_s, s.roll_rad, s.pitch_rad, s.yaw_rad, (x, y, z), s.velocity_mps)
 
 
 def _is_jump(before: list[Telemetry], new: Telemetry, safety: SafetyConfig) -> bool:

@@ -236,8 +236,8 @@ class Renderer:
         texels = nodes * np.float32(texture.px_per_m)
         texels += (_CENTER_TEXEL - tile * texture.px_per_m).astype(np.float32)
         crop = COARSE_PX // step
-        texels = cv2.resize(texels, None, fx=crop, fy=crop)[crop:-crop, crop:-crop]
-        picture = sample(texture.image, texels, cv2.BORDER_WRAP)
+        wider = cv2.resize(texels, None, fx=crop, fy=crop)
+        picture = sample(texture.image, wider[crop:-crop, crop:-crop], cv2.BORDER_WRAP)
         if misses.any():
             mask = cv2.resize(misses[1:-1, 1:-1].astype(np.uint8), picture.shape[::-1],
                               interpolation=cv2.INTER_NEAREST)  # fmt: skip

@@ -252,8 +252,8 @@ class TargetEstimate:
 class Sighting:
     """A pose of the target and the vehicle's attitude at that time, if it was known.
 
-    `off_rad2` is by how much, seen from the camera, the vehicle's own motion was wrong of late about
-    where the target went: mean squares of its places' steps and of its speeds times time.
+    `off_rad2` is by how much, seen from the camera, the vehicle's own account of its way was wrong
+    of late: mean squares, of its places' steps and of its speeds times the time.
     """
 
     pose: MarkerPose

@@ -277,13 +277,14 @@ def _alignment(fit: _Fit, equations: _Equations, scene: _Scene, start_px: Array)
     corners_px = through_lens(mapped(fit.H, UNIT).T, scene.camera).T
     pattern = pattern_seen(fit.rendered, equations.grey, light)
     many = repeated(error.reshape(grid.n, grid.n))
-    covariance = np.linalg.inv(equations.N)[_SHAPE, _SHAPE] * many
+    inverse = np.asarray(np.linalg.inv(equations.N))
+    covariance = inverse[_SHAPE, _SHAPE] * many
     cells = cells_seen(
         drawing.cells,
         fit.rendered.soft_cells,
         error,
         equations.J,
-        equations.N * equations.noise,
+        inverse / equations.noise,
         many * equations.noise,
         light.gain,
     )

@@ -26,7 +26,7 @@ class CellsSeen:
 
 
 def cells_seen(
-    cells: Array, soft: Array, error: Array, J: Array, N: Array, noise: float, gain: float
+    cells: Array, soft: Array, error: Array, J: Array, inverse: Array, noise: float, gain: float
 ) -> CellsSeen:
     """What a fit leaves over, cell by cell.
 
@@ -35,7 +35,7 @@ def cells_seen(
         soft: share of each row (and column) of cells in each node, blurred, (n, m).
         error: grey values minus the fit, (n * n,).
         J: changes of the grey values with the fit's unknowns, (k, n * n).
-        N: the fit's normal matrix with its priors, (k, k), per unit of noise.
+        inverse: of the fit's normal matrix with its priors, (k, k), per unit of noise.
         noise: variance of a node's grey value, of nodes that measure on their own.
         gain: grey levels from black to white.
     """
@@ -44,7 +44,7 @@ def cells_seen(
     shared = gain * (soft.T @ J.reshape(-1, n, n) @ soft).reshape(-1, m * m)
     squared = (soft**2).sum(axis=0)
     energy = gain**2 * np.outer(squared, squared).ravel()
-    taken = np.einsum("ij,ij->j", shared, np.linalg.solve(N, shared))
+    taken = np.einsum("ij,ij->j", shared, inverse.dot(shared))
     own = np.maximum(energy - taken, 1e-9 * energy + 1e-12)
     flips = np.where(cells.ravel() > 0.5, -1.0, 1.0) * seen / own
     return CellsSeen(float(flips.max()), math.sqrt(noise / float(own.min())))

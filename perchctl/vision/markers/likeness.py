@@ -25,15 +25,13 @@ class PatternSeen:
 
 
 def pattern_seen(drawing: Rendered, grey: Array, light: Light) -> PatternSeen:
-    """In the picture's grey values (n * n,)."""
+    """In the picture's grey values (n * n,): what no plain square explains of them."""
     plain = drawing.plain
     A = plain.products + 1e-9 * np.eye(len(plain.products))
-
-    def unexplained(values: Array) -> Array:
-        mix = np.asarray(np.linalg.solve(A, onto(plain.rows, values)), dtype=np.float64)
-        return np.asarray(values - mixed(plain.rows, mix))
-
-    bits, seen = unexplained(light.rows[GAIN]), unexplained(grey)
+    both = light.rows[GAIN], grey
+    b = np.stack([onto(plain.rows, each) for each in both], axis=1)
+    shares = np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    bits, seen = (each - mixed(plain.rows, shares[:, k]) for k, each in enumerate(both))
     energy, product = float((bits * bits).sum()), float((bits * seen).sum())
     scale = math.sqrt(energy * float((seen * seen).sum()))
     if scale < 1e-9:
