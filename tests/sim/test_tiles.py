@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import perchctl.sim.placed as placed
+import perchctl.sim.renderer as rendering
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim.pixels import defocused
@@ -92,10 +93,10 @@ def test_most_of_a_near_sheet_is_even(renderer: Renderer, monkeypatch: pytest.Mo
 
 def test_noise_has_its_spread_and_no_memory() -> None:
     """Neither of the pixel beside, nor of the frame before; and no mean."""
-    scene = replace(SCENE, no_target=True, neighbours=())
-    bare = Renderer(scene, CAMERA, TargetConfig()).render([pose(1.0)]).astype(float)
-    noisy = Renderer(replace(scene, camera_noise_sigma=6.0), CAMERA, TargetConfig())
-    one, other = (noisy.render([pose(1.0)], frame_index=i) - bare for i in (1, 2))
+    paper = EXPOSURES["nothing but paper"]
+    bare = Renderer(SCENE, CAMERA, TargetConfig()).render(paper).astype(float)
+    noisy = Renderer(replace(SCENE, camera_noise_sigma=6.0), CAMERA, TargetConfig())
+    one, other = (noisy.render(paper, frame_index=i) - bare for i in (1, 2))
     for noise in (one, other):
         assert abs(noise.mean()) < 0.05
         assert noise.std() == pytest.approx(6.0, rel=0.02)
@@ -103,6 +104,26 @@ def test_noise_has_its_spread_and_no_memory() -> None:
         assert abs((noise[:, 1:] * noise[:, :-1]).mean()) < 0.01 * 36.0
         assert abs((noise[1:] * noise[:-1]).mean()) < 0.01 * 36.0
     assert abs((one * other).mean()) < 0.01 * 36.0
+
+
+@pytest.mark.parametrize("below_m", [0.3, 1.0, 1.7])
+def test_noise_covers_that_the_ceiling_is_drawn_at_a_quarter_of_the_size(
+    below_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = replace(SCENE, no_target=True, neighbours=())
+    half = Renderer(scene, CAMERA, TargetConfig()).render([pose(below_m)]).astype(float)
+    monkeypatch.setattr(rendering, "_COVERING_SIGMA", 0.0)
+    quarter = Renderer(scene, CAMERA, TargetConfig()).render([pose(below_m)]).astype(float)
+    assert 0.0 < (half - quarter).std() < 1.5
+    assert abs((half - quarter).mean()) < 0.1
+    assert abs(half.std() / quarter.std() - 1.0) < 0.02
+
+
+def test_frames_have_noise_of_their_own_for_minutes() -> None:
+    noisy = Renderer(replace(SCENE, camera_noise_sigma=6.0), CAMERA, TargetConfig())
+    paper = EXPOSURES["nothing but paper"]
+    pictures = {noisy.render(paper, frame_index=k).tobytes() for k in range(0, 4200, 60)}
+    assert len(pictures) == 70
 
 
 SPAN = st.tuples(st.integers(0, 9), st.integers(1, 6))

@@ -47,7 +47,7 @@ KINDS = (b"header", b"turn", b"sent", b"event", b"summary")
 KEPT = tuple(b'{"kind":"' + kind + b'"' for kind in KINDS)
 
 
-PICTURES = 34
+PICTURES = 38
 """So many are kept: from the first before take-off until only the small marker is in view."""
 SMALL = {"link.telemetry_period_s": 0.02, "link.loop_hz": 25}
 """Half the turns, and half the samples."""
@@ -66,8 +66,8 @@ def _seen(log: Path) -> None:
         "simulation.camera_noise_sigma": [0.4, 0.4],
     }
     profile = short_profile(SMALL | changes)
-    watcher = LogWatcher.lockstep(log, profile, 3, record=True)
-    flight = fly_lockstep(profile, 3, watcher, operator_at={Phase.PERCH: Operator.STOP})
+    watcher = LogWatcher.lockstep(log, profile, 4, record=True)
+    flight = fly_lockstep(profile, 4, watcher, operator_at={Phase.PERCH: Operator.STOP})
     watcher.close(flight.report, flight.perched_miss_m, flight.fell)
 
 
