@@ -231,13 +231,18 @@ def _followed(
 
 
 def estimate(
-    state: PipelineState, t_s: float, attitude: Attitude | None, pipeline: Pipeline
+    state: PipelineState,
+    t_s: float,
+    attitude: Attitude | None,
+    pipeline: Pipeline,
+    spread: bool = True,
 ) -> TargetEstimate | None:
     """The target at a moment after the newest frame, for the vehicle's attitude of then.
 
     A tracked target is predicted by its filter, and carried to where the vehicle is now by
     the vehicle's own motion since the frame. One that is no longer tracked stays in the
-    world where it was last. None when none was seen yet.
+    world where it was last. None when none was seen yet. Nothing steers by the spread: without
+    `spread` it is left as it was at the newest frame, which takes half the time.
     """
     target = state.target
     if target is None or attitude is None or target.world_m is None:
@@ -251,12 +256,12 @@ def estimate(
         return _carried(target, t_s, attitude, pipeline)
     if not state.in_world:
         return _carried(target, t_s, attitude, pipeline)
-    tracks = {n: predicted(t, t_s, pipeline.tracks.world) for n, t in state.tracks.items()}
+    world = pipeline.tracks.world
+    tracks = {n: predicted(t, t_s, world, spread) for n, t in state.tracks.items()}
     merged = pipeline.strategy.merge(tracks, state.measured.fed)
     assert merged is not None
-    sigma_yaw_rad = math.sqrt(max(merged.var_yaw_rad2, 0.0))
-    place = _in_world(merged, attitude, pipeline)
-    return replace(target, t_s=t_s, sigma_yaw_rad=sigma_yaw_rad, **place)
+    now = replace(target, t_s=t_s, **_in_world(merged, attitude, pipeline))
+    return replace(now, **_spread_in_world(merged, attitude, pipeline)) if spread else now
 
 
 def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
@@ -284,6 +289,7 @@ def _at_frame(
     never = -np.inf
     if attitude is not None and in_world:
         place = _in_world(merged, attitude, pipeline)
+        place |= _spread_in_world(merged, attitude, pipeline)
     else:
         place = _level(merged, attitude, pipeline)
     return TargetEstimate(
@@ -294,7 +300,6 @@ def _at_frame(
         measured=measured,
         tracked=True,
         unseen=merged.unseen,
-        sigma_yaw_rad=math.sqrt(max(merged.var_yaw_rad2, 0.0)),
         **place,
     )
 
@@ -310,25 +315,32 @@ def _level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dic
         "e_yaw_rad": e_yaw_rad,
         "velocity_mps": merged.velocity_mps,
         "sigma_m": _sigma(merged.cov_m2, merged.bias_m),
+        "sigma_yaw_rad": _sigma_yaw(merged),
         "world_m": world_m,
         "world_yaw_rad": world_yaw_rad,
     }
 
 
 def _in_world(merged: Merged, attitude: Attitude, pipeline: Pipeline) -> dict[str, Any]:
-    """The same of tracks in the world, as seen from the vehicle at `attitude`."""
-    turn = attitude.R_world_level.T
-    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+    """The same of tracks in the world, as seen from the vehicle at `attitude`, but the spread."""
     world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
     e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)
     return {
         "e_m": e_m,
         "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": turn.dot(merged.velocity_mps),
-        "sigma_m": _sigma(turn.dot(merged.cov_m2).dot(turn.T), bias_m),
+        "velocity_mps": attitude.R_world_level.T.dot(merged.velocity_mps),
         "world_m": world_m,
         "world_yaw_rad": world_yaw_rad,
         "world_velocity_mps": merged.velocity_mps,
+    }
+
+
+def _spread_in_world(merged: Merged, attitude: Attitude, pipeline: Pipeline) -> dict[str, Any]:
+    turn = attitude.R_world_level.T
+    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
+    return {
+        "sigma_m": _sigma(turn.dot(merged.cov_m2).dot(turn.T), bias_m),
+        "sigma_yaw_rad": _sigma_yaw(merged),
     }
 
 
@@ -340,6 +352,10 @@ def _carried(
     assert target.world_yaw_rad is not None
     e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
+
+
+def _sigma_yaw(merged: Merged) -> float:
+    return math.sqrt(max(merged.var_yaw_rad2, 0.0))
 
 
 def _sigma(cov_m2: Array, bias_m: Array) -> Array:

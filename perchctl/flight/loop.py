@@ -86,7 +86,7 @@ def fly(parts: FlightParts) -> FlightReport:
     turns = Turns(parts.clock, parts.watchers)
     senses = Senses(
         parts.link, parts.source, parts.pipeline, parts.profile, send=parts.link.external,
-        checksums=turns.are_told,
+        recorded=turns.are_told,
     )  # fmt: skip
     _wait_until_ready(parts, senses, turns)  # nothing is started before it returns
     if senses.history.newest is not None:

@@ -74,7 +74,7 @@ class Senses:
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     noticed: Noticed = field(default_factory=Noticed)
     send: Send = lambda place: True
-    checksums: bool = False  # of the pictures, for who records the turns
+    recorded: bool = False  # the turns are: with the pictures' checksums and the present's spread
     sights: Sights | None = field(init=False, default=None)
     refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
@@ -215,7 +215,7 @@ class Senses:
         at, its target is a remembered place."""
         newest = self.history.newest
         attitude = None if newest is None else attitude_of(newest)
-        target = estimate(self.state, now_s, attitude, self.pipeline)
+        target = estimate(self.state, now_s, attitude, self.pipeline, spread=self.recorded)
         if self.sights is not None:
             target = self.sights.steered(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
@@ -231,7 +231,7 @@ class Senses:
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
         self._health, verdict = assess(self._health, frame, live)
-        if self.checksums and self.taken.frame is not None:
+        if self.recorded and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
         # A dark target may still be seen, and a bare ceiling looks like an empty screen:

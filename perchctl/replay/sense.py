@@ -146,7 +146,7 @@ def sense(
     cannot be read: from then on the pipeline would remember another flight.
     """
     given = _Given(pictures, pipeline.camera.size_px, later_s)
-    senses = Senses(given, given, pipeline, profile)
+    senses = Senses(given, given, pipeline, profile, recorded=True)
     with one_thread():
         for turn in turns:
             given.turn(turn)

@@ -24,6 +24,7 @@ from filterpy.kalman import predict
 
 from perchctl.geometry import Array, finite, wrap_rad
 from perchctl.profile import KalmanConfig
+from perchctl.values import replace
 from perchctl.vision.types import MarkerTrack
 
 YAW, YAW_RATE, X, VX, Y, VY, Z, VZ = range(8)
@@ -245,12 +246,19 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
     return x, left.dot(P).dot(left.T) + gain.dot(R).dot(gain.T), gain
 
 
-def predicted(track: MarkerTrack, t_s: float, setup: FilterSetup) -> MarkerTrack:
-    """The track at a time after its frame, with no measurement in between."""
+def predicted(
+    track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
+) -> MarkerTrack:
+    """The track at a time after its frame, with no measurement in between. Without `spread` its
+    covariance stays that of the frame."""
     dt_s = min(t_s - track.t_s, MAX_PREDICTION_S)
     if dt_s <= 0.0:
         return track
-    return _moved(track, track.x, dt_s, t_s, track.unseen, setup)
+    if spread:
+        return _moved(track, track.x, dt_s, t_s, track.unseen, setup)
+    x = transition(dt_s).dot(_drifting(track.x, setup))
+    x[YAW] = wrap_rad(float(x[YAW]))
+    return replace(track, t_s=t_s, x=x)
 
 
 def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:

@@ -236,6 +236,9 @@ def test_what_is_foreseen_is_what_is_predicted_and_measured(
         t_s=1.0, x=rng.normal(0.0, 0.5, 8), P=half @ half.T, bias=rng.normal(size=(8, 4))
     )
     wanted, found = predicted(track, 1.0 + later_s, setup), foreseen(track, 1.0 + later_s, setup)
+    bare = predicted(track, 1.0 + later_s, setup, spread=False)
+    assert np.array_equal(bare.x, wanted.x)
+    assert bare.t_s == wanted.t_s
     assert found.R is not None
     assert found.bias is not None
     assert np.allclose(found.z, H @ wanted.x)

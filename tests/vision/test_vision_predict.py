@@ -92,8 +92,8 @@ def test_speeds_that_are_wrong_are_overruled_by_places(seed: int) -> None:
     assert rms(both) < 1.5 * rms(places)
 
 
-def test_an_estimate_whose_world_jumps_is_caught_up_with_by_the_speeds() -> None:
-    """The vehicle has not moved: one picture is expected in the wrong place, no more."""
+def test_a_jump_of_the_estimates_world_spoils_one_picture() -> None:
+    """The vehicle has not moved: what follows is expected where it is."""
     flight = Flight(1, 1e-4, 5e-3)
     found = []
     for k, error_px in enumerate(errors_px(flight, 60)):
