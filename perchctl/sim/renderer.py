@@ -53,8 +53,8 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""By so much the bank of noise is larger than a picture: each frame has another part of it, in
-another place for minutes, and what is small stays near to the processor."""
+"""By so much the bank of noise is larger than a picture. Each frame has another part of it, 4225
+of them until the first comes again; and so small a bank stays near to the processor."""
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
 _COVERING_SIGMA = 4.0
