@@ -234,7 +234,7 @@ def test_a_planted_failure_of_two_causes_is_brought_down_to_these() -> None:
     """A turn of 170 deg takes its time, and so does a second attempt; only both take too long."""
     base = write(
         "planted.yaml",
-        "planner: {align: {yaw_rate_dps: 20}, perching_time_s: 24}\n"
+        "planner: {align: {yaw_rate_dps: 20}, perching_time_s: 22}\n"
         "simulation: {target_yaw_deg: [170, 170], first_contact_fails: 1, "
         "draught_mps: [0.05, 0.05], start_offset_m: 0.05, mass_kg: [0.039, 0.039]}\n",
     )
