@@ -8,14 +8,11 @@ goes in and comes out.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile
 from perchctl.profile.mask import read_mask
 from perchctl.values import replace
@@ -25,12 +22,13 @@ from perchctl.vision.markers.cut import prepare
 from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
 from perchctl.vision.markers.mask import GearMask, make_mask
 from perchctl.vision.merge import stage_of
+from perchctl.vision.merged_target import spread_in_world, told_in_level, told_in_world
 from perchctl.vision.own import Chooser, OwnPlace
-from perchctl.vision.places import seen_from, to_level, to_world
+from perchctl.vision.places import to_level
 from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners, sighted
 from perchctl.vision.solve import Candidate
-from perchctl.vision.strategies import Merged, MergeStrategy, Prior, make_strategy
+from perchctl.vision.strategies import MergeStrategy, Prior, make_strategy
 from perchctl.vision.tracks import (
     Followed,
     TrackSetup,
@@ -260,8 +258,10 @@ def estimate(
     tracks = {n: predicted(t, t_s, world, spread) for n, t in state.tracks.items()}
     merged = pipeline.strategy.merge(tracks, state.measured.fed)
     assert merged is not None
-    now = replace(target, t_s=t_s, **_in_world(merged, attitude, pipeline))
-    return replace(now, **_spread_in_world(merged, attitude, pipeline)) if spread else now
+    now = replace(target, t_s=t_s, **told_in_world(merged, attitude, pipeline.pose))
+    if not spread:
+        return now
+    return replace(now, **spread_in_world(merged, attitude, world, pipeline.pose))
 
 
 def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
@@ -288,10 +288,10 @@ def _at_frame(
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
     if attitude is not None and in_world:
-        place = _in_world(merged, attitude, pipeline)
-        place |= _spread_in_world(merged, attitude, pipeline)
+        place = told_in_world(merged, attitude, pipeline.pose)
+        place |= spread_in_world(merged, attitude, pipeline.tracks.world, pipeline.pose)
     else:
-        place = _level(merged, attitude, pipeline)
+        place = told_in_level(merged, attitude, pipeline.pose)
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s if measured else never if before is None else before.measured_s,
@@ -304,46 +304,6 @@ def _at_frame(
     )
 
 
-def _level(merged: Merged, attitude: Attitude | None, pipeline: Pipeline) -> dict[str, Any]:
-    """Place and motion of tracks in the level frame, as a `TargetEstimate` has them."""
-    e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    world_m, world_yaw_rad = None, None
-    if attitude is not None:
-        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, pipeline.pose)
-    return {
-        "e_m": e_m,
-        "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": merged.velocity_mps,
-        "sigma_m": _sigma(merged.cov_m2, merged.bias_m),
-        "sigma_yaw_rad": _sigma_yaw(merged),
-        "world_m": world_m,
-        "world_yaw_rad": world_yaw_rad,
-    }
-
-
-def _in_world(merged: Merged, attitude: Attitude, pipeline: Pipeline) -> dict[str, Any]:
-    """The same of tracks in the world, as seen from the vehicle at `attitude`, but the spread."""
-    world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
-    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, pipeline.pose)
-    return {
-        "e_m": e_m,
-        "e_yaw_rad": e_yaw_rad,
-        "velocity_mps": attitude.R_world_level.T.dot(merged.velocity_mps),
-        "world_m": world_m,
-        "world_yaw_rad": world_yaw_rad,
-        "world_velocity_mps": merged.velocity_mps,
-    }
-
-
-def _spread_in_world(merged: Merged, attitude: Attitude, pipeline: Pipeline) -> dict[str, Any]:
-    turn = attitude.R_world_level.T
-    bias_m = seen_from(merged.bias_m, attitude, pipeline.tracks.world, pipeline.pose)
-    return {
-        "sigma_m": _sigma(turn.dot(merged.cov_m2).dot(turn.T), bias_m),
-        "sigma_yaw_rad": _sigma_yaw(merged),
-    }
-
-
 def _carried(
     target: TargetEstimate, t_s: float, attitude: Attitude, pipeline: Pipeline
 ) -> TargetEstimate:
@@ -352,12 +312,3 @@ def _carried(
     assert target.world_yaw_rad is not None
     e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
-
-
-def _sigma_yaw(merged: Merged) -> float:
-    return math.sqrt(max(merged.var_yaw_rad2, 0.0))
-
-
-def _sigma(cov_m2: Array, bias_m: Array) -> Array:
-    variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
