@@ -41,9 +41,8 @@ _SETTLED_PX = 0.06
 _ROUNDS = 3
 _LEAST_WINDOW2 = _single(0.81)  # square of its sigma, px^2
 _FAR = _single(1e6)
-_LOST = _single(1e5)  # further off than any edge: some of the others are among them
 _QUARTER = PROFILES // 4
-_MIDDLE_MEAN: Floats = np.full(_QUARTER, 1.0 / _QUARTER, dtype=np.float32)
+_QUARTER_ONES: Floats = np.ones(_QUARTER, dtype=np.float32)
 # The line through values in the middles of both halves of the profiles, (2, n).
 _SLOPE: Floats = _ALONG32 * _single(0.5 / float(ALONG[PROFILES // 2 :].mean()))
 _THROUGH_HALVES: Floats = np.stack([_single(0.5) - _SLOPE, _single(0.5) + _SLOPE])
@@ -202,12 +201,19 @@ def _narrow(g: _Gradients, line: Floats, blur2: Floats) -> _Centroids:
 
 def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
     """Straight lines (rows, n) through the middles of the two halves of each row: where a
-    window is put, whatever a quarter of either half shows."""
+    window is put, whatever a quarter of either half shows. A half that shows nothing is
+    taken to lie where the other does."""
     halves = np.where(usable, edge, _HIGH_LOW).reshape(-1, 2, 2 * _QUARTER)
     halves.sort(axis=2)
     first = _QUARTER // 2
-    middles = halves[:, :, first : first + _QUARTER] @ _MIDDLE_MEAN
-    return np.where(np.abs(middles) < _LOST, middles, _ZERO) @ _THROUGH_HALVES
+    middle = halves[:, :, first : first + _QUARTER]
+    # Left out before the sum: beside the others' size an edge's place is rounded away.
+    shown = np.abs(middle) < _FAR
+    sums, counts = (middle * shown) @ _QUARTER_ONES, shown @ _QUARTER_ONES
+    middles = np.where(counts, sums, sums[:, ::-1]) / np.maximum(
+        np.where(counts, counts, counts[:, ::-1]), _ONE
+    )
+    return np.asarray(middles @ _THROUGH_HALVES)
 
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:

@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from perchctl.geometry import Array
 from perchctl.vision.markers.edges import Edges, Surroundings, locate
@@ -20,10 +22,15 @@ def soft_step(x: Array, blur_px: float) -> Array:
 
 
 def located(
-    place_px: Array, blur_px: float, *, far_side: bool = False, noise: float = 0.0
+    place_px: Array,
+    blur_px: float,
+    *,
+    far_side: bool = False,
+    noise: float = 0.0,
+    shown: slice = slice(None),
 ) -> Edges:
     """One row of profiles (n,) with the edge at `place_px`; with `far_side`, white ends
-    a cell further out."""
+    a cell further out. Others than those `shown` count for nothing."""
     x = OFFSETS - place_px[:, None]
     white = soft_step(x, blur_px)
     if far_side:
@@ -31,11 +38,13 @@ def located(
     grey = 30.0 + 170.0 * white
     grey += np.random.default_rng(0).normal(0.0, 1.0, grey.shape) * noise
     none = np.zeros((1, PROFILES))
+    possible = np.zeros((1, PROFILES), dtype=np.bool_)
+    possible[0, shown] = True
     around = Surroundings(
         depth_px=np.array([DEPTH_PX]),
         inside=none,
         outside=none + 1.0 if far_side else none,
-        possible=np.ones((1, PROFILES), dtype=np.bool_),
+        possible=possible,
     )
     return locate(grey[None].astype(np.float32), np.array([HALF_PX]), np.array([NEAR_PX]), around)
 
@@ -66,3 +75,22 @@ def test_profiles_with_an_edge_elsewhere_are_outliers() -> None:
     edges = located(place, 1.0)
     assert (edges.weight[0, 5:9] == 0.0).all()
     assert (np.delete(edges.weight[0], range(5, 9)) > 0.5).all()
+
+
+@given(
+    shown=st.integers(3, PROFILES).flatmap(
+        lambda n: st.integers(0, PROFILES - n).map(lambda first: slice(first, first + n))
+    ),
+    place_px=st.floats(-4.0, 4.0),
+    slope_px=st.floats(-0.5, 0.5),
+    blur_px=st.floats(0.7, 1.5),
+)
+def test_a_side_of_which_little_is_shown_is_found_all_the_same(
+    shown: slice, place_px: float, slope_px: float, blur_px: float
+) -> None:
+    """Of a marker that the picture cuts off: wherever the rest of the side would be."""
+    place = place_px + slope_px * ALONG
+    edges = located(place, blur_px, noise=4.0, shown=shown)
+    weight = edges.weight[0]
+    assert weight.sum() > 1.0
+    assert abs(float((weight * (edges.offset_px[0] - place)).sum() / weight.sum())) < 0.2
