@@ -5,8 +5,8 @@ the markers grow out of the picture. Ascents are rendered with motion blur and n
 vehicle swaying a little; every frame goes through the pipeline. `--without` switches the
 alignment of what is left of the drawing off. Blind is the share of the last 10 cm without
 a measured pose; the squared error is that of (x, y, z, yaw) in units of its covariance, a
-degree of freedom. In every ascent the markers are printed a little too large or too small, as
-a printer's half dot has it, and the state estimate wanders.
+degree of freedom. In every ascent the target is printed a little too large or too small, by as
+much as a print that was measured leaves open, and the state estimate wanders.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from perchctl.geometry import Array, make_T, rot_z, rotation_from_rpy, wrap_rad
 from perchctl.pipeline import Pipeline, PipelineState, make_pipeline, step
 from perchctl.profile import CameraConfig, DetectorConfig, Mounting, Profile, VehicleConfig
 from perchctl.sim.renderer import Renderer
+from perchctl.target.measured import MEASURED_SIGMA
 from perchctl.vision.types import Attitude, Frame
 
 LAST_M, FROM_M, SPEED_MPS, RATE_HZ = 0.10, 0.16, 0.10, 30.0
 EXPOSURE_S = 0.008
-PRINT_M = 2e-5
 TARGET_M = np.array([0.0, 0.0, CEILING_Z_M])
 BELOW_M = (0.02, 0.025, 0.0)
 SWAY_M, SWAY_DEG, SWAY_YAW_DEG = 0.003, 1.5, 3.0
@@ -82,7 +82,7 @@ class Row:
 
 def setup_for(case: Case, cut: bool) -> Pipeline:
     profile = Profile(
-        target=TARGET,
+        target=TARGET.model_copy(update={"size_sigma": MEASURED_SIGMA}),
         camera=CameraConfig(mount=Mounting(position_m=(0.0, 0.0, 0.0))),
         vehicle=VehicleConfig(gear_body_m=case.gear_m),
         detector=DetectorConfig(cut=cut),
@@ -166,11 +166,11 @@ def main() -> None:
 
 
 def printed(seed: int, rng: np.random.Generator) -> Renderer:
-    """The target as a printer makes it: a side is the distance of two lines."""
-    large, small = (
-        SIDES_M[name] + rng.normal(0.0, math.sqrt(2.0) * PRINT_M) for name in ("large", "small")
+    """The target as a printer makes it: all of it too large or too small."""
+    share = 1.0 + rng.normal(0.0, MEASURED_SIGMA)
+    return renderer(
+        seed, large_side_m=share * SIDES_M["large"], small_side_m=share * SIDES_M["small"]
     )
-    return renderer(seed, large_side_m=large, small_side_m=small)
 
 
 def _figures(rows: list[Row]) -> tuple[object, ...]:

@@ -52,7 +52,10 @@ _MAX_INCREMENT = 0.5  # of a round; beyond it the fit has broken down
 _SHAPE_SIGMA, _VIEW_SIGMA = 0.2, 0.03
 _BEND_SIGMA = 0.5  # of the tone curve, in units of the gain
 _MIN_BLUR_PX, _MAX_BLUR_CELLS = 0.35, 1.6
-_BLUR_STEP = 0.05  # a smaller change of blur draws nothing anew
+_MOST_BLUR_STEP = 0.5  # of a round: of the blur's square; a node's square at least
+_BLUR_STEP, _BLUR_STEP_CELLS = 0.05, 0.02
+"""A change of blur draws nothing anew that is smaller than both: as a share of it, and in cells.
+A blur of half a cell that is 5 % off leaves more than codewords differ by."""
 _MIN_GAIN = 10.0  # grey levels from black to white
 _MIN_SIDE_PX, _MAX_SIDE_PX = 4.0, 2000.0
 _SHAPE, _BLUR, _LIGHT = slice(0, 8), 8, 9  # unknowns: the increment, blur, those of light
@@ -98,7 +101,7 @@ class _Scene:
     drawing: Drawing
     side_px: float
     node_px: float
-    max_blur_px: float
+    cell_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,12 +192,16 @@ def _scene(
         drawing=drawing,
         side_px=side_px,
         node_px=reach * side_px / n,
-        max_blur_px=_MAX_BLUR_CELLS * side_px / len(drawing.cells),
+        cell_px=side_px / len(drawing.cells),
     )
 
 
+def _possible_blur_px(blur_px: float, scene: _Scene) -> float:
+    return min(max(blur_px, _MIN_BLUR_PX), _MAX_BLUR_CELLS * scene.cell_px)
+
+
 def _first_fit(blur_px: float, scene: _Scene) -> _Fit:
-    blur_px = min(max(blur_px, _MIN_BLUR_PX), scene.max_blur_px)
+    blur_px = _possible_blur_px(blur_px, scene)
     return _Fit(
         H=scene.H,
         total=np.zeros(8),
@@ -256,11 +263,13 @@ def _stepped(fit: _Fit, step: Array, scene: _Scene) -> _Fit:
     H /= H[2, 2]
     moved_px = 0.5 * scene.side_px * float(np.abs(p[:6]).max())
     since_lens_px = fit.since_lens_px + moved_px
-    squared = fit.rendered.sigma**2 + float(np.clip(step[_BLUR], -1.0, 1.0))
-    wanted_px = math.sqrt(max(squared, 1e-3)) * scene.node_px
-    wanted_px = min(max(wanted_px, _MIN_BLUR_PX), scene.max_blur_px)
+    sigma2 = fit.rendered.sigma**2
+    most = max(1.0, _MOST_BLUR_STEP * sigma2)
+    squared = sigma2 + float(np.clip(step[_BLUR], -most, most))
+    wanted_px = _possible_blur_px(math.sqrt(max(squared, 1e-3)) * scene.node_px, scene)
     blur_px = fit.rendered.sigma * scene.node_px
-    redraw = abs(wanted_px - blur_px) > _BLUR_STEP * blur_px
+    least_px = min(_BLUR_STEP * blur_px, _BLUR_STEP_CELLS * scene.cell_px)
+    redraw = abs(wanted_px - blur_px) > least_px
     return replace(
         fit,
         H=H,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision.camera_model import project
 from perchctl.vision.markers.align import align
-from perchctl.vision.markers.by_drawing import verified
+from perchctl.vision.markers.by_drawing import told_apart, verified
 from perchctl.vision.markers.drawing import Drawing, drawing_of
 from perchctl.vision.pose import square
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
@@ -65,6 +65,22 @@ def test_corners_of_small_and_blurred_markers(
         assert np.abs(error).max() < 6.0 * found.sigma_px + 0.02
         assert found.gain == pytest.approx(175.0, rel=0.2)
     assert math.sqrt(np.mean(squares)) < allowed_px
+
+
+@pytest.mark.parametrize(
+    ("name", "side_px", "blur_px"),
+    [("large", 24.0, 4.0), ("large", 24.0, 5.0), ("small", 26.0, 4.0), ("small", 32.0, 5.0)],
+)
+def test_a_blur_that_nobody_expected_is_found_well_enough_to_tell_codewords_apart(
+    name: str, side_px: float, blur_px: float
+) -> None:
+    """Of half a cell; a fit that ends while the blur still grows leaves more than they differ."""
+    for seed in range(6):
+        image, true = view(name, side_px, seed, blur_px=blur_px, noise=1.0)
+        found = align(image, off(true, seed), DRAWINGS[name], CAMERA, 1.5)
+        assert found is not None
+        assert verified(found)
+        assert told_apart(found)
 
 
 @pytest.mark.parametrize("tone", ["gamma", "clipped"])
