@@ -131,7 +131,8 @@ def test_covered_for_a_moment_it_stays_where_it_is(bare: Pilot, variances: Varia
     bare.advance(0.7)
     assert variances.told < 0.003
     assert max(map(abs, error_m(bare))) < 0.05
-    bare.stream(0.5, sights(bare), SIGHT_S)
+    # Half a second brings it to 3.9e-4, the limit; 3.5e-4 to 3.7e-4 is where it stays.
+    bare.stream(1.0, sights(bare), SIGHT_S)
     assert variances.told == pytest.approx(3e-4, rel=0.3)
     assert max(map(abs, error_m(bare))) < 0.02
 
