@@ -209,11 +209,9 @@ def _halves_line(edge: Floats, usable: NDArray[np.bool_]) -> Floats:
     middle = halves[:, :, first : first + _QUARTER]
     # Left out before the sum: beside the others' size an edge's place is rounded away.
     shown = np.abs(middle) < _FAR
-    sums, counts = (middle * shown) @ _QUARTER_ONES, shown @ _QUARTER_ONES
-    middles = np.where(counts, sums, sums[:, ::-1]) / np.maximum(
-        np.where(counts, counts, counts[:, ::-1]), _ONE
-    )
-    return np.asarray(middles @ _THROUGH_HALVES)
+    count = shown @ _QUARTER_ONES
+    mean = (middle * shown) @ _QUARTER_ONES / np.maximum(count, _ONE)
+    return np.asarray(np.where(count, mean, mean[:, ::-1]) @ _THROUGH_HALVES)
 
 
 def _robust_line(edge: Floats, usable: NDArray[np.bool_], rounds: int) -> tuple[Floats, Floats]:
