@@ -22,6 +22,7 @@ SIGHT_S = 0.034
 """30 Hz, in control periods."""
 SIGHT_NOISE_M = 0.005
 FLYING_M = 0.8
+PERIOD_MS = 20
 NAMES = ("varX", "varY", "varZ", "varPX", "varPY", "varPZ")
 
 
@@ -32,15 +33,18 @@ class Variances:
         self._pilot = pilot
         self._news = threading.Condition()
         self._stamp_ms, self._data = -1, dict.fromkeys(NAMES, 0.0)
-        self.block = LogConfig(name="variances", period_in_ms=20)
+        self.block = LogConfig(name="variances", period_in_ms=PERIOD_MS)
         for name in NAMES:
             self.block.add_variable(f"kalman.{name}", "float")
         pilot.cf.log.add_config(self.block)
         self.block.data_received_cb.add_callback(self._take)
+        started = threading.Event()
+        self.block.started_cb.add_callback(lambda _block, _on: started.set())
         self.block.start()
+        assert started.wait(WAIT_S)  # from when on its samples are counted
 
     def now(self) -> dict[str, float]:
-        due_ms = 1000.0 * self._pilot.t_s - 45.0
+        due_ms = PERIOD_MS * int(1000.0 * self._pilot.t_s / PERIOD_MS + 1e-6)
         with self._news:
             assert self._news.wait_for(lambda: self._stamp_ms >= due_ms, WAIT_S)
             return {name: self._data[f"kalman.{name}"] for name in NAMES}
@@ -131,8 +135,7 @@ def test_covered_for_a_moment_it_stays_where_it_is(bare: Pilot, variances: Varia
     bare.advance(0.7)
     assert variances.told < 0.003
     assert max(map(abs, error_m(bare))) < 0.05
-    # Half a second brings it to 3.9e-4, the limit; 3.5e-4 to 3.7e-4 is where it stays.
-    bare.stream(1.0, sights(bare), SIGHT_S)
+    bare.stream(0.5, sights(bare), SIGHT_S)
     assert variances.told == pytest.approx(3e-4, rel=0.3)
     assert max(map(abs, error_m(bare))) < 0.02
 
