@@ -11,12 +11,12 @@ import socket
 from dataclasses import dataclass
 from urllib.parse import parse_qsl, urlsplit
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.cpx import CpxPicture, CpxSplitter
 from perchctl.camera.credentials import without_password
+from perchctl.camera.jpeg import grey_pixels, size_in
 from perchctl.camera.mosaic import MosaicFilter
 from perchctl.camera.source import Clock
 from perchctl.camera.stream import (
@@ -152,17 +152,16 @@ def _nothing(splitter: CpxSplitter) -> str:
 
 
 def decoded(picture: CpxPicture) -> NDArray[np.uint8] | None:
-    """Grey (height, width); None where a JPEG is none, or of another size than its header says."""
+    """Grey (height, width); None if a JPEG cannot be decoded, or says another size than the
+    deck's header, which allows `MOST_SIDE_PX`."""
     shape = (picture.height, picture.width)
-    pixels = np.frombuffer(picture.data, np.uint8)
     if not picture.is_jpeg:
-        return pixels.reshape(shape)
-    try:
-        image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
+        return np.frombuffer(picture.data, np.uint8).reshape(shape)
+    # One picture's header never comes with another's bytes; nor is a damaged size decoded.
+    if size_in(picture.data) != (picture.width, picture.height):
         return None
-    # Of the size that its header says: one picture's header never comes with another's bytes.
-    return image if image is not None and image.shape == shape else None  # type: ignore[return-value]
+    image = grey_pixels(picture.data)
+    return image if image is not None and image.shape == shape else None
 
 
 def _family(host: str) -> socket.AddressFamily:

@@ -128,6 +128,33 @@ def camera_number(
     raise NotFound(f"camera:{wanted} was not found; {there}; plug in the receiver or camera")
 
 
+def finder_of(
+    number: int, opener: Opener = open_driver, devices: Path = DEVICES, names: Path = NAMES
+) -> Callable[[], int]:
+    """A function that finds the camera of that number again after it was unplugged: by its
+    lasting path, else by its name, as the system may give it another number.
+
+    Errors of that function: NotFound.
+    """
+    before = next((c for c in cameras(opener, devices, names) if c.number == number), None)
+
+    def find() -> int:
+        if before is None or not (before.stable_path or before.name):
+            return number
+        known = cameras(opener, devices, names)
+        back = [c.number for c in known if c.stable_path and c.stable_path == before.stable_path]
+        if not back and not before.stable_path:
+            back = [c.number for c in known if c.name == before.name]
+        if number in back:
+            return number
+        if len(back) == 1:
+            return back[0]
+        there = f"there are {listed(known, paths=True)}" if known else "no camera is there"
+        raise NotFound(f"{before} is not back; {there}")
+
+    return find
+
+
 def _fitting(wanted: str, known: Sequence[Camera]) -> list[Camera]:
     """By the whole name, else by a part of it or of the path."""
     low = wanted.casefold()

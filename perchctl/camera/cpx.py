@@ -13,7 +13,7 @@ import re
 import struct
 from dataclasses import dataclass
 
-from perchctl.camera.mjpeg import Damaged, jpeg_end
+from perchctl.camera.jpeg import Damaged, jpeg_end
 
 MAX_PACKET_BYTES = 1022
 """That a length may count: the deck's buffers hold no more (its MTU)."""

@@ -17,7 +17,7 @@ import cv2
 
 from perchctl.camera.computer import cameras, listed
 from perchctl.camera.controls import Wanted, set_controls, strayed_controls
-from perchctl.camera.source import Clock, LiveSource
+from perchctl.camera.source import Clock, LiveSource, one_line
 from perchctl.camera.v4l2 import (
     Call,
     Delivered,
@@ -28,11 +28,13 @@ from perchctl.camera.v4l2 import (
     modes_of,
     open_driver,
 )
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.profile import CameraConfig
 
 LOST_AFTER_FAILURES = 25
 RETRY_S = 0.04
+REOPEN_EVERY_S = 1.0
+"""Between two attempts to open a camera that was lost: an attempt takes a driver some 0.1 s."""
 RATE_TOLERANCE = 0.02
 """29.97 Hz are 30."""
 
@@ -124,36 +126,83 @@ def _near(one_hz: float, other_hz: float) -> bool:
 
 class CaptureSource(LiveSource):
     """Keeps only the newest frame of what has read() and release(), as cv2.VideoCapture,
-    stamped when the grab returns."""
+    stamped when the grab returns.
+
+    A picture that cannot be read or decoded is dropped. After `LOST_AFTER_FAILURES` in a row the
+    camera counts as lost: it is released, and opened again as soon as it is back. One that has
+    never given a picture fails at once.
+    """
 
     def __init__(
-        self, name: str, latency_s: float, clock: Clock, capture: Any, retry_s: float = RETRY_S
+        self,
+        name: str,
+        latency_s: float,
+        clock: Clock,
+        opened: Callable[[], Any],
+        retry_s: float = RETRY_S,
+        reopen_every_s: float = REOPEN_EVERY_S,
     ) -> None:
+        """`opened` opens the camera, the first time and again."""
         super().__init__(name, latency_s, clock)
-        self._capture = capture
+        self._opened = opened
         self._retry_s = retry_s
+        self._reopen_every_s = reopen_every_s
+        self._capture: Any = None
+        self._reopened = False
 
     def begin(self) -> None:
+        """Open the camera, and read from it in a thread. Errors: those of `opened`."""
+        self._capture = self._opened()
         self._start(self._grab)
 
     def _grab(self) -> None:
-        failures = 0
         try:
-            while not self._stop.is_set():
-                ok, image = self._capture.read()
-                if ok:
-                    failures = 0
-                    self._put(image)
-                    continue
-                failures += 1
-                if failures >= LOST_AFTER_FAILURES:
-                    self._fail(f"{self._name} stopped delivering frames; is it unplugged?")
+            while (why := self._read_until_lost()) is not None:
+                if self._count == 0:
+                    self._fail(f"{self._name} {why}; plug it in again, or name another camera")
                     return
-                self._stop.wait(self._retry_s)
-        except cv2.error as error:
-            self._fail(f"{self._name} failed while reading: {str(error).strip()}")
+                self._capture.release()
+                self._reopen(why)
         finally:
             self._capture.release()
+
+    def _read_until_lost(self) -> str | None:
+        """Return why the camera counts as lost; None if the source was closed."""
+        failures = 0
+        while not self._stop.is_set():
+            why = "stopped delivering frames"
+            try:
+                ok, image = self._capture.read()
+                if ok:
+                    self._put(image)
+                    failures = 0
+                    if self._reopened:
+                        self._reopened = False
+                        self._streams_again()
+                    continue
+            except Exception as error:  # whatever a damaged picture does to OpenCV
+                why = f"gives pictures that cannot be decoded ({one_line(error)})"
+            failures += 1
+            if failures >= LOST_AFTER_FAILURES:
+                return why
+            self._stop.wait(self._retry_s)
+        return None
+
+    def _streams_again(self) -> None:
+        """Called in the thread when the first picture after a loss has come."""
+
+    def _reopen(self, why: str) -> None:
+        """Try until the camera is open, or the source is closed."""
+        lost = f"it {why}, and is opened again every {self._reopen_every_s:g} s"
+        self._why_silent = lost
+        while not self._stop.wait(self._reopen_every_s):
+            try:
+                self._capture = self._opened()
+                self._reopened = True
+                return
+            except Exception as error:
+                reason = str(error) if isinstance(error, PerchError) else one_line(error)
+                self._why_silent = f"{lost}; the last attempt: {reason}"
 
 
 class DeviceSource(CaptureSource):
@@ -161,7 +210,8 @@ class DeviceSource(CaptureSource):
 
     `opened` replaces the real camera, anything with read(), get(), set() and release(), and
     `opener` its driver. Controls are set before the first picture, and once more after it where
-    the driver has changed them when it began to stream.
+    the driver has changed them when it began to stream. `find` gives the camera's number when it
+    has come back after a loss; without it that is the same one.
 
     Errors: NotFound; InvalidValue, a control or format that the driver does not take.
     """
@@ -177,16 +227,33 @@ class DeviceSource(CaptureSource):
         opened: Callable[[int, Asked], Any] = open_capture,
         opener: Opener = open_driver,
         retry_s: float = RETRY_S,
+        reopen_every_s: float = REOPEN_EVERY_S,
+        find: Callable[[], int] | None = None,
     ) -> None:
-        super().__init__(f"camera:{number}", latency_s, clock, opened(number, asked), retry_s)
+        super().__init__(
+            f"camera:{number}", latency_s, clock, self._prepared, retry_s, reopen_every_s
+        )
+        self._number = number
         self._asked = asked
-        self._driver = lambda: opener(number)
+        self._open_number = opened
+        self._opener = opener
+        self._find = find
+        self.begin()
+
+    def _driver(self) -> contextlib.AbstractContextManager[Call]:
+        return self._opener(self._number)
+
+    def _prepared(self) -> Any:
+        """The opened camera, with its controls set."""
+        if self._capture is not None and self._find is not None:
+            self._number = self._find()
+        capture = self._open_number(self._number, self._asked)
         try:
             self._prepare()
         except BaseException:
-            self._capture.release()
+            capture.release()
             raise
-        self.begin()
+        return capture
 
     def _prepare(self) -> None:
         asked, source = self._asked, self._name
@@ -227,6 +294,10 @@ class DeviceSource(CaptureSource):
         if self._asked.format is None and self._asked.rate_hz is None:
             return Delivered("", self._size_px or (0, 0), None)
         return _by_opencv(self._capture, self._size_px)
+
+    def _streams_again(self) -> None:
+        with contextlib.suppress(OSError), self._driver() as call:
+            self._controls_again(call)
 
     def _controls_again(self, call: Call) -> list[str]:
         asked = self._asked.controls

@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.credentials import without_password
+from perchctl.camera.jpeg import grey_pixels, size_in
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.vision.types import Frame
 
 DEFAULT_RATE_HZ = 30.0
+MOST_FILE_PX = 1 << 27
+"""Of a picture in a file: more than any camera of today takes, and decoded within 3 s."""
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp"})
 
 
@@ -86,6 +89,13 @@ class VideoSource(Recording):
         self._period_s = 1.0 / rate_hz
         self._last_s = -self._period_s
         name = f"video:{without_password(str(path))}"
+        width, height = (
+            int(self._capture.get(key))
+            for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        if too_large := _too_large((width, height)):
+            self._capture.release()
+            raise InvalidValue(f"{name} {too_large}")
         super().__init__(name, latency_s, rate_hz, round(count) if count > 0 else None)
 
     def _read(self) -> tuple[NDArray[np.uint8], float] | None:
@@ -143,18 +153,46 @@ class BrokenPicture(InvalidValue):
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """A picture file as grey; raises BrokenPicture if it is none, or is cut off."""
+    """A picture file as grey; raises BrokenPicture if it is none, is cut off or too large."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise BrokenPicture(path, f"cannot be read: {error.strerror or error}") from None
+    try:
+        return picture_in(data)
+    except ValueError as error:
+        raise BrokenPicture(path, str(error)) from None
+
+
+def picture_in(data: bytes) -> NDArray[np.uint8]:
+    """The grey picture of a file's bytes.
+
+    Raises ValueError with what stands behind the file's name: it is cut off, a JPEG or PNG of
+    more than `MOST_FILE_PX`, or none that OpenCV reads.
+    """
     if is_cut_off(data):
-        raise BrokenPicture(path, "is cut off")
-    # An empty array is an error of OpenCV's.
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+        raise ValueError("is cut off")
+    if too_large := _too_large(_said_size_px(data)):
+        raise ValueError(too_large)
+    image = grey_pixels(data)
     if image is None:
-        raise BrokenPicture(path, "cannot be read as a picture")
+        raise ValueError("cannot be read as a picture")
     return to_grey(image)
+
+
+def _said_size_px(data: bytes) -> tuple[int, int]:
+    """Width and height that a JPEG or PNG says in front of its pixels; zeros of another file."""
+    if data.startswith(b"\x89PNG"):
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    return (data.startswith(b"\xff\xd8") and size_in(data)) or (0, 0)
+
+
+def _too_large(size_px: tuple[int, int]) -> str:
+    """What to say of a picture of that size; an empty string if it can be read."""
+    width, height = size_px
+    if width * height <= MOST_FILE_PX:
+        return ""
+    return f"says {width}x{height} px, and at most {MOST_FILE_PX:,} pixels are read"
 
 
 def is_cut_off(data: bytes) -> bool:

@@ -7,9 +7,6 @@ import ssl
 from dataclasses import replace
 from urllib.parse import SplitResult, urljoin, urlsplit, urlunsplit
 
-import cv2
-import numpy as np
-
 from perchctl.camera.credentials import (
     Challenge,
     answer,
@@ -17,7 +14,8 @@ from perchctl.camera.credentials import (
     credentials_of,
     without_password,
 )
-from perchctl.camera.source import Clock
+from perchctl.camera.jpeg import MOST_STREAM_PX, JpegSplitter, grey_pixels, size_in
+from perchctl.camera.source import Clock, Grey
 from perchctl.camera.stream import (
     CONNECT_TIMEOUT_S,
     READ_TIMEOUT_S,
@@ -26,103 +24,11 @@ from perchctl.camera.stream import (
 )
 
 READ_BYTES = 65536
-MAX_PICTURE_BYTES = 8_000_000
 MAX_REDIRECTS = 3
 MOST_REQUESTS = 3
 """One that is answered by what to answer to, once more where that was too old."""
 
 _HEADERS = {"Accept": "multipart/x-mixed-replace, image/jpeg, */*", "Connection": "close"}
-_SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
-_STANDALONE = frozenset(range(0xD0, 0xD8)) | {0x01}  # markers without a length
-
-
-class Damaged(Exception):
-    """The bytes at a start-of-image marker are no whole JPEG."""
-
-
-class JpegSplitter:
-    """Cuts a byte stream into whole JPEG pictures; pure.
-
-    Goes by the JPEG's own structure and not by the multipart headers, so wrong
-    lengths, odd boundaries and missing headers do no harm, and a picture is out
-    with its last byte. A truncated picture is dropped and the search goes on at
-    the next start of a picture (after up to 64 kB where the tear cut a length).
-    `damaged` counts what was dropped.
-    """
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.damaged = 0
-
-    def feed(self, data: bytes) -> list[bytes]:
-        """Append bytes; the pictures now complete, oldest first."""
-        self._buffer += data
-        pictures: list[bytes] = []
-        while True:
-            start = self._buffer.find(_SOI + b"\xff")
-            if start < 0:
-                del self._buffer[: max(len(self._buffer) - 2, 0)]
-                return pictures
-            del self._buffer[:start]
-            try:
-                end = jpeg_end(self._buffer)
-            except Damaged:
-                self.damaged += 1
-                del self._buffer[:2]
-                continue
-            if end is not None:
-                pictures.append(bytes(self._buffer[:end]))
-                del self._buffer[:end]
-                continue
-            if len(self._buffer) <= MAX_PICTURE_BYTES:
-                return pictures
-            self.damaged += 1
-            del self._buffer[:2]
-
-
-def jpeg_end(data: bytes | bytearray) -> int | None:
-    """Length of the JPEG at the start of `data`, or None while it is incomplete.
-
-    Raises Damaged where the structure breaks: a segment that is followed by no
-    marker, or another picture's start inside this one.
-    """
-    at = 2
-    while True:
-        # Header segments: FF, code, two bytes of length.
-        if at + 2 > len(data):
-            return None
-        code = data[at + 1]
-        if data[at] != 0xFF:
-            raise Damaged
-        if code == 0xFF:  # fill byte
-            at += 1
-            continue
-        if code == 0xD9:
-            return at + 2
-        if code in _STANDALONE:
-            at += 2
-            continue
-        if code < 0xC0 or code == 0xD8:
-            raise Damaged
-        if at + 4 > len(data):
-            return None
-        length = int.from_bytes(data[at + 2 : at + 4], "big")
-        if length < 2:
-            raise Damaged
-        at += 2 + length
-        if code != 0xDA:
-            continue
-        # Start of scan: entropy-coded bytes, in which FF is followed by 00 or a restart.
-        while True:
-            at = data.find(b"\xff", at)
-            if at < 0 or at + 1 >= len(data):
-                return None
-            if data[at + 1] == 0x00 or data[at + 1] in _STANDALONE:
-                at += 2
-            elif data[at + 1] == 0xFF:
-                at += 1
-            else:
-                break
 
 
 class MjpegSource(StreamSource):
@@ -169,7 +75,11 @@ class MjpegSource(StreamSource):
             response = self._answered(connection, parts)
             location = response.getheader("Location")
             if response.status in (301, 302, 303, 307, 308) and location and redirects > 0:
-                return self._connect(_redirected(url, location), redirects - 1)
+                target = redirected(url, location)
+                if why := _unsafe(url, target):
+                    self.not_found = self._count == 0
+                    return why
+                return self._connect(target, redirects - 1)
             if response.status != 200:
                 gone = response.status in (401, 403, 404, 410)
                 self.not_found = gone and self._count == 0
@@ -217,24 +127,52 @@ class MjpegSource(StreamSource):
             data = response.read1(READ_BYTES)
             if not data:
                 return
-            pictures = splitter.feed(data)
-            self.damaged = earlier + splitter.damaged
             # If the network delivered several at once only the newest is worth decoding.
-            for picture in reversed(pictures):
-                image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
+            for picture in reversed(splitter.feed(data)):
+                image = self._decoded(picture)
                 if image is not None:
                     self._put(image, encoded=picture)
                     break
-                self.damaged += 1
+                splitter.damaged += 1
+            self.damaged = earlier + splitter.damaged
+
+    def _decoded(self, picture: bytes) -> Grey | None:
+        """The JPEG's pixels; None if it is damaged, or says a size above `MOST_STREAM_PX`."""
+        size_px = size_in(picture)
+        if size_px is None:
+            return None
+        width, height = size_px
+        if width * height > MOST_STREAM_PX:
+            self._why_silent = (
+                f"its pictures say {width}x{height} px, and at most {MOST_STREAM_PX:,} pixels are "
+                f"decoded; set the camera to a smaller size"
+            )
+            return None
+        return grey_pixels(picture)
 
 
-def _redirected(url: str, location: str) -> str:
-    """Where to go: name and password go along to the same host only."""
+def redirected(url: str, location: str) -> str:
+    """Where to go: name and password go along to the same host only, and never from https to
+    another scheme."""
     before, after = urlsplit(url), urlsplit(urljoin(url, location))
     same = (before.hostname, before.port) == (after.hostname, after.port)
-    if same and after.username is None and before.username is not None:
+    kept = same and after.scheme in (before.scheme, "https")
+    if kept and after.username is None and before.username is not None:
         after = after._replace(netloc=f"{before.netloc.rpartition('@')[0]}@{after.netloc}")
     return urlunsplit(after)
+
+
+def _unsafe(url: str, target: str) -> str:
+    """Why a redirect is not followed; an empty string if it is."""
+    scheme, shown = urlsplit(target).scheme, without_password(target)
+    if scheme == "http" and urlsplit(url).scheme == "https":
+        return (
+            f"the server redirects from https to {shown}, where pictures and password are not "
+            f"encrypted; name that address in camera.source if you accept that"
+        )
+    if scheme not in ("http", "https"):
+        return f"the server redirects to {shown}; name that address in camera.source"
+    return ""
 
 
 def _challenge(response: http.client.HTTPResponse) -> Challenge | None:

@@ -8,11 +8,12 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from perchctl.camera.aideck import FORM, AiDeckSource, aideck_address
-from perchctl.camera.computer import camera_number
+from perchctl.camera.computer import camera_number, finder_of
 from perchctl.camera.credentials import without_password
 from perchctl.camera.device import CaptureSource, DeviceSource, asked_of
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.gst import open_pipeline
+from perchctl.camera.mirror import as_profiled
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.rtsp import RtspSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
@@ -92,7 +93,8 @@ def open_source(
         clock: the loop's clock, s.
         timeout_s: how long the first frame of a live source may take.
         pictures_hz: as if taken at this rate (``images:`` only).
-        config: whose format, rate and controls are asked of ``camera:``.
+        config: whose format, rate and controls are asked of ``camera:``; if it says that the
+            pictures are mirrored, each is turned right.
         tell: gets a sentence for each thing that the camera does not do as asked.
 
     Raises:
@@ -100,6 +102,20 @@ def open_source(
         unreadable content, a control or format that the camera lacks. TimedOut: no
         first frame in time.
     """
+    source = _opened(spec, latency_s, size_px, clock, timeout_s, pictures_hz, config, tell)
+    return source if config is None else as_profiled(source, config)
+
+
+def _opened(
+    spec: str,
+    latency_s: float,
+    size_px: tuple[int, int] | None,
+    clock: Clock,
+    timeout_s: float,
+    pictures_hz: float,
+    config: CameraConfig | None,
+    tell: Callable[[str], None],
+) -> FrameSource:
     scheme, rest = scheme_of(spec), spec.partition(":")[2]
     if scheme in SCHEMES:
         spec = f"{scheme}:{rest}"  # FFmpeg knows rtsp:// and not RTSP://
@@ -108,10 +124,14 @@ def open_source(
     if scheme == "images" and rest:
         return ImagesSource(str(Path(rest).expanduser()), latency_s, pictures_hz)
     if scheme == "camera":
-        asked = asked_of(config, size_px)
-        return _started(DeviceSource(camera_number(rest), latency_s, asked, clock), timeout_s, tell)
+        number = camera_number(rest)
+        device = DeviceSource(
+            number, latency_s, asked_of(config, size_px), clock, find=finder_of(number)
+        )
+        return _started(device, timeout_s, tell)
     if scheme == "gst" and rest.strip():
-        pipeline = CaptureSource(without_password(spec), latency_s, clock, open_pipeline(rest))
+        name = without_password(spec)
+        pipeline = CaptureSource(name, latency_s, clock, lambda: open_pipeline(rest))
         pipeline.begin()
         return _started(pipeline, timeout_s, tell)
     if (stream := _stream(spec, scheme, rest, latency_s, clock)) is not None:
@@ -137,6 +157,7 @@ def _stream(
 ) -> StreamSource | None:
     if scheme == "aideck":
         return AiDeckSource(aideck_address(spec), latency_s, clock)
+    kinds: dict[str, Callable[[str, float, Clock], StreamSource]]
     kinds = {"http": MjpegSource, "https": MjpegSource, "rtsp": RtspSource}
     if scheme not in kinds or not rest.strip("/"):
         return None

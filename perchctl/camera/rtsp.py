@@ -5,17 +5,28 @@ PyAV's open and read both end in time, and say why they failed; OpenCV's FFmpeg 
 
 from __future__ import annotations
 
+import contextlib
+import http.client
 import math
 import socket
 from collections import deque
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import urlsplit, urlunsplit
 
-from perchctl.camera.credentials import without_password
+from perchctl.camera.credentials import (
+    Challenge,
+    answer,
+    challenge_of,
+    credentials_of,
+    without_password,
+)
+from perchctl.camera.jpeg import MOST_STREAM_PX
 from perchctl.camera.source import Clock
 from perchctl.camera.stream import READ_TIMEOUT_S, RECONNECT_WAIT_S, StreamSource
 
 CONNECT_TIMEOUT_S = 5.0
+RTSP_PORT = 554
+MOST_ANSWER_BYTES = 65536
 MAX_DAMAGED = 100
 """Packets in a row that cannot be decoded before it connects anew."""
 WINDOW_S = 10.0
@@ -89,6 +100,13 @@ class RtspSource(StreamSource):
         import av  # late: most flights have another camera
         import av.error
 
+        # Before the first picture is before the flight: later it would cost pictures.
+        if self._count == 0 and (target := redirect_of(self._url, self._timeouts_s[0])):
+            self.not_found = True
+            return (
+                f"the server redirects to {without_password(target)}, which would get the name "
+                f"and password; name that address in camera.source"
+            )
         try:
             with av.open(self._url, options=_OPTIONS, timeout=self._timeouts_s) as stream:
                 return self._read(stream)
@@ -106,24 +124,58 @@ class RtspSource(StreamSource):
         video = stream.streams.video[0]
         # A thread for each frame would hold back as many frames as there are threads.
         video.thread_type = "NONE"
+        video.codec_context.options = {"max_pixels": str(MOST_STREAM_PX)}
         waiting, damaged = Waiting(), 0
         for packet in stream.demux(video):
             if self._stop.is_set():
                 return "closed"
             try:
-                frames = packet.decode()
-                damaged = 0
-            except av.error.InvalidDataError:
+                frames = [(f.to_ndarray(format="gray"), f.time) for f in packet.decode()[-1:]]
+            except (av.error.FFmpegError, ValueError):
                 damaged += 1
+                self.damaged += 1
                 if damaged >= MAX_DAMAGED:
                     return "its pictures cannot be decoded"
                 continue
-            for frame in frames[-1:]:
-                self._put(
-                    frame.to_ndarray(format="gray"),
-                    waited_s=waiting.of(frame.time, self._clock()),
-                )
+            damaged = 0
+            for image, time_s in frames:
+                self._put(image, waited_s=waiting.of(time_s, self._clock()))
         return "the stream ended"
+
+
+def redirect_of(url: str, timeout_s: float) -> str:
+    """The other host or port to which the server redirects a URL with name and password; an empty
+    string if there is none. FFmpeg would follow, and take name and password along."""
+    parts = urlsplit(url)
+    who = credentials_of(parts)
+    if who is None or parts.hostname is None:
+        return ""
+    asked = urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+    challenge: Challenge | None = None
+    failures = (OSError, ValueError, IndexError, http.client.HTTPException)
+    with (
+        contextlib.suppress(*failures),  # FFmpeg will say why
+        socket.create_connection((parts.hostname, parts.port or RTSP_PORT), timeout_s) as server,
+        server.makefile("rb") as answers,
+    ):
+        # Once more with name and password, if they are asked for.
+        for number, method in enumerate(("OPTIONS", "DESCRIBE", "DESCRIBE"), start=1):
+            request = f"{method} {asked} RTSP/1.0\r\nCSeq: {number}\r\n"
+            if challenge is not None:
+                request += f"Authorization: {answer(challenge, who, method, asked)}\r\n"
+            server.sendall(f"{request}\r\n".encode())
+            status = int(answers.readline(MOST_ANSWER_BYTES).split()[1])
+            headers = http.client.parse_headers(answers)
+            answers.read(min(int(headers.get("Content-Length", 0)), MOST_ANSWER_BYTES))
+            if 300 <= status < 400:
+                target = urlsplit(headers.get("Location", ""))
+                same = (target.hostname, target.port or RTSP_PORT) == (
+                    parts.hostname, parts.port or RTSP_PORT
+                )  # fmt: skip
+                return "" if same else urlunsplit(target)
+            if status == 401 and challenge is None:
+                challenge = challenge_of(headers.get_all("WWW-Authenticate") or [])
+    return ""
 
 
 def unresolved(url: str) -> str:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.camera.credentials import without_password
 from perchctl.camera.slot import NewestSlot
 from perchctl.errors import InvalidValue
 from perchctl.vision.types import CameraModel, Frame
@@ -79,11 +80,19 @@ def check_size(size_px: tuple[int, int] | None, camera: CameraModel, source: str
     )
 
 
+def one_line(error: Exception) -> str:
+    """An error that was not foreseen, for a sentence: its class, and its text without passwords."""
+    text = " ".join(without_password(str(error)).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
 class LiveSource:
     """Newest-frame slot between a grabbing thread and the loop.
 
-    A subclass runs `_start(target)`; its thread calls `_put` for each picture,
-    looks at `_stop` and ends with `_fail` when the camera is lost.
+    A subclass runs `_start(target)`; its thread calls `_put` for each picture, looks at `_stop`
+    and ends with `_fail` when the camera is lost for good. While it waits for a picture,
+    `_why_silent` may hold the reason, which `problem` then gives. A thread that ends in another
+    way, by an exception too, is a problem of the camera.
     """
 
     live = True
@@ -103,6 +112,7 @@ class LiveSource:
         self._last_arrival_s = clock()
         self._arrived = 0  # pictures, a receiver's repetitions too
         self._failure: str | None = None
+        self._why_silent = ""
         self._size_px: tuple[int, int] | None = None
 
     @property
@@ -118,8 +128,9 @@ class LiveSource:
             if self._failure is not None:
                 return self._failure
             silent_s = now_s - self._last_arrival_s
+            why = f": {self._why_silent}" if self._why_silent else ""
         if silent_s > SILENT_AFTER_S:
-            return f"{self._name} has delivered no frame for {silent_s:.1f} s"
+            return f"{self._name} has delivered no frame for {silent_s:.1f} s{why}"
         return None
 
     def describe(self) -> str:
@@ -146,8 +157,20 @@ class LiveSource:
             self._thread.join(CLOSE_WITHIN_S)
 
     def _start(self, target: Callable[[], None]) -> None:
-        self._thread = threading.Thread(target=target, name=self._name, daemon=True)
+        self._thread = threading.Thread(
+            target=self._grabbing, args=(target,), name=self._name, daemon=True
+        )
         self._thread.start()
+
+    def _grabbing(self, target: Callable[[], None]) -> None:
+        """The whole life of the grabbing thread: it does not end unnoticed."""
+        ended = "its thread has ended"
+        try:
+            target()
+        except Exception as error:
+            ended = f"its thread was ended by {one_line(error)}"
+        if self._failure is None and not self._stop.is_set():
+            self._fail(f"{self._name} gives no pictures any more: {ended}; start perchctl anew")
 
     def _put(
         self,
@@ -168,6 +191,7 @@ class LiveSource:
             self._slot.put(grey, t_s, arrival_s, encoded)
             self._last_arrival_s = arrival_s
             self._arrived += 1
+            self._why_silent = ""
             self._size_px = (grey.shape[1], grey.shape[0])
         self._first.set()
 
@@ -183,6 +207,10 @@ class SourceAround:
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
+
+    @property
+    def inner(self) -> FrameSource:
+        return self._source
 
     @property
     def live(self) -> bool:

@@ -6,7 +6,7 @@ import contextlib
 import http.client
 import socket
 
-from perchctl.camera.source import Clock, LiveSource
+from perchctl.camera.source import Clock, LiveSource, one_line
 
 CONNECT_TIMEOUT_S = 3.0
 READ_TIMEOUT_S = 2.0
@@ -53,7 +53,7 @@ class StreamSource(LiveSource):
                 current.shutdown(socket.SHUT_RDWR)
 
     def _connection(self) -> str:
-        """One connection until it ends; why it ended. May raise what `_run` takes."""
+        """Read one connection until it ends; return why it ended. It may raise any Exception."""
         raise NotImplementedError
 
     def _run(self) -> None:
@@ -63,7 +63,8 @@ class StreamSource(LiveSource):
             self.connections += 1
             try:
                 reason = self._connection()
-            except (OSError, http.client.HTTPException, ValueError) as error:
+            except Exception as error:
+                # Whatever damaged bytes do to a library: a new connection may bring whole ones.
                 reason = _reason(error)
             if self.not_found:
                 self._fail(f"{self._name}: {reason}")
@@ -80,4 +81,6 @@ def _reason(error: Exception) -> str:
         return "no answer in time"
     if isinstance(error, ConnectionRefusedError):
         return "connection refused"
-    return str(error) or type(error).__name__
+    if isinstance(error, (OSError, http.client.HTTPException, ValueError)):
+        return str(error) or type(error).__name__
+    return one_line(error)

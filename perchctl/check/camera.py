@@ -9,7 +9,7 @@ from itertools import pairwise
 from statistics import mean, median
 
 from perchctl.camera.health import MEANING
-from perchctl.camera.mirror import MIRRORED
+from perchctl.camera.mirror import MIRRORED, mirrored_note
 from perchctl.check.computer import LEAST_RATED, frame_period_s, percentile
 from perchctl.check.pictures import Blur, Light, blur_of, light_of, noise_of
 from perchctl.check.rehearsal import Rehearsal
@@ -50,7 +50,6 @@ _ADVICE = {
     MEANING["snow"]: "set the receiver to the camera's channel, switch the camera on",
     MEANING["uniform"]: "uncover the lens, switch the camera on",
     MEANING["dark"]: _LIGHT,
-    MIRRORED: "see mirrored",
 }
 PICTURE_NAMES = (
     "frame rate", "lost frames", "picture age", "pictures", "light", "noise", "focus", "mirrored",
@@ -123,7 +122,7 @@ def rows(rehearsal: Rehearsal, optical: Optical, design: Design, profile: Profil
         _light(optical.light),
         _noise(optical.noise),
         _focus(optical.blur),
-        _mirrored(rehearsal),
+        _mirrored(rehearsal, profile),
         _target(rehearsal),
         _print(rehearsal),
         _ranges(design, optical.blur is not None),
@@ -192,7 +191,7 @@ def _pictures(rehearsal: Rehearsal) -> Row:
     text, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
     found = f"{count} of {rehearsal.pictures}: {text}"
-    advice = _ADVICE.get(text, _SEE)
+    advice = "see mirrored" if text.startswith(MIRRORED) else _ADVICE.get(text, _SEE)
     return by_limits("pictures", share, BAD_WARN, BAD_FAIL, found, advice)
 
 
@@ -227,9 +226,9 @@ def _focus(blur: Blur | None) -> Row:
     return by_limits("focus", blur.least_px, FOCUS_WARN_PX, FOCUS_FAIL_PX, found, advice)
 
 
-def _mirrored(rehearsal: Rehearsal) -> Row:
+def _mirrored(rehearsal: Rehearsal, profile: Profile) -> Row:
     if rehearsal.mirrored >= MIRRORED_FRAMES:
-        found, _, advice = MIRRORED.partition(": ")
+        found, _, advice = mirrored_note(profile.camera).partition(": ")
         return failed("mirrored", found, advice)
     if not rehearsal.found:
         return skipped("mirrored", "no target was seen to tell by")

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from perchctl.calibration.files import camera_of
 from perchctl.camera.credentials import without_password
 from perchctl.camera.device import device_listing
-from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource
 from perchctl.check import (
@@ -251,7 +250,7 @@ def _source(
         config=config, tell=remarks.append,
     )  # fmt: skip
     stack.callback(source.close)
-    return UnmirroredSource(source) if config.mirrored else source
+    return source
 
 
 def _camera(

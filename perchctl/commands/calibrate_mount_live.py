@@ -22,7 +22,6 @@ from perchctl.calibration.mounting.capture import LEAST_S, Moment, Sensors, Tape
 from perchctl.calibration.mounting.eye import Eye
 from perchctl.calibration.mounting.recording import Part, Recording, write_recordings
 from perchctl.calibration.mounting.seen import seen_by
-from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.commands.interrupt import Stopper, unheeded
@@ -79,10 +78,9 @@ def recorded(setup: LiveSetup) -> tuple[Recording, ...]:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
         config = setup.profile.camera
         size_px, timeout_s = setup.camera.size_px, config.start_timeout_s
-        raw = open_source(setup.source, 0.0, size_px, now, timeout_s, config=config)
-        stack.callback(raw.close)
-        check_size(raw.size_px, setup.camera, raw.describe())
-        source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
+        source = open_source(setup.source, 0.0, size_px, now, timeout_s, config=config)
+        stack.callback(source.close)
+        check_size(source.size_px, setup.camera, source.describe())
         sensors = _vehicle(setup, now, stack)
         page = stack.enter_context(
             live_page(setup.camera, "perchctl calibrate --mount", setup.port)

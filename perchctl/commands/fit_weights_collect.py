@@ -12,9 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.calibration.files import camera_of
-from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import open_source
-from perchctl.camera.source import FrameSource
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
@@ -114,13 +112,11 @@ def _collect_with_person(
     with ExitStack() as stack:
         truth = _truth(request, profile, now)
         stack.callback(truth.close)
-        source: FrameSource = open_source(
+        source = open_source(
             spec, config.start_latency_s, camera.size_px, now, config.start_timeout_s,
             config=config,
         )  # fmt: skip
         stack.callback(source.close)
-        if config.mirrored:
-            source = UnmirroredSource(source)
         experiment = Experiment(
             _open_session(path, request.frames),
             source,

@@ -26,6 +26,7 @@ from perchctl.commands.output import print_record, say, tell
 from perchctl.errors import Interrupted, PerchError, UsageError
 from perchctl.files import check_output, write_files
 from perchctl.profile import Profile, load_profile
+from perchctl.profile.picture import edges_of
 from perchctl.profile.written import profile_text
 
 HEAD = """\
@@ -136,7 +137,7 @@ def _answer(
     known = completed({**given, **before})
     default = question.default(known)
     while True:
-        text = ask(f"{question.text}\n  [{default}] ").strip() or default
+        text = ask(f"{question.text}{question.hint(known)}\n  [{default}] ").strip() or default
         try:
             checked({**before, question.name: text}, question.name, output)
         except PerchError as error:
@@ -182,6 +183,13 @@ def _report(request: NewProfileRequest, profile: Profile, answers: Mapping[str, 
                 if own
                 else "the simulated camera is made by it, and nothing is left to do"
             )
+        )
+    if profile.camera.mirrored:
+        front, left = edges_of(profile.camera.mount, mirrored=True) or ("", "")
+        say(
+            f"camera: with the front at its {front} and the left side at its {left} edge the "
+            f"picture is mirrored: wrote camera.mirrored: true, which turns each picture right "
+            f"before use; if the picture is not mirrored, answer the two again"
         )
     for row in doubts:
         say(f"{row.name}: {row.found}; {row.advice}")

@@ -37,13 +37,15 @@ Texts = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Question:
-    """`default` and `check` are given the answers so far; `check` raises InvalidValue."""
+    """`default`, `check` and `hint` are given the answers so far; `check` raises InvalidValue.
+    `hint` stands behind the text."""
 
     name: str
     option: str
     text: str
     default: Callable[[Texts], str]
     check: Callable[[str, Texts], object]
+    hint: Callable[[Texts], str] = lambda _: ""
 
 
 def _simulated(answers: Texts) -> bool:
@@ -162,6 +164,9 @@ QUESTIONS: tuple[Question, ...] = (
     Question(
         "left", "--left-at", "And a hand over its left side?",
         lambda answers: edges_beside(_edge(answers["front"], answers))[0], _edge_beside,
+        lambda answers: " ({}, or {} if the camera mirrors its picture)".format(
+            *edges_beside(_edge(answers["front"], answers))
+        ),
     ),
     Question(
         "camera", "--camera-at",

@@ -176,7 +176,7 @@ def frames(
         if (gone := source.problem(-math.inf)) is not None:
             say(gone)
             return
-        notes.silence(source.problem(now_s) is not None, source.describe())
+        notes.silence(source.problem(now_s))
         stop.requested.wait(POLL_S)
 
 
@@ -205,10 +205,10 @@ def _open(
     config = options.profile.camera
     pictures_hz = STILLS_HZ if options.stills else DEFAULT_RATE_HZ
     latency_s = config.start_latency_s
-    raw = open_source(
+    source = open_source(
         options.source, latency_s, size_px, now, pictures_hz=pictures_hz, config=config
     )
-    source: FrameSource = UnmirroredSource(raw) if config.mirrored else raw
+    raw = source.inner if isinstance(source, UnmirroredSource) else source
     paths = raw.paths if isinstance(raw, ImagesSource) else None
     if isinstance(raw, Recording):
         return _Input(source, paths, raw.rate_hz, raw.count)
@@ -246,6 +246,7 @@ class _Run:
             live=source.live,
             stills=options.stills,
             disagreement_frames=options.profile.merge.disagreement_frames,
+            camera=options.profile.camera,
         )
         self._axis_m = AXES_OF_SIDE * options.profile.target.large.side_m
         title = f"perchctl track {without_password(options.source)}"

@@ -43,6 +43,7 @@ class SimCamera:
     - late: `camera_latency_s` plus normal jitter (sigma `camera_jitter_s`, cut at
       2.5 sigma), never before the exposure's end, never overtaking;
     - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
+    - mirrored: with `camera_mirrored` flipped left to right;
     - blank: with `camera_blank_rate` a blue screen in the place of the picture;
     - given out again: at the receiver's own rate, where it has one (`perchctl.sim.receiver`);
     - gone: nothing arrives at or after `camera_gone_at_s`.
@@ -110,6 +111,8 @@ class SimCamera:
         frozen = s.camera_freeze_at_s is not None and middle_s >= s.camera_freeze_at_s
         if self._last is None or not frozen:
             self._last = self._picture(middle_s, pose_at)
+            if s.camera_mirrored:
+                self._last = _flipped(self._last)
         picture = blanked(s, self._index, self._last)
         self._under_way.append(DeliveredFrame(arrival_s, middle_s, picture, self._index))
 
@@ -146,3 +149,7 @@ class SimCamera:
         for each, state in zip(T, states, strict=True):
             each[:3, :3], each[:3, 3] = state.R_world_body, state.position_m
         return T @ self._T_body_cam
+
+
+def _flipped(picture: Later) -> Later:
+    return Later(lambda: np.ascontiguousarray(picture()[:, ::-1]))

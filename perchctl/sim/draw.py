@@ -80,6 +80,7 @@ def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
         camera_latency_s=latency_s,
         camera_burst=burst,
         camera_noise_sigma=noise_sigma,
+        camera_mirrored=profile.camera.mirrored,
         **_as_they_stand(sim),
         estimate_tilt_bias_rad=_pinned(tilt_bias, sim.estimate_tilt_bias_xy_deg, in_degrees=True),
         drift_mps=_pinned(drift, sim.drift_xyz_mps),

@@ -16,6 +16,7 @@ import numpy as np
 from perchctl.calibration.mounting.recording import AttitudeSample, Part, Recording
 from perchctl.calibration.mounting.seen import seeing, seen_by, seen_mirrored, seen_pose
 from perchctl.calibration.mounting.turns import turn, turn_vector
+from perchctl.camera.mirror import unmirrored
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy, rpy_from_rotation
 from perchctl.pipeline import PipelineState, make_pipeline, step
 from perchctl.profile import Profile
@@ -334,6 +335,8 @@ def record(
     poses, mirrored = [], 0
     for frame in pictures(hand, profile, camera):
         picture = Frame(frame.index, frame.t_arrival_s, frame.image, frame.t_arrival_s, "whole")
+        if profile.camera.mirrored:
+            picture = unmirrored(picture)
         state, output = step(state, picture, None, pipeline)
         mirrored += seen_mirrored(output)
         if (pose := seen_pose(output, frame.t_arrival_s)) is not None:

@@ -51,6 +51,7 @@ class Scenario:
         camera_receiver_hz: of the receiver's output, where it gives out its newest picture
             again and again, with `camera_receiver_noise` on it each time; None: it does not.
         camera_blank_rate: share of pictures that are a blue screen.
+        camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.wind`).
         gusts: single ones beside it (`perchctl.sim.gusts`).
@@ -115,6 +116,7 @@ class Scenario:
     camera_receiver_hz: float | None = None
     camera_receiver_noise: float = 0.0
     camera_blank_rate: float = 0.0
+    camera_mirrored: bool = False
     estimate_noise_m: float = 0.002
     estimate_tilt_bias_rad: tuple[float, float] = (0.0, 0.0)
     drift_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)

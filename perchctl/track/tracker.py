@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from perchctl.camera.health import HealthState, Verdict, assess
-from perchctl.camera.mirror import MIRRORED
+from perchctl.camera.mirror import mirrored_note
 from perchctl.display.page.live import State
 from perchctl.display.page.sketch import Sketch
 from perchctl.pipeline import (
@@ -19,7 +19,7 @@ from perchctl.pipeline import (
     pictures,
     step,
 )
-from perchctl.profile import Profile
+from perchctl.profile import CameraConfig, Profile
 from perchctl.track.jumps import JUMPS, jumped, pose_in
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
 from perchctl.vision.fields import BLENDED, INTERLACED
@@ -59,6 +59,7 @@ class Tracker:
     live: bool
     stills: bool = False
     disagreement_frames: int = 15
+    camera: CameraConfig = field(default_factory=CameraConfig)
     notes: tuple[str, ...] = ()
     output: PipelineOutput | None = None
     picture: Frame | None = None
@@ -111,7 +112,7 @@ class Tracker:
             self.notes += (JUMPS,)
         self._pose = pose or self._pose
         if output.detections.mirrored:
-            self.notes += (MIRRORED,)
+            self.notes += (mirrored_note(self.camera),)
         if output.disagreeing_frames >= (1 if self.stills else self.disagreement_frames):
             self.notes += (_DISAGREE,)
         return self._last
@@ -174,10 +175,11 @@ class Notes:
         self._before = frozenset(map(_kind, notes))
         self._silent = False
 
-    def silence(self, silent: bool, source: str) -> None:
-        if silent and not self._silent:
-            self._say(f"{source} delivers no frame; waiting for it (Ctrl-C ends)")
-        self._silent = self._silent or silent
+    def silence(self, problem: str | None) -> None:
+        """`problem`: why the source gives no frame at present; None if it only has none yet."""
+        if problem is not None and not self._silent:
+            self._say(f"{problem}; waiting for it (Ctrl-C ends)")
+        self._silent = self._silent or problem is not None
 
 
 def _kind(note: str) -> str:

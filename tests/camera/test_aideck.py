@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from perchctl.calibration.files import load_calibration
+from perchctl.camera import aideck as aideck_module
 from perchctl.camera.aideck import (
     NO_PICTURE_S,
     AiDeckAddress,
@@ -27,6 +28,7 @@ from perchctl.errors import InvalidValue, TimedOut
 from perchctl.profile import TargetConfig
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
+from tests.camera.test_live import resized
 from tests.helpers.aideck import (
     AiDeck,
     Pause,
@@ -127,6 +129,16 @@ def test_a_jpeg_of_another_size_than_its_header_s_is_none() -> None:
     data = b"".join(p[4:] for p in SMALLER[1:])
     assert decoded(CpxPicture(0.0, 324, 244, True, data)) is None
     assert decoded(CpxPicture(0.0, 162, 122, True, data)) is not None
+
+
+@pytest.mark.parametrize("said", [(65_000, 65_000), (325, 244), (0, 244)])
+def test_a_jpeg_whose_size_bytes_are_damaged_is_not_decoded(
+    said: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = b"".join(p[4:] for p in jpeg_packets(picture(80))[1:])
+    assert decoded(CpxPicture(0.0, 324, 244, True, whole)) is not None
+    monkeypatch.setattr(aideck_module, "grey_pixels", lambda data: pytest.fail("decoded"))
+    assert decoded(CpxPicture(0.0, 324, 244, True, resized(whole, *said))) is None
 
 
 def test_it_reconnects_when_the_deck_restarts_or_stalls(deck: AiDeck, opened: Opened) -> None:

@@ -13,7 +13,7 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.camera.computer import camera_number, cameras
+from perchctl.camera.computer import camera_number, cameras, finder_of
 from perchctl.camera.controls import set_controls
 from perchctl.camera.device import Asked, DeviceSource, asked_of, differences, set_up
 from perchctl.camera.v4l2 import (
@@ -30,6 +30,7 @@ from perchctl.commands import check_cameras
 from perchctl.commands.check_cameras import camera_lines, list_cameras
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
+from tests.helpers.live import wait_for
 from tests.helpers.v4l2 import READ_ONLY, FakeControl, FakeDevice
 
 WAIT_S = 10.0
@@ -228,6 +229,55 @@ def test_controls_are_set_before_the_first_picture_and_again_where_streaming_res
         assert values(device)["exposure_time_absolute"] == 157, "the driver has forgotten it"
         assert source.remarks() == []
         assert values(device)["exposure_time_absolute"] == 80
+    finally:
+        source.close()
+
+
+def test_a_camera_that_was_unplugged_is_found_by_path_or_name(dev: Callable[..., Path]) -> None:
+    devices = dev(0, 1, 2, usb_grabber=1)
+    own, twin, other = FakeDevice("USB Video"), FakeDevice("USB Video"), FakeDevice("Webcam")
+    opener = Opener({0: other, 1: own, 2: twin})
+    by_path = finder_of(1, opener, devices, devices)
+    by_name = finder_of(2, opener, devices, devices)
+    by_number = finder_of(7, opener, devices, devices)
+    assert (by_path(), by_name(), by_number()) == (1, 2, 7)
+
+    link = devices / "v4l" / "by-id" / "usb_grabber"
+    link.unlink()
+    for name in ("video1", "video2"):
+        (devices / name).unlink()
+    for find in (by_path, by_name):
+        with pytest.raises(NotFound, match=r"USB Video.*not back"):
+            find()
+
+    (devices / "video5").touch()
+    link.symlink_to(devices / "video5")
+    opener.devices = {0: other, 5: own}
+    assert by_path() == 5
+    assert by_name() == 5, "the only one of its name"
+    (devices / "video1").touch()
+    opener.devices[1] = other
+    assert by_path() == 5, "another camera has its number now"
+
+
+def test_controls_are_set_again_when_a_camera_comes_back() -> None:
+    device = FakeDevice()
+    source = DeviceSource(
+        0, 0.05, Asked(controls=FIXED), lambda: 100.0, lambda n, asked: device, device.opener,
+        retry_s=0.0, reopen_every_s=0.0,
+    )  # fmt: skip
+    try:
+        assert source.wait_first(WAIT_S)
+        fresh = FakeDevice(resets={"Exposure Time, Absolute": 157})
+        device.controls, device.resets = fresh.controls, fresh.resets
+        assert values(device)["auto_exposure"] == 3
+        device.unplugged = True
+        wait_for(lambda: device.released)
+        device.unplugged = False
+        wait_for(lambda: not source._reopened and device.log[-1] == "read")
+        wait_for(lambda: {name: values(device)[name] for name in FIXED} == {
+            "exposure_time_absolute": 80, "auto_exposure": 1, "white_balance_automatic": 0,
+        })  # fmt: skip
     finally:
         source.close()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import ssl
+import struct
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -13,15 +14,20 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from perchctl.camera.device import LOST_AFTER_FAILURES, Asked, DeviceSource, open_capture
+from perchctl.camera import mjpeg
+from perchctl.camera.device import (
+    LOST_AFTER_FAILURES,
+    Asked,
+    CaptureSource,
+    DeviceSource,
+    open_capture,
+)
 from perchctl.camera.mirror import UnmirroredSource
-from perchctl.camera.mjpeg import MAX_PICTURE_BYTES, JpegSplitter, MjpegSource
+from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.open import open_source
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
-from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
+from perchctl.camera.stream import MAX_FAILED_CONNECTIONS, StreamSource
 from perchctl.errors import NotFound, TimedOut
 from tests.helpers.live import WAIT_S, Clock, level, next_frame, wait_for
 
@@ -33,65 +39,14 @@ def jpeg(level: int, size: tuple[int, int] = (48, 64), **options: int) -> bytes:
     return bytes(cv2.imencode(".jpg", image, flags)[1].tobytes())
 
 
-# -- the splitter ------------------------------------------------------------
-
-PICTURES = [
-    jpeg(40),
-    jpeg(90, IMWRITE_JPEG_PROGRESSIVE=1),
-    jpeg(140, IMWRITE_JPEG_RST_INTERVAL=2),
-    jpeg(200, (8, 8)),
-]
+def resized(picture: bytes, width: int, height: int) -> bytes:
+    """The JPEG with another size in its header."""
+    at = max(picture.find(b"\xff\xc0"), picture.find(b"\xff\xc2"))
+    return picture[: at + 5] + struct.pack(">HH", height, width) + picture[at + 9 :]
 
 
 def part(picture: bytes, headers: bytes = b"Content-Type: image/jpeg\r\n") -> bytes:
     return b"--frame\r\n" + headers + b"\r\n" + picture + b"\r\n"
-
-
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.lists(st.sampled_from(PICTURES), max_size=6), st.data())
-def test_whole_pictures_come_out_however_the_bytes_arrive(
-    pictures: list[bytes], data: st.DataObject
-) -> None:
-    headers = st.sampled_from([b"", b"Content-Length: 17\r\n", b"\xff\xd8 nonsense\r\n", b"\xff"])
-    stream = b"".join(part(p, data.draw(headers)) for p in pictures)
-    splitter, out = JpegSplitter(), []
-    while stream:
-        n = data.draw(st.integers(1, max(len(stream), 1)))
-        out += splitter.feed(stream[:n])
-        stream = stream[n:]
-    assert out == pictures
-
-
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.sampled_from(PICTURES), st.floats(0.05, 0.99), st.integers(1, 3))
-def test_after_truncated_pictures_the_next_whole_one_comes(
-    picture: bytes, share: float, times: int
-) -> None:
-    torn = picture[: max(int(len(picture) * share), 4)]
-    after = jpeg(120)
-    count = 70_000 // len(after)  # a tear within a segment's length may point 64 kB ahead
-    splitter = JpegSplitter()
-    out = splitter.feed(part(torn) * times + part(after) * count)
-    # The torn end may by chance fit into what follows and cost that picture.
-    assert out[-(count - 1) :] == [after] * (count - 1)
-    assert torn not in out
-
-
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(st.binary(max_size=3000))
-def test_noise_neither_raises_nor_piles_up(noise: bytes) -> None:
-    splitter = JpegSplitter()
-    splitter.feed(noise)
-    assert len(splitter._buffer) <= len(noise)
-
-
-def test_a_picture_that_never_ends_is_given_up() -> None:
-    splitter = JpegSplitter()
-    head = PICTURES[0][: PICTURES[0].index(b"\xff\xda") + 20]
-    splitter.feed(head + b"\x11" * (MAX_PICTURE_BYTES + 1))
-    assert splitter.damaged == 1
-    assert len(splitter._buffer) < 100
-    assert splitter.feed(PICTURES[0]) == [PICTURES[0]]
 
 
 # -- a server whose every byte the test chooses --------------------------------
@@ -246,6 +201,80 @@ def test_a_truncated_picture_is_skipped(server: Server, opened: list[LiveSource]
     wait_for(lambda: source.damaged >= 1)
 
 
+@pytest.mark.parametrize("size", [(40_000, 40_000), (32_000, 32_000), (0, 64)])
+def test_damaged_size_bytes_cost_their_own_picture_alone(
+    size: tuple[int, int], server: Server, opened: list[LiveSource]
+) -> None:
+    go = threading.Event()
+    server.scripts.put([part(resized(jpeg(60), *size)), go, part(jpeg(160)), threading.Event()])
+    source = stream(server, Clock(), opened)
+    wait_for(lambda: source.damaged == 1)
+    go.set()
+    assert level(next_frame(source)) == 160
+    assert source.connections == 1
+    assert source.problem(100.0) is None
+
+
+def test_a_picture_above_the_largest_size_is_not_decoded_and_the_problem_says_so(
+    server: Server, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[bytes] = []
+    monkeypatch.setattr(mjpeg, "grey_pixels", tried.append)
+    server.scripts.put([part(resized(jpeg(60), 4097, 4096)), threading.Event()])
+    source = stream(server, Clock(), opened)
+    wait_for(lambda: source.damaged == 1)
+    assert tried == []
+    assert "4097x4096 px" in str(source.problem(102.0))
+
+
+class Broken(StreamSource):
+    """Its connection raises what nobody has foreseen."""
+
+    def __init__(self, error: Exception, attempts: int) -> None:
+        super().__init__("http://me:secret@camera/x", 0.0, Clock(), reconnect_wait_s=0.0)
+        self.errors = [error] * attempts
+        self._start(self._run)
+
+    def _connection(self) -> str:
+        if self.errors:
+            raise self.errors.pop()
+        self._put(np.full((48, 64), 60, np.uint8))
+        self._stop.wait(WAIT_S)
+        return "closed"
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), cv2.error("no"), MemoryError(), RuntimeError()])
+def test_an_unforeseen_error_in_a_stream_is_followed_by_another_connection(
+    error: Exception, opened: list[LiveSource]
+) -> None:
+    opened.append(source := Broken(error, MAX_FAILED_CONNECTIONS - 1))
+    next_frame(source)
+    assert source.problem(100.0) is None
+    opened.append(source := Broken(error, MAX_FAILED_CONNECTIONS))
+    wait_for(lambda: source.problem(100.0) is not None)
+    assert type(error).__name__ in str(source.problem(100.0))
+
+
+@pytest.mark.parametrize("error", [TypeError("of http://me:secret@camera/x"), None])
+def test_a_thread_that_ends_is_the_camera_s_problem(
+    error: Exception | None, opened: list[LiveSource]
+) -> None:
+    class Ending(LiveSource):
+        def grab(self) -> None:
+            if error is not None:
+                raise error
+
+    source = Ending("camera:7", 0.0, Clock())
+    opened.append(source)
+    source._start(source.grab)
+    assert not source.wait_first(WAIT_S)
+    problem = str(source.problem(100.0))
+    assert problem.startswith("camera:7")
+    assert "thread" in problem
+    assert ("TypeError" in problem) == (error is not None)
+    assert "secret" not in problem
+
+
 def test_it_reconnects_when_the_stream_ends(server: Server, opened: list[LiveSource]) -> None:
     clock = Clock()
     gate = threading.Event()
@@ -350,10 +379,11 @@ def test_open_source_waits_for_the_first_frame(server: Server) -> None:
 
 
 class Capture:
-    """Stands for cv2.VideoCapture; gives queued pictures, fails at None and at the end."""
+    """Stands for cv2.VideoCapture; gives queued pictures, fails at None and at the end, and
+    raises a queued error."""
 
     def __init__(self) -> None:
-        self.pictures: queue.Queue[np.ndarray[Any, Any] | None] = queue.Queue()
+        self.pictures: queue.Queue[np.ndarray[Any, Any] | Exception | None] = queue.Queue()
         self.unplugged = False
         self.released = threading.Event()
         self.reads = 0
@@ -366,6 +396,8 @@ class Capture:
             image = self.pictures.get(timeout=0.01)
         except queue.Empty:
             return False, None
+        if isinstance(image, Exception):
+            raise image
         return image is not None, image
 
     def release(self) -> None:
@@ -390,16 +422,115 @@ def test_a_device_delivers_grey_frames_and_is_released(opened: list[LiveSource])
     assert capture.released.wait(WAIT_S)
 
 
-def test_an_unplugged_device_is_a_problem(opened: list[LiveSource]) -> None:
+def grey(value: int) -> np.ndarray[Any, Any]:
+    return np.full((48, 64), value, np.uint8)
+
+
+def test_a_device_s_damaged_picture_is_dropped(opened: list[LiveSource]) -> None:
     capture = Capture()
-    capture.pictures.put(np.full((48, 64), 50, np.uint8))
+    for each in (grey(60), cv2.error("damaged"), grey(160)):
+        capture.pictures.put(each)
     source = DeviceSource(0, 0.0, Asked(), Clock(), lambda n, asked: capture, retry_s=0.0)
     opened.append(source)
-    assert source.wait_first(WAIT_S)
+    wait_for(lambda: source._count == 2)
+    assert not capture.released.is_set()
+    assert source.problem(100.0) is None
+
+
+def test_a_device_that_never_gives_a_picture_fails(opened: list[LiveSource]) -> None:
+    capture = Capture()
     capture.unplugged = True
-    wait_for(lambda: "unplugged" in (source.problem(100.0) or ""))
-    assert capture.reads >= LOST_AFTER_FAILURES
+    source = DeviceSource(0, 0.0, Asked(), Clock(), lambda n, asked: capture, retry_s=0.0)
+    opened.append(source)
+    assert not source.wait_first(WAIT_S)
+    assert "stopped delivering" in str(source.problem(float("-inf")))
+    assert capture.reads == LOST_AFTER_FAILURES
     assert capture.released.wait(WAIT_S)
+
+
+class Bus:
+    """Where a camera is plugged in and out; `opened` counts the attempts to open one."""
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture: Capture | None = capture
+        self.numbers: list[int] = []
+
+    def open(self, number: int, asked: Asked) -> Capture:
+        self.numbers.append(number)
+        if self.capture is None:
+            raise NotFound(f"camera:{number} was not found; no /dev/video* exists")
+        return self.capture
+
+
+def test_a_device_that_comes_back_is_opened_again_under_its_new_number(
+    opened: list[LiveSource],
+) -> None:
+    first, clock = Capture(), Clock()
+    first.pictures.put(grey(60))
+    bus = Bus(first)
+    source = DeviceSource(
+        0, 0.0, Asked(), clock, bus.open, retry_s=0.0, reopen_every_s=0.001, find=lambda: 3
+    )
+    opened.append(source)
+    assert level(next_frame(source)) == 60
+    bus.capture, first.unplugged = None, True
+    wait_for(lambda: len(bus.numbers) > 3)
+    assert first.released.is_set()
+    clock.t_s = 102.0
+    assert "camera:3 was not found" in str(source.problem(102.0))
+    assert source.problem(float("-inf")) is None, "it is not the end"
+    again = Capture()
+    again.pictures.put(grey(160))
+    bus.capture = again
+    frame = next_frame(source)
+    assert (level(frame), frame.index, frame.t_arrival_s) == (160, 1, 102.0)
+    assert source.problem(102.0) is None
+    assert bus.numbers == [0] + [3] * (len(bus.numbers) - 1)
+    assert not again.released.is_set()
+
+
+def test_attempts_to_open_a_lost_device_are_bounded_in_rate() -> None:
+    waits: list[float] = []
+    reads = LOST_AFTER_FAILURES - 1
+
+    class Instant(threading.Event):
+        """Waiting takes no time, is noted, and ends with a close."""
+
+        def is_set(self) -> bool:
+            return len(waits) >= reads + 10
+
+        def wait(self, timeout: float | None = None) -> bool:
+            waits.append(timeout or 0.0)
+            return self.is_set()
+
+    def no_camera() -> None:
+        attempts.append(len(waits))
+        raise NotFound("camera:0 was not found")
+
+    attempts: list[int] = []
+    source = CaptureSource("camera:0", 0.0, Clock(), no_camera, retry_s=0.25, reopen_every_s=0.5)
+    source._put(grey(60))
+    source._capture = capture = Capture()
+    capture.unplugged = True
+    source._stop = Instant()
+    source._grab()
+    assert waits == [0.25] * reads + [0.5] * 10
+    assert attempts == list(range(reads + 1, reads + 10)), "one behind each wait"
+
+
+def test_a_device_that_flaps_is_never_given_up(opened: list[LiveSource]) -> None:
+    captures = []
+
+    def one_picture(number: int, asked: Asked) -> Capture:
+        captures.append(Capture())
+        captures[-1].pictures.put(grey(len(captures)))
+        return captures[-1]
+
+    source = DeviceSource(0, 0.0, Asked(), Clock(), one_picture, retry_s=0.0, reopen_every_s=0.0)
+    opened.append(source)
+    wait_for(lambda: len(captures) > 3)
+    wait_for(lambda: source._count > 3)
+    assert all(each.released.is_set() for each in captures[:-2])
 
 
 def test_a_missing_device_says_what_there_is() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.camera.mjpeg import MjpegSource
+from perchctl.camera.mjpeg import MjpegSource, redirected
 from perchctl.camera.open import open_source
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound
@@ -128,6 +128,58 @@ def test_who_may_not_see_it_is_told_at_once(
         open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
     assert "wrong" not in str(caught.value)
     assert len(server.authorization) <= 3
+
+
+WHO = "me:secret@"
+
+
+@pytest.mark.parametrize(
+    ("before", "location", "kept"),
+    [
+        ("http://me:secret@cam/a", "/b", True),
+        ("http://me:secret@cam/a", "http://cam/b", True),
+        ("http://me:secret@cam/a", "https://cam/b", True),
+        ("https://me:secret@cam/a", "/b", True),
+        ("https://me:secret@cam/a", "//cam/b", True),
+        ("https://me:secret@cam/a", "http://cam/b", False),
+        ("https://me:secret@cam:8443/a", "http://cam:8443/b", False),
+        ("https://me:secret@cam/a", "ftp://cam/b", False),
+        ("http://me:secret@cam/a", "rtsp://cam/b", False),
+        ("http://me:secret@cam/a", "http://other/b", False),
+        ("http://me:secret@cam/a", "http://cam:81/b", False),
+        ("https://me:secret@cam/a", "https://cam.other/b", False),
+    ],
+)
+def test_name_and_password_go_to_the_same_host_and_never_unencrypted_behind_https(
+    before: str, location: str, kept: bool
+) -> None:
+    assert (WHO in redirected(before, location)) == kept
+
+
+def test_a_redirect_from_https_to_http_is_not_followed(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pem = Path(__file__).parents[1] / "helpers" / "loopback.pem"
+    server.encrypt(pem)
+    monkeypatch.setenv("SSL_CERT_FILE", str(pem))
+    plain = Server()
+    try:
+        plain.challenges = ['Basic realm="camera"']
+        server.redirect_first = plain.url
+        url = server.url.replace("http://", f"https://{WHO}")
+        with pytest.raises(NotFound, match=r"https.*encrypted") as caught:
+            open_source(url, 0.0, None, Clock(), timeout_s=WAIT_S)
+        assert plain.paths == [], "nobody can answer there in the camera's place"
+        assert plain.url in str(caught.value)
+        assert "secret" not in str(caught.value)
+    finally:
+        plain.close()
+
+
+def test_a_redirect_to_another_protocol_is_not_followed(server: Server) -> None:
+    server.redirect_first = "rtsp://127.0.0.1/live"
+    with pytest.raises(NotFound, match=r"rtsp://127\.0\.0\.1/live"):
+        open_source(server.url, 0.0, None, Clock(), timeout_s=WAIT_S)
 
 
 def test_name_and_password_do_not_go_to_another_host(

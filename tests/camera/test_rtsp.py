@@ -5,11 +5,17 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
+import av
+import av.error
+import numpy as np
 import pytest
 
 from perchctl.camera import rtsp
+from perchctl.camera.jpeg import MOST_STREAM_PX
 from perchctl.camera.open import open_source
 from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting, unresolved
 from perchctl.camera.source import LiveSource
@@ -92,6 +98,55 @@ def test_the_resolver_is_asked_only_before_the_first_picture(
     never.set()
 
 
+class Packets:
+    """An open stream of PyAV's whose packets give pictures of these levels, or raise."""
+
+    def __init__(self, *steps: int | Exception) -> None:
+        self.context = SimpleNamespace(options={})
+        self.video = SimpleNamespace(thread_type="", codec_context=self.context)
+        self.streams = SimpleNamespace(video=[self.video])
+        self.steps = steps
+
+    def __enter__(self) -> Packets:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def demux(self, video: object) -> Iterator[SimpleNamespace]:
+        assert video is self.video
+        for step in self.steps:
+            yield SimpleNamespace(decode=partial(self.decode, step))
+        threading.Event().wait(0.05)
+
+    def decode(self, step: int | Exception) -> list[SimpleNamespace]:
+        if isinstance(step, Exception):
+            raise step
+        image = np.full((48, 64), step, np.uint8)
+        return [SimpleNamespace(to_ndarray=lambda format: image, time=None)]
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        av.error.InvalidDataError(-1, "damaged"),
+        av.error.ArgumentError(22, "damaged"),
+        av.error.UnknownError(-2, "damaged"),
+        ValueError("a picture of no size"),
+    ],
+)
+def test_a_packet_that_cannot_be_decoded_costs_no_connection(
+    error: Exception, opened: list[LiveSource], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stream = Packets(60, error, 160)
+    monkeypatch.setattr(av, "open", lambda *_, **__: stream)
+    source = RtspSource("rtsp://camera/x", 0.0, Clock(), reconnect_wait_s=WAIT_S)
+    opened.append(source)
+    wait_for(lambda: source._count == 2)
+    assert (source.connections, source.damaged) == (1, 1)
+    assert int(stream.context.options["max_pixels"]) == MOST_STREAM_PX
+
+
 def test_connections_are_bounded(server: RtspServer, opened: list[LiveSource]) -> None:
     server.status = "500 Internal Server Error"
     source = started(server, opened)
@@ -126,6 +181,35 @@ def test_what_trying_again_would_not_mend_is_told_at_once(
     assert sentence in str(caught.value)
     assert "hush" not in str(caught.value)
     assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("asks_first", [False, True])
+def test_name_and_password_do_not_go_where_the_server_redirects(
+    server: RtspServer, asks_first: bool
+) -> None:
+    other = RtspServer(who=("me", "secret"))
+    server.redirect = other.url()
+    server.who = ("me", "secret") if asks_first else None
+    try:
+        with pytest.raises(NotFound, match=r"redirects to rtsp://127") as caught:
+            open_source(server.url("me:secret@"), 0.0, None, Clock(), timeout_s=WAIT_S)
+        assert other.asked == []
+        assert "secret" not in str(caught.value)
+    finally:
+        other.close()
+
+
+def test_a_redirect_of_a_url_without_a_password_is_followed(
+    server: RtspServer, opened: list[LiveSource]
+) -> None:
+    never, other = threading.Event(), RtspServer()
+    server.redirect = other.url()
+    other.scripts.put([*seconds(20, 60, 80), never])
+    try:
+        next_frame(started(server, opened))
+    finally:
+        never.set()
+        other.close()
 
 
 def test_nobody_listens(server: RtspServer) -> None:

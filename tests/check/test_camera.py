@@ -18,6 +18,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration.files import camera_of
 from perchctl.camera.health import MEANING
+from perchctl.camera.mirror import mirrored_note
 from perchctl.check import camera, computer
 from perchctl.check.camera import Optical
 from perchctl.check.pictures import Blur, Light
@@ -118,6 +119,19 @@ def shown(fault: str) -> tuple[Rehearsal, dict[str, Row]]:
 
 def good() -> tuple[Rehearsal, dict[str, Row]]:
     return shown("none")
+
+
+@pytest.mark.parametrize("is_set", [False, True])
+def test_the_advice_for_a_mirrored_picture_goes_by_the_profile(is_set: bool) -> None:
+    done, _ = shown("mirrored")
+    config = PROFILE.camera.model_copy(update={"mirrored": is_set})
+    profile = PROFILE.model_copy(update={"camera": config})
+    note = mirrored_note(config)
+    noted = replace(done, problems=Counter({note: done.pictures}))
+    found = camera.rows(noted, camera.optical_of(done, PIPELINE), DESIGN, profile)
+    rows = {row.name: row for row in found}
+    assert rows["mirrored"].advice == note.partition(": ")[2]
+    assert rows["pictures"].advice == "see mirrored"
 
 
 def test_a_good_camera_fails_nothing() -> None:

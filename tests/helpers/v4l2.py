@@ -136,6 +136,7 @@ class FakeDevice:
     stubborn: tuple[str, ...] = ()
     log: list[str] = field(default_factory=list)
     released: bool = False
+    unplugged: bool = False
 
     @contextlib.contextmanager
     def opener(self, number: int = 0) -> Iterator[Call]:
@@ -214,6 +215,8 @@ class FakeDevice:
 
     def read(self) -> tuple[bool, Any]:
         self.log.append("read")
+        if self.unplugged:
+            return False, None
         for name, value in self.resets.items():
             self.control(name).value = value
         self.resets = {}

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import gzip
+import tracemalloc
 from pathlib import Path
 
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
+from perchctl.log import read
 from perchctl.log.read import read_log
 from tests.helpers import log as synthetic
+from tests.helpers.commands import run
 
 
 @pytest.fixture
@@ -49,6 +52,34 @@ def refusal(path: Path, content: bytes) -> str:
 )
 def test_what_it_is(content: bytes, named: str, tmp_path: Path) -> None:
     assert named in refusal(tmp_path / "x.jsonl", content)
+
+
+@pytest.mark.parametrize("begin", [b"{", b""])
+def test_what_unfolds_without_bound_is_read_up_to_a_limit(
+    begin: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "bomb.jsonl.gz"
+    path.write_bytes(gzip.compress(begin + bytes(40_000_000)))
+    monkeypatch.setattr(read, "MOST_LOG_BYTES", 1_000_000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InvalidValue, match="more than 1 MB" if begin else "binary"):
+            read_log(path)
+        assert tracemalloc.get_traced_memory()[1] < 6_000_000
+    finally:
+        tracemalloc.stop()
+    assert run("log", "show", str(path)).code == InvalidValue.exit_code
+
+
+def test_a_log_has_a_largest_size_unpacked_or_not(
+    good: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(read, "MOST_LOG_BYTES", len(good))
+    path = tmp_path / "x.jsonl"
+    for packed in (bytes, gzip.compress):
+        path.write_bytes(packed(good))
+        assert not read_log(path).ignored_bytes
+        assert "more than" in refusal(path, packed(good + b"{}\n"))
 
 
 def test_a_header_that_is_cut_off(good: bytes, tmp_path: Path) -> None:

@@ -108,6 +108,35 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
     assert one.link.uri.startswith("radio://")
 
 
+@pytest.mark.parametrize("front", sorted(EDGES))
+def test_a_mirrored_picture_is_asked_about_and_named(
+    front: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain, mirrored = edges_beside(front)
+    asked: list[str] = []
+
+    def ask(question: str) -> str:
+        asked.append(question)
+        return ""
+
+    given = {question.name: question.default({}) for question in QUESTIONS[:1]}
+    run(NewProfileRequest(tmp_path / "asked.yaml", given | {"front": front}), ask=ask)
+    (question,) = [text for text in asked if "left side" in text]
+    assert plain in question
+    assert mirrored in question
+    assert "mirrors" in question
+    assert "camera.mirrored" not in capsys.readouterr().err
+
+    for left in (mirrored, mirrored[0]):
+        answers = {"front": front, "left": left}
+        request = NewProfileRequest(tmp_path / f"{left}.yaml", answers, defaults=True)
+        assert run(request) == 0
+        said = capsys.readouterr().err
+        assert "camera.mirrored: true" in said
+        assert front in said
+        assert mirrored in said
+
+
 def test_a_password_is_in_the_source_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, cast
 
@@ -71,6 +71,16 @@ scenarios = st.builds(
     camera_freeze_at_s=st.one_of(st.none(), st.floats(0.0, 1.5)),
     camera_gone_at_s=st.one_of(st.none(), st.floats(0.0, 1.5)),
 )
+
+
+@settings(max_examples=20, deadline=None, derandomize=True)
+@given(scenarios)
+def test_one_that_mirrors_gives_the_same_pictures_flipped(scene: Scenario) -> None:
+    plain, _ = run(scene, 0.6, 0.005)
+    mirrored, _ = run(replace(scene, camera_mirrored=True), 0.6, 0.005)
+    for one, other in zip(plain, mirrored, strict=True):
+        assert (one.t_arrival_s, one.index) == (other.t_arrival_s, other.index)
+        assert (one.image[:, ::-1] == other.image).all()
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

@@ -34,11 +34,15 @@ def test_a_mirrored_picture_is_named_and_can_be_turned(
     said = capsys.readouterr().err
     assert line["stage"] == "none"
     assert "m.png: the picture is mirrored" in said
+    assert "set camera.mirrored" in said
     profile = tmp_path / "turned.yaml"
     profile.write_text("extends: sim\ncamera: {mirrored: true}\n")
     (line,) = track(tmp_path, str(profile), stills=True)
     assert line["stage"] == "both"
     assert "is mirrored:" not in capsys.readouterr().err
+    cv2.imwrite(str(tmp_path / "m.png"), image)
+    track(tmp_path, str(profile), stills=True)
+    assert "take camera.mirrored out" in capsys.readouterr().err
 
 
 def test_pictures_that_show_nothing_are_named(
@@ -146,5 +150,5 @@ def test_a_live_source_is_waited_for_and_its_end_is_told(
     seen = [f.index for f in frames(Script(3), lambda: 5.0, Stopper(), Notes(say))]
     assert seen == [2, 1, 0]
     said = capsys.readouterr().err
-    assert "http://camera delivers no frame; waiting" in said
+    assert said.startswith("perchctl: silent for 2 s; waiting")
     assert said.endswith("perchctl: the stream has ended\n")

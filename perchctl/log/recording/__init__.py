@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from perchctl.log.recording.export import Exported
     from perchctl.log.recording.pictures import Picture
 
+__all__ = ["export_mcap", "pictures_of", "recording_of"]
+
 
 def pictures_of(
     path: Path | str, *, exact: bool = True, numbers: Container[int] | None = None

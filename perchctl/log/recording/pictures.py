@@ -8,11 +8,11 @@ from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
+from perchctl.camera.files import picture_in
 from perchctl.errors import InvalidValue
 from perchctl.log.recording.messages import FRAME, IMAGE
 from perchctl.log.recording.walk import Walked, walk
@@ -43,11 +43,10 @@ def pictures_in(
 
 
 def _picture(path: Path, data: Walked, frame: dict[str, Any], exact: bool) -> Picture:
-    pixels = np.frombuffer(CompressedImage.FromString(data.data).data, np.uint8)
-    image = cv2.imdecode(pixels, cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise InvalidValue(f"{path}: picture {frame['number']} cannot be decoded")
-    grey = np.asarray(image, np.uint8)
+    try:
+        grey = picture_in(CompressedImage.FromString(data.data).data)
+    except ValueError as error:
+        raise InvalidValue(f"{path}: picture {frame['number']} {error}") from None
     if exact and zlib.crc32(grey.data) != frame["crc32"]:
         raise InvalidValue(
             f"{path}: picture {frame['number']} decodes to other pixels here than in the flight: "

@@ -1,0 +1,236 @@
+"""JPEGs out of a byte stream: whole ones only, at a cost in proportion to the bytes."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from perchctl.camera import jpeg as module
+from perchctl.camera.jpeg import (
+    MAX_PICTURE_BYTES,
+    Damaged,
+    JpegSplitter,
+    grey_pixels,
+    jpeg_end,
+    size_in,
+)
+from tests.camera.test_live import jpeg, part, resized
+
+PICTURES = [
+    jpeg(40),
+    jpeg(90, IMWRITE_JPEG_PROGRESSIVE=1),
+    jpeg(140, IMWRITE_JPEG_RST_INTERVAL=2),
+    jpeg(200, (8, 8)),
+]
+SOI = b"\xff\xd8"
+SCAN = PICTURES[0][: PICTURES[0].index(b"\xff\xda") + 20]
+"""A picture up to the first bytes of its scan."""
+
+
+def fed(pieces: list[bytes]) -> tuple[list[bytes], int]:
+    splitter = JpegSplitter()
+    out = [picture for piece in pieces for picture in splitter.feed(piece)]
+    return out, splitter.damaged
+
+
+def cut(stream: bytes, places: list[int]) -> list[bytes]:
+    ends = [*sorted(place % (len(stream) + 1) for place in places), len(stream)]
+    return [stream[a:b] for a, b in zip([0, *ends], ends, strict=False)]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.lists(st.sampled_from(PICTURES), max_size=6), st.data())
+def test_whole_pictures_come_out_however_the_bytes_arrive(
+    pictures: list[bytes], data: st.DataObject
+) -> None:
+    headers = st.sampled_from([b"", b"Content-Length: 17\r\n", b"\xff\xd8 nonsense\r\n", b"\xff"])
+    stream = b"".join(part(p, data.draw(headers)) for p in pictures)
+    places = data.draw(st.lists(st.integers(0, 100_000), max_size=40))
+    assert fed(cut(stream, places)) == (pictures, 0)
+
+
+FILLINGS = [b"", b"\xff", SOI, b"\xff\xd8\xff", b"\xff\xd9", b"\xff\xda\x00\x02", b"\xff\xe0\xff",
+            b"\xff\xff\xff", b"\xff\x00", b"\xff\xd8\xff\xe0\x00\x04\xff\xd8"]  # fmt: skip
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    st.lists(st.sampled_from(PICTURES), min_size=1, max_size=4),
+    st.lists(
+        st.tuples(
+            st.integers(0, 20_000), st.integers(0, 300), st.sampled_from(FILLINGS) | st.binary()
+        ),
+        max_size=4,
+    ),
+    st.lists(st.integers(0, 20_000), max_size=60),
+)
+@example([PICTURES[3]], [], list(range(2000)))
+def test_the_pieces_make_no_difference_whatever_is_damaged(
+    pictures: list[bytes], damages: list[tuple[int, int, bytes]], places: list[int]
+) -> None:
+    stream = b"".join(part(p) for p in pictures)
+    for at, length, filling in damages:
+        at %= len(stream)
+        stream = stream[:at] + filling + stream[at + length :]
+    assert fed(cut(stream, places)) == fed([stream])
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.sampled_from(PICTURES), st.floats(0.05, 0.99), st.integers(1, 3))
+def test_pictures_come_again_behind_truncated_ones(
+    picture: bytes, share: float, times: int
+) -> None:
+    torn = picture[: max(int(len(picture) * share), 4)]
+    after = jpeg(120)
+    # A tear within a segment's length points up to 64 kB ahead. Three of them in a row may, and
+    # each time the picture in which the search goes on is lost, too.
+    lost = times * (65_537 // len(part(after)) + 2)
+    out, _ = fed([part(torn) * times + part(after) * (lost + 5)])
+    assert torn not in out
+    assert out[-5:] == [after] * 5
+
+
+def test_a_tear_in_the_pixels_costs_its_own_picture_alone() -> None:
+    for picture in (PICTURES[0], PICTURES[2]):
+        for more in (20, 21, 200):
+            torn = picture[: picture.index(b"\xff\xda") + more]
+            assert fed([part(torn) + part(PICTURES[0])]) == ([PICTURES[0]], 1)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.binary(max_size=3000))
+def test_noise_neither_raises_nor_piles_up(noise: bytes) -> None:
+    splitter = JpegSplitter()
+    splitter.feed(noise)
+    assert len(splitter._buffer) <= len(noise)
+
+
+def test_a_picture_that_never_ends_is_given_up() -> None:
+    splitter = JpegSplitter()
+    splitter.feed(SCAN + b"\x11" * (MAX_PICTURE_BYTES + 1))
+    assert splitter.damaged == 1
+    assert len(splitter._buffer) < 100
+    assert splitter.feed(PICTURES[0]) == [PICTURES[0]]
+
+
+# -- what it costs -------------------------------------------------------------------
+
+
+class Counted:
+    """A pattern that counts the bytes that it is searched in, and ends what takes too many."""
+
+    left = 0
+
+    def __init__(self, pattern: Any) -> None:
+        self._pattern = pattern
+
+    def search(self, data: Any, pos: int = 0, endpos: int | None = None) -> Any:
+        until = len(data) if endpos is None else endpos
+        found = self._pattern.search(data, pos, until)
+        Counted.left -= 1 + max((until if found is None else found.end()) - pos, 0)
+        assert Counted.left >= 0, "the work grows faster than the bytes"
+        return found
+
+
+HOSTILE = {
+    "stuffing": SCAN + b"\xff\x00" * 60_000,
+    "restarts": SCAN + b"\xff\xd0" * 60_000,
+    "fill bytes": SOI + b"\xff" * 120_000,
+    "a scan": SCAN + bytes(range(255)) * 500,
+    "starts": b"\xff\xd8\xff" * 40_000,
+    "starts and breaks": b"\xff\xd8\xff\x00" * 30_000,
+    "segments": SOI + b"\xff\xe0\x00\x02" * 30_000,
+    "segments of starts": SOI + b"\xff\xe0\x00\x04\xff\xd8" * 20_000,
+    "scans of starts": SOI + b"\xff\xda\x00\x04\xff\xd8" * 20_000,
+    "far lengths": b"\xff\xd8\xff\xe0\xff\xff" * 20_000,
+    "far scans": b"\xff\xd8\xff\xda\xf0\x00" * 10_000 + b"\xff\x00" * 60_000,
+    "text": b"--frame\r\nContent-Type: image/jpeg\r\n" * 4_000,
+}
+
+
+@pytest.mark.parametrize("piece", [7, 1400])
+@pytest.mark.parametrize("name", HOSTILE)
+def test_the_work_is_in_proportion_to_the_bytes(
+    name: str, piece: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for pattern in ("_START", "_SCAN_END", "_NO_FILL", "_MARKER"):
+        monkeypatch.setattr(module, pattern, Counted(getattr(module, pattern)))
+    stream = (
+        HOSTILE[name] + b"\x00\xff\x02" + part(PICTURES[0])
+    )  # where each one's structure breaks
+    monkeypatch.setattr(Counted, "left", 4 * len(stream))
+    splitter = JpegSplitter()
+    for k in range(0, len(stream), piece):
+        splitter.feed(stream[k : k + piece])
+
+
+def test_what_is_held_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MAX_PICTURE_BYTES", 50_000)
+    for stream in HOSTILE.values():
+        splitter = JpegSplitter()
+        for k in range(0, len(stream), 1400):
+            splitter.feed(stream[k : k + 1400])
+            assert len(splitter._buffer) <= 50_000 + 1400
+
+
+# -- what size it says ---------------------------------------------------------------
+
+
+def with_thumbnail(picture: bytes) -> bytes:
+    """As cameras write it: a small whole JPEG within a segment in front of the picture's own."""
+    small = jpeg(10, (16, 24))
+    return SOI + b"\xff\xe1" + struct.pack(">H", 2 + len(small)) + small + picture[2:]
+
+
+@pytest.mark.parametrize("picture", PICTURES)
+def test_the_size_is_the_decoder_s(picture: bytes) -> None:
+    image = grey_pixels(picture)
+    assert image is not None
+    for each in (picture, with_thumbnail(picture), SOI + b"\xff\xff" + picture[3:]):
+        assert size_in(each) == (image.shape[1], image.shape[0])
+        assert jpeg_end(each) == len(each)
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    st.sampled_from(PICTURES),
+    st.lists(st.tuples(st.integers(2, 600), st.integers(0, 255)), min_size=1, max_size=3),
+)
+def test_no_damage_makes_a_picture_larger_than_it_says(
+    picture: bytes, damages: list[tuple[int, int]]
+) -> None:
+    data = bytearray(picture)
+    for at, value in damages:
+        data[at % len(data)] = value
+    size_px = size_in(data)
+    if size_px is None or size_px[0] * size_px[1] > 1 << 22:
+        return  # refused without decoding
+    image = grey_pixels(bytes(data))
+    assert image is None or sorted(image.shape) == sorted(size_px)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(st.binary(max_size=300))
+def test_any_bytes_have_a_size_or_none_and_are_decoded_or_not(data: bytes) -> None:
+    size_in(SOI + data)
+    grey_pixels(data)
+
+
+def test_a_size_that_opencv_refuses_is_no_exception() -> None:
+    with pytest.raises(cv2.error):
+        cv2.imdecode(
+            np.frombuffer(resized(PICTURES[0], 40_000, 40_000), np.uint8), cv2.IMREAD_GRAYSCALE
+        )
+    assert grey_pixels(resized(PICTURES[0], 40_000, 40_000)) is None
+
+
+def test_an_incomplete_jpeg_has_no_end_and_a_broken_one_is_damaged() -> None:
+    assert jpeg_end(PICTURES[0][:-1]) is None
+    with pytest.raises(Damaged):
+        jpeg_end(PICTURES[0][:-2] + PICTURES[0])
