@@ -3,22 +3,18 @@
 Nothing here blocks without a bound, nothing blocking is called from cflib's
 callbacks, and the link is closed only when nothing flies: `close_link` sends a
 zero setpoint, which drops a flying vehicle (docs/firmware.md, "When setpoints stop").
+A radio that falls silent is waited for, and a driver that has ended is opened again, for as
+long as the link is open: what was ordered meanwhile goes out first.
 """
 
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from collections.abc import Callable
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link.connection import (
-    Connection,
-    open_connection,
-    send_at_once,
-    send_packets,
-)
+from perchctl.link.connection import Connection, open_connection, send_packets
 from perchctl.link.encode import (
     ARM,
     UNLOCK_PERIOD_S,
@@ -32,29 +28,29 @@ from perchctl.link.log_blocks import LogBlocks
 from perchctl.link.outside import Feed, Settling, parameters_of
 from perchctl.link.prepare import check_firmware, set_parameters
 from perchctl.link.protocol import Guard, ToldSent, tell_nobody
-from perchctl.link.sender import Sender
+from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.uri import check_uri
 from perchctl.link.variables import measured_by
 from perchctl.mission.sent import Sent
 from perchctl.profile import LinkConfig
 from perchctl.profile.positioning import PositioningConfig
+from perchctl.sim.crtp.codec import Packet
 from perchctl.vehicle import (
     ARMED,
     FLYING,
     Command,
-    EmergencyStop,
     ExternalPosition,
     Idle,
-    Land,
     MeasuredBy,
     RawThrust,
     Telemetry,
 )
 
 SILENCE_S = 1.5
-SENDER_STUCK_S = 0.5
 DRAIN_S = 1.0
 LANDING_WAIT_S = 6.0
+UNHEARD_S = 0.5
+"""What went out so long before the vehicle was last heard is taken for lost with the link."""
 FAREWELL = RawThrust(0)
 """What cflib's `close_link` sends."""
 
@@ -85,7 +81,7 @@ class CflibLink:
         self._sender: Sender | None = None
         self._guard: Guard | None = None
         self._told: ToldSent = tell_nobody
-        self._reopener: threading.Thread | None = None
+        self._lost_since_s: float | None = None  # last heard, while the link is lost
         self.connection: Connection | None = None
 
     def connect(self) -> None:
@@ -108,11 +104,8 @@ class CflibLink:
             self._sender.put(command)
 
     def external(self, place: ExternalPosition) -> bool:
-        connection = self.connection
-        if connection is None or connection.lost is not None:
-            return False
         try:
-            return send_at_once(connection.cf, encode_external(place))
+            return self.connection is not None and self.connection.send(encode_external(place))
         except Exception:  # the library's; commands report their own
             return False
 
@@ -136,10 +129,12 @@ class CflibLink:
         if self.connection is not None and self.connection.lost is not None:
             return self.connection.lost
         sender = self._sender
-        if sender is not None and sender.problem is not None:
-            return sender.problem
-        if sender is not None and sender.stuck_s() > SENDER_STUCK_S:
-            return f"cflib has held a command for {sender.stuck_s():.1f} s"
+        if sender is not None:
+            sender.look_after()
+            if sender.problem is not None:
+                return sender.problem
+            if (stuck_s := sender.stuck_s()) > HANGS_S:
+                return f"no command has gone out for {stuck_s:.1f} s"
         silent_s = now_s - self._blocks.last_arrival_s
         if silent_s > SILENCE_S:
             return f"nothing heard for {silent_s:.1f} s"
@@ -175,7 +170,13 @@ class CflibLink:
             needed_by="positioning from outside",
         )
         self._sender = Sender(
-            self._hand_over, self._ask_guard, self._clock, lambda sent: self._told(sent)
+            self._hand_over,
+            self._ask_guard,
+            self._clock,
+            lambda sent: self._told(sent),
+            pieces=encode,
+            tend=self._tend,
+            spare=self._resume_logging,
         )
 
     def _start_logging(self, connection: Connection) -> None:
@@ -202,38 +203,41 @@ class CflibLink:
             time.sleep(UNLOCK_PERIOD_S)
 
     def _ask_guard(self) -> Command | None:
-        """In the sender's thread."""
+        """In the thread of the sender's that never touches cflib."""
         if self._guard is None:
             return None
         return self._guard.poll(self._clock(), self._blocks.newest)
 
-    def _hand_over(self, command: Command) -> None:
+    def _hand_over(self, packet: Packet) -> bool:
         """In the sender's thread."""
-        connection = self.connection
-        if connection is None:
+        return self.connection is not None and self.connection.send(packet)
+
+    def _resume_logging(self) -> bool:
+        """In the sender's thread."""
+        return self._blocks.resume(self._hand_over)
+
+    def _tend(self, stuck_s: float, hangs: bool) -> None:
+        """See to the link, in the thread of the sender's that never touches cflib."""
+        connection, sender = self.connection, self._sender
+        if connection is None or sender is None:
             return
-        if connection.lost is not None and isinstance(command, (Land, EmergencyStop)):
-            self._reopen(connection, command)
-        send_packets(connection.cf, encode(command))
-
-    def _reopen(self, connection: Connection, order: Command) -> None:
-        """Once in a flight, beside the loop and the sender: what has to come down is worth one
-        more try. The order goes out again as soon as there is a link."""
-        if self._reopener is not None:
+        if connection.lost is not None:
+            if self._lost_since_s is None:
+                self._lost_since_s = self._blocks.last_arrival_s
+            connection.reopen()
             return
-
-        def run() -> None:
-            if connection.reopen() and self._sender is not None:
-                self._sender.put(order, "reconnect")
-
-        self._reopener = threading.Thread(target=run, name="perchctl-reconnect", daemon=True)
-        self._reopener.start()
+        if self._lost_since_s is not None:
+            sender.again(self._lost_since_s - UNHEARD_S)
+            self._lost_since_s = None
+        if hangs:
+            connection.reopen(f"cflib has held a packet for more than {HANGS_S:g} s")
+        elif stuck_s > HANGS_S and connection.is_dead():
+            connection.reopen(f"the radio has taken nothing for {stuck_s:.1f} s, nor lost anything")
 
     def _may_hear_more(self) -> bool:
-        connection, reopener = self.connection, self._reopener
-        if connection is None:
-            return False
-        return connection.lost is None or (reopener is not None and reopener.is_alive())
+        """A link that is lost is being opened again as long as there is a sender."""
+        connection = self.connection
+        return connection is not None and (connection.lost is None or self._sender is not None)
 
     def _may_say_farewell(self) -> bool:
         """Only where a zero setpoint neither drops nor locks the vehicle, by fresh telemetry."""

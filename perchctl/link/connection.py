@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 from perchctl.errors import ConnectionFailed
@@ -21,10 +22,18 @@ from perchctl.sim.crtp.codec import Packet
 CONNECT_TRIES = 2
 CLOSE_TIMEOUT_S = 3.0
 RADIO_RETRIES = 100_000
-"""Lost packets in a row after which cflib gives a radio up. Its own 100 are over in about
-0.2 s, and then nothing can be ordered any more; the age of the telemetry ends a flight long
-before these."""
-REOPEN_TIMEOUT_S, REOPEN_PAUSE_S = 3.0, 0.2
+"""Lost packets in a row after which cflib gives a radio up: about 200 s, cflib's own 100 are 0.2 s.
+
+More than any flight outlives without its radio, because waiting is the better way back. A driver
+that goes on repeating is heard with the first packet that the vehicle answers. One that has given
+up has to be opened again: the dongle is reset, and safelink agreed upon anew. Nothing hangs by
+the waiting: what finds no room is not handed over (`Connection.send`), and the age of the
+telemetry ends the flight long before."""
+REOPEN_PAUSE_S = 0.05
+SAFELINK_S = 0.15
+"""The driver's ten attempts at a safelink take 20 to 50 ms."""
+DEAD_S = 0.5
+"""For so long a dongle may answer nothing, not even that a packet was lost: that takes it 2 ms."""
 
 
 class Connection:
@@ -45,65 +54,108 @@ class Connection:
         self.cf: Any = Crazyflie(rw_cache=str(cache))
         self.lost: str | None = None
         self.claimed: Claim | None = None
-        self._left = False
         self._settled = threading.Event()  # connected, or failed
+        self._change = threading.Lock()  # of what follows; cflib is never called with it
+        self._left = False
+        self._number = 0  # of the present driver; what earlier ones report counts no more
+        self._closer: threading.Thread | None = None
+        self._opener: threading.Thread | None = None
+        self._has_safelink = False
+        self._refused_since_s: float | None = None  # by the lock
+        self._asked_s = self._counted_s = 0.0  # `is_dead`, and since when it finds the same
+        self._counted: object = None
+        self._keep_cflib_from_hanging()
         self.cf.fully_connected.add_callback(lambda _uri: self._settled.set())
-        self.cf.connection_failed.add_callback(self._on_lost)
-        self.cf.connection_lost.add_callback(self._on_lost)
+        self.cf.connection_failed.add_callback(self._on_failed)
+        self.cf.connection_lost.add_callback(self._on_failed)
 
     def open(self, uri: str, timeout_s: float) -> bool:
         """Whether the vehicle is fully connected, or refused (`lost`), within `timeout_s`."""
         # Opening a radio may block in its driver: it gets a thread and a bound.
-        opener = threading.Thread(target=self.cf.open_link, args=(uri,), daemon=True)
-        opener.start()
-        return self._settled.wait(timeout_s)
+        _begin("perchctl-open", lambda: self.cf.open_link(uri))
+        if not self._settled.wait(timeout_s):
+            return False
+        self._has_safelink = not getattr(self.cf.link, "needs_resending", True)
+        return True
 
-    def reopen(self) -> bool:
-        """A new driver under the same tables and log blocks, after the link was lost in
-        flight; whether one could be opened. Blocks for `REOPEN_TIMEOUT_S` at most.
+    def send(self, packet: Packet) -> bool:
+        """Send it now, or not at all: whether the driver has taken it.
+
+        Nothing waits here for cflib's lock, or for the one place in its radio's queue. In
+        cflib's own `send_packet` it would: for 2 s, with the lock held, and then the driver
+        reports its end from inside the call. What the radio has taken it repeats until it is
+        acknowledged, and cannot be called back.
+        """
+        if self.lost is not None:
+            return False
+        outgoing = _as_cflib(packet)
+        lock = self.cf._send_lock
+        if not lock.acquire(blocking=False):
+            if self._refused_since_s is None:
+                self._refused_since_s = time.monotonic()
+            return False
+        try:
+            self._refused_since_s = None
+            driver = self.cf.link
+            if driver is None or isinstance(driver, _Nowhere):
+                return False
+            queue = getattr(driver, "out_queue", None)
+            if queue is not None and queue.full():
+                return False
+            driver.send_packet(outgoing)
+            self.cf.packet_sent.call(outgoing)
+            return True
+        finally:
+            lock.release()
+
+    def is_dead(self) -> bool:
+        """Whether a driver that takes nothing will not take anything any more. Asked again and
+        again while it takes nothing, and only then: it has to be seen for `DEAD_S`.
+
+        A radio that is only out of reach counts the packets it has lost, and goes on by itself. One
+        whose dongle was pulled out counts nothing (cflib repeats that for ever, too).
+        """
+        now_s, asked_s = time.monotonic(), self._asked_s
+        self._asked_s = now_s
+        if self._refused_since_s is not None and now_s - self._refused_since_s > DEAD_S:
+            return True
+        thread = getattr(self.cf.link, "_thread", None)
+        left = getattr(thread, "_retry_before_disconnect", None)
+        if self._counted != (thread, left) or now_s - asked_s > DEAD_S:
+            self._counted, self._counted_s = (thread, left), now_s
+        if thread is None:
+            return False
+        return not thread.is_alive() or (left is not None and now_s - self._counted_s > DEAD_S)
+
+    def reopen(self, cause: str | None = None) -> None:
+        """Open new drivers until one answers, in the place of one that has ended, or that is
+        given up now for this cause. Returns at once; until then the link is `lost`.
 
         cflib's own `open_link` would reset the vehicle's log blocks and read every table and
-        parameter before it is connected; the driver alone is up in milliseconds, and the
-        blocks, which know nothing of it, go on arriving.
+        parameter before it is connected; the driver alone is up in milliseconds.
         """
-        import cflib.crtp
-
-        opened = threading.Event()
-
-        def run() -> None:
-            end_s = time.monotonic() + REOPEN_TIMEOUT_S
-            while time.monotonic() < end_s and not self._left:
-                try:
-                    driver = cflib.crtp.get_link_driver(
-                        self.cf.link_uri,
-                        self.cf.link_statistics.radio_link_statistics_callback,
-                        self._on_reopened_lost,
-                    )
-                except Exception:  # whatever the driver raises: not there, not yet
-                    time.sleep(REOPEN_PAUSE_S)
-                    continue
-                if driver is None or self._left:
-                    if driver is not None:
-                        driver.close()
-                    return
-                self.cf.link, self.lost = driver, None
-                opened.set()
+        with self._change:
+            if self._left or (self._opener is not None and self._opener.is_alive()):
                 return
-
-        threading.Thread(target=run, name="perchctl-reopen", daemon=True).start()
-        return opened.wait(REOPEN_TIMEOUT_S)
+            if self.lost is None:
+                if cause is None:
+                    return
+                self._give_up(cause)
+            self._opener = _begin("perchctl-reconnect", self._open_again)
 
     def close(self) -> None:
         """Close with cflib's farewell, a zero setpoint: only when nothing flies."""
-        self._left = True
+        with self._change:
+            self._left = True
         _run_bounded([self.cf.close_link])
         self._release()
 
     def abandon(self) -> None:
         """Release the driver and clean up, sending nothing more."""
-        self._left = True
-        # Without its driver, close_link has nowhere to send the zero setpoint.
-        driver, self.cf.link = self.cf.link, None
+        with self._change:
+            self._left = True
+            # Without its driver, close_link has nowhere to send the zero setpoint.
+            driver, self.cf.link = self.cf.link, None
         _run_bounded([self.cf.close_link] if driver is None else [driver.close, self.cf.close_link])
         self._release()
 
@@ -111,15 +163,97 @@ class Connection:
         if self.claimed is not None:
             self.claimed.release()
 
-    def _on_reopened_lost(self, message: str) -> None:
-        driver, self.cf.link = self.cf.link, None
-        if driver is not None:
-            driver.close()
-        self.lost = plain_cause(message)
+    def _keep_cflib_from_hanging(self) -> None:
+        """A driver reports its end from inside `send_packet`, where the caller holds cflib's
+        lock, or from its own thread. cflib's handler closes the link there, and joins the thread
+        of its pings, which waits for that lock: then nothing can be sent ever again. So nothing is
+        joined there, and nobody pings (the radio's own null packets keep the link)."""
+        self.cf._link_error_cb = partial(self._on_error, self._number)
+        if not hasattr(self.cf, "_send_lock"):  # another cflib's
+            self.cf._send_lock = threading.Lock()
+        with contextlib.suppress(AttributeError):  # another cflib's
+            self.cf.link_statistics.latency.start = _do_nothing
 
-    def _on_lost(self, _uri: str, message: str) -> None:
+    def _on_error(self, number: int, message: str) -> None:
+        """In any thread, and in the middle of anything: takes note, no more."""
+        with self._change:
+            if number == self._number and not self._left:
+                self._give_up(plain_cause(message))
+        self._settled.set()
+
+    def _on_failed(self, _uri: str, message: str) -> None:
         self.lost = plain_cause(message)
         self._settled.set()
+
+    def _give_up(self, cause: str) -> None:
+        """With `_change` held."""
+        self._number += 1
+        self.lost = cause
+        driver, self.cf.link = self.cf.link, _Nowhere()
+        if driver is not None:
+            self._closer = _begin("perchctl-close", driver.close)
+
+    def _open_again(self) -> None:
+        if self._closer is not None:
+            self._closer.join(CLOSE_TIMEOUT_S)  # two drivers would share one dongle
+        while not self._left and not self._is_open_again():
+            time.sleep(REOPEN_PAUSE_S)
+
+    def _is_open_again(self) -> bool:
+        """One attempt."""
+        import cflib.crtp
+
+        with self._change:
+            self._number += 1
+            number = self._number
+        _forget_dead_dongle(self.cf.link_uri)
+        try:
+            driver = cflib.crtp.get_link_driver(
+                self.cf.link_uri,
+                self.cf.link_statistics.radio_link_statistics_callback,
+                partial(self._on_error, number),
+            )
+        except Exception:  # whatever the driver raises: not there, not yet
+            return False
+        if driver is None:
+            return False
+        if self._agrees_on_safelink(driver):
+            with self._change:
+                if number == self._number and not self._left:
+                    # Whoever hung in the old driver may hold the old lock for ever.
+                    self.cf._send_lock = threading.Lock()
+                    self._refused_since_s = None
+                    self.cf.link, self.lost = driver, None
+                    return True
+        _run_bounded([driver.close])
+        return False
+
+    def _agrees_on_safelink(self, driver: Any) -> bool:
+        """A vehicle that was spoken to by safelink hears one packet of a driver without it, and
+        then none (docs/firmware.md, "Safelink"). A radio that opens while the vehicle is out of
+        reach is such a driver, for as long as it lives."""
+        end_s = time.monotonic() + SAFELINK_S
+        while self._has_safelink and getattr(driver, "needs_resending", False):
+            if self._left or time.monotonic() >= end_s:
+                return False
+            time.sleep(0.01)
+        return True
+
+
+class _Nowhere:
+    """In the place of cflib's driver while there is none. By itself cflib looks only once a second
+    whether there is one again, and telemetry would wait for that."""
+
+    needs_resending = False
+
+    def send_packet(self, packet: object) -> None:
+        return None
+
+    def receive_packet(self, wait_s: float = 0.0) -> None:
+        time.sleep(min(max(wait_s, 0.0), 0.02))
+
+    def close(self) -> None:
+        return None
 
 
 def open_connection(uri: str, timeout_s: float) -> Connection:
@@ -177,31 +311,6 @@ def send_packets(cf: Any, packets: Iterable[Packet]) -> None:
         cf.send_packet(_as_cflib(packet))
 
 
-def send_at_once(cf: Any, packet: Packet) -> bool:
-    """Send it now, or not at all: whether it went out.
-
-    What is true only now must not wait behind another packet, in cflib's lock or in the one
-    place of its radio's queue, and go out later: the newer one is sent instead. What the radio
-    has already taken, and repeats until it is acknowledged, cannot be called back.
-    """
-    outgoing = _as_cflib(packet)
-    lock = cf._send_lock
-    if not lock.acquire(blocking=False):
-        return False
-    try:
-        driver = cf.link
-        if driver is None:
-            return False
-        waiting = getattr(driver, "out_queue", None)
-        if waiting is not None and waiting.full():
-            return False
-        driver.send_packet(outgoing)
-        cf.packet_sent.call(outgoing)
-        return True
-    finally:
-        lock.release()
-
-
 def _as_cflib(packet: Packet) -> Any:
     from cflib.crtp.crtpstack import CRTPPacket
 
@@ -242,9 +351,28 @@ def _run_bounded(calls: Iterable[Callable[[], None]]) -> None:
         for call in calls:
             call()
 
-    closer = threading.Thread(target=run, daemon=True)
-    closer.start()
-    closer.join(CLOSE_TIMEOUT_S)
+    _begin("perchctl-close", run).join(CLOSE_TIMEOUT_S)
+
+
+def _begin(name: str, call: Callable[[], object]) -> threading.Thread:
+    """A thread for what may block in a driver."""
+    thread = threading.Thread(target=call, name=name, daemon=True)
+    thread.start()
+    return thread
+
+
+def _do_nothing() -> None:
+    return None
+
+
+def _forget_dead_dongle(uri: str) -> None:
+    """cflib keeps a dongle's thread for good, also one that the dongle's end has ended."""
+    with contextlib.suppress(Exception):  # a URI without a dongle, another cflib
+        from cflib.crtp.radiodriver import RadioDriver, RadioManager
+
+        number = RadioDriver.parse_uri(uri)[0]
+        if not RadioManager._radios[number].is_alive():
+            RadioManager.remove(number)
 
 
 def _keep_radio_patient() -> None:

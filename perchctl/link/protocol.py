@@ -22,8 +22,8 @@ class Guard(Protocol):
     def poll(self, now_s: float, newest: Telemetry | None) -> Command | None:
         """What the link has to send now of itself, None almost always.
 
-        Called about every 50 ms, in the link's own thread where it has one; `newest` is the
-        newest telemetry that has arrived."""
+        Called about every 50 ms, in a thread of the link's own where it has one, but not while a
+        command waits that cannot go out; `newest` is the newest telemetry that has arrived."""
 
 
 class Link(Protocol):

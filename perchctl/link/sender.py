@@ -1,8 +1,13 @@
-"""A thread that hands commands to a blocking library, so the flight loop never blocks.
+"""Hands commands to a library that may block, fail or hang, so that the flight loop never does.
 
-Setpoints coalesce (only the newest counts), and one that has waited too long is dropped;
-orders keep their place. `stuck_s` is the heartbeat: for how long the present hand-over has
-been hanging. In between the thread asks its `guard` what has to be sent while the loop hangs.
+Two threads. The first hands the commands over, in pieces (a landing is four packets), and may
+hang in the library with one. The second never touches the library: it asks the `guard` what has
+to be sent while the loop hangs, and gives the work to a new first thread where the old one hangs
+or has ended.
+
+Setpoints coalesce (only the newest counts), and one that has waited too long is dropped. Orders
+keep their place until the library has taken them, however long that takes; an emergency stop
+takes everybody's place.
 """
 
 from __future__ import annotations
@@ -10,61 +15,134 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
 
 from perchctl.link.protocol import ToldSent, tell_nobody
 from perchctl.mission.sent import Sent, SentBy
-from perchctl.vehicle import Command, PositionSetpoint, RawThrust
+from perchctl.vehicle import Command, EmergencyStop, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
 STALE_S = 0.25
 """A setpoint that has waited longer, behind a command that hung, is for another moment."""
 GUARD_PERIOD_S = 0.05
+HANGS_S = 0.5
+"""For so long the library may hold one piece: by then the vehicle levels out by itself
+(docs/firmware.md, "Silence")."""
+RETRY_S = 0.002
+"""Until a piece that found no room is offered again: about what one packet takes by radio."""
+
+
+@dataclass(eq=False)
+class _Waiting:
+    """A command from `put` until the library has all of it. `rest` is None until the first
+    attempt, then the pieces that are still to be handed over; `begun` once one has been."""
+
+    put_s: float
+    command: Command
+    by: SentBy | None
+    rest: deque[Any] | None = None
+    begun: bool = False
+
+
+def _whole(command: Command) -> Sequence[Any]:
+    return (command,)
 
 
 class Sender:
-    """`guard` gives the command to send of itself, None almost always; asked in the thread,
-    every `GUARD_PERIOD_S` and after each command. `told` is given what the loop did not put in,
-    once it is handed over."""
+    """Runs from its creation to `stop`.
+
+    `hand_over` gives one piece to the library and returns False where there was no room for it:
+    it is then offered again. `guard` returns the command to send of itself, None almost always.
+    It is asked every `GUARD_PERIOD_S`, but not while something waits that cannot go out: a
+    guard counts its orders. `told` is given what the loop did not put in, once it is handed over.
+
+    `pieces` divides a command. `tend` is called as often as the guard is, by the same thread,
+    with `stuck_s` and whether the library is to blame for it: it has held one piece, or raised
+    errors, for longer than `HANGS_S`. It has to see to the link, and must not block. `spare` is
+    called by the first thread when no command waits; it may hand over something of its own, and
+    returns whether it did.
+
+    `problem` is what went wrong for good, in one sentence, else None.
+    """
 
     def __init__(
         self,
-        hand_over: Callable[[Command], None],
+        hand_over: Callable[[Any], bool | None],
         guard: Callable[[], Command | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         told: ToldSent = tell_nobody,
+        *,
+        pieces: Callable[[Command], Sequence[Any]] = _whole,
+        tend: Callable[[float, bool], None] = lambda stuck_s, hangs: None,
+        spare: Callable[[], bool] = lambda: False,
     ) -> None:
         self._hand_over = hand_over
         self._guard = guard
         self._clock = clock
         self._told = told
-        self._queue: deque[tuple[float, Command, SentBy | None]] = deque()
+        self._pieces = pieces
+        self._tend = tend
+        self._spare = spare
+        self._queue: deque[_Waiting] = deque()
         self._ready = threading.Condition()
-        self._busy_since_s: float | None = None
+        self._waiting_since_s: float | None = None  # for the library to take the next piece
+        self._called_s: float | None = None  # when the library was called, until it returns
+        self._held_since_s: float | None = None  # the call that was too long at the last look
+        self._raised = False  # by the library, at the last attempt
+        self._last: tuple[float, Command] | None = None
         self._running = True
         self.problem: str | None = None
-        self._thread = threading.Thread(target=self._run, name="perchctl-sender", daemon=True)
-        self._thread.start()
+        with self._ready:
+            self._start_worker()
+            self._start_keeper()
 
     def put(self, command: Command, by: SentBy | None = None) -> None:
         """`by`: who sends it in the loop's place."""
         with self._ready:
-            if self._queue and isinstance(self._queue[-1][1], _STREAMED):
+            if isinstance(command, EmergencyStop):
+                self._queue.clear()  # nothing that was ordered before it matters any more
+            elif self._queue and self._is_replaced(self._queue[-1], command):
                 self._queue.pop()
-            self._queue.append((self._clock(), command, by))
-            self._ready.notify()
+            self._queue.append(_Waiting(self._clock(), command, by))
+            if self._waiting_since_s is None:
+                self._waiting_since_s = self._clock()
+            self._ready.notify_all()
+        self.look_after()
+
+    def again(self, since_s: float) -> None:
+        """Put the last command once more if it was an order, handed over since then: it may
+        have been lost together with the link."""
+        with self._ready:
+            if self._last is None:
+                return
+            handed_s, command = self._last
+            overtaken = any(not isinstance(w.command, _STREAMED) for w in self._queue)
+        if handed_s >= since_s and not overtaken and not isinstance(command, _STREAMED):
+            self.put(command, "reconnect")
 
     def stuck_s(self) -> float:
-        """Seconds for which one command has been in the library's hands; 0 when idle."""
-        since = self._busy_since_s
-        return 0.0 if since is None else self._clock() - since
+        """Seconds for which the library has taken nothing of what waits; 0 when nothing does."""
+        since_s = self._waiting_since_s
+        return 0.0 if since_s is None else self._clock() - since_s
+
+    def look_after(self) -> None:
+        """Start the second thread again where it has ended; it does the same for the first. For
+        the loop's thread."""
+        if self._keeper.is_alive():
+            return
+        with self._ready:
+            if self._running and not self._keeper.is_alive():
+                self.problem = "the thread of the watchdog had ended, and was started again"
+                self._start_keeper()
 
     def drain(self, timeout_s: float) -> bool:
         """Wait until everything is handed over; False when that takes too long."""
         end_s = time.monotonic() + timeout_s
         with self._ready:
-            while self._queue or self._busy_since_s is not None:
+            while self._queue:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0:
                     return False
@@ -75,47 +153,140 @@ class Sender:
         with self._ready:
             self._running = False
             self._ready.notify_all()
-        self._thread.join(timeout=1.0)
+        for thread in (self._worker, self._keeper):
+            thread.join(timeout=1.0)
 
-    def _run(self) -> None:
-        asked_s = self._clock()
+    # --- the first thread ------------------------------------------------------------------
+
+    def _start_worker(self) -> None:
+        self._called_s = None
+        self._worker = threading.Thread(target=self._work, name="perchctl-sender", daemon=True)
+        self._worker.start()
+
+    def _work(self) -> None:
+        pause_s = 0.0
         while True:
             with self._ready:
-                if self._running and not self._queue:
-                    self._ready.wait(GUARD_PERIOD_S)
-                if not self._running:
+                if pause_s > 0.0:
+                    self._ready.wait(pause_s)
+                if not self._is_mine():
                     return
                 waiting = self._next()
+                self._called_s = self._clock()
             try:
+                pause_s = 0.0
                 if waiting is not None:
-                    self._give(*waiting)
-                if self._clock() - asked_s >= GUARD_PERIOD_S:
-                    asked_s = self._clock()
-                    self._send_for_guard()
+                    pause_s = self._send(waiting)
+                elif not self._spare():
+                    pause_s = GUARD_PERIOD_S
+                self._raised = False
             except Exception as error:  # the library's, whatever it is: reported by `problem`
                 self.problem = f"a command could not be sent: {error}"
+                self._raised, pause_s = True, GUARD_PERIOD_S
             with self._ready:
-                self._busy_since_s = None
-                self._ready.notify_all()
+                if not self._is_mine():
+                    return
+                self._called_s = None
+                if waiting is None and self._queue:
+                    pause_s = 0.0  # something came meanwhile
 
-    def _next(self) -> tuple[Command, SentBy | None] | None:
+    def _is_mine(self) -> bool:
+        """Whether the work is still this thread's: it is not once it was found hanging."""
+        return self._running and self._worker is threading.current_thread()
+
+    def _next(self) -> _Waiting | None:
+        """What comes first; it stays where it is until the library has all of it."""
         while self._queue:
-            put_s, command, by = self._queue.popleft()
-            if isinstance(command, _STREAMED) and self._clock() - put_s > STALE_S:
-                continue
-            self._busy_since_s = self._clock()
-            return command, by
+            first = self._queue[0]
+            stale = self._clock() - first.put_s > STALE_S
+            if not (stale and isinstance(first.command, _STREAMED)):
+                return first
+            self._queue.popleft()
+        self._done()
         return None
 
-    def _send_for_guard(self) -> None:
+    def _send(self, waiting: _Waiting) -> float:
+        """Hand the next piece over, if there is room. Returns the seconds to pause for."""
+        at_s = self._clock()
+        if waiting.rest is None:
+            try:
+                waiting.rest = deque(self._pieces(waiting.command))
+            except Exception:
+                self._remove(waiting)  # it will never be better
+                raise
+        if waiting.rest and self._hand_over(waiting.rest[0]) is False:
+            return RETRY_S
+        with self._ready:
+            if not self._is_mine():
+                return 0.0  # the next thread has begun with the same piece
+            self._called_s = None
+            if waiting.rest:
+                waiting.rest.popleft()
+            waiting.begun = True
+            self._waiting_since_s = self._clock()
+            if waiting.rest:
+                return 0.0
+            self._last = at_s, waiting.command
+            self._remove(waiting)
+        if waiting.by is not None:
+            with suppress(Exception):  # whatever looks on: the next one goes out all the same
+                self._told(Sent(at_s, waiting.by, waiting.command))
+        return 0.0
+
+    def _remove(self, waiting: _Waiting) -> None:
+        with self._ready:
+            with suppress(ValueError):  # an emergency stop has taken its place
+                self._queue.remove(waiting)
+            if not self._queue:
+                self._done()
+
+    def _done(self) -> None:
+        self._waiting_since_s = None
+        self._ready.notify_all()
+
+    def _is_replaced(self, last: _Waiting, command: Command) -> bool:
+        """A setpoint by whatever comes, an order of which nothing has gone out by its like."""
+        if isinstance(last.command, _STREAMED):
+            return True
+        return not last.begun and type(last.command) is type(command)
+
+    # --- the second thread -----------------------------------------------------------------
+
+    def _start_keeper(self) -> None:
+        self._keeper = threading.Thread(target=self._keep, name="perchctl-guard", daemon=True)
+        self._keeper.start()
+
+    def _keep(self) -> None:
+        while True:
+            with self._ready:
+                self._ready.wait_for(lambda: not self._running, GUARD_PERIOD_S)
+                if not self._running:
+                    return
+            for part in (self._look_after_worker, self._ask_guard):
+                try:
+                    part()
+                except Exception as error:  # the other part goes on
+                    self.problem = f"the link is not looked after: {error}"
+
+    def _look_after_worker(self) -> None:
+        called_s, stuck_s = self._called_s, self.stuck_s()
+        too_long = called_s is not None and self._clock() - called_s > HANGS_S
+        # At two looks: after a suspension of the computer the first finds every call too long.
+        hangs = too_long and called_s == self._held_since_s
+        self._held_since_s = called_s if too_long else None
+        try:
+            self._tend(stuck_s, hangs or (self._raised and stuck_s > HANGS_S))
+        finally:
+            with self._ready:
+                if self._running and not self._worker.is_alive():
+                    self.problem = "the thread that sends had ended, and was started again"
+                    self._start_worker()
+                elif self._running and hangs and self._called_s == called_s:
+                    self._start_worker()
+
+    def _ask_guard(self) -> None:
+        if self.stuck_s() > GUARD_PERIOD_S:
+            return
         command = self._guard()
         if command is not None:
-            self._busy_since_s = self._clock()
-            self._give(command, "watchdog")
-
-    def _give(self, command: Command, by: SentBy | None) -> None:
-        at_s = self._clock()
-        self._hand_over(command)
-        if by is not None:
-            with suppress(Exception):  # whatever looks on: the next command goes out all the same
-                self._told(Sent(at_s, by, command))
+            self.put(command, "watchdog")

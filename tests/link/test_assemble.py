@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.link.assemble import BLOCKS, MOST_CARRIED_S, Assembler
-from perchctl.mission.conditions import PROOFS, conditions_since
+from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
 from perchctl.mission.context import Context
-from perchctl.mission.state import Observation, Phase, PlannerState
+from perchctl.mission.state import Condition, Observation, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 
@@ -47,8 +47,15 @@ HANGING = PlannerState(
 
 
 @pytest.mark.parametrize("behind_s", [0.0, 0.15, 2.0])
-def test_a_frozen_position_proves_nothing(behind_s: float) -> None:
-    """A position block that alone stops arriving looks like a vehicle at rest."""
+def test_a_frozen_position_proves_no_place(behind_s: float) -> None:
+    """A position block that alone stops arriving looks like a vehicle at rest. What rests on
+    acceleration, thrust and the supervisor's word, which are fresh, is proven all the same."""
     obs = Observation(1.0, replace(HANGS, behind_s=behind_s))
     proven = PROOFS & conditions_since(Context(HANGING, obs, Profile())).keys()
-    assert bool(proven) == (behind_s == 0.0)
+    assert not (proven & BY_PLACE and behind_s > 0.0)
+    assert Condition.WEIGHT_HANGS in proven
+    old = replace(HANGS, t_s=1.0 - 0.15)
+    assert (
+        not PROOFS
+        & conditions_since(Context(HANGING, replace(obs, telemetry=old), Profile())).keys()
+    )

@@ -1,10 +1,9 @@
-"""The link's small parts: signs, time, the sender, URIs."""
+"""The link's small parts: signs, time, URIs."""
 
 from __future__ import annotations
 
 import math
 import re
-import threading
 
 import pytest
 from hypothesis import given
@@ -12,7 +11,6 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
 from perchctl.link import scan as scan_room
-from perchctl.link.sender import STALE_S, Sender
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
     BATTERY_BLOCK,
@@ -22,9 +20,8 @@ from perchctl.link.telemetry import (
 )
 from perchctl.link.timebase import WRAP_MS, Timebase
 from perchctl.link.uri import UDEV_HELP, check_uri
-from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, StopMotors
 
-SIZES = {"float": 4, "uint16_t": 2, "int8_t": 1}
+SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
 
 
 @pytest.mark.parametrize("block", [STATE_BLOCK, ATTITUDE_BLOCK, BATTERY_BLOCK])
@@ -68,44 +65,13 @@ def test_timebase_follows_stamps_not_arrivals(start_ms: int, delays_ms: list[int
         assert times[i] == pytest.approx(100.0 + 0.01 * i + best_s, abs=2e-4)
 
 
-def test_sender_keeps_orders_and_only_the_newest_setpoint() -> None:
-    gate, begun = threading.Event(), threading.Event()
-    sent: list[Command] = []
-
-    def hand_over(command: Command) -> None:
-        begun.set()
-        gate.wait(5.0)
-        sent.append(command)
-
-    sender = Sender(hand_over)
-    points = [PositionSetpoint(float(i), 0.0, 1.0, 0.0) for i in range(4)]
-    sender.put(points[0])
-    assert begun.wait(5.0)
-    sender.put(points[1])
-    sender.put(points[2])
-    sender.put(StopMotors())
-    sender.put(points[3])
-    assert sender.stuck_s() > 0
-    gate.set()
-    assert sender.drain(5.0)
-    sender.stop()
-    assert sent == [points[0], points[2], StopMotors(), points[3]] or sent == [
-        points[0],
-        StopMotors(),
-        points[3],
-    ]
-
-
-def test_sender_reports_what_the_library_raised() -> None:
-    def hand_over(command: Command) -> None:
-        raise RuntimeError("no radio")
-
-    sender = Sender(hand_over)
-    sender.put(StopMotors())
-    assert sender.drain(5.0)
-    sender.stop()
-    assert sender.problem is not None
-    assert "no radio" in sender.problem
+def test_a_vehicle_that_has_started_again_is_followed_from_its_first_stamp_on() -> None:
+    """Packets that overtake each other are no new start."""
+    base = Timebase()
+    assert base.to_loop_s(60_000, 100.0) == pytest.approx(100.0)
+    assert base.to_loop_s(59_990, 100.0) == pytest.approx(99.99)
+    assert base.to_loop_s(300, 103.0) == pytest.approx(103.0)
+    assert base.to_loop_s(310, 103.02) == pytest.approx(103.01)
 
 
 @pytest.mark.parametrize(
@@ -170,40 +136,3 @@ def test_udev_lines_name_all_three_devices() -> None:
     """Conventions: radio, bootloader, Crazyflie over USB."""
     for ids in (("1915", "7777"), ("1915", "0101"), ("0483", "5740")):
         assert any(all(i in line for i in ids) for line in UDEV_HELP.splitlines())
-
-
-def test_a_setpoint_that_waited_behind_a_hang_is_dropped_an_order_is_not() -> None:
-    gate, begun = threading.Event(), threading.Event()
-    sent: list[Command] = []
-    now_s = [10.0]
-
-    def hand_over(command: Command) -> None:
-        begun.set()
-        gate.wait(5.0)
-        sent.append(command)
-
-    sender = Sender(hand_over, clock=lambda: now_s[0])
-    sender.put(StopMotors())
-    assert begun.wait(5.0)
-    sender.put(Land(-0.05, 2.0))
-    sender.put(PositionSetpoint(0.0, 0.0, 1.0, 0.0))
-    now_s[0] += STALE_S + 0.01
-    gate.set()
-    assert sender.drain(5.0)
-    sender.stop()
-    assert sent == [StopMotors(), Land(-0.05, 2.0)]
-
-
-def test_the_senders_thread_asks_its_guard_by_itself() -> None:
-    sent: list[Command] = []
-    stopped = threading.Event()
-
-    def hand_over(command: Command) -> None:
-        sent.append(command)
-        if len(sent) == 3:
-            stopped.set()
-
-    sender = Sender(hand_over, guard=EmergencyStop)
-    assert stopped.wait(5.0)
-    sender.stop()
-    assert set(sent) == {EmergencyStop()}

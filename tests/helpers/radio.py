@@ -1,0 +1,182 @@
+"""A Crazyradio and the vehicle in its air, under cflib's own radio driver.
+
+Everything above the USB cable is the installed cflib: the driver with its thread, its queue of
+one packet, its 2 s of waiting for a place there and its calls of the error callback. Below it the
+dongle carries each packet to a `CrtpServer`, and falls silent, is pulled out or comes back on a
+word of the test. The vehicle's radio answers as docs/firmware.md has it ("Safelink", "Radio
+silence").
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import cflib.crtp
+import pytest
+from cflib.crtp import radiodriver
+from cflib.crtp.crtpdriver import CRTPDriver
+from cflib.crtp.exceptions import WrongUriType
+from cflib.drivers.crazyradio import Crazyradio, _radio_ack
+
+from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.sim.crtp.server import CrtpServer
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.vehicle import SimulatedVehicle
+
+URI = "radio://0/80/2M/E7E7E7E7E7"
+FORGETS_LOGS_S = 1.0
+"""docs/firmware.md, "Radio silence"."""
+_ANSWERED_S, _UNANSWERED_S = 0.0005, 0.002  # of a packet; unanswered it is repeated three times
+_NULL, _SAFELINK = 0xF3, 0x05
+_LOG_SETTINGS, _LOG_RESET = 1, bytes((5,))
+
+
+class Air:
+    """The vehicle at the other end, in real time.
+
+    `heard` are the packets that reached it and when, `opened` is how often a dongle was.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.heard: list[tuple[float, Packet]] = []
+        self.opened = 0
+        self.silent = threading.Event()
+        self.unplugged = threading.Event()
+        self._changed = threading.Condition()
+        self._began_s = self._heard_s = time.monotonic()
+        self._vehicle = SimulatedVehicle(scenario)
+        self._server = CrtpServer(self._vehicle.firmware)
+        self._safelink, self._up, self._down = False, 1, 1
+        self._waiting: deque[bytes] = deque()
+        self._last = b""
+
+    def hears(self, what: Callable[[Packet], bool], since_s: float, limit_s: float) -> float | None:
+        """When the first such packet since then reached the vehicle; None where none does."""
+
+        def first() -> float | None:
+            return next((t_s for t_s, p in self.heard if t_s >= since_s and what(p)), None)
+
+        with self._changed:
+            self._changed.wait_for(lambda: first() is not None, limit_s)
+            return first()
+
+    def exchange(self, data: bytes) -> bytes | None:
+        """The acknowledgement of one packet of the dongle's; None without one."""
+        now_s = time.monotonic()
+        with self._changed:
+            self._vehicle.advance_to(now_s - self._began_s)
+            if self.silent.is_set():
+                return None
+            if now_s - self._heard_s > FORGETS_LOGS_S:
+                self._server.handle(Packet(Port.LOG, _LOG_SETTINGS, _LOG_RESET))
+                self._waiting.clear()
+            self._heard_s = now_s
+            self._waiting.extend(packet.encode() for packet in self._server.due())
+            return self._acknowledge(data)
+
+    def _acknowledge(self, data: bytes) -> bytes:
+        head = data[0]
+        if len(data) == 3 and head & _NULL == _NULL and data[1] == _SAFELINK:
+            self._safelink, self._up, self._down = bool(data[2]), 1, 1
+            self._last = data
+            return data
+        if not self._safelink or head & 0x08 != self._up << 3:
+            self._up = 1 - self._up
+            self._take(data)
+        if not self._safelink or head & 0x04 != self._down << 2:
+            self._down = 1 - self._down
+            self._last = self._waiting.popleft() if self._waiting else bytes((_NULL,))
+            if self._safelink:
+                self._last = bytes((self._last[0] & _NULL | self._down << 2,)) + self._last[1:]
+        return self._last
+
+    def _take(self, data: bytes) -> None:
+        packet = Packet.decode(data)
+        if packet is None or data[0] & _NULL == _NULL:
+            return
+        self.heard.append((self._heard_s, packet))
+        self._waiting.extend(answer.encode() for answer in self._server.handle(packet))
+        self._changed.notify_all()
+
+
+class Dongle(Crazyradio):  # type: ignore[misc]
+    """cflib's Crazyradio without its USB."""
+
+    def __init__(self, air: Air) -> None:
+        if air.unplugged.is_set():
+            raise Exception("Cannot find a Crazyradio Dongle")
+        air.opened += 1
+        self._air, self._gone = air, False
+        self.version, self.arc = 0.53, 3
+
+    def send_packet(self, data: Any) -> Any:
+        self._gone = self._gone or self._air.unplugged.is_set()
+        if self._gone:  # a dongle that was pulled out does not come back under its old handle
+            time.sleep(_ANSWERED_S)
+            return None
+        answer, ack = self._air.exchange(bytes(data)), _radio_ack()
+        time.sleep(_UNANSWERED_S if answer is None else _ANSWERED_S)
+        if answer is not None:
+            ack.ack, ack.data = True, answer
+        return ack
+
+    def set_arc(self, arc: int) -> None:
+        self.arc = arc
+
+    def set_channel(self, channel: int) -> None:
+        self.current_channel = channel
+
+    def set_address(self, address: Any) -> None:
+        self.current_address = address
+
+    def set_data_rate(self, datarate: int) -> None:
+        self.current_datarate = datarate
+
+    def close(self) -> None:
+        self._gone = True
+
+
+class OpaqueRadio(CRTPDriver):  # type: ignore[misc]
+    """cflib's radio driver as one of another make: its queue cannot be looked at, so that whoever
+    sends may be held for 2 s, and is then called back from inside. `hold` keeps it in there for as
+    long as a test wants."""
+
+    def __init__(self) -> None:
+        self.inner = radiodriver.RadioDriver()
+        self.hold: threading.Event | None = None
+
+    @property
+    def needs_resending(self) -> bool:
+        return bool(self.inner.needs_resending)
+
+    def connect(self, uri: str, statistics: Any, error: Any) -> None:
+        if not uri.startswith("radio://"):
+            raise WrongUriType("not a radio's")
+        self.inner.connect(uri, statistics, error)
+
+    def send_packet(self, packet: Any) -> Any:
+        if self.hold is not None:
+            self.hold.wait()
+        return self.inner.send_packet(packet)
+
+    def receive_packet(self, wait: float = 0) -> Any:
+        return self.inner.receive_packet(wait)
+
+    def close(self) -> None:
+        self.inner.close()
+
+
+def plug_in(air: Air, patch: pytest.MonkeyPatch, driver: type[CRTPDriver]) -> None:
+    """From now on cflib finds this dongle, and this driver for ``radio://``."""
+
+    class Found(Dongle):
+        def __init__(self, devid: int = 0) -> None:
+            super().__init__(air)
+
+    patch.setattr(radiodriver, "Crazyradio", Found)
+    patch.setattr(radiodriver.RadioManager, "_radios", [])
+    patch.setattr(cflib.crtp, "CLASSES", [driver])
