@@ -14,7 +14,7 @@ from perchctl.errors import UsageError
 from perchctl.faults import draws
 from perchctl.faults.draws import Draw
 from perchctl.faults.effects import Effect
-from perchctl.faults.excuses import (
+from perchctl.faults.expected_outcomes import (
     CUT,
     LEFT_LANDING,
     LETS_GO_LATER,
@@ -22,7 +22,7 @@ from perchctl.faults.excuses import (
     OPERATOR_STOPS,
     SAGS_TOO_FAST,
     TOO_LOW,
-    Excuse,
+    ExpectedOutcome,
 )
 from perchctl.mission.state import Phase
 from perchctl.sim.scenario import Scenario
@@ -64,7 +64,7 @@ class Fault:
     what: str
     phases: tuple[Phase, ...]
     draw: Draw
-    excuses: tuple[Excuse, ...] = ()
+    expected_outcomes: tuple[ExpectedOutcome, ...] = ()
 
 
 FAULTS: tuple[Fault, ...] = (

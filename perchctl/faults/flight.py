@@ -11,18 +11,21 @@ import cv2
 
 from perchctl.calibration.files import camera_of
 from perchctl.errors import PerchError
+from perchctl.faults.bounds import DescentBound, PlaceBound, drifted_m
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
-from perchctl.faults.effects import Effect, ExternalPositions
+from perchctl.faults.claims import claims_of, claims_of_rescue, last_row
+from perchctl.faults.effects import Effect, ExternalPositions, Suspended
 from perchctl.faults.effects import Operator as Presses
-from perchctl.faults.excuses import LEAST_LIFT, Facts
+from perchctl.faults.expected_outcomes import unexpected
+from perchctl.faults.facts import FactsRecorder
 from perchctl.faults.inject import Disk, Edges, Injector, changed_scenario
-from perchctl.faults.oracle import Claim, Limits, Oracle
-from perchctl.faults.program import FaultyClock, ProgramKilled
+from perchctl.faults.oracle import Limits, Oracle, Sample
+from perchctl.faults.program import FaultyClock, PlantedError, ProgramKilled
 from perchctl.faults.radio import FaultyRadio
 from perchctl.faults.result import End, FaultResult
 from perchctl.faults.truth import WatchedVehicle, sample_of
-from perchctl.flight.lockstep import LockstepSource
+from perchctl.flight.lockstep import lockstep_source
 from perchctl.flight.lockstep_positions import by_mocap, feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.memory import give_back_memory, peak_memory_mb
@@ -32,31 +35,40 @@ from perchctl.link.bursty import radio_of
 from perchctl.link.mock import MockLink
 from perchctl.log.exact import to_exact
 from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.watch import FlightReport, Watcher
+from perchctl.mission.state import Phase
+from perchctl.mission.watch import Event, FlightReport, Tick, Watcher
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
+from perchctl.sim.crtp.codec import Packet, Port
 from perchctl.sim.draw import draw_capture, draw_scenario
-from perchctl.sim.powertrain import most_thrust_n
 from perchctl.sim.scenario import Scenario
-from perchctl.sim.thrust_curve import MOTOR_FORCE_N
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
+END_OF: dict[Phase, End] = {
+    Phase.PERCHED: "perched",
+    Phase.LANDED: "landed",
+    Phase.ABORTED: "aborted",
+}
 LONGEST_FLIGHT_S = 240.0
+PROBE = Packet(Port.LINK, 0, b"")
+"""A packet that orders nothing: it arrives when any would."""
 
 
 @dataclass
 class _Ended:
-    """How the program ended; `report` is None when it was killed or raised."""
+    """How the program ended; `report` is None when it was killed or raised. `crashed`: by an
+    exception that no fault planted."""
 
+    end: End
     report: FlightReport | None = None
     error: str = ""
-    gone: bool = False
-    report_s: float | None = None
+    crashed: bool = False
 
 
 class FaultyFlight:
     """One flight, assembled; `fly` once."""
+
+    problem: str | None = None
 
     def __init__(
         self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None
@@ -68,40 +80,37 @@ class FaultyFlight:
         camera = camera_of(profile.camera)
         capture = draw_capture(profile, scenario.seed)
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
-        radio = FaultyRadio(radio_of(scenario))
+        self._radio = radio = FaultyRadio(radio_of(scenario))
         radio.serves(vehicle.firmware)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
-        assert vehicle.camera is not None
-        inner = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
-        source = FaultyCamera(inner, scenario.seed)
+        source = FaultyCamera(lockstep_source(vehicle, profile), scenario.seed)
         self._clock = FaultyClock(self._link, lambda: _cut(radio), LONGEST_FLIGHT_S)
-        switch, disk = OperatorSwitch(listening=True, clock=self._clock.now), Disk()
-        edges = Edges(vehicle, radio, source, self._clock, switch.press, switch.land, disk)
+        self._switch = OperatorSwitch(listening=True, clock=self._clock.now)
+        disk = Disk()
+        edges = Edges(vehicle, radio, source, self._clock, self._press, self._switch.land, disk)
         self._injector = Injector(edges, case.effects, case.phase, case.moment_s)
         self._injector.on_begin = self._note_beginning
         self._injectors = [self._injector]
         if case.landed_from is not None:
             lands: tuple[Effect, ...] = (Presses((0.0,), hang_up=True),)
             self._injectors.append(Injector(edges, lands, case.landed_from, case.landed_after_s))
-        watchers: tuple[Watcher, ...] = (*self._injectors, disk)
+        watchers: tuple[Watcher, ...] = (*self._injectors, disk, self)
         if log is not None:
             log.truth = self._for_log
             watchers = (*watchers, log)
         pipeline = make_pipeline(profile, camera)
         seen = source if log is None else log.watched(source)
         self._parts = FlightParts(
-            self._link, seen, self._clock, profile, pipeline, watchers, switch.read,
+            self._link, seen, self._clock, profile, pipeline, watchers, self._switch.read,
             positions=feed_lockstep(self._link, profile),
             remarks=tuple if log is None else log.remarks,
         )  # fmt: skip
         safety = profile.safety
-        self._oracle = Oracle(Limits(safety.fence_radius_m, safety.max_height_m))
-        self._own_landing = False
-        self._weak_s: float | None = None
-        self._low_s: float | None = None
-        self._low_m = 0.0
-        self._hung_m: float | None = None
-        self._let_go_s: float | None = None
+        self._oracle = Oracle(Limits(safety.max_height_m, safety.max_tilt_deg))
+        self._place_bound = PlaceBound(scenario, profile)
+        self._descent_bound = DescentBound(case.effects, profile)
+        self._recorder = FactsRecorder(vehicle, profile)
+        self._touched = False  # the ceiling, since the fault began
 
     def fly(self) -> FaultResult:
         began_s = time.perf_counter()
@@ -109,11 +118,18 @@ class FaultyFlight:
         ended = self._program()
         self._vehicle.camera = None
         end_s = self._link.now_s
-        self._oracle.ended(end_s)
+        self._oracle.ended(end_s, crashed=ended.crashed, endless=self._clock.endless)
         self._vehicle.advance_to(end_s + AFTER_S)
         if self._oracle.in_the_air:
             self._vehicle.advance_to(end_s + AFTER_IN_THE_AIR_S)
         return self._result(ended, end_s, time.perf_counter() - began_s)
+
+    def tick(self, tick: Tick) -> None:
+        return None
+
+    def event(self, event: Event) -> None:
+        """What a rescue tells of the vehicle is held against the truth."""
+        self._oracle.claims(claims_of_rescue(event), event.t_s)
 
     def _program(self) -> _Ended:
         """The program's life: connect, fly, close, whatever happens."""
@@ -124,61 +140,74 @@ class FaultyFlight:
             ended = self._mission()
             self._link.close()
         except ProgramKilled:
-            return _Ended(gone=True)
+            return _Ended("gone")
         return ended
 
     def _mission(self) -> _Ended:
         try:
             report = fly(self._parts)
-        except PerchError as error:
-            return _Ended(error=str(error))
+        except PlantedError as error:
+            return _Ended("failed", error=str(error))
         except Exception as error:
-            return _Ended(error=f"unforeseen {type(error).__name__}: {error}")
+            if isinstance(error, PerchError) and self._injector.flown is None:
+                return _Ended("refused", error=str(error))
+            return _Ended("failed", error=f"{type(error).__name__}: {error}", crashed=True)
         self._vehicle.camera = None  # nobody looks any more
-        self._oracle.claims(claim_of(report), self._link.now_s)
-        return _Ended(report, report_s=self._link.now_s)
+        self._oracle.claims(claims_of(report), self._link.now_s)
+        return _Ended(END_OF[report.phase], report)
+
+    def _press(self) -> None:
+        self._oracle.pressed(self._link.now_s)
+        self._switch.press()
 
     def _each(self, t_s: float) -> None:
         for injector in self._injectors:
             injector.each(t_s)
-        sample = sample_of(self._vehicle, self._injector.drifted_m)
+        sample = self._sample(t_s)
         self._oracle.see(sample)
-        if sample.hanging:
-            self._hung_m = sample.height_m
+        self._recorder.see(sample, begun=self._injector.begin_s is not None)
         landing = self._injector.flown is Phase.LANDING
         if landing and sample.floor and not sample.motors_on:
             self._vehicle.camera = None  # most of the time would go into pictures of the wait
-        world = self._vehicle.world
-        if world.magnet.let_go and self._let_go_s is None:
-            self._let_go_s = t_s
-        if self._injector.begin_s is not None:
-            weakest = min(world.powertrain.strength or (1.0,))
-            lift_n = min(4.0 * MOTOR_FORCE_N, weakest * most_thrust_n(world.battery_rest_v))
-            weight_n = self._scenario.mass_kg * GRAVITY_MPS2
-            if self._weak_s is None and lift_n < LEAST_LIFT * weight_n:
-                self._weak_s = t_s
-            if self._low_s is None and world.battery_v < self._profile.safety.min_load_v:
-                self._low_s, self._low_m = t_s, sample.height_m
+
+    def _sample(self, t_s: float) -> Sample:
+        """The truth of the vehicle, and how it stands to where it should be."""
+        sample, world = sample_of(self._vehicle), self._vehicle.world
+        begin_s, phase = self._injector.begin_s, self._injector.flown
+        place = (sample.x_m, sample.y_m)
+        self._place_bound.target_at(world.magnet.target_xy_m)
+        self._place_bound.enter(phase, place)
+        astray_m = self._place_bound.astray_m(place)
+        if begin_s is not None:
+            astray_m -= drifted_m(self._case.effects, self._scenario, t_s - begin_s)
+            self._touched = self._touched or sample.hanging or world.contacts()[0] > 0.0
+        uplink = not self._is_suspended(t_s) and self._radio.up(PROBE, t_s)
+        overdue = self._descent_bound.is_overdue(
+            t_s, sample.height_m, touching=self._touched, uplink=uplink
+        )
+        return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink)
+
+    def _is_suspended(self, t_s: float) -> bool:
+        begin_s = self._injector.begin_s
+        return begin_s is not None and any(
+            isinstance(effect, Suspended) and begin_s <= t_s < begin_s + effect.for_s
+            for effect in self._case.effects
+        )
 
     def _note_beginning(self) -> None:
-        self._own_landing = self._vehicle.firmware.planner.active
+        self._descent_bound.begin(self._vehicle.t_s, self._injector.flown)
 
     def _result(self, ended: _Ended, end_s: float, wall_s: float) -> FaultResult:
         case, report = self._case, ended.report
         verdict = self._oracle.verdict()
-        facts = Facts(
-            effects=case.effects,
+        facts = self._recorder.facts(
+            case.effects,
             begin_s=self._injector.begin_s,
-            report_s=ended.report_s,
-            let_go_s=self._let_go_s,
-            own_landing=self._own_landing,
-            weak_s=self._weak_s,
-            low_s=self._low_s,
-            low_m=self._low_m,
-            hung_m=self._hung_m,
+            killed_s=self._clock.killed_s,
+            stop_s=self._oracle.stop_s,
         )
-        excuses = [excuse for excuse in case.fault.excuses if excuse.when(facts)]
-        excused = {flag for excuse in excuses for flag in excuse.expected}
+        listed = case.fault.expected_outcomes
+        expected = [outcome for outcome in listed if outcome.cause(facts) is not None]
         hanging = self._oracle.newest is not None and self._oracle.newest.hanging
         perched = report is not None and report.phase is Phase.PERCHED and hanging
         result = FaultResult(
@@ -188,18 +217,23 @@ class FaultyFlight:
             moment_s=case.moment_s,
             begin_s=self._injector.begin_s,
             parameters=_parameters(case),
-            end=_end_of(ended),
+            end=ended.end,
             cause="" if report is None else report.outcome.value,
             reason=ended.error if report is None else report.reason,
             flags=verdict.flags,
-            counted=tuple(flag for flag in verdict.flags if flag not in excused),
-            unavoidable="; ".join(excuse.reason for excuse in excuses) or None,
+            counted=unexpected(verdict.flags, listed, facts),
+            unavoidable="; ".join(outcome.reason for outcome in expected) or None,
             time_s=end_s,
             miss_m=self._vehicle.world.gear_miss_m() if perched else None,
             drop_m=verdict.drop_m,
             slip_ratio=verdict.slip_ratio,
             wall_s=wall_s,
             way=() if report is None else tuple(e.phase.value for e in report.history if e.phase),
+            row="" if report is None else last_row(report),
+            expected=tuple(outcome.name for outcome in expected),
+            touchdown_mps=verdict.touchdown_mps,
+            touchdown_aside_mps=verdict.touchdown_aside_mps,
+            astray_m=verdict.astray_m,
         )
         if self._log is not None:
             self._log.close(report, result.miss_m, "fell" in result.flags)
@@ -243,33 +277,11 @@ def fly_fault_seed(
     return replace(result, cpu_s=cpu_s, peak_memory_mb=peak_memory_mb(), scenario=scenario)
 
 
-def claim_of(report: FlightReport) -> Claim:
-    """What a report says about where the vehicle is."""
-    if report.phase is Phase.PERCHED:
-        return "perched"
-    if report.phase is Phase.LANDED:
-        return "landed"
-    return "cut" if report.outcome is Outcome.EMERGENCY else "none"
-
-
 def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
     if case.first_hold is not None:
         hold_n = case.first_hold * scenario.mass_kg * GRAVITY_MPS2
         scenario = replace(scenario, first_contact_force_n=hold_n)
     return changed_scenario(scenario, case.effects)
-
-
-def _end_of(ended: _Ended) -> End:
-    if ended.gone:
-        return "gone"
-    if ended.report is None:
-        return "refused"
-    match ended.report.phase:
-        case Phase.PERCHED:
-            return "perched"
-        case Phase.LANDED:
-            return "landed"
-    return "aborted"
 
 
 def _parameters(case: Case) -> dict[str, Any]:

@@ -1,48 +1,67 @@
 """Whether a simulated flight went wrong, by the truth of the world and nothing else.
 
 The oracle is given samples of the true vehicle (`Sample`) while the flight and the time
-after it pass, is told when the program ended and what it claimed, and raises flags:
+after it pass. It is told when the operator pressed Ctrl-C, when the program ended, and what it
+claimed, and raises flags, the gravest first:
 
+- *crashed*: the program ended by an exception that no fault planted;
 - *fell*: motors off, or free fall, above 0.1 m while the weight does not hang; a
-  touchdown above 0.8 m/s. A vehicle that the magnet lets go of with its motors still is
+  touchdown above 0.8 m/s downwards. A vehicle that the magnet lets go of with its motors still is
   judged by how deep it falls until it is caught (`drop_limit_m`); the floor is too deep;
+- *slid*: a touchdown above 0.5 m/s sideways;
 - *flies_on*: off the ground with turning motors 5 s after the program's end (what falls
-  with still motors has fallen);
-- *pressed*: full thrust against ceiling or floor for more than 4 s;
-- *strayed*: truly beyond fence or height limit by more than 0.3 m. What a fault adds to the
-  estimate as a slow drift is allowed on top: nothing on board can know it;
-- *lied*: the program's claim contradicts where the vehicle is;
+  with still motors has fallen), or not on its way down in time after a loss for which the
+  profile lands (`perchctl.faults.bounds.DescentBound`);
+- *endless*: the flight did not end by itself;
+- *stop_not_obeyed*: the motors turn 0.5 s after the second Ctrl-C, though all that time packets
+  passed from the program to the vehicle;
+- *pressed*: the motors press against ceiling or floor for more than 4 s;
+- *strayed*: in the air more than 1 m from where it should be (`perchctl.faults.bounds.PlaceBound`),
+  or truly above the height limit by more than 0.3 m;
+- *lied*: one of the program's claims contradicts what is true of the vehicle;
 - *locked_needlessly*: locked in the end, although it was never crashed, tumbled or tilted.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal, NamedTuple, get_args
 
-Flag = Literal["fell", "flies_on", "pressed", "strayed", "lied", "locked_needlessly"]
+from perchctl.faults.claims import Claim
+
+Flag = Literal[
+    "crashed", "fell", "slid", "flies_on", "endless", "stop_not_obeyed", "pressed", "strayed",
+    "lied", "locked_needlessly",
+]  # fmt: skip
 FLAGS: tuple[Flag, ...] = get_args(Flag)
-Claim = Literal["perched", "landed", "cut", "none"]
-"""What a program says at its end: it hangs, it stands on the floor with the motors off,
-the motors were cut in an emergency, or nothing of the kind."""
 
 LOW_M = 0.1
 """Below this height nothing falls."""
 OFF_S = 0.1
 FREE_FALL_G, FREE_FALL_S = 0.2, 0.15
-TOUCHDOWN_MPS = 0.8
+TOUCHDOWN_MPS, TOUCHDOWN_ASIDE_MPS = 0.8, 0.5
 UNPOWERED_G = 0.5
 FAST_MPS = 0.45
 """Sinking faster than any order: falling, until slower again."""
 CAUGHT_MPS, SLOW_AGAIN_S = 0.05, 0.3
 FROM_HANGING_S = 1.0
-PRESSED_S = 4.0
-BEYOND_M = 0.3
+PRESSED_S, RELEASED_S = 4.0, 0.2
+"""What bounces off the ceiling for less than `RELEASED_S` presses on."""
+ASTRAY_M, TOO_HIGH_M = 1.0, 0.3
 ALONE_S = 5.0
-TILTED_UP = math.cos(math.radians(55.0))
+TILT_WITHIN_DEG = 10.0
+"""A claim that it tilted beyond the limit is believed from so much less on: the program knows the
+tilt by an estimate."""
 CLAIM_S = 0.5
 """A claim has to become true within this time (motors are cut 25 ms after the order)."""
+STOP_S = 0.5
+"""So long after the second Ctrl-C the motors are off."""
+SECOND_AFTER_S, SILENCE_S, HAMMERED_S = 0.5, 0.3, 2.0
+"""A press is the second Ctrl-C (docs/faults.md, 16) so long after the first, and after so long
+without any: what comes faster may be one key held down, unless it goes on for so long."""
 
 
 class Sample(NamedTuple):
@@ -56,29 +75,39 @@ class Sample(NamedTuple):
     up_z: float  # of the body's z axis: 1 level, -1 upside down
     acc_g: float  # size of the specific force
     motors_on: bool
-    pressing: bool  # full thrust against something
+    pressing: bool  # the motors push against ceiling or floor
     floor: bool
     hanging: bool  # the magnet holds the gear
     hold_ratio: float  # of the magnet's hold to the weight
     locked: bool
     ended_by_vehicle: bool  # crashed or tumbled, as the supervisor saw it
-    drifted_m: float = 0.0  # how far a fault has led the estimate astray
+    aside_mps: float = 0.0  # horizontal speed
+    uplink: bool = True  # what the program sends would arrive
+    astray_m: float = 0.0  # from where it should be, less what the fault has made it drift by
+    overdue: bool = False  # it should have been on its way down for some time
 
 
 @dataclass(frozen=True)
 class Limits:
-    fence_radius_m: float
+    """Of the profile that is flown: `safety`."""
+
     max_height_m: float
+    max_tilt_deg: float = 55.0
 
 
 @dataclass(frozen=True)
 class Verdict:
     """`flags` with when each was first raised; `drop_m` the deepest fall until caught, and
-    `slip_ratio` the magnet's hold over the weight where that was a slip from the magnet."""
+    `slip_ratio` the magnet's hold over the weight where that was a slip from the magnet.
+    `touchdown_mps`, `touchdown_aside_mps`: the largest speeds, downwards and sideways, with which
+    the floor was met. `astray_m`: the farthest from where it should have been, in the air."""
 
     flags: dict[Flag, float]
     drop_m: float
     slip_ratio: float | None
+    touchdown_mps: float
+    touchdown_aside_mps: float
+    astray_m: float
 
 
 def drop_limit_m(hold_ratio: float) -> float:
@@ -88,53 +117,98 @@ def drop_limit_m(hold_ratio: float) -> float:
     return 0.6 if hold_ratio <= 0.75 else 1.0
 
 
+def second_press_s(presses_s: Sequence[float]) -> float | None:
+    """When the operator asked for the emergency stop; None: never. The oracle's own reading of
+    the law: it does not take the program's switch at its word."""
+    run_s = presses_s[0] if presses_s else 0.0
+    for before_s, press_s in pairwise(presses_s):
+        if press_s - before_s >= SILENCE_S:
+            run_s = press_s
+            if press_s - presses_s[0] >= SECOND_AFTER_S:
+                return press_s
+        elif press_s - run_s >= HAMMERED_S:
+            return press_s
+    return None
+
+
 class Oracle:
     """Samples in, at most 20 ms apart; flags out."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self.flags: dict[Flag, float] = {}
-        self.drop_m = 0.0
-        self._slip_ratio: float | None = None
         self.newest: Sample | None = None
+        self._drop_m = 0.0
+        self._slip_ratio: float | None = None
+        self._touchdown_mps = self._touchdown_aside_mps = 0.0
+        self._astray_m = 0.0
         self._hung: Sample | None = None  # last sample that hung
         self._off_s: float | None = None
         self._free_s: float | None = None
+        self._press_s: float | None = None  # newest sample that pressed
         self._pressed_s: float | None = None
         self._calm_height_m = 0.0  # where it last did not sink fast
         self._fall: _Fall | None = None
         self._weak_s: float | None = None  # when it was last without the thrust to slow down
-        self._sink_mps = 0.0
-        self._was_down = True
+        self._before: Sample | None = None
+        self._least_up_z = 1.0
+        self._ended_by_vehicle = False
         self._may_lock = False
-        self._claim: tuple[float, Claim] = (math.inf, "none")
-        self._claim_open = False
+        self._claims: dict[Claim, float] = {}  # those that are not found true yet
+        self._presses_s: list[float] = []
+        self._obeyed = False
+        self._muted_s = -math.inf  # when last nothing arrived
         self._end_s = math.inf
 
-    def claims(self, claim: Claim, t_s: float) -> None:
+    def claims(self, claims: frozenset[Claim], t_s: float) -> None:
         """What the program said, and when."""
-        self._claim = (t_s, claim)
-        self._claim_open = True
+        self._claims |= dict.fromkeys(claims, t_s)
 
-    def ended(self, t_s: float) -> None:
-        """The program is gone from here on."""
+    def pressed(self, t_s: float) -> None:
+        """The operator pressed Ctrl-C."""
+        self._presses_s.append(t_s)
+
+    def ended(self, t_s: float, *, crashed: bool = False, endless: bool = False) -> None:
+        """The program is gone from here on: `crashed` by an exception that nobody planted,
+        `endless` since it was ended from outside."""
         self._end_s = t_s
+        if crashed:
+            self._raise("crashed", t_s)
+        if endless:
+            self._raise("endless", t_s)
+
+    @property
+    def stop_s(self) -> float | None:
+        """When the operator asked for the emergency stop."""
+        return second_press_s(self._presses_s)
 
     def verdict(self) -> Verdict:
         """After the last sample."""
-        return Verdict(dict(self.flags), self.drop_m, self._slip_ratio)
+        return Verdict(
+            dict(sorted(self.flags.items(), key=lambda raised: raised[1])),
+            self._drop_m,
+            self._slip_ratio,
+            self._touchdown_mps,
+            self._touchdown_aside_mps,
+            self._astray_m,
+        )
 
     def see(self, s: Sample) -> None:
         self.newest = s
         if s.hanging:
             self._hung = s
+        self._least_up_z = min(self._least_up_z, s.up_z)
+        self._ended_by_vehicle = self._ended_by_vehicle or s.ended_by_vehicle
         self._watch_unpowered(s)
         self._watch_fall(s)
         self._watch_touchdown(s)
         self._watch_pressing(s)
         self._watch_place(s)
         self._watch_end(s)
+        self._watch_claims(s)
+        self._watch_stop(s)
         self._watch_lock(s)
+        self._before = s
 
     @property
     def in_the_air(self) -> bool:
@@ -169,8 +243,8 @@ class Oracle:
             self._fall = _Fall(top_m, None if hung is None else hung.hold_ratio)
         fall = self._fall
         drop_m = fall.top_m - s.height_m
-        if drop_m > self.drop_m:
-            self.drop_m, self._slip_ratio = drop_m, fall.slip_ratio
+        if drop_m > self._drop_m:
+            self._drop_m, self._slip_ratio = drop_m, fall.slip_ratio
         unpowered = self._weak_s is not None and s.t_s - self._weak_s <= FROM_HANGING_S
         too_deep = fall.slip_ratio is not None and drop_m > drop_limit_m(fall.slip_ratio)
         if unpowered and (too_deep or s.floor):
@@ -182,35 +256,79 @@ class Oracle:
             self._calm_height_m = s.height_m
 
     def _watch_touchdown(self, s: Sample) -> None:
-        if s.floor and not self._was_down and self._sink_mps > TOUCHDOWN_MPS:
+        """By the speed of the sample before, which the floor has not braked yet."""
+        before = self._before
+        if before is None or before.floor or not s.floor:
+            return
+        sink_mps = -before.vz_mps
+        self._touchdown_mps = max(self._touchdown_mps, sink_mps)
+        self._touchdown_aside_mps = max(self._touchdown_aside_mps, before.aside_mps)
+        if sink_mps > TOUCHDOWN_MPS:
             self._raise("fell", s.t_s)
-        self._was_down = s.floor
-        self._sink_mps = -s.vz_mps
+        if before.aside_mps > TOUCHDOWN_ASIDE_MPS:
+            self._raise("slid", s.t_s)
 
     def _watch_pressing(self, s: Sample) -> None:
-        self._pressed_s = _since(self._pressed_s, s.pressing, s.t_s)
-        if _lasts(self._pressed_s, PRESSED_S, s.t_s):
+        if s.pressing:
+            self._press_s = s.t_s
+        presses = self._press_s is not None and s.t_s - self._press_s <= RELEASED_S
+        self._pressed_s = _since(self._pressed_s, presses, s.t_s)
+        if s.pressing and _lasts(self._pressed_s, PRESSED_S, s.t_s):
             self._raise("pressed", s.t_s)
 
     def _watch_place(self, s: Sample) -> None:
-        beyond_m = BEYOND_M + s.drifted_m
-        aside = math.hypot(s.x_m, s.y_m) > self._limits.fence_radius_m + beyond_m
-        if _airborne(s) and (aside or s.height_m > self._limits.max_height_m + beyond_m):
+        if not _airborne(s):
+            return
+        self._astray_m = max(self._astray_m, s.astray_m)
+        if s.astray_m > ASTRAY_M or s.height_m > self._limits.max_height_m + TOO_HIGH_M:
             self._raise("strayed", s.t_s)
 
     def _watch_end(self, s: Sample) -> None:
-        claimed_s, claim = self._claim
-        if self._claim_open and _is_true(claim, s):
-            self._claim_open = False
-        elif self._claim_open and s.t_s >= claimed_s + CLAIM_S:
-            self._claim_open = False
-            self._raise("lied", s.t_s)
-        if s.t_s >= self._end_s + ALONE_S and s.motors_on and _airborne(s):
+        left_alone = s.t_s >= self._end_s + ALONE_S
+        if (left_alone or s.overdue) and s.motors_on and _airborne(s):
             self._raise("flies_on", s.t_s)
+
+    def _watch_claims(self, s: Sample) -> None:
+        for claim, claimed_s in list(self._claims.items()):
+            if self._is_true(claim, s):
+                del self._claims[claim]
+            elif s.t_s >= claimed_s + CLAIM_S:
+                del self._claims[claim]
+                self._raise("lied", s.t_s)
+
+    def _is_true(self, claim: Claim, s: Sample) -> bool:
+        match claim:
+            case "hangs":
+                return s.hanging and not s.motors_on
+            case "stands":
+                return not s.motors_on and not _airborne(s)
+            case "hangs or stands":
+                return not s.motors_on and (s.hanging or not _airborne(s))
+            case "motors off":
+                return not s.motors_on
+            case "locked":
+                return s.locked
+            case "ended by the supervisor":
+                return self._ended_by_vehicle
+            case "tilted":
+                limit_deg = self._limits.max_tilt_deg - TILT_WITHIN_DEG
+                return self._least_up_z < math.cos(math.radians(limit_deg))
+
+    def _watch_stop(self, s: Sample) -> None:
+        """Only while packets pass: what cannot be heard is not disobeyed."""
+        if not s.uplink:
+            self._muted_s = s.t_s
+        stop_s = self.stop_s
+        if stop_s is None or self._obeyed or stop_s > self._end_s:
+            return
+        self._obeyed = not s.motors_on
+        if not self._obeyed and s.t_s > max(stop_s, self._muted_s) + STOP_S:
+            self._raise("stop_not_obeyed", s.t_s)
 
     def _watch_lock(self, s: Sample) -> None:
         """What comes after the lock, as the tumble of what was cut in the air, is no reason."""
-        if s.ended_by_vehicle or s.up_z < TILTED_UP:
+        tilted_up_z = math.cos(math.radians(self._limits.max_tilt_deg))
+        if s.ended_by_vehicle or s.up_z < tilted_up_z:
             self._may_lock = True
         if s.locked and not self._may_lock:
             self._raise("locked_needlessly", s.t_s)
@@ -227,18 +345,6 @@ class _Fall:
 
 def _airborne(s: Sample) -> bool:
     return not s.floor and s.height_m > LOW_M
-
-
-def _is_true(claim: Claim, s: Sample) -> bool:
-    match claim:
-        case "perched":
-            return s.hanging and not s.motors_on
-        case "landed":
-            return not s.motors_on and not _airborne(s)
-        case "cut":
-            return not s.motors_on
-        case "none":
-            return True
 
 
 def _since(since_s: float | None, holds: bool, t_s: float) -> float | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from matplotlib.patches import Patch, Rectangle
 
 from perchctl.faults.catalogue import FAULTS
+from perchctl.faults.oracle import Flag
 from perchctl.faults.result import FaultResult
 from perchctl.faults.summary import PHASES
 from perchctl.plot import BLACK, GREY, new_figure, save_png
@@ -18,9 +19,11 @@ KINDS: tuple[tuple[str, str], ...] = (
     ("ended otherwise", "#F3E9C0"),
     ("unavoidable", "#B9B9B9"),
     ("wrong", "#E8A33D"),
-    ("fell or flies on", "#C8372D"),
+    ("fell, flies on, stop ignored", "#C8372D"),
 )
 """From good to bad; a cell has the colour of its worst flight."""
+GRAVE: frozenset[Flag] = frozenset({"crashed", "fell", "flies_on", "endless", "stop_not_obeyed"})
+"""Somebody or something may get hurt."""
 
 
 def plot_heat_map(results: Sequence[FaultResult], png_path: Path) -> None:
@@ -57,7 +60,7 @@ def plot_heat_map(results: Sequence[FaultResult], png_path: Path) -> None:
 
 def kind_of(result: FaultResult) -> int:
     """Which of `KINDS` a flight is."""
-    if {"fell", "flies_on"} & set(result.counted):
+    if GRAVE & set(result.counted):
         return 5
     if result.counted:
         return 4

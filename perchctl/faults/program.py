@@ -16,6 +16,10 @@ class ProgramKilled(BaseException):
     """The program is gone; no `except Exception` of it sees that."""
 
 
+class PlantedError(Exception):
+    """An exception that a fault raises: unforeseen by the program, but not by the campaign."""
+
+
 class FaultyClock:
     """The vehicle's own time. Faults happen where the loop waits for its next turn.
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from perchctl.faults.claims import UNCONFIRMED
 from perchctl.faults.result import End, FaultResult
 
 DOWN: frozenset[End] = frozenset({"perched", "landed"})
 CUT: frozenset[End] = frozenset({"perched", "landed", "aborted"})
-UNCONFIRMED = "could not be confirmed"
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Promise:
 
     def is_kept(self, result: FaultResult) -> bool:
         """Whether the flight ended as promised, and nothing avoidable went wrong in it."""
-        if result.counted or result.reason.startswith("unforeseen"):
+        if result.counted:
             return False
-        if self.unseen and result.end == "aborted" and UNCONFIRMED in result.reason:
+        if self.unseen and result.row == UNCONFIRMED:
             return True
         if result.end != "perched" and self.names not in result.reason:
             return False
@@ -140,7 +140,10 @@ PROMISES = (
         "reads up to its last record",
         ("suspended", "killed"), CUT | {"gone"},
     ),
-    Promise("perchctl itself fails", "the vehicle is landed first, whatever was raised", ()),
+    Promise(
+        "perchctl itself fails", "the vehicle is landed first, whatever was raised", (),
+        DOWN | {"failed"},
+    ),
     Promise("tumbled, crashed, locked", "stop; the message says to inspect and restart", ()),
 )  # fmt: skip
 

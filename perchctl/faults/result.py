@@ -9,8 +9,9 @@ from typing import Any, Literal
 from perchctl.faults.oracle import FLAGS, Flag
 from perchctl.sim.scenario import Scenario
 
-End = Literal["perched", "landed", "aborted", "refused", "gone"]
-"""`refused`: never took off, or ended by an error; `gone`: the program ended before its flight."""
+End = Literal["perched", "landed", "aborted", "refused", "failed", "gone"]
+"""`refused`: never took off; `failed`: an exception ended the flight, behind its rescue; `gone`:
+the program ended before its flight."""
 
 
 @dataclass(frozen=True)
@@ -19,11 +20,15 @@ class FaultResult:
 
     Attributes:
         flags: what went wrong, with when.
-        counted: the flags that no excuse takes away.
-        unavoidable: the excuse's reason, None where none holds.
+        counted: the flags that no expected outcome covers.
+        expected: the names of the expected outcomes whose cause came, whether or not a flag was
+            raised; `unavoidable`: their reasons, None where there are none.
         begin_s: when the fault began; None when the flight was over before.
+        row: of the mission's table, that ended the flight; empty where none did.
         drop_m: the deepest fall until caught, in the simulation's truth; `slip_ratio`: the
             magnet's hold over the weight, where that was a slip from the magnet.
+        touchdown_mps, touchdown_aside_mps: the hardest touchdown, downwards and sideways.
+        astray_m: in the air, the farthest from where it should have been.
         log, log_problem: the flight's log, and what it lacks; None without.
         cpu_s, peak_memory_mb, scenario: as a `perchctl.flight.results.FlightResult` has them.
     """
@@ -51,6 +56,11 @@ class FaultResult:
     cpu_s: float = 0.0
     peak_memory_mb: float = 0.0
     scenario: Scenario | None = None
+    row: str = ""
+    expected: tuple[str, ...] = ()
+    touchdown_mps: float = 0.0
+    touchdown_aside_mps: float = 0.0
+    astray_m: float = 0.0
 
     @property
     def outcome(self) -> str:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from perchctl.faults.catalogue import AIR, FAULTS
+from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
+from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.result import End, FaultResult
 from perchctl.flight.rates import rate_record, rate_text
@@ -24,19 +26,55 @@ HEADS = ("appr", "srch", "est", "align", "asc", "perch", "compl", "recov", "land
 
 def fault_summary(results: Sequence[FaultResult]) -> dict[str, Any]:
     """Ready for JSON. The flags are counted outside the unavoidable; `unavoidable` is the
-    number of flights in which one was excused, `wrong` the share of flights with a flag and its
-    interval, `drop_m` the deepest slips from a magnet that
-    held up to so much of the weight."""
+    number of flights in which one was expected, `expected_outcomes` the share of flights in which
+    the cause of each came, `rare_outcomes` that of all that nobody chose; `wrong` the share of
+    flights with a flag, `not_known` of those that ended without the program's knowing whether the
+    vehicle hangs or stands, `unconfirmed` of those whose landing it did not see; `drop_m` the
+    deepest slips from a magnet that held up to so much of the weight, `touchdown` the hardest
+    ones outside of expected outcomes."""
     return {
         "flights": len(results),
         **{end: sum(r.end == end for r in results) for end in ENDS},
         **{flag: sum(flag in r.counted for r in results) for flag in FLAGS},
         "wrong": rate_record(sum(bool(r.counted) for r in results), len(results)),
-        "unavoidable": sum(_is_excused(r) for r in results),
+        "unavoidable": sum(_is_unavoidable(r) for r in results),
+        "expected_outcomes": {
+            name: rate_record(count, len(results)) for name, count in expected(results).items()
+        },
+        "rare_outcomes": rate_record(_rare(results), len(results)),
+        "not_known": rate_record(_ended_by(results, NOT_KNOWN), len(results)),
+        "unconfirmed": rate_record(_ended_by(results, UNCONFIRMED), len(results)),
         "drop_m": {name: _deepest_m(results, *bounds) for name, bounds in SLIPS.items()},
+        "touchdown": {
+            "down_mps": _hardest_mps(results, "touchdown_mps"),
+            "aside_mps": _hardest_mps(results, "touchdown_aside_mps"),
+        },
         "peak_memory_mb": peak_mb(results),
         "worst_seeds": [r.seed for r in worst_first(results)[:WORST]],
     }
+
+
+def expected(results: Iterable[FaultResult]) -> dict[str, int]:
+    """In how many flights the cause of each expected outcome came."""
+    names = Counter(name for r in results for name in r.expected)
+    return {outcome.name: names[outcome.name] for outcome in EXPECTED_OUTCOMES}
+
+
+def _rare(results: Iterable[FaultResult]) -> int:
+    """Flights with an expected outcome that neither the user nor the firmware chose."""
+    rare = {outcome.name for outcome in EXPECTED_OUTCOMES if not outcome.chosen}
+    return sum(bool(rare & set(r.expected)) for r in results)
+
+
+def _ended_by(results: Iterable[FaultResult], row: str) -> int:
+    return sum(r.row == row for r in results)
+
+
+def _hardest_mps(
+    results: Iterable[FaultResult], of: Literal["touchdown_mps", "touchdown_aside_mps"]
+) -> float:
+    found: list[float] = [getattr(r, of) for r in results if not r.expected]
+    return round(max(found, default=0.0), 3)
 
 
 def _deepest_m(results: Iterable[FaultResult], above: float, to: float) -> float | None:
@@ -66,8 +104,21 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     lines.append(f"flights            {figures['flights']}" + (f": {ends}" if ends else ""))
     lines.append(f"with a flag        {rate_text(len(worst_first(results)), len(results))}")
     lines += [f"{flag.replace('_', ' '):<18} {figures[flag]}" for flag in FLAGS]
+    flights = len(results)
     lines.append(f"unavoidable        {figures['unavoidable']}")
-    lines += [f"  {count} x {reason}" for reason, count in reasons(results).items()]
+    lines.append(f"expected outcomes  {rate_text(_rare(results), flights)}, those chosen aside")
+    lines += [
+        f"  {rate_text(count, flights)} {name}"
+        for name, count in expected(results).items()
+        if count
+    ]
+    lines.append(f"not known          {rate_text(_ended_by(results, NOT_KNOWN), flights)}")
+    lines.append(f"unconfirmed        {rate_text(_ended_by(results, UNCONFIRMED), flights)}")
+    hardest = figures["touchdown"]
+    lines.append(
+        f"hardest touchdown  {hardest['down_mps']:.2f} m/s down, "
+        f"{hardest['aside_mps']:.2f} m/s sideways"
+    )
     drops = ", ".join(f"{d:.2f} m {n}" for n, d in figures["drop_m"].items() if d is not None)
     if drops:
         lines.append(f"deepest slip       {drops} of the weight")
@@ -78,12 +129,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     return "\n".join(lines)
 
 
-def reasons(results: Iterable[FaultResult]) -> dict[str, int]:
-    """Why flights were excused, and how many."""
-    return dict(Counter(r.unavoidable or "" for r in results if _is_excused(r)))
-
-
-def _is_excused(result: FaultResult) -> bool:
+def _is_unavoidable(result: FaultResult) -> bool:
     """Whether something went wrong that could not be avoided."""
     return len(result.counted) < len(result.flags)
 
@@ -93,8 +139,8 @@ def _cell(results: Iterable[FaultResult], fault: str, phase: str) -> str:
     if not here:
         return "."
     wrong = sum(bool(r.counted) for r in here)
-    excused = "u" if any(_is_excused(r) for r in here) else ""
-    return f"{len(here)}{f'!{wrong}' if wrong else ''}{excused}"
+    unavoidable = "u" if any(_is_unavoidable(r) for r in here) else ""
+    return f"{len(here)}{f'!{wrong}' if wrong else ''}{unavoidable}"
 
 
 def _line(r: FaultResult) -> tuple[str, ...]:

@@ -16,8 +16,9 @@ from perchctl.vehicle import LOCKED
 from perchctl.vision.types import CameraModel
 
 SAMPLE_S = 0.01
-FULL_THRUST = 64000.0
-PRESSING_RATIO = 1.1
+FULL_THRUST = 60000.0
+"""The largest raw order, of 65,535 (docs/firmware.md, "Raw thrust"): it lifts whatever can fly."""
+PRESSING_RATIO = 1.02
 """Rotors that lift more than this part of the weight press where something is in the way."""
 
 
@@ -36,15 +37,15 @@ class WatchedVehicle(SimulatedVehicle):
         self._next_s = SAMPLE_S
 
     def advance_to(self, t_s: float) -> None:
-        while self.firmware.t_s < t_s - CONTROL_PERIOD_S / 2:
+        while self.t_s < t_s - CONTROL_PERIOD_S / 2:
             super().advance_to(min(t_s, self._next_s))
-            if self.firmware.t_s >= self._next_s - CONTROL_PERIOD_S / 2:
+            if self.t_s >= self._next_s - CONTROL_PERIOD_S / 2:
                 self._next_s += SAMPLE_S
-                self.each(self.firmware.t_s)
+                self.each(self.t_s)
 
 
-def sample_of(vehicle: SimulatedVehicle, drifted_m: float = 0.0) -> Sample:
-    """What is true now."""
+def sample_of(vehicle: SimulatedVehicle) -> Sample:
+    """What is true now of the vehicle; the rest of a sample is what it is held to."""
     world, firmware = vehicle.world, vehicle.firmware
     weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
     _, qx, qy, _ = world.quaternion
@@ -52,13 +53,13 @@ def sample_of(vehicle: SimulatedVehicle, drifted_m: float = 0.0) -> Sample:
     ceiling_n, floor = world.contacts()
     motors_on = max(firmware.motors) > 0.0
     lift_n = sum(world.powertrain.forces_n)
-    full = motors_on and (
+    pushing = motors_on and (
         firmware.controller.thrust >= FULL_THRUST or lift_n >= PRESSING_RATIO * weight_n
     )
     supervisor = firmware.supervisor
     fx, fy, fz = world.fx_mps2, world.fy_mps2, world.fz_mps2
     return Sample(
-        firmware.t_s,
+        vehicle.t_s,
         world.x_m,
         world.y_m,
         world.z_m - REST_HEIGHT_M,
@@ -66,11 +67,11 @@ def sample_of(vehicle: SimulatedVehicle, drifted_m: float = 0.0) -> Sample:
         up_z,
         math.sqrt(fx * fx + fy * fy + fz * fz) / GRAVITY_MPS2,
         motors_on,
-        full and (ceiling_n > 0.0 or (floor and up_z < 0.5)),
+        pushing and (ceiling_n > 0.0 or (floor and up_z < 0.5)),
         floor,
         world.magnet_engaged,
         world.magnet.hold_n / weight_n,
         bool(firmware.supervisor_info & LOCKED),
         supervisor.crashed or supervisor.tumbled,
-        drifted_m,
+        math.hypot(world.vx_mps, world.vy_mps),
     )

@@ -7,7 +7,16 @@ from typing import Any
 
 import pytest
 
-from perchctl.faults.oracle import Claim, Limits, Oracle, Sample, Verdict, drop_limit_m
+from perchctl.faults.claims import Claim
+from perchctl.faults.oracle import (
+    FLAGS,
+    Limits,
+    Oracle,
+    Sample,
+    Verdict,
+    drop_limit_m,
+    second_press_s,
+)
 
 DT_S = 0.01
 G = 9.81
@@ -25,7 +34,7 @@ class Script:
     """Feeds an oracle; time goes on by itself."""
 
     def __init__(self) -> None:
-        self.oracle = Oracle(Limits(fence_radius_m=2.0, max_height_m=3.0))
+        self.oracle = Oracle(Limits(max_height_m=3.0, max_tilt_deg=55.0))
         self.t_s = 0.0
 
     def show(self, sample: Sample, for_s: float, **changes: Any) -> Script:
@@ -67,7 +76,7 @@ def arrested(start: float, for_s: float) -> Iterator[float]:
 
 def test_a_flight_that_hangs_raises_nothing() -> None:
     script = Script().show(ON_THE_FLOOR, 1.0).show(HOVER, 2.0).show(HANGING, 2.0)
-    script.oracle.claims("perched", script.t_s)
+    script.oracle.claims(frozenset({"hangs"}), script.t_s)
     script.oracle.ended(script.t_s)
     assert script.show(HANGING, 6.0).flags == set()
     assert script.verdict.drop_m == 0.0
@@ -97,6 +106,24 @@ def test_touchdown(sink_mps: float, flags: set[str]) -> None:
     low = HOVER._replace(height_m=0.3)
     script = Script().show(low, 0.1)
     assert script.sink(low, iter([sink_mps] * 100)).flags == flags
+    assert script.verdict.touchdown_mps == pytest.approx(sink_mps)
+
+
+@pytest.mark.parametrize(("aside_mps", "flags"), [(0.6, {"slid"}), (0.4, set())])
+def test_a_touchdown_sideways(aside_mps: float, flags: set[str]) -> None:
+    """By its speed before the floor brakes it; a vehicle that slides on is judged once."""
+    low = HOVER._replace(height_m=0.2, aside_mps=aside_mps)
+    script = Script().show(low, 0.1).sink(low, iter([0.2] * 200))
+    assert script.show(ON_THE_FLOOR, 0.5, aside_mps=0.0).flags == flags
+    assert script.verdict.touchdown_aside_mps == pytest.approx(aside_mps)
+
+
+def test_the_hardest_touchdown_is_kept() -> None:
+    low = HOVER._replace(height_m=0.1)
+    script = Script()
+    for sink_mps in (0.3, 0.5, 0.1):
+        script.show(low, 0.1).sink(low, iter([sink_mps] * 200))
+    assert script.verdict.touchdown_mps == pytest.approx(0.5)
 
 
 def slip(ratio: float, acc: float, fall_s: float, brake_s: float = 0.2) -> Verdict:
@@ -165,52 +192,83 @@ def test_pressed(for_s: float, flags: set[str]) -> None:
 def test_pressed_again_and_again_is_not_pressed_in_a_row() -> None:
     script = Script()
     for _ in range(3):
-        script.show(HOVER, 3.0, pressing=True).show(HOVER, 0.1)
+        script.show(HOVER, 3.0, pressing=True).show(HOVER, 0.3)
     assert script.flags == set()
+
+
+def test_what_bounces_off_presses_on() -> None:
+    script = Script()
+    for _ in range(50):
+        script.show(HOVER, 0.05, pressing=True).show(HOVER, 0.05)
+    assert script.flags == {"pressed"}
 
 
 @pytest.mark.parametrize(
     ("changes", "flags"),
     [
-        ({"x_m": 2.2}, set()),
-        ({"x_m": 1.7, "y_m": -1.7}, {"strayed"}),
+        ({"astray_m": 0.9}, set()),
+        ({"astray_m": 1.1}, {"strayed"}),
         ({"height_m": 3.2}, set()),
         ({"height_m": 3.4}, {"strayed"}),
-        ({"x_m": 2.6, "drifted_m": 0.5}, set()),
-        ({"x_m": 2.9, "drifted_m": 0.5}, {"strayed"}),
     ],
 )
 def test_strayed(changes: dict[str, float], flags: set[str]) -> None:
-    assert Script().show(HOVER, 0.5, **changes).flags == flags
+    script = Script().show(HOVER, 0.5, **changes)
+    assert script.flags == flags
+    assert script.verdict.astray_m == changes.get("astray_m", 0.0)
 
 
-def test_outside_on_the_floor_is_where_it_landed() -> None:
-    assert Script().show(ON_THE_FLOOR, 1.0, x_m=2.5).flags == set()
+def test_astray_on_the_floor_is_where_it_landed() -> None:
+    assert Script().show(ON_THE_FLOOR, 1.0, astray_m=2.5).flags == set()
+
+
+LOCKED = ON_THE_FLOOR._replace(locked=True, ended_by_vehicle=True)
 
 
 @pytest.mark.parametrize(
     ("claim", "truth", "flags"),
     [
-        ("perched", HANGING, set()),
-        ("perched", HANGING._replace(motors_on=True), {"lied"}),
-        ("perched", ON_THE_FLOOR, {"lied"}),
-        ("landed", ON_THE_FLOOR, set()),
-        ("landed", ON_THE_FLOOR._replace(motors_on=True), {"lied"}),
-        ("landed", HANGING, {"lied"}),
-        ("cut", ON_THE_FLOOR, set()),
-        ("cut", ON_THE_FLOOR._replace(motors_on=True), {"lied"}),
-        ("none", ON_THE_FLOOR._replace(motors_on=True), set()),
+        ("hangs", HANGING, set()),
+        ("hangs", HANGING._replace(motors_on=True), {"lied"}),
+        ("hangs", ON_THE_FLOOR, {"lied"}),
+        ("stands", ON_THE_FLOOR, set()),
+        ("stands", ON_THE_FLOOR._replace(motors_on=True), {"lied"}),
+        ("stands", HANGING, {"lied"}),
+        ("hangs or stands", HANGING, set()),
+        ("hangs or stands", ON_THE_FLOOR, set()),
+        ("hangs or stands", HANGING._replace(motors_on=True), {"lied"}),
+        ("hangs or stands", HOVER, {"lied"}),
+        ("motors off", ON_THE_FLOOR, set()),
+        ("motors off", ON_THE_FLOOR._replace(motors_on=True), {"lied"}),
+        ("locked", LOCKED, set()),
+        ("locked", ON_THE_FLOOR, {"lied"}),
+        ("ended by the supervisor", LOCKED, set()),
+        ("ended by the supervisor", ON_THE_FLOOR, {"lied"}),
+        ("tilted", ON_THE_FLOOR._replace(up_z=0.3), set()),
+        ("tilted", ON_THE_FLOOR._replace(up_z=0.9), {"lied"}),
     ],
 )
 def test_lied(claim: Claim, truth: Sample, flags: set[str]) -> None:
     script = Script().show(truth, 1.0)
-    script.oracle.claims(claim, script.t_s)
+    script.oracle.claims(frozenset({claim}), script.t_s)
     assert script.show(truth, 2.0).flags == flags
+
+
+def test_each_of_several_claims_has_to_be_true() -> None:
+    script = Script().show(HANGING, 1.0)
+    script.oracle.claims(frozenset({"hangs", "locked"}), script.t_s)
+    assert script.show(HANGING, 2.0).flags == {"lied"}
+
+
+def test_what_tilted_and_crashed_before_did_so() -> None:
+    script = Script().show(HOVER, 0.2, up_z=0.2, ended_by_vehicle=True).show(ON_THE_FLOOR, 1.0)
+    script.oracle.claims(frozenset({"tilted", "ended by the supervisor"}), script.t_s)
+    assert script.show(ON_THE_FLOOR, 2.0).flags == set()
 
 
 def test_a_claim_has_half_a_second_to_become_true() -> None:
     script = Script().show(ON_THE_FLOOR, 1.0, motors_on=True)
-    script.oracle.claims("cut", script.t_s)
+    script.oracle.claims(frozenset({"motors off"}), script.t_s)
     assert script.show(ON_THE_FLOOR, 0.3, motors_on=True).show(ON_THE_FLOOR, 2.0).flags == set()
 
 
@@ -229,6 +287,92 @@ def test_flies_on(truth: Sample, flags: set[str]) -> None:
     script.oracle.ended(script.t_s)
     assert script.show(truth, 4.9).flags == set()
     assert script.show(truth, 0.3).flags == flags
+
+
+def test_what_should_have_come_down_flies_on() -> None:
+    assert Script().show(HOVER, 0.1, overdue=True).flags == {"flies_on"}
+    assert Script().show(HANGING, 0.1, overdue=True).flags == set()
+    assert Script().show(ON_THE_FLOOR, 0.1, overdue=True, motors_on=True).flags == set()
+
+
+def test_how_the_program_ended() -> None:
+    for how in ("crashed", "endless"):
+        script = Script().show(ON_THE_FLOOR, 1.0)
+        script.oracle.ended(script.t_s, **{how: True})
+        assert script.show(ON_THE_FLOOR, 1.0).verdict.flags == {how: pytest.approx(1.0)}
+
+
+# --- the second Ctrl-C ------------------------------------------------------------------
+
+
+def every(period_s: float, for_s: float) -> list[float]:
+    return [period_s * k for k in range(int(for_s / period_s) + 1)]
+
+
+@pytest.mark.parametrize(
+    ("presses_s", "second_s"),
+    [
+        ([], None),
+        ([3.0], None),
+        ([3.0, 3.4], None),
+        ([3.0, 3.6], 3.6),
+        ([3.0, 3.2, 3.4, 3.6], None),
+        ([3.0, 3.2, 3.4, 3.8], 3.8),
+        (every(0.03, 1.9), None),
+        (every(0.14, 1.9), None),
+        (every(0.1, 2.5), 2.0),
+    ],
+)
+def test_which_press_is_the_second(presses_s: list[float], second_s: float | None) -> None:
+    found_s = second_press_s(presses_s)
+    assert found_s == (None if second_s is None else pytest.approx(second_s))
+
+
+def stopped(after_s: float, silent_s: float = 0.0) -> set[str]:
+    """Ctrl-C twice in a hover; the motors stand still so long after the second, near the floor.
+    For `silent_s` from there on no packet passes."""
+    low = HOVER._replace(height_m=0.05)
+    script = Script().show(low, 1.0)
+    script.oracle.pressed(script.t_s)
+    script.show(low, 1.0)
+    script.oracle.pressed(script.t_s)
+    if silent_s:
+        script.show(low, silent_s, uplink=False)
+    if after_s > silent_s:
+        script.show(low, after_s - silent_s)
+    return script.show(low, 1.0, motors_on=False).flags
+
+
+def test_the_second_ctrl_c_stops_the_motors_within_half_a_second() -> None:
+    assert stopped(0.4) == set()
+    assert stopped(0.6) == {"stop_not_obeyed"}
+
+
+def test_what_is_not_heard_is_not_disobeyed() -> None:
+    assert stopped(1.4, silent_s=1.0) == set()
+    assert stopped(1.6, silent_s=1.0) == {"stop_not_obeyed"}
+
+
+def test_one_ctrl_c_asks_for_no_stop() -> None:
+    script = Script().show(HOVER, 1.0)
+    script.oracle.pressed(script.t_s)
+    assert script.show(HOVER, 5.0).flags == set()
+    assert script.oracle.stop_s is None
+
+
+def test_nobody_is_there_to_obey_after_the_end() -> None:
+    script = Script().show(ON_THE_FLOOR, 1.0, motors_on=True)
+    script.oracle.ended(script.t_s)
+    for _ in range(2):
+        script.show(ON_THE_FLOOR, 1.0, motors_on=True)
+        script.oracle.pressed(script.t_s)
+    assert script.show(ON_THE_FLOOR, 1.0, motors_on=True).flags == set()
+
+
+def test_flags_are_told_in_the_order_in_which_they_came() -> None:
+    script = Script().show(HOVER, 0.1, astray_m=2.0).show(HOVER, 0.3, motors_on=False)
+    assert list(script.verdict.flags) == ["strayed", "fell"]
+    assert set(script.verdict.flags) <= set(FLAGS)
 
 
 def test_a_lock_without_reason_is_needless() -> None:

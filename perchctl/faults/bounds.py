@@ -1,0 +1,186 @@
+"""What a flight is held to in the true world: where the vehicle should be in each phase, and by
+when it should be on its way down.
+
+Neither goes by the program's estimate: that may be what is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from perchctl.faults.effects import (
+    BlockDead,
+    CameraFault,
+    Effect,
+    EstimateError,
+    ExternalPositions,
+    Hung,
+    Push,
+    Silence,
+    TelemetryDelayed,
+)
+from perchctl.geometry import rot_z
+from perchctl.mission.state import Phase
+from perchctl.profile import Profile
+from perchctl.sim.scenario import Scenario
+
+Place = tuple[float, float]
+"""On the floor, world axes, m."""
+
+UNDER_TARGET = frozenset({Phase.ASCEND, Phase.PERCH, Phase.COMPLETE})
+TERMINALS = frozenset({Phase.LANDING, Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
+BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER})
+IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
+NO_PICTURE = ("silent", "frozen", "snow")
+"""The camera's faults that leave no picture to look at; without a `NO_SIGHT` there is no target."""
+NO_SIGHT = (*NO_PICTURE, "covered", "dark")
+NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
+LASTS_S = 0.5
+"""A loss that ends so soon after its limit may have been waited out."""
+REACTION_S = 1.0
+"""From the profile's limit to the way down, at most: a turn's delay, thrust that goes down."""
+WATCHED_S, SUNK_M = 2.0, 0.15
+"""After so much more time it has come down by this, at less than a third of a landing's speed."""
+LOW_M = 0.3
+"""Where a landing hands over, and slows down."""
+
+
+class PlaceBound:
+    """Where the vehicle should be, horizontally, phase by phase:
+
+    - take-off: above its start (or `planner.approach_xy_m`);
+    - search, estimate, alignment, recovery: on the way between there and any target;
+    - ascent, press, completion: under a target;
+    - landing, and whatever comes after: where it should have been when the landing began.
+
+    Targets are all that look like the own one: nothing tells them apart.
+    """
+
+    def __init__(self, scenario: Scenario, profile: Profile) -> None:
+        approach = profile.planner.approach_xy_m
+        self._starts: list[Place] = [] if approach is None else [approach]
+        self._targets = list(targets_of(scenario))
+        self._phase: Phase | None = None
+        self._down_at: Place | None = None
+
+    def target_at(self, place: Place) -> None:
+        """A target hangs there, too, or by now."""
+        if place not in self._targets:
+            self._targets.append(place)
+
+    def enter(self, phase: Phase | None, place: Place) -> None:
+        """The program's phase, and where the vehicle truly is: the first time, its start."""
+        if self._phase is None:
+            self._starts.insert(0, place)
+        if phase in TERMINALS and self._down_at is None:
+            self._down_at = min(self._nearest(place), key=lambda spot: math.dist(spot, place))
+        self._phase = phase or Phase.APPROACH
+
+    def astray_m(self, place: Place) -> float:
+        """How far a vehicle at `place` is from where it should be."""
+        return min(math.dist(spot, place) for spot in self._nearest(place))
+
+    def _nearest(self, place: Place) -> list[Place]:
+        """The nearest spot of each way that it may be on."""
+        if self._down_at is not None:
+            return [self._down_at]
+        if self._phase in (None, Phase.APPROACH):
+            ends = self._starts
+        elif self._phase in UNDER_TARGET and self._targets:
+            return list(self._targets)
+        else:
+            ends = [*self._starts, *self._targets]
+        return [_nearest_between(a, b, place) for a in ends for b in ends]
+
+
+def _nearest_between(a: Place, b: Place, place: Place) -> Place:
+    """The spot of the line from `a` to `b` that is nearest to `place`."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    long_m2 = dx * dx + dy * dy
+    if long_m2 == 0.0:
+        return a
+    part = ((place[0] - a[0]) * dx + (place[1] - a[1]) * dy) / long_m2
+    part = min(1.0, max(0.0, part))
+    return a[0] + part * dx, a[1] + part * dy
+
+
+def targets_of(scenario: Scenario) -> list[Place]:
+    """The own target and those that look like it; none under a bare ceiling."""
+    if scenario.no_target:
+        return []
+    x_m, y_m = scenario.target_xy_m
+    turn = rot_z(scenario.target_yaw_rad)
+    found = [(x_m, y_m)]
+    for neighbour in scenario.neighbours:
+        if neighbour.large_id is None:
+            dx, dy, _ = turn @ (*neighbour.xy_m, 0.0)
+            found.append((x_m + float(dx), y_m + float(dy)))
+    return found
+
+
+def drifted_m(effects: Iterable[Effect], scenario: Scenario, fault_s: float) -> float:
+    """How far the vehicle may have been led or pushed aside `fault_s` after the fault's beginning
+    without anything on board that could know: by a slide of the estimate, and by a force as long
+    as it acts. A step of the estimate is none of these: it can be seen."""
+    aside_m = 0.0
+    for effect in effects:
+        match effect:
+            case EstimateError():
+                x_mps, y_mps, _ = effect.drift_mps
+                aside_m += math.hypot(x_mps, y_mps) * min(fault_s, effect.for_s)
+            case Push():
+                x_n, y_n, _ = effect.force_n
+                acts_s = min(fault_s, effect.for_s)
+                aside_m += 0.5 * math.hypot(x_n, y_n) / scenario.mass_kg * acts_s**2
+    return aside_m
+
+
+class DescentBound:
+    """By when the vehicle should be on its way down: where what the fault takes away is lost for
+    longer than the profile waits for it."""
+
+    def __init__(self, effects: Sequence[Effect], profile: Profile) -> None:
+        self._effects, self._profile = effects, profile
+        self._down_by_s = math.inf
+        self._from_m: float | None = None
+
+    def begin(self, t_s: float, phase: Phase | None) -> None:
+        """The fault begins, in a phase of the program."""
+        limits_s = [self._limit_s(effect, phase or Phase.APPROACH) for effect in self._effects]
+        self._down_by_s = t_s + min(limits_s, default=math.inf) + REACTION_S
+
+    def is_overdue(self, t_s: float, height_m: float, *, touching: bool, uplink: bool) -> bool:
+        """Whether it should have come down by now and has not. What touches the ceiling before it
+        has to come down may hang there, which takes its time to find out; and what hears nothing
+        obeys nothing."""
+        if not uplink or (touching and self._from_m is None):
+            self._down_by_s = math.inf
+        if t_s < self._down_by_s:
+            return False
+        if self._from_m is None:
+            self._from_m = height_m
+        late = t_s >= self._down_by_s + WATCHED_S
+        return late and height_m > max(LOW_M, self._from_m - SUNK_M)
+
+    def _limit_s(self, effect: Effect, phase: Phase) -> float:
+        """After how long it lands for this; never where it need not."""
+        safety, positioning = self._profile.safety, self._profile.positioning
+        lasts_s, limits_s = 0.0, [math.inf]
+        match effect:
+            case Silence(lasts_s, up=False, down=True) | BlockDead("state" | "attitude", lasts_s):
+                limits_s.append(safety.telemetry_land_s)
+            case TelemetryDelayed(delay_s, lasts_s) if delay_s > safety.telemetry_land_s:
+                limits_s.append(safety.telemetry_land_s)
+            case Hung(lasts_s):
+                limits_s.append(safety.loop_late_land_s)
+            case CameraFault(kind, lasts_s):
+                if kind in NO_PICTURE and phase in BY_CAMERA:
+                    limits_s.append(safety.camera_land_s)
+                if kind in NO_SIGHT and positioning.by == "target":
+                    limits_s.append(positioning.land_s)
+            case ExternalPositions(how, lasts_s) if how in NO_POSITION:
+                limits_s.append(positioning.land_s)
+        limit_s = min(limits_s)
+        flown = phase in IN_THE_OPEN and lasts_s > limit_s + LASTS_S
+        return limit_s if flown else math.inf

@@ -1,0 +1,77 @@
+"""What the program says at its end, as claims that can be true or false of a vehicle.
+
+A flight ends by a row of the mission's table, in a phase, with an outcome; each of the three
+becomes a sentence or an exit code that somebody acts on, and each claims something. They are found
+by name, not by the wording of the sentence.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from perchctl.mission.state import Outcome, Phase
+from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
+
+Claim = Literal[
+    "hangs", "stands", "hangs or stands", "motors off", "locked", "ended by the supervisor",
+    "tilted",
+]  # fmt: skip
+"""`hangs`, `stands` and `hangs or stands` say that the motors are off, too."""
+
+
+def _claims(*claims: Claim) -> frozenset[Claim]:
+    return frozenset(claims)
+
+
+ROW_CLAIMS: dict[str, frozenset[Claim]] = {
+    "operator-stop": _claims("motors off"),
+    "hung-but-locked": _claims("hangs", "locked"),
+    "locked": _claims("locked", "motors off"),
+    "tumbled": _claims("ended by the supervisor", "motors off"),
+    "crashed": _claims("ended by the supervisor", "motors off"),
+    "tilted": _claims("tilted", "motors off"),
+    "perched": _claims("hangs"),
+    "hung": _claims("hangs"),
+    "landed": _claims("stands"),
+    "hangs-or-stands": _claims("hangs or stands"),
+    "landing-timeout": _claims(),
+}
+"""What the sentence of each row that ends a flight says of the vehicle."""
+PHASE_CLAIMS = {Phase.PERCHED: _claims("hangs"), Phase.LANDED: _claims("stands")}
+OUTCOME_CLAIMS: dict[Outcome, frozenset[Claim]] = {
+    Outcome.PERCHED: _claims("hangs"),
+    Outcome.TARGET_NOT_FOUND: _claims("stands"),
+    Outcome.ATTEMPTS_USED_UP: _claims("hangs or stands"),
+    Outcome.SAFETY: _claims(),
+    Outcome.EMERGENCY: _claims("motors off"),
+    Outcome.OPERATOR: _claims("hangs or stands"),
+}
+"""What the meaning of each outcome's exit code says (`perchctl.errors.EXIT_CODES`)."""
+NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
+"""The rows of a flight whose end the program does not know: whether the vehicle hangs or stands,
+and whether it came down at all."""
+RESCUE_UNCONFIRMED = "could not be confirmed"
+"""Says so in the note of a rescue."""
+
+
+def last_row(report: FlightReport) -> str:
+    """The row that ended the flight; empty where none did."""
+    return report.history[-1].row if report.history else ""
+
+
+def claims_of(report: FlightReport) -> frozenset[Claim]:
+    """All that a report says of the vehicle."""
+    return frozenset().union(
+        ROW_CLAIMS.get(last_row(report), frozenset()),
+        PHASE_CLAIMS.get(report.phase, frozenset()),
+        OUTCOME_CLAIMS[report.outcome],
+        _claims("locked") if report.locked else _claims(),
+    )
+
+
+def claims_of_rescue(event: Event) -> frozenset[Claim]:
+    """What the note of a rescue says; nothing where the event is none."""
+    if event.kind is not EventKind.NOTE or RESCUE not in event.reason:
+        return _claims()
+    unconfirmed = RESCUE_UNCONFIRMED in event.reason
+    return _claims() if unconfirmed else _claims("hangs or stands")

@@ -1,0 +1,119 @@
+"""Where physics or the firmware leave no better end, and what is then expected.
+
+An expected outcome takes away the flags it names, and no other, where they were raised after its
+cause began and within a stated time of it. Its cause is what was true in the flight (`Facts`), not
+what was drawn, and not what the program reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+
+from perchctl.faults.effects import Killed
+from perchctl.faults.facts import Facts
+from perchctl.faults.oracle import Flag
+from perchctl.mission.guards import CATCHABLE_M
+
+NOTICED_S, DOWN_MPS = 1.5, 0.4
+"""How long a low battery takes to be believed, and how fast a landing goes at best."""
+
+
+@dataclass(frozen=True)
+class ExpectedOutcome:
+    """`flags` are no fault of the program between the time that `cause` gives (None: it never
+    came) and `within_s` later. `chosen`: the user, the firmware or who kills a program decides it,
+    so that no program could make it rare."""
+
+    name: str
+    cause: Callable[[Facts], float | None]
+    within_s: float
+    flags: frozenset[Flag]
+    reason: str
+    chosen: bool = False
+
+    def covers(self, flag: Flag, t_s: float, facts: Facts) -> bool:
+        """Whether a flag raised then is a consequence of the cause."""
+        cause_s = self.cause(facts)
+        return cause_s is not None and flag in self.flags and 0.0 <= t_s - cause_s <= self.within_s
+
+
+def unexpected(
+    flags: Mapping[Flag, float], outcomes: Iterable[ExpectedOutcome], facts: Facts
+) -> tuple[Flag, ...]:
+    """The flags that count: those that no expected outcome covers."""
+    listed = tuple(outcomes)
+    return tuple(
+        flag
+        for flag, t_s in flags.items()
+        if not any(outcome.covers(flag, t_s, facts) for outcome in listed)
+    )
+
+
+def _flags(*flags: Flag) -> frozenset[Flag]:
+    return frozenset(flags)
+
+
+def _cut(facts: Facts) -> float | None:
+    return None if facts.own_landing else facts.muted_s
+
+
+def _killed_in_landing(facts: Facts) -> float | None:
+    killed = any(isinstance(effect, Killed) for effect in facts.effects)
+    return facts.killed_s if killed and facts.own_landing else None
+
+
+def _let_go_after_the_watch(facts: Facts) -> float | None:
+    return facts.let_go_s if facts.watched else None
+
+
+def _slipped_low(facts: Facts) -> float | None:
+    return facts.slipped_s if facts.slipped_m < CATCHABLE_M else None
+
+
+def _sagged_too_fast(facts: Facts) -> float | None:
+    if facts.weak_s is None:
+        return None
+    down_s = NOTICED_S + facts.low_m / DOWN_MPS
+    in_time = facts.low_s is not None and facts.weak_s - facts.low_s >= down_s
+    return None if in_time else facts.weak_s
+
+
+CUT = ExpectedOutcome(
+    "cut by the firmware", _cut, 4.0, _flags("fell", "slid", "strayed", "locked_needlessly"),
+    "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
+    "program sends arrives any more", chosen=True,
+)  # fmt: skip
+LEFT_LANDING = ExpectedOutcome(
+    "lands alone", _killed_in_landing, 20.0, _flags("flies_on"),
+    "the vehicle flies its own landing to the end without the program: it comes down, softly",
+    chosen=True,
+)  # fmt: skip
+OPERATOR_STOPS = ExpectedOutcome(
+    "the operator's word", lambda facts: facts.stop_s, 4.0,
+    _flags("fell", "slid", "strayed", "locked_needlessly"),
+    "a second Ctrl-C is an emergency stop: it cuts the motors and locks", chosen=True,
+)  # fmt: skip
+LETS_GO_LATER = ExpectedOutcome(
+    "let go after the flight", _let_go_after_the_watch, 4.0, _flags("fell", "slid"),
+    "the whole weight has hung for the time it is watched; the program is no longer there "
+    "when the magnet lets go",
+)  # fmt: skip
+TOO_LOW = ExpectedOutcome(
+    "too low to catch", _slipped_low, 4.0, _flags("fell", "slid"),
+    "a fall from standing motors takes up to 0.8 m to catch; it hung lower than 1 m",
+)  # fmt: skip
+NO_LIFT = ExpectedOutcome(
+    "too weak to hover", lambda facts: facts.weak_s, 15.0, _flags("fell", "slid"),
+    "what battery and motors can lift is less than the weight: four times what the weak motor "
+    "gives, for with more of the others it turns over",
+)  # fmt: skip
+SAGS_TOO_FAST = ExpectedOutcome(
+    "sags too fast", _sagged_too_fast, 15.0, _flags("fell", "slid"),
+    "from the voltage at which it lands to the one that does not lift the weight any more it "
+    "has less time than the way down takes",
+)  # fmt: skip
+
+EXPECTED_OUTCOMES = (
+    CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT, SAGS_TOO_FAST,
+)  # fmt: skip

@@ -1,0 +1,182 @@
+"""Where a vehicle should be in each phase, and by when it should be on its way down."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from perchctl.faults import effects as e
+from perchctl.faults.bounds import (
+    LASTS_S,
+    LOW_M,
+    REACTION_S,
+    SUNK_M,
+    WATCHED_S,
+    DescentBound,
+    PlaceBound,
+    drifted_m,
+    targets_of,
+)
+from perchctl.mission.state import Phase
+from perchctl.profile import Profile, load_profile
+from perchctl.sim.scenario import Neighbour, Scenario
+
+P = Phase
+SIM, TARGET_ONLY = load_profile("sim"), load_profile("target_only")
+SCENARIO = Scenario(target_xy_m=(2.0, 0.0))
+SAFETY = SIM.safety
+
+
+def bound(*phases: Phase, scenario: Scenario = SCENARIO, at: tuple[float, float]) -> PlaceBound:
+    """Started at the origin, and `at` that place when the last of the phases was entered."""
+    made = PlaceBound(scenario, SIM)
+    made.enter(None, (0.0, 0.0))
+    for phase in phases[:-1]:
+        made.enter(phase, (0.0, 0.0))
+    made.enter(phases[-1], at)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("phase", "place", "astray_m"),
+    [
+        (P.APPROACH, (0.0, 0.3), 0.3),
+        (P.APPROACH, (2.0, 0.0), 2.0),
+        (P.SEARCH, (1.0, 0.3), 0.3),
+        (P.ALIGN, (1.0, 0.3), 0.3),
+        (P.ALIGN, (-0.5, 0.0), 0.5),
+        (P.RECOVER, (1.5, -0.2), 0.2),
+        (P.ASCEND, (1.0, 0.0), 1.0),
+        (P.PERCH, (2.0, 0.4), 0.4),
+        (P.COMPLETE, (2.0, 0.4), 0.4),
+    ],
+)
+def test_where_it_should_be(phase: Phase, place: tuple[float, float], astray_m: float) -> None:
+    assert bound(phase, at=place).astray_m(place) == pytest.approx(astray_m)
+
+
+def test_a_landing_goes_down_where_it_should_have_been_as_it_began() -> None:
+    """Not where it was: what had strayed by then strays on."""
+    down = bound(P.ALIGN, P.LANDING, at=(1.2, 0.7))
+    assert down.astray_m((1.2, 0.7)) == pytest.approx(0.7)
+    assert down.astray_m((2.2, 0.0)) == pytest.approx(1.0)
+    down.enter(P.ABORTED, (2.2, 0.0))
+    assert down.astray_m((2.2, 0.0)) == pytest.approx(1.0)
+
+
+def test_a_landing_from_the_take_off_is_above_the_start() -> None:
+    assert bound(P.APPROACH, P.LANDING, at=(0.4, 0.0)).astray_m((0.4, 0.3)) == 0.5
+
+
+def test_under_a_bare_ceiling_it_stays_above_its_start() -> None:
+    bare = bound(P.SEARCH, at=(0.0, 0.0), scenario=Scenario(no_target=True, target_xy_m=(2.0, 0.0)))
+    assert bare.astray_m((1.0, 0.0)) == 1.0
+
+
+def test_all_that_looks_like_its_target_may_be_flown_to() -> None:
+    alike = Neighbour((0.0, 1.0))
+    other = Neighbour((5.0, 0.0), large_id=7, small_id=8)
+    scenario = Scenario(
+        target_xy_m=(2.0, 0.0), target_yaw_rad=0.5 * math.pi, neighbours=(alike, other)
+    )
+    assert targets_of(scenario) == [(2.0, 0.0), pytest.approx((1.0, 0.0))]
+    assert bound(P.PERCH, at=(0.0, 0.0), scenario=scenario).astray_m((1.0, 0.2)) == pytest.approx(
+        0.2
+    )
+
+
+def test_a_target_that_moved_is_followed() -> None:
+    made = bound(P.PERCH, at=(2.0, 0.0))
+    made.target_at((2.0, 0.3))
+    assert made.astray_m((2.0, 0.3)) == 0.0
+    assert made.astray_m((2.0, 0.0)) == 0.0
+
+
+def test_what_nothing_on_board_can_know_is_allowed_on_top() -> None:
+    slide = e.EstimateError(step_m=(2.0, 0.0, 0.0), drift_mps=(0.3, 0.4, 9.0), for_s=4.0)
+    assert drifted_m((slide,), SCENARIO, 2.0) == pytest.approx(1.0)
+    assert drifted_m((slide,), SCENARIO, 60.0) == pytest.approx(2.0)
+    push = e.Push((0.042, 0.0, 1.0), 2.0)  # 1 m/s^2 at 42 g
+    assert drifted_m((push,), SCENARIO, 1.0) == pytest.approx(0.5)
+    assert drifted_m((push, slide), SCENARIO, 60.0) == pytest.approx(4.0)
+    lost = e.ExternalPositions("silent", e.FOR_EVER)
+    assert drifted_m((lost, e.CameraFault("covered", 9.0)), SCENARIO, 60.0) == 0.0
+
+
+# --- the way down -----------------------------------------------------------------------
+
+EVER = e.FOR_EVER
+NEVER = math.inf
+
+
+@pytest.mark.parametrize(
+    ("effect", "profile", "phase", "limit_s"),
+    [
+        (e.Silence(EVER, False, True), SIM, P.APPROACH, SAFETY.telemetry_land_s),
+        (e.Silence(EVER, False, True), SIM, P.ALIGN, SAFETY.telemetry_land_s),
+        (e.Silence(EVER, False, True), SIM, P.COMPLETE, NEVER),
+        (e.Silence(EVER, True, True), SIM, P.ALIGN, NEVER),
+        (e.Silence(1.0 + LASTS_S, False, True), SIM, P.ALIGN, NEVER),
+        (e.BlockDead("state", EVER), SIM, P.SEARCH, SAFETY.telemetry_land_s),
+        (e.BlockDead("battery", EVER), SIM, P.SEARCH, NEVER),
+        (e.TelemetryDelayed(1.5, EVER), SIM, P.ASCEND, SAFETY.telemetry_land_s),
+        (e.TelemetryDelayed(0.5, EVER), SIM, P.ASCEND, NEVER),
+        (e.Hung(5.0), SIM, P.ALIGN, SAFETY.loop_late_land_s),
+        (e.Hung(5.0), SIM, P.LANDING, NEVER),
+        (e.CameraFault("silent", EVER), SIM, P.ALIGN, SAFETY.camera_land_s),
+        (e.CameraFault("silent", EVER), SIM, P.APPROACH, NEVER),
+        (e.CameraFault("covered", EVER), SIM, P.ALIGN, NEVER),
+        (e.CameraFault("covered", EVER), TARGET_ONLY, P.ALIGN, TARGET_ONLY.positioning.land_s),
+        (e.CameraFault("lossy", EVER), TARGET_ONLY, P.ALIGN, NEVER),
+        (e.ExternalPositions("silent", EVER), SIM, P.APPROACH, SIM.positioning.land_s),
+        (e.ExternalPositions("late", EVER, 0.1), SIM, P.ALIGN, NEVER),
+        (e.Operator((0.0,)), SIM, P.ALIGN, NEVER),
+    ],
+)
+def test_after_what_loss_it_comes_down_and_when(
+    effect: e.Effect, profile: Profile, phase: Phase, limit_s: float
+) -> None:
+    late_s = limit_s + REACTION_S + WATCHED_S
+    assert overdue_s(effect, profile, phase) == pytest.approx(late_s, abs=0.011)
+
+
+def overdue_s(effect: e.Effect, profile: Profile, phase: Phase, touching: bool = False) -> float:
+    """How long after the fault's beginning a vehicle that hovers on is overdue."""
+    made = DescentBound((effect,), profile)
+    made.begin(10.0, phase)
+    for k in range(2000):
+        t_s = 10.0 + 0.01 * k
+        if made.is_overdue(t_s, 1.5, touching=touching, uplink=True):
+            return t_s - 10.0
+    return math.inf
+
+
+def test_what_touches_the_ceiling_or_hears_nothing_is_not_overdue() -> None:
+    gone = e.Silence(EVER, False, True)
+    assert overdue_s(gone, SIM, P.ALIGN, touching=True) == math.inf
+    made = DescentBound((gone,), SIM)
+    made.begin(0.0, P.ALIGN)
+    assert not made.is_overdue(3.0, 1.5, touching=False, uplink=False)
+    assert not made.is_overdue(9.0, 1.5, touching=False, uplink=True)
+
+
+def test_what_rises_to_the_ceiling_instead_is_overdue() -> None:
+    made = DescentBound((e.Hung(EVER),), SIM)
+    made.begin(0.0, P.ALIGN)
+    assert not made.is_overdue(2.01, 1.5, touching=False, uplink=True)
+    assert not made.is_overdue(3.0, 2.0, touching=True, uplink=True)
+    assert made.is_overdue(4.1, 2.0, touching=True, uplink=True)
+
+
+def test_what_is_on_its_way_down_is_not_overdue() -> None:
+    for sunk_m, late in ((SUNK_M + 0.01, False), (SUNK_M - 0.01, True)):
+        made = DescentBound((e.Hung(EVER),), SIM)
+        made.begin(0.0, P.ALIGN)
+        assert not made.is_overdue(2.0 + 1e-6, 1.5, touching=False, uplink=True)
+        found = made.is_overdue(4.1, 1.5 - sunk_m, touching=False, uplink=True)
+        assert found is late
+    low = DescentBound((e.Hung(EVER),), SIM)
+    low.begin(0.0, P.ALIGN)
+    assert not low.is_overdue(4.1, LOW_M, touching=False, uplink=True)
+    assert not low.is_overdue(9.0, LOW_M, touching=False, uplink=True)

@@ -1,0 +1,92 @@
+"""What the program says at its end is found by name: each row, phase and outcome has its claims."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from perchctl.commands.fly import EXIT_CODE_OF
+from perchctl.errors import EXIT_CODES
+from perchctl.faults.claims import (
+    NOT_KNOWN,
+    OUTCOME_CLAIMS,
+    PHASE_CLAIMS,
+    RESCUE_UNCONFIRMED,
+    ROW_CLAIMS,
+    UNCONFIRMED,
+    claims_of,
+    claims_of_rescue,
+)
+from perchctl.mission.state import TERMINALS, MotorStop, Outcome, Phase
+from perchctl.mission.table import TABLE
+from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
+
+LAST_ROWS = {row.name: row for row in TABLE if row.to in TERMINALS}
+
+
+def report(phase: Phase, outcome: Outcome, row: str, locked: bool = False) -> FlightReport:
+    last = Event(20.0, EventKind.PHASE, "why", phase, row)
+    return FlightReport(phase, outcome, "why", 1, 20.0, locked, (last,))
+
+
+def test_each_row_that_ends_a_flight_has_its_claims() -> None:
+    """A new row needs its own: until it has, nothing holds its sentence against the truth."""
+    assert set(ROW_CLAIMS) == set(LAST_ROWS)
+    assert {NOT_KNOWN, UNCONFIRMED} <= set(LAST_ROWS)
+
+
+@pytest.mark.parametrize("name", sorted(LAST_ROWS))
+def test_a_row_claims_what_its_sentence_says(name: str) -> None:
+    row, claims = LAST_ROWS[name], ROW_CLAIMS[name]
+    if row.to is not Phase.ABORTED:
+        assert PHASE_CLAIMS[row.to] <= claims
+    if row.motor_stop is not MotorStop.NONE:
+        assert "motors off" in claims
+    if isinstance(row.reason, str):
+        said = {"locked": "locked", "tilted": "tilted", "motors cut": "motors off"}
+        for word, claim in said.items():
+            assert (word in row.reason) <= (claim in claims), row.reason
+        assert ("motors off" in row.reason) <= bool(
+            claims & {"hangs", "stands", "hangs or stands", "motors off"}
+        )
+
+
+@pytest.mark.parametrize("outcome", Outcome)
+def test_an_outcome_claims_what_its_exit_code_means(outcome: Outcome) -> None:
+    """The words of the exit codes' table, as the README prints it."""
+    claims = OUTCOME_CLAIMS[outcome]
+    meaning = EXIT_CODES[EXIT_CODE_OF[outcome]]
+    words: dict[frozenset[str], str] = {
+        frozenset({"hangs"}): r"^perched",
+        frozenset({"stands"}): r"landed$",
+        frozenset({"hangs or stands"}): r"landed.* left",
+        frozenset({"motors off"}): r"motors cut",
+        frozenset(): r"^safety abort$",
+    }
+    assert re.search(words[claims], meaning)
+
+
+def test_a_report_claims_all_that_it_says() -> None:
+    perched = report(Phase.PERCHED, Outcome.PERCHED, "perched")
+    assert claims_of(perched) == {"hangs"}
+    landed = report(Phase.LANDED, Outcome.OPERATOR, "landed")
+    assert claims_of(landed) == {"stands", "hangs or stands"}
+    hung = report(Phase.PERCHED, Outcome.TARGET_NOT_FOUND, "hung")
+    assert claims_of(hung) == {"hangs", "stands"}  # exit 50 says that it landed
+    cut = report(Phase.ABORTED, Outcome.EMERGENCY, "operator-stop", locked=True)
+    assert claims_of(cut) == {"motors off", "locked"}
+    not_known = report(Phase.ABORTED, Outcome.SAFETY, NOT_KNOWN)
+    assert claims_of(not_known) == {"hangs or stands"}
+    assert claims_of(report(Phase.ABORTED, Outcome.SAFETY, UNCONFIRMED)) == set()
+
+
+def test_what_a_rescue_says_counts_too() -> None:
+    def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
+        return Event(9.0, kind, text)
+
+    down = note(f"ValueError{RESCUE}it is down, or hangs: the motors are off")
+    assert claims_of_rescue(down) == {"hangs or stands"}
+    assert claims_of_rescue(note(f"ValueError{RESCUE}{RESCUE_UNCONFIRMED}")) == set()
+    assert claims_of_rescue(note("no battery reading")) == set()
+    assert claims_of_rescue(note(f"E{RESCUE}down", EventKind.PHASE)) == set()

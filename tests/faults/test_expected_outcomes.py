@@ -1,0 +1,121 @@
+"""Expected outcomes: each by its cause, and only for a while after it began."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from perchctl.faults import effects as e
+from perchctl.faults.catalogue import FAULTS, Case, draw_case
+from perchctl.faults.expected_outcomes import (
+    CUT,
+    EXPECTED_OUTCOMES,
+    LEFT_LANDING,
+    LETS_GO_LATER,
+    NO_LIFT,
+    OPERATOR_STOPS,
+    SAGS_TOO_FAST,
+    TOO_LOW,
+    ExpectedOutcome,
+    unexpected,
+)
+from perchctl.faults.facts import LEAST_LIFT, Facts
+from perchctl.faults.oracle import FLAGS
+from perchctl.geometry import GRAVITY_MPS2
+from perchctl.profile import Profile, load_profile
+from perchctl.sim.draw import draw_scenario
+from perchctl.sim.powertrain import most_thrust_n
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.thrust_curve import MOTOR_FORCE_N
+
+
+def test_they_name_flags_and_reasons() -> None:
+    used = {outcome.name for fault in FAULTS for outcome in fault.expected_outcomes}
+    assert used == {outcome.name for outcome in EXPECTED_OUTCOMES}
+    for outcome in EXPECTED_OUTCOMES:
+        assert outcome.reason
+        assert outcome.flags
+        assert outcome.flags <= set(FLAGS)
+        assert outcome.within_s > 0.0
+
+
+@pytest.mark.parametrize(
+    ("outcome", "facts", "cause_s"),
+    [
+        (CUT, Facts(muted_s=7.0), 7.0),
+        (CUT, Facts(), None),
+        (CUT, Facts(muted_s=7.0, own_landing=True), None),
+        (LEFT_LANDING, Facts(effects=(e.Killed(),), killed_s=6.0, own_landing=True), 6.0),
+        (LEFT_LANDING, Facts(effects=(e.Killed(),), killed_s=6.0), None),
+        (LEFT_LANDING, Facts(effects=(e.Hung(9.0),), killed_s=6.0, own_landing=True), None),
+        (OPERATOR_STOPS, Facts(stop_s=9.0), 9.0),
+        (OPERATOR_STOPS, Facts(effects=(e.Operator((0.0, 0.8)),), begin_s=5.0), None),
+        (LETS_GO_LATER, Facts(let_go_s=21.0, watched=True), 21.0),
+        (LETS_GO_LATER, Facts(let_go_s=21.0), None),
+        (TOO_LOW, Facts(slipped_s=8.0, slipped_m=0.8), 8.0),
+        (TOO_LOW, Facts(slipped_s=8.0, slipped_m=1.2), None),
+        (NO_LIFT, Facts(weak_s=6.0), 6.0),
+        (NO_LIFT, Facts(), None),
+        (SAGS_TOO_FAST, Facts(weak_s=10.0, low_s=8.0, low_m=2.0), 10.0),
+        (SAGS_TOO_FAST, Facts(weak_s=10.0), 10.0),
+        (SAGS_TOO_FAST, Facts(weak_s=15.0, low_s=8.0, low_m=2.0), None),
+        (SAGS_TOO_FAST, Facts(weak_s=10.0, low_s=8.0, low_m=0.1), None),
+        (SAGS_TOO_FAST, Facts(low_s=8.0, low_m=2.0), None),
+    ],
+)
+def test_each_by_its_cause(outcome: ExpectedOutcome, facts: Facts, cause_s: float | None) -> None:
+    assert outcome.cause(facts) == cause_s
+
+
+def test_what_came_before_the_cause_is_no_consequence_of_it() -> None:
+    facts = Facts(stop_s=10.0)
+    for t_s, counted in ((9.9, ("fell",)), (10.1, ()), (13.9, ()), (14.1, ("fell",))):
+        assert unexpected({"fell": t_s}, (OPERATOR_STOPS,), facts) == counted
+
+
+def test_other_flags_count_whatever_was_expected() -> None:
+    flags: dict[Any, float] = {"fell": 10.5, "lied": 10.5}
+    assert unexpected(flags, (CUT, OPERATOR_STOPS), Facts(stop_s=10.0)) == ("lied",)
+    assert unexpected(flags, (), Facts(stop_s=10.0)) == ("fell", "lied")
+
+
+# --- how many drawn cases may have one ------------------------------------------------
+
+WATCHED_S, LOOKED_S = 5.2, 6.0
+"""From contact to the end of the watch, with the shipped profiles' times, and for how long the
+oracle looks on from there."""
+
+
+def may_come(outcome: ExpectedOutcome, case: Case, scenario: Scenario) -> bool:
+    """Whether the cause of a rare outcome may come in a drawn case, by what was drawn alone: at
+    most as strict as the flight itself is."""
+    weight_n = scenario.mass_kg * GRAVITY_MPS2
+    for effect in case.effects:
+        match outcome, effect:
+            case ExpectedOutcome(name=LETS_GO_LATER.name), e.MagnetLetsGo(after_s):
+                return WATCHED_S < after_s < WATCHED_S + LOOKED_S
+            case ExpectedOutcome(name=TOO_LOW.name), e.MagnetHolds() | e.MagnetLetsGo():
+                return scenario.ceiling_z_m < 1.0
+            case ExpectedOutcome(name=NO_LIFT.name), e.MotorWeak(_, strength):
+                lift_n = strength * most_thrust_n(scenario.battery_rest_v - 0.1)
+                return min(4.0 * MOTOR_FORCE_N, lift_n) < LEAST_LIFT * weight_n
+            case ExpectedOutcome(name=SAGS_TOO_FAST.name), e.BatterySags(_, by_v):
+                lift_n = most_thrust_n(scenario.battery_rest_v - by_v - 0.1)
+                return min(4.0 * MOTOR_FORCE_N, lift_n) < LEAST_LIFT * weight_n
+    return False
+
+
+@pytest.mark.parametrize("name", ["sim", "target_only"])
+def test_fewer_than_one_drawn_case_in_a_hundred_may_have_a_rare_one(name: str) -> None:
+    """The user's stop, the firmware's own cut and a killed program aside."""
+    profile: Profile = load_profile(name)
+    drawn, rare = 5000, 0
+    for seed in range(drawn):
+        fault = draw_case(seed, Scenario()).fault  # whatever the scenario, the same one
+        outcomes = [outcome for outcome in fault.expected_outcomes if not outcome.chosen]
+        if outcomes:
+            scenario = draw_scenario(profile, seed)
+            case = draw_case(seed, scenario)
+            rare += any(may_come(outcome, case, scenario) for outcome in outcomes)
+    assert 0 < rare < 0.01 * drawn

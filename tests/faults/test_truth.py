@@ -1,0 +1,131 @@
+"""What the oracle is told of the true vehicle, and the facts that are kept of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.calibration.files import load_calibration
+from perchctl.faults.facts import CUT_S, FactsRecorder
+from perchctl.faults.oracle import Sample
+from perchctl.faults.truth import WatchedVehicle, sample_of
+from perchctl.profile import Profile, TargetConfig, load_profile
+from perchctl.sim.scenario import Scenario
+
+CAMERA = load_calibration("example_640x480.yaml")
+SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, no_target=True)
+PROFILE: Profile = load_profile("sim")
+DT_S = 0.01
+
+
+def pressed_by(order: float, mass_kg: float) -> Sample:
+    """At a ceiling without a magnet, under a raw order, of 65,535."""
+    vehicle = WatchedVehicle(replace(SCENARIO, mass_kg=mass_kg), CAMERA, TargetConfig())
+    world, scenario, firmware = vehicle.world, vehicle.scenario, vehicle.firmware
+    world.set_pose((0.0, 0.0, scenario.ceiling_z_m - scenario.gear_body_m[2]), hold=True)
+    for step in range(700):
+        if step == 500:  # the motors are up to speed
+            world.let_go()
+        firmware.motors = firmware.driver.pwm((order,) * 4, world.battery_v)
+        world.step(firmware.motors)
+    return sample_of(vehicle)
+
+
+@pytest.mark.parametrize("mass_kg", [0.030, 0.038, 0.042])
+def test_the_largest_raw_thrust_presses_at_any_mass(mass_kg: float) -> None:
+    """At 42 g it lifts 7 % more than the weight (docs/firmware.md, "Thrust budget")."""
+    assert pressed_by(60000.0, mass_kg).pressing
+
+
+def test_what_the_motors_do_not_hold_there_does_not_press() -> None:
+    assert not pressed_by(50000.0, 0.042).pressing
+    assert not pressed_by(0.0, 0.042).pressing
+
+
+def test_a_sample_knows_how_fast_it_goes_sideways() -> None:
+    vehicle = WatchedVehicle(SCENARIO, CAMERA, TargetConfig())
+    vehicle.world.set_pose((0.0, 0.0, 1.0), velocity_mps=(0.3, -0.4, 9.0))
+    assert sample_of(vehicle).aside_mps == pytest.approx(0.5)
+
+
+# --- facts ------------------------------------------------------------------------------
+
+HANGING = Sample(
+    t_s=0.0, x_m=0.0, y_m=0.0, height_m=2.0, vz_mps=0.0, up_z=1.0, acc_g=1.0, motors_on=False,
+    pressing=False, floor=False, hanging=True, hold_ratio=2.0, locked=False,
+    ended_by_vehicle=False,
+)  # fmt: skip
+HOVER = HANGING._replace(hanging=False, motors_on=True)
+
+
+class Recorded:
+    """A recorder beside a vehicle of which only the script is true."""
+
+    def __init__(self, rest_v: float = 4.1) -> None:
+        self.magnet = SimpleNamespace(let_go=False)
+        self.planner = SimpleNamespace(active=False)
+        self.world = SimpleNamespace(
+            magnet=self.magnet,
+            powertrain=SimpleNamespace(strength=None),
+            battery_rest_v=rest_v,
+            battery_v=rest_v - 0.5,
+        )
+        vehicle: Any = SimpleNamespace(
+            world=self.world,
+            firmware=SimpleNamespace(planner=self.planner),
+            scenario=SimpleNamespace(mass_kg=0.04),
+        )
+        self.recorder = FactsRecorder(vehicle, PROFILE)
+        self.t_s = 0.0
+
+    def show(self, sample: Sample, for_s: float, **changes: Any) -> Recorded:
+        for _ in range(round(for_s / DT_S)):
+            self.recorder.see(sample._replace(t_s=self.t_s, **changes), begun=True)
+            self.t_s += DT_S
+        return self
+
+
+@pytest.mark.parametrize(("short_s", "watched"), [(0.0, True), (0.3, False)])
+def test_the_magnet_is_watched_by_the_world_not_by_the_report(
+    short_s: float, watched: bool
+) -> None:
+    """The whole weight, motors off, for as long as the planner puts it there and looks."""
+    complete = PROFILE.planner.complete
+    it = Recorded().show(HOVER, 1.0).show(HANGING, 9.0, motors_on=True)
+    it.show(HANGING, complete.hang_s + complete.watch_s - short_s)
+    it.magnet.let_go = True
+    it.show(HANGING, DT_S)
+    assert it.recorder.let_go_s == pytest.approx(it.t_s - DT_S)
+    assert it.recorder.watched is watched
+
+
+@pytest.mark.parametrize("own_landing", [False, True])
+def test_silence_that_ends_in_a_cut(own_landing: bool) -> None:
+    it = Recorded().show(HOVER, 1.0).show(HOVER, CUT_S - 0.1, uplink=False).show(HOVER, 1.0)
+    assert it.recorder.muted_s is None
+    it.planner.active = own_landing
+    it.show(HOVER, CUT_S + 1.0, uplink=False)
+    assert it.recorder.muted_s == pytest.approx(2.0 + 2.0 * CUT_S - 0.1, abs=0.02)
+    assert it.recorder.own_landing is own_landing
+
+
+def test_a_slip_from_still_motors_is_kept_with_its_height() -> None:
+    it = Recorded().show(HANGING, 1.0, motors_on=True).show(HOVER, 0.5)
+    assert it.recorder.slipped_s is None
+    it.show(HANGING, 1.0, height_m=0.9).show(HOVER, 0.1, motors_on=False, height_m=0.89)
+    assert it.recorder.slipped_s == pytest.approx(2.5)
+    assert it.recorder.slipped_m == 0.89
+
+
+def test_when_nothing_lifts_it_any_more() -> None:
+    it = Recorded().show(HOVER, 0.5)
+    assert (it.recorder.weak_s, it.recorder.low_s) == (None, None)
+    it.world.battery_rest_v, it.world.battery_v = 3.3, 2.9
+    it.show(HOVER, 0.5, height_m=1.2)
+    assert it.recorder.weak_s == pytest.approx(0.5)
+    assert (it.recorder.low_s, it.recorder.low_m) == (pytest.approx(0.5), 1.2)
