@@ -21,10 +21,11 @@ if str(ROOT) not in sys.path:
 
 from perchctl.errors import EXIT_CODES  # noqa: E402
 from perchctl.faults.catalogue import AIR, FAULTS, FROM_THE_START, Fault  # noqa: E402
-from perchctl.faults.excuses import EXCUSES  # noqa: E402
+from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
 from perchctl.mission.diagram import diagram, rows_table  # noqa: E402
+from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
 from perchctl.profile import Profile, SimulationConfig  # noqa: E402
 from perchctl.profile.keys import UNITS, allowed, keys  # noqa: E402
 from perchctl.profile.worlds import WORLDS  # noqa: E402
@@ -103,14 +104,17 @@ def exit_codes() -> str:
 
 
 def fault_catalogue() -> str:
-    head = ["| name | rows | what happens | begins in | excuses |", "|---|---|---|---|---|"]
+    head = [
+        "| name | rows | what happens | begins in | expected outcomes |",
+        "|---|---|---|---|---|",
+    ]
     return "\n".join([*head, *map(_fault_row, FAULTS)])
 
 
 def _fault_row(fault: Fault) -> str:
     rows = ", ".join(map(str, fault.rows))
-    excuses = ", ".join(excuse.name for excuse in fault.excuses)
-    return f"| `{fault.name}` | {rows} | {fault.what} | {_phases(fault)} | {excuses} |"
+    expected = ", ".join(outcome.name for outcome in fault.expected_outcomes)
+    return f"| `{fault.name}` | {rows} | {fault.what} | {_phases(fault)} | {expected} |"
 
 
 def _phases(fault: Fault) -> str:
@@ -122,13 +126,14 @@ def _phases(fault: Fault) -> str:
     return f"any phase but {', '.join(missing)}" if missing else "any phase"
 
 
-def fault_excuses() -> str:
+def expected_outcomes() -> str:
     rows = [
-        f"| {excuse.name} | {', '.join(sorted(excuse.expected)).replace('_', ' ')} | "
-        f"{excuse.reason} |"
-        for excuse in EXCUSES
+        f"| {outcome.name} | {', '.join(sorted(outcome.flags)).replace('_', ' ')} | "
+        f"{outcome.within_s:g} s | {outcome.reason} |"
+        for outcome in EXPECTED_OUTCOMES
     ]
-    return "\n".join(["| excuse | what is not counted | why |", "|---|---|---|", *rows])
+    head = ["| outcome | what is not counted | within | why |", "|---|---|---|---|"]
+    return "\n".join([*head, *rows])
 
 
 def promises() -> str:
@@ -136,17 +141,28 @@ def promises() -> str:
     return "\n".join(["| what | what happens |", "|---|---|", *rows])
 
 
+def manoeuvres() -> str:
+    """A row for each evidence; stages in which all cells say the same stand in one column."""
+    head = [f"{stage.value}, {reach.value}" for stage in Stage for reach in Reach]
+    rows = []
+    for evidence in Evidence:
+        cells = [MANOEUVRES[evidence, reach, stage].value for stage in Stage for reach in Reach]
+        rows.append(f"| {evidence.value} | {' | '.join(cells)} |")
+    return "\n".join([f"| evidence | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|", *rows])
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "import-order": import_order,
     "diagram": lambda: f"```mermaid\n{diagram()}\n```",
     "rows": rows_table,
+    "manoeuvres": manoeuvres,
     "profile-keys": profile_keys,
     "worlds": worlds,
     "log-fields": log_fields,
     "event-fields": lambda: log_fields(EVENT_FIELDS),
     "exit-codes": exit_codes,
     "fault-catalogue": fault_catalogue,
-    "fault-excuses": fault_excuses,
+    "expected-outcomes": expected_outcomes,
     "promises": promises,
 }
 

@@ -20,9 +20,10 @@ MOST_CELL_V = 5.0
 class Telemetry:
     """The vehicle's newest state, SI and right-handed (see `perchctl.geometry`).
 
-    `t_s` is on the loop's clock; `thrust` is the commanded 0..65535;
-    `acc_z_g` is the specific force along body z (+1 at rest on the ground). `behind_s`: by how
-    much position and velocity, which come by a packet of their own, are older than `t_s`.
+    `t_s` is on the loop's clock; `thrust` is the commanded 0..65535; `acc_x_g`, `acc_y_g` and
+    `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
+    `behind_s`: by how much position and velocity, which come by a packet of their own, are older
+    than `t_s`.
     """
 
     t_s: float
@@ -38,6 +39,8 @@ class Telemetry:
     battery_state: int = 0  # pm.state; 3 = low power
     position_variance_m2: float | None = None  # largest of the estimator's three
     behind_s: float = 0.0
+    acc_x_g: float = 0.0
+    acc_y_g: float = 0.0
 
     def has(self, bit: int) -> bool:
         return bool(self.supervisor & bit)

@@ -23,7 +23,7 @@ MOST_GROUND_TOLERANCE_M = 0.45
 """What hangs is higher."""
 USUAL_RATE_HZ = 25.0
 OVERDUE = 0.5
-"""Of the landing's time: so long it goes by setpoints (`perchctl.mission.landing`)."""
+"""Of the landing's time: so long it goes by setpoints (`perchctl.mission.lander`)."""
 
 
 def _least_time_s(takeoff_m: float, takeoff_mps: float, *dwells_s: float) -> float:

@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 from perchctl.mission.state import BatteryOutlook
-from perchctl.mission.watch import Event, EventKind, Outside
+from perchctl.mission.turn import Outside
+from perchctl.mission.watch import Event, EventKind
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 

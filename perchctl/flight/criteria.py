@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from perchctl.errors import distinct_figures
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CAN_FLY,
@@ -69,9 +70,9 @@ def battery_low(telemetry: Telemetry, profile: Profile) -> Problem | None:
     needed_v = profile.safety.min_rest_v
     if not NO_BATTERY_READING_V <= telemetry.battery_v < needed_v:
         return None
+    rests, needed = distinct_figures(telemetry.battery_v, needed_v, 2)
     return Problem(
-        f"the battery rests at {telemetry.battery_v:.2f} V, at least {needed_v:.2f} V are "
-        f"needed (safety.min_rest_v)",
+        f"the battery rests at {rests} V, at least {needed} V are needed (safety.min_rest_v)",
         "charge it",
     )
 
@@ -84,7 +85,8 @@ def unsettled(telemetry: Telemetry, profile: Profile) -> Problem | None:
     advice = "is there a positioning system?"
     if profile.positioning.by == "target":
         advice = "do the positions arrive, and does the target stay in view?"
-    return Problem(f"variance {variance:.3g} m^2, at most {most:g} allowed", advice)
+    found, allowed = distinct_figures(variance, most, 2)
+    return Problem(f"variance {found} m^2, at most {allowed} allowed", advice)
 
 
 def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
@@ -126,11 +128,11 @@ def tilt_deg(telemetry: Telemetry) -> float:
 
 
 def tilted(telemetry: Telemetry, profile: Profile) -> Problem | None:
-    most_deg = profile.safety.start_tilt_deg
-    if tilt_deg(telemetry) <= most_deg:
+    found_deg, most_deg = tilt_deg(telemetry), profile.safety.start_tilt_deg
+    if found_deg <= most_deg:
         return None
-    found = f"tilted by {tilt_deg(telemetry):.0f} deg, at most {most_deg:g} allowed"
-    return Problem(found, "put it on level ground")
+    found, allowed = distinct_figures(found_deg, most_deg, 0)
+    return Problem(f"tilted by {found} deg, at most {allowed} allowed", "put it on level ground")
 
 
 def moving(telemetry: Telemetry) -> Problem | None:
@@ -153,7 +155,8 @@ def within_reach(target: TargetEstimate | None) -> Problem | None:
     away_m = math.hypot(*(float(e) for e in target.e_m))
     if away_m >= WITHIN_REACH_M:
         return None
+    away, needed = distinct_figures(away_m, WITHIN_REACH_M, 2)
     return Problem(
-        f"the target is only {away_m:.2f} m away, at least {WITHIN_REACH_M:g} m are needed",
+        f"the target is only {away} m away, at least {needed} m are needed",
         "the vehicle hangs, or stands too close under it; take it down first",
     )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import bisect
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from perchctl.geometry import wrap_rad
+from perchctl.mission.imu import ImuMotion, moved
 from perchctl.profile import SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry, is_battery_reading
@@ -24,6 +25,7 @@ class History:
 
     `battery_changed_s`: when the last reading differed from the one before, `battery_v`; without
     any reading, when the first sample came: an absent one ages like one that stands still.
+    `imu`: the motion that all samples of the flight tell.
     """
 
     samples: tuple[Telemetry, ...] = ()
@@ -31,6 +33,7 @@ class History:
     turned_rad: float = 0.0
     battery_changed_s: float | None = None
     battery_v: float | None = None
+    imu: ImuMotion = field(default_factory=ImuMotion)
 
     @property
     def newest(self) -> Telemetry | None:
@@ -46,7 +49,7 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
     jumped, turned_rad = False, 0.0
     if not new:
         return replace(history, jumped=jumped, turned_rad=turned_rad)
-    samples = list(history.samples)
+    samples, imu = list(history.samples), history.imu
     changed_s, battery_v = history.battery_changed_s, history.battery_v
     for sample in new:
         if not is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
@@ -58,12 +61,13 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
             changed_s = sample.t_s
         if is_battery_reading(sample.battery_v) and sample.battery_v != battery_v:
             changed_s, battery_v = sample.t_s, sample.battery_v
+        imu = moved(imu, samples[-1] if samples else None, sample)
         samples.append(sample)
     if samples:
         oldest = samples[-1].t_s - KEEP_S
         first = bisect.bisect_left(samples, oldest, key=_time_s)
         samples = samples[first:]
-    return History(tuple(samples), jumped, turned_rad, changed_s, battery_v)
+    return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
 
 
 def belated(history: History, late: list[Telemetry], safety: SafetyConfig) -> History:
@@ -177,6 +181,8 @@ def is_finite(s: Telemetry) -> bool:
         s.roll_rad,
         s.pitch_rad,
         s.yaw_rad,
+        s.acc_x_g,
+        s.acc_y_g,
         s.acc_z_g,
         s.thrust,
     )

@@ -7,6 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from perchctl.calibration.files import camera_of
+from perchctl.camera.mirror import as_profiled
 from perchctl.camera.slot import NewestSlot
 from perchctl.camera.source import FrameSource
 from perchctl.flight.lockstep_positions import feed_lockstep
@@ -91,6 +92,13 @@ class LockstepSource:
 
     def close(self) -> None:
         return None
+
+
+def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
+    """The vehicle's camera as the flight sees it by its profile."""
+    assert vehicle.camera is not None
+    source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
+    return as_profiled(source, profile.camera)
 
 
 class Truth:
@@ -178,8 +186,7 @@ def fly_lockstep(
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
     link = MockLink(vehicle, profile.link.telemetry_period_s, radio_of(scenario))
     positions = feed_lockstep(link, profile)
-    assert vehicle.camera is not None
-    source: FrameSource = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
+    source = lockstep_source(vehicle, profile)
     truth = Truth(vehicle)
     watchers = (truth, *watchers)
     if log is not None:

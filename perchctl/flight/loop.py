@@ -28,7 +28,7 @@ from perchctl.flight.turns import Turns
 from perchctl.flight.watchdog import Watchdog
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
-from perchctl.mission.context import Context
+from perchctl.mission.lander import Finding
 from perchctl.mission.sent import Sent
 from perchctl.mission.state import (
     FLYING_PHASES,
@@ -75,6 +75,10 @@ class FlightParts:
     positions: Callable[[float], FeedStatus] | None = None
     remarks: Callable[[], Sequence[str]] = tuple
 
+    def position_age_s(self, now_s: float) -> float:
+        """Of the newest position that a motion capture gave; 0 without one."""
+        return 0.0 if self.positions is None else self.positions(now_s).age_s
+
 
 def fly(parts: FlightParts) -> FlightReport:
     """Connect is done: wait until ready, fly the mission, return how it ended.
@@ -91,34 +95,31 @@ def fly(parts: FlightParts) -> FlightReport:
     _wait_until_ready(parts, senses, turns)  # nothing is started before it returns
     if senses.history.newest is not None:
         senses.ground_z_m = senses.history.newest.position_m[2]
-    watchdog, told = Watchdog(parts.profile, parts.operator), _teller(parts.watchers)
+    watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
     parts.link.guard(watchdog, told)
-    started_s = parts.clock.now()
     try:
         return _mission(parts, senses, watchdog, turns)
     except BaseException as error:
         watchdog.rescuing()
-        safe = rescue(
+        found = rescue(
             parts.link,
             parts.clock,
-            parts.profile.planner.landing,
+            parts.profile,
             parts.operator,
-            senses.history.newest,
-            senses.ground_z_m,
-            flown_s=parts.clock.now() - started_s,
-            held_m=watchdog.held_m,
-            blind_s=watchdog.blind_s(parts.clock.now()),
-            told=told,
+            watchdog.state,
+            senses.history,
+            parts.position_age_s,
+            told,
         )
         with contextlib.suppress(Exception):  # the log may be what failed
             turns.failed(senses, error)
-        _tell_rescue(parts, error, safe)
+        _tell_rescue(parts, error, found)
         raise
 
 
-def _teller(watchers: Sequence[Watcher]) -> Callable[[Sent], None]:
+def _teller(parts: FlightParts) -> Callable[[Sent], None]:
     """What is sent in the loop's place is told to those who want it."""
-    told = [watcher for watcher in watchers if isinstance(watcher, SentWatcher)]
+    told = [watcher for watcher in parts.watchers if isinstance(watcher, SentWatcher)]
 
     def tell(sent: Sent) -> None:
         for watcher in told:
@@ -128,11 +129,16 @@ def _teller(watchers: Sequence[Watcher]) -> Callable[[Sent], None]:
     return tell
 
 
-def _tell_rescue(parts: FlightParts, error: BaseException, safe: bool) -> None:
-    what = "it is down, or hangs: the motors are off"
-    if not safe:
-        what = "a landing was ordered, but could not be confirmed: keep away from the vehicle"
-    text = f"{type(error).__name__}{RESCUE}{what}"
+RESCUED = {
+    Finding.STANDS: "the vehicle stands on the floor, its motors are off",
+    Finding.HANGS: "the vehicle hangs on the magnet, its motors are off",
+    Finding.UNKNOWN: "the motors are off; it is not known whether the vehicle hangs or stands",
+    None: "a landing was flown, but could not be confirmed: keep away from the vehicle",
+}
+
+
+def _tell_rescue(parts: FlightParts, error: BaseException, found: Finding | None) -> None:
+    text = f"{type(error).__name__}{RESCUE}{RESCUED[found]}"
     for watcher in parts.watchers:
         with contextlib.suppress(Exception):  # it may be the one that failed
             watcher.event(Event(parts.clock.now(), EventKind.NOTE, text))
@@ -201,10 +207,8 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         if not isinstance(command, Idle):
             parts.link.send(command)
         turns.lap()
-        watchdog.turn(
-            now_s, max(due_s, now_s) + period_s, state, command, obs.telemetry,
-            placed=Context(state, obs, parts.profile).placed, position_age_s=obs.position_age_s,
-        )  # fmt: skip
+        watchdog.tick(max(due_s, now_s) + period_s, state, command, obs)
+        senses.sends_sights = state.blind_s is None
         events = events_of(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True

@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from perchctl.errors import Interrupted
 from perchctl.mission.state import Operator
 
 AGAIN_S = 0.5
 """A second press counts this long after the first."""
-HELD_S = 0.12
-"""Presses that follow each other faster are one key held down: keyboards repeat at 10 to
-33 Hz, after 0.25 to 0.7 s."""
+HELD_S = 0.3
+"""Presses that follow each other faster are one: a key held down repeats at 5 to 33 Hz."""
+DELAY_S = 1.0
+"""A keyboard waits at most this long before it repeats a key that is held down; 0.25 to 0.66 s are
+usual."""
+INSIST_S = 2.0
+"""Who presses on for so long wants the motors stopped, by a key held down or by hammering."""
+_EPS_S = 1e-9
 
 
 @dataclass
 class OperatorSwitch:
     """Ctrl-C as the planner understands it: once lands, twice stops.
 
-    `press` is Ctrl-C. A key held down is one press, so a second press counts once no third
-    has followed it within `HELD_S`. `land` is for STOP on the live page and for the signals
-    that ask a program to end: it lands as one Ctrl-C does, however often it comes, and never
-    adds up to a stop of the motors. All are safe from any thread.
+    `press` is Ctrl-C. A second press is one after at least `HELD_S` of silence and `AGAIN_S` after
+    the first. The first repetition of a key held down looks like that, too, so after a silence of
+    up to `DELAY_S` it counts once no other has followed it for `HELD_S`. Presses that still follow
+    each other `INSIST_S` after the first are a stop as well. `land` is for STOP on the live page
+    and for the signals that ask a program to end: it lands as one Ctrl-C does, however often it
+    comes, and never adds up to a stop of the motors. All methods may be called from any thread.
 
     Until the flight loop listens there is nothing to land: `leave` raises `Interrupted`.
     """
@@ -31,31 +39,37 @@ class OperatorSwitch:
     listening: bool = False
     landing_requested: bool = False
     clock: Callable[[], float] = time.monotonic
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _first_s: float | None = None
     _last_s: float = 0.0
     _second_s: float | None = None
     _stopped: bool = False
 
     def read(self) -> Operator:
-        self._confirm(self.clock())
-        if self._stopped:
-            return Operator.STOP
-        pressed = self._first_s is not None or self.landing_requested
-        return Operator.LAND if pressed else Operator.NONE
+        with self._lock:
+            self._confirm(self.clock())
+            if self._stopped:
+                return Operator.STOP
+            pressed = self._first_s is not None or self.landing_requested
+            return Operator.LAND if pressed else Operator.NONE
 
     def land(self) -> None:
         self.landing_requested = True
 
     def press(self) -> None:
-        now_s = self.clock()
-        self._confirm(now_s)
-        if self._first_s is None:
-            self._first_s = now_s
-        elif now_s - self._last_s < HELD_S:
-            self._second_s = None
-        elif now_s - self._first_s >= AGAIN_S:
-            self._second_s = now_s
-        self._last_s = now_s
+        with self._lock:
+            now_s = self.clock()
+            self._confirm(now_s)
+            silent_s = now_s - self._last_s
+            if self._first_s is None:
+                self._first_s = now_s
+            elif silent_s < HELD_S - _EPS_S:  # a key has begun to repeat, or it is hammered
+                self._second_s = None
+                self._stopped |= now_s - self._first_s >= INSIST_S - _EPS_S
+            elif now_s - self._first_s >= AGAIN_S - _EPS_S:
+                self._second_s = now_s
+                self._stopped |= silent_s > DELAY_S + _EPS_S
+            self._last_s = now_s
 
     def leave(self) -> None:
         """On a signal, in the main thread."""
@@ -64,5 +78,5 @@ class OperatorSwitch:
 
     def _confirm(self, now_s: float) -> None:
         second_s = self._second_s
-        if second_s is not None and now_s - second_s >= HELD_S:
+        if second_s is not None and now_s - second_s >= HELD_S - _EPS_S:
             self._stopped = True

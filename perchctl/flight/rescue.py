@@ -2,94 +2,79 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from contextlib import suppress
 
 from perchctl.flight.clock import Clock
-from perchctl.flight.history import is_finite
-from perchctl.link.evidence import is_known, motors_may_run
+from perchctl.flight.history import History, extended
 from perchctl.link.protocol import Link, ToldSent, tell_nobody
-from perchctl.mission.landing import (
-    LEAST_ORDERS,
-    MAX_ORDERS,
-    PEEL_BELOW_M,
-    PEEL_BLIND_S,
-    PEELED_M,
-    REPEAT_ORDER_S,
-    own_landing,
-)
+from perchctl.mission import lander
+from perchctl.mission.context import Context
+from perchctl.mission.lander import Finding
 from perchctl.mission.sent import Sent
-from perchctl.mission.state import Operator
-from perchctl.profile import LandingConfig
-from perchctl.vehicle import HL_ACTIVE, Command, EmergencyStop, PositionSetpoint, Telemetry
+from perchctl.mission.state import Condition, Observation, Operator, PlannerState
+from perchctl.profile import Profile
+from perchctl.vehicle import Command, EmergencyStop, Idle
 
 LOOK_S = 0.5
 """For so long a vehicle must be seen with its motors off before a rescue leaves it."""
-PERIOD_S = 0.1
 
 
 def rescue(
     link: Link,
     clock: Clock,
-    landing: LandingConfig,
+    profile: Profile,
     operator: Callable[[], Operator],
-    known: Telemetry | None,
-    ground_z_m: float = 0.0,
-    flown_s: float = 0.0,
-    held_m: float | None = None,
-    blind_s: float = 0.0,
+    state: PlannerState | None,
+    history: History,
+    position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     told: ToldSent = tell_nobody,
-) -> bool:
-    """Order a landing and wait for it, bounded; whether the motors were seen off at the end.
-    The landing needs no further packet once it is under way.
+) -> Finding | None:
+    """Fly the way down without the planner, the camera and the log, bounded by the landing's
+    time. Returns where the vehicle is, once its motors have been seen off; else None.
 
-    `known` is the newest telemetry the loop has taken in, `ground_z_m` the height of the
-    ground in the estimate, `flown_s` for how long it has flown, `blind_s` for how long without the
-    positions from outside that it needs. What the ceiling held at
-    `held_m` is first peeled off: its own landing would run by the clock, and end up there. On
-    the ground it is looked at again for `LOOK_S`: a take-off just begun does not show at once.
-    `told` is given what was sent.
+    `state` is the planner's last, None before its first tick; `history` the telemetry so far;
+    `position_age_s` how old the newest position from outside is at a time. By the target none is
+    sent any more. `told` is given what was sent.
     """
 
     def send(command: Command) -> None:
-        link.send(command)
-        told(Sent(clock.now(), "rescue", command))
+        with suppress(Exception):  # the link may be what failed: the next one goes out all the same
+            link.send(command)
+            told(Sent(clock.now(), "rescue", command))
 
-    newest = known
-    start_s = off_since_s = clock.now()
-    ordered_s, orders = -REPEAT_ORDER_S, 0
-    while clock.now() < start_s + landing.timeout_s:
-        now_s = clock.now()
+    start_s, period_s = clock.now(), 1.0 / profile.link.loop_hz
+    while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return False
-        samples = link.telemetry()
-        newest = next((s for s in reversed(samples) if is_finite(s)), newest)
-        if motors_may_run(newest, now_s):
-            off_since_s = now_s
-            if orders == 0 and now_s < start_s + PEEL_BLIND_S:
-                peel = _peel(newest, now_s, held_m)
-                if peel is not None:
-                    send(peel)
-                    clock.wait_until(now_s + PERIOD_S)
-                    continue
-            under_way = newest is not None and is_known(newest, now_s) and newest.has(HL_ACTIVE)
-            seen = under_way and orders >= LEAST_ORDERS
-            due = orders == 0 or (not seen and now_s - ordered_s > REPEAT_ORDER_S)
-            if due and orders < MAX_ORDERS:
-                gone_s = blind_s + now_s - start_s if blind_s > 0.0 else 0.0
-                send(own_landing(landing, ground_z_m, flown_s, newest, gone_s))
-                ordered_s, orders = now_s, orders + 1
-        elif now_s - off_since_s >= LOOK_S:
-            return True
-        clock.wait_until(now_s + PERIOD_S)
-    return False
+            return None
+        with suppress(Exception):
+            history = extended(history, link.telemetry(), profile.safety)
+        newest = history.newest
+        if newest is not None:
+            obs = Observation(
+                t_s=now_s,
+                telemetry=newest,
+                link_problem=link.problem(now_s),
+                jumped=history.jumped,
+                turned_rad=history.turned_rad,
+                position_age_s=(
+                    math.inf if profile.positioning.by == "target" else position_age_s(now_s)
+                ),
+                imu=history.imu,
+            )
+            state, command = lander.step(state or _before_take_off(obs), obs, profile)
+            if not isinstance(command, Idle):
+                send(command)
+            c = Context(state, obs, profile)
+            if c.held(Condition.DOWN) >= LOOK_S:
+                return lander.finding(c)
+        clock.wait_until(now_s + period_s)
+    return None
 
 
-def _peel(newest: Telemetry | None, now_s: float, held_m: float | None) -> PositionSetpoint | None:
-    """Below where it was held, until it is seen there."""
-    if newest is None or held_m is None:
-        return None
-    x, y, z = newest.position_m
-    if is_known(newest, now_s) and z < held_m - PEELED_M:
-        return None
-    return PositionSetpoint(x, y, held_m - PEEL_BELOW_M, newest.yaw_rad)
+def _before_take_off(obs: Observation) -> PlannerState:
+    """Where the planner's first tick was the one that failed."""
+    position_m = obs.telemetry.position_m
+    return PlannerState(t_s=obs.t_s, started_s=obs.t_s, ground_m=position_m, entry_m=position_m)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from perchctl.camera.health import MEANING, HealthState, assess
-from perchctl.camera.mirror import MIRRORED
+from perchctl.camera.mirror import mirrored_note
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.flight.history import (
     History,
@@ -35,10 +35,12 @@ from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineSta
 
 MIRRORED_FRAMES = 5
 REMARK_PICTURES = 3
+HEARD_S = 0.15
+"""A sight that is carried on by an older estimate swings the vehicle that flies by it."""
 ENDED = " has ended"
 SENSED = (
     "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
-    "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused",
+    "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
 )  # fmt: skip
 """The fields of an `Observation` that come from here; the others are the loop's."""
 
@@ -76,6 +78,7 @@ class Senses:
     send: Send = lambda place: True
     recorded: bool = False  # the turns are: with the pictures' checksums and the present's spread
     sights: Sights | None = field(init=False, default=None)
+    sends_sights: bool = True  # until the way down goes on without them
     refused: str | None = None  # the last target that was another vehicle's, and why
     _health: HealthState = field(default_factory=HealthState)
     _note: str | None = None
@@ -93,7 +96,7 @@ class Senses:
         as a sign of the camera's life."""
         samples = self.link.telemetry()
         self.history = extended(self.history, samples, self.profile.safety)
-        if self.sights is not None:
+        if self.sights is not None and self.sends_sights:
             self.sights.begin(self.history, now_s, touches=not look)
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
@@ -129,10 +132,15 @@ class Senses:
                 self._mirrored = _mirrored_frames(self._mirrored, self.output.detections)
                 self._remark(self.output)
                 self._notice(self.output, used_s)
-                if self.sights is not None:
+                if self.sights is not None and self.sends_sights and self._is_heard(now_s):
                     self.sights.see(self.state.measured, self.history, now_s)
         mirrored = self._mirrored >= MIRRORED_FRAMES
-        self.camera_problem = MIRRORED if mirrored else self._note
+        self.camera_problem = mirrored_note(self.profile.camera) if mirrored else self._note
+
+    def _is_heard(self, now_s: float) -> bool:
+        """Whether the telemetry is new enough to carry a sight on to the present."""
+        newest = self.history.newest
+        return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
 
     def present(self, began_s: float, now_s: float) -> None:
         """What has arrived while camera or vision hung, since the turn of `began_s`."""
@@ -159,6 +167,7 @@ class Senses:
             disagreeing_frames=self.state.disagreeing_frames,
             delay_s=self.noticed.used_s,
             target_refused=self.refused,
+            imu=self.history.imu,
         )
 
     @property

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 from perchctl.calibration.files import camera_of
 from perchctl.camera.credentials import without_password
-from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
 from perchctl.camera.source import FrameSource
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError, no_simulator
@@ -116,8 +115,6 @@ def fly_session(
             config=config,
         )  # fmt: skip
         stack.callback(source.close)
-        if config.mirrored:
-            source = UnmirroredSource(source)
         source = watch_source(source)
         positioning = at_hand(profile.positioning, simulated.capture if simulated else None)
         capture = opened_capture(stack, positioning, clock)

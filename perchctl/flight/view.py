@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from perchctl.errors import distinct_figures
 from perchctl.flight.criteria import Problem
 from perchctl.geometry import rot_z
 from perchctl.positioning.place import Place
@@ -104,12 +105,15 @@ def _too_far(sight: Sight, profile: Profile, camera: CameraModel) -> str:
     """How far aside it would be, and how far it might be."""
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
-    aside = f"{math.hypot(*sight.aside_m):.2f} m aside of the camera's axis"
+    aside_m, most = math.hypot(*sight.aside_m), ""
+    aside = f"{aside_m:.2f}"
     side_m, mount = profile.target.large.side_m, profile.camera.mount
     reach = reach_at(side_m, FieldOfView(camera), mount, sight.height_m)
-    room_m = 0.0 if reach is None else max(0.0, reach.radius_m - _leant_m(sight))
-    most = "" if reach is None else f", {room_m:.2f} m at most,"
-    return f"{aside}{most} {sight.height_m:.2f} m over the camera"
+    if reach is not None:
+        room_m = math.floor(100.0 * max(0.0, reach.radius_m - _leant_m(sight))) / 100.0
+        aside, room = distinct_figures(aside_m, room_m, 2)
+        most = f", {room} m at most,"
+    return f"{aside} m aside of the camera's axis{most} {sight.height_m:.2f} m over the camera"
 
 
 def not_in_view(

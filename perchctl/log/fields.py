@@ -13,7 +13,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from perchctl.mission.state import BatteryOutlook
-from perchctl.mission.watch import Event, Outside
+from perchctl.mission.turn import Outside
+from perchctl.mission.watch import Event
 from perchctl.vehicle import (
     Command,
     EmergencyStop,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from perchctl.mission import lander
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import (
     FREE_SPEED_MPS,
@@ -23,7 +24,6 @@ from perchctl.mission.guidance import (
     walk,
 )
 from perchctl.mission.hold import sinking
-from perchctl.mission.landing import landing
 from perchctl.mission.release import (
     Acted,
     catch,
@@ -179,6 +179,8 @@ def _perch(c: Context) -> Acted:
     perch = c.profile.planner.perch
     if perch.mode == "raw":
         return c.state, RawThrust(perch.thrust)
+    if c.target_m is None:
+        return _fly_to(c, c.state.setpoint or hold_here(c), lift=False)
     goal = _target_goal(c, c.contact_goal_z_m + perch.press_m)
     return _fly_to(c, _walked(c, goal, perch.climb_mps, 0.0), lift=False)
 
@@ -245,7 +247,7 @@ ACTIONS: dict[Phase, Callable[[Context], Acted]] = {
     Phase.PERCH: _perch,
     Phase.COMPLETE: _complete,
     Phase.RECOVER: _recover,
-    Phase.LANDING: landing,
+    Phase.LANDING: lander.act,
     Phase.PERCHED: _terminal,
     Phase.LANDED: _terminal,
     Phase.ABORTED: _aborted,

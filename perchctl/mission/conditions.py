@@ -15,6 +15,8 @@ from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST
 
 DESCENDED_M, HELD_WITHIN_M = 0.1, 0.1
+CARRIED_ON_MPS = 0.1
+"""By so much the height of a pressed vehicle may run away from the last sight's."""
 DRIFTED_M = 0.02
 """So far the estimate may have drifted up from the contact, and a slip counts all the same."""
 PRESSED_M = 0.08
@@ -28,6 +30,8 @@ SATURATED = 0.98
 """Of the largest thrust: from here on nothing tells how much more it takes."""
 LITTLE_LEFT = 0.93
 """A hover thrust above this part of the largest: full thrust is no sign of pressing then."""
+SUPERVISOR_S = 5.0
+"""The flying bit outlives the motors by 2 s (docs/firmware.md, "Supervisor")."""
 PROVABLE = 0.99
 """Of the thrust that presses: so much at most is asked of a contact."""
 STILL_MOTORS_THRUST = 5000
@@ -67,15 +71,32 @@ def _contact(c: Context) -> bool:
     The gear is where the target is and has stopped; the accelerometer reads the
     one g of a body at rest; yet the thrust is above what hovering takes, so the
     ceiling must be carrying the difference.
+    Where the target is the positioning system, its place is the last sight's, carried on; and
+    that nothing climbs is felt, since an impact leaves the estimated speed a decimetre a second
+    wrong (docs/firmware.md, "After the impact").
     """
     perch, tel = c.profile.planner.perch, c.obs.telemetry
+    steady = abs(tel.velocity_mps[2]) <= perch.contact_speed_mps and c.placed
+    felt_s = c.obs.t_s - c.obs.imu.steady_s
     return (
-        abs(c.error_z_m) <= perch.contact_z_m
-        and abs(tel.velocity_mps[2]) <= perch.contact_speed_mps
+        abs(c.error_z_m) <= perch.contact_z_m + (CARRIED_ON_MPS * unseen_s(c) if c.by_sight else 0)
+        and (steady or felt_s >= perch.contact_dwell_s)
         and abs(tel.acc_z_g - 1.0) <= perch.contact_acc_g
         and c.state.hover_thrust > 0
+        and c.thrust_is_known
         and tel.thrust >= contact_thrust(c)
     )
+
+
+def unseen_s(c: Context) -> float:
+    """Since the exposure of the last sight."""
+    return max(0.0, c.obs.t_s - c.state.reckoning.sight_s)
+
+
+def contact_aside_m(c: Context) -> tuple[float, float]:
+    """How far the gear is from the target's axis, and the standard deviation of that."""
+    reckoning = c.state.reckoning
+    return math.hypot(*reckoning.aside_m), reckoning.aside_sigma_m
 
 
 def press_thrust(profile: Profile) -> float:
@@ -109,13 +130,14 @@ def hovers(c: Context) -> bool:
 
 def _magnet_holds(c: Context) -> bool:
     """The vehicle stays up on a thrust that could not carry it."""
-    held = c.obs.telemetry.thrust <= _most_held(c) and not _slipping(c)
+    held = _is_carried(c) and not _slipping(c)
     return held and (c.placed or _still(c))
 
 
-def _most_held(c: Context) -> float:
-    """A thrust that could not carry the vehicle."""
-    return c.profile.planner.complete.hold_ratio * c.state.hover_thrust
+def _is_carried(c: Context) -> bool:
+    """Whether the thrust could not carry the vehicle."""
+    most = c.profile.planner.complete.hold_ratio * c.state.hover_thrust
+    return c.thrust_is_known and c.state.hover_thrust > 0 and c.obs.telemetry.thrust <= most
 
 
 def _slipping(c: Context) -> bool:
@@ -144,7 +166,7 @@ def _weight_hangs(c: Context) -> bool:
     """The motors stand still, and the vehicle hangs where it made contact."""
     return (
         c.state.released_s is not None
-        and c.obs.telemetry.thrust <= STILL_MOTORS_THRUST
+        and (c.obs.telemetry.thrust <= STILL_MOTORS_THRUST or not c.thrust_is_known)
         and _still(c)
         and not _slipping(c)
     )
@@ -158,7 +180,7 @@ def _hanging(c: Context) -> bool:
     it, and what follows, a slow release under watch, suits both."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
     if not c.placed:
-        return c.state.hover_thrust > 0 and tel.thrust <= _most_held(c) and _still(c)
+        return _is_carried(c) and _still(c)
     at_contact = (
         c.state.contact_z_m is not None
         and abs(tel.position_m[2] - c.state.contact_z_m) <= complete.slip_m
@@ -170,13 +192,7 @@ def _hanging(c: Context) -> bool:
         and c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M
         and not c.far_below_target
     )
-    return (
-        c.state.hover_thrust > 0
-        and tel.thrust <= _most_held(c)
-        and c.height_m > 0.3
-        and (at_contact or at_target or stayed)
-        and _still(c)
-    )
+    return _is_carried(c) and c.height_m > 0.3 and (at_contact or at_target or stayed) and _still(c)
 
 
 def _steady(c: Context) -> bool:
@@ -204,21 +220,23 @@ def _tilted(c: Context) -> bool:
 
 
 def _down(c: Context) -> bool:
-    """Motors off by the telemetry, and the supervisor agrees that nothing flies."""
-    return c.obs.telemetry.thrust < 1 and not c.flying
+    """Motors off by the telemetry, and the supervisor agrees that nothing flies; its word is
+    old where it has not agreed for long."""
+    stopped_s = c.state.stopped_s
+    long_off = stopped_s is not None and c.obs.t_s - stopped_s > SUPERVISOR_S
+    return c.obs.telemetry.thrust < 1 and (not c.flying or long_off)
 
 
 def _on_floor(c: Context) -> bool:
     """Low, or come down from where the landing began, since a drifting estimate has the floor
     anywhere; not moving, and on a thrust that could not carry the vehicle."""
-    carried = c.state.hover_thrust > 0 and c.obs.telemetry.thrust <= _most_held(c)
     near_target = c.obs.target is not None and abs(c.error_z_m) <= 0.3
     came_down_m = c.state.entry_m[2] - c.obs.telemetry.position_m[2]
     came_down = c.state.phase is Phase.LANDING and came_down_m > DESCENDED_M
     low = c.height_m < c.profile.planner.landing.handover_m or (
         came_down and c.state.contact_z_m is None
     )
-    return carried and low and not near_target and _still(c)
+    return _is_carried(c) and low and not near_target and _still(c)
 
 
 def _blocked(c: Context) -> bool:
@@ -244,7 +262,7 @@ def _knocked(c: Context) -> bool:
 def _saturated(c: Context) -> bool:
     """All the thrust there is, and it does not rise (nor is it just being caught)."""
     full = c.obs.telemetry.thrust >= SATURATED * FULL_THRUST
-    return full and -0.15 < c.obs.telemetry.velocity_mps[2] < 0.05
+    return full and -0.15 < c.climb_mps < 0.05
 
 
 CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
@@ -310,15 +328,20 @@ def conditions_since(c: Context) -> dict[Condition, float]:
 
 
 def _void(c: Context) -> frozenset[Condition]:
-    """Those that do not count in this tick, whatever they say."""
-    if c.proves:
-        void = _NONE if c.placed else BY_PLACE
+    """Those that do not count in this tick, whatever they say: each asks for the freshness of what
+    it rests on. A position block that is dead voids what rests on a place, and no more."""
+    if not c.imu_proves:
+        void = PROOFS
+    elif c.placed:
+        void = _NONE
     else:
-        void = PROOFS if c.placed else PROOFS | BY_PLACE
+        void = BY_PLACE
+        if c.by_sight and c.state.phase is Phase.PERCH:
+            void = void - {Condition.CONTACT}  # by the last sight's place, for a while
     if c.state.phase is not Phase.LANDING:
         return void
     # In a landing it begins a release, which goes on over fresh telemetry only: late telemetry
     # may do that, where the vehicle would else hang there until it is cut.
     # By the same right it goes on without a position.
-    late = c.telemetry_age_s > c.profile.safety.telemetry_hold_s
+    late = c.attitude_age_s > c.profile.safety.telemetry_hold_s
     return void | {Condition.HANGING} if late else void - {Condition.HANGING}

@@ -17,6 +17,10 @@ FAR_BELOW_M = 0.5
 PUT_RIGHT_S = 0.5
 """Once positions from outside come again, the estimate is drawn back to them for so long: its
 steps and its speed are not the vehicle's."""
+CORRECTED_S, BLOWN_MPS = 0.2, 0.4
+"""An estimate that the newest sights agree with is no farther from the felt speed."""
+ANSWER_S = 0.2
+"""A raw thrust that is ordered shows in the telemetry within that."""
 HANGING_S = 1.0
 """For how long a thrust below the weight must be enough before it proves the magnet."""
 
@@ -55,18 +59,60 @@ class Context:
         return self.obs.t_s - tel.t_s + tel.behind_s
 
     @property
+    def attitude_age_s(self) -> float:
+        """Of attitude, acceleration, thrust and the supervisor's word, which come together."""
+        return self.obs.t_s - self.obs.telemetry.t_s
+
+    @property
     def proves(self) -> bool:
-        """Whether the telemetry is new enough to prove anything. What is old is unknown."""
+        """Whether all of the telemetry is new enough to prove anything. What is old is unknown."""
         return self.telemetry_age_s <= self.profile.safety.proof_age_s
 
     @property
-    def placed(self) -> bool:
-        """Whether the estimated position and speed can prove anything: not where they come from
-        outside and do not, or have only just come again. With decks always."""
+    def imu_proves(self) -> bool:
+        """Whether attitude, acceleration, thrust and the supervisor's word are new enough to prove
+        anything, whatever became of the position's packets."""
+        return self.attitude_age_s <= self.profile.safety.proof_age_s
+
+    @property
+    def thrust_is_known(self) -> bool:
+        """Whether the thrust that is read follows what is ordered."""
+        unanswered_s = self.state.unanswered_s
+        return unanswered_s is None or self.obs.t_s - unanswered_s <= ANSWER_S
+
+    @property
+    def located(self) -> bool:
+        """Whether the estimated position and speed are believed: not where they come from outside
+        and do not, or have only just come again. With decks always."""
         if self.state.astray or self.obs.position_age_s > self.profile.positioning.hold_s:
             return False
         stale_s = self.state.stale_s
         return stale_s is None or self.obs.t_s - stale_s > PUT_RIGHT_S
+
+    @property
+    def placed(self) -> bool:
+        """Whether the estimated position and speed can prove anything: believed, and fresh."""
+        return self.located and self.proves
+
+    @property
+    def is_blown(self) -> bool:
+        """Whether the accelerometer has felt a blow or a gust that the estimate has not, and no
+        sight since corrects it: sideways the firmware's estimator feels nothing."""
+        reckoning = self.state.reckoning
+        if not self.by_sight or reckoning.imu is None or self.obs.position_age_s <= CORRECTED_S:
+            return False
+        (x, y, _), (ex, ey, _) = reckoning.velocity_mps, self.obs.telemetry.velocity_mps
+        return math.hypot(x - ex, y - ey) > BLOWN_MPS
+
+    @property
+    def climb_mps(self) -> float:
+        """Vertical speed: the estimate's where that is believed and fresh, else as reckoned by the
+        accelerometer."""
+        blind = self.state.blind_s is not None or not self.placed
+        reckoning = self.state.reckoning
+        if blind and reckoning.imu is not None:
+            return reckoning.velocity_mps[2]
+        return self.obs.telemetry.velocity_mps[2]
 
     @property
     def by_sight(self) -> bool:
@@ -77,7 +123,7 @@ class Context:
         """Faster than that. A speed that drifts, since no position corrects it, counts only where
         the accelerometer shows, too, that something less than its weight carries the vehicle."""
         tel = self.obs.telemetry
-        if tel.velocity_mps[2] >= -mps:
+        if self.climb_mps >= -mps:
             return False
         return self.placed or tel.acc_z_g < 1.0 - self.profile.planner.perch.contact_acc_g
 

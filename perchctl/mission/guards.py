@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from perchctl.mission import budget
-from perchctl.mission.conditions import SATURATED, press_thrust
+from perchctl.mission.conditions import SATURATED, contact_aside_m, press_thrust
 from perchctl.mission.context import Context
 from perchctl.mission.hold import unplaced
 from perchctl.mission.mounting import explained
@@ -22,16 +22,9 @@ place (7 cm in simulated flights); later a setpoint is walked ahead of it, and a
 half a metre. A landing goes straight down."""
 ABOVE_START_M = 0.1
 ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
-HUNG_WITHIN_M = 0.3
-HIGH_M, STAYED_M = 0.45, 0.15
 BELOW_S = 0.3
 WEAK_S = 2.0
 BLIND_PRESS_S = 1.25
-LOOKED_S = 2.0
-HANGS_OR_STANDS = (
-    "motors off; without a sight of the target it is not known whether it hangs or stands: look "
-    "before you touch it"
-)
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -123,59 +116,6 @@ def is_watched(c: Context) -> bool:
     return watched and c.held(Condition.DOWN) >= 0.1
 
 
-def hangs_where_it_did(c: Context) -> bool:
-    """At its contact; or, where the estimate drifts, seen to hang all the time. What telemetry
-    did not show for a moment may lie on the floor by now."""
-    seen = c.held(Condition.WEIGHT_HANGS) >= c.profile.planner.complete.watch_s
-    return seen or still_at_contact(c)
-
-
-def hangs_stopped(c: Context) -> bool:
-    """The motors were stopped where it hung, and there it still is."""
-    stopped_s, hangs_s = c.state.stopped_s, c.state.since.get(Condition.WEIGHT_HANGS)
-    if stopped_s is None:
-        return False
-    hung = _stopped_hanging(c) and hangs_s is not None and hangs_s <= stopped_s
-    return hung or still_at_contact(c)
-
-
-def _stopped_hanging(c: Context) -> bool:
-    """The motors were stopped at the ceiling: a landing without positions puts the weight on
-    whatever carries it, the floor, perhaps."""
-    stopped_s = c.state.stopped_s
-    landing = c.state.phase is Phase.LANDING
-    return stopped_s is not None and (not landing or stopped_s < c.state.entered_s)
-
-
-def still_at_contact(c: Context) -> bool:
-    """Where the magnet has it, by a position: a slip ends the contact at once, and what the
-    estimate drifts while it hangs blind is less than this."""
-    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
-    if contact_z_m is None or not c.proves or not c.placed:
-        return False
-    falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
-    return not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M
-
-
-def hangs_in_landing(c: Context) -> bool:
-    """With its motors off where the magnet had it, or where the landing began, up there: what
-    has not come down is not on the floor, whether or not a contact was noticed. Or stopped
-    before the landing began, and carried all the time since."""
-    z_m, ground = c.obs.telemetry.position_m[2], c.state.ground_m
-    began_m = c.state.entry_m[2]
-    high = began_m - (ground[2] if ground else 0.0) > HIGH_M
-    stayed = c.proves and c.placed and high and not c.far_below_target and began_m - z_m < STAYED_M
-    return stayed or (hangs_stopped(c) and c.height_m > LOW_M)
-
-
-def hangs_or_stands(c: Context) -> bool:
-    """It came down blindly from the magnet's reach, or did not, or was stopped there: something
-    carries it, which may be either. A target that is seen again, far above, tells that it has come
-    down."""
-    in_reach = c.state.blind_in_reach or (c.by_sight and _stopped_hanging(c))
-    return in_reach and not c.placed and not is_low_by_eye(c)
-
-
 def settling_too_long(c: Context) -> bool:
     ascend = c.profile.planner.ascend
     return c.held(Condition.NEAR_STANDOFF) > ascend.settle_timeout_s
@@ -186,7 +126,7 @@ def has_slipped(c: Context) -> bool:
     give back."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
     falls = c.state.released_s is not None and tel.acc_z_g < complete.slip_acc_g
-    if falls and c.proves and tel.velocity_mps[2] < FALLING_MPS:
+    if falls and c.imu_proves and c.climb_mps < FALLING_MPS:
         return True
     return c.held(Condition.SLIPPING) >= complete.slip_dwell_s
 
@@ -194,6 +134,21 @@ def has_slipped(c: Context) -> bool:
 def unsure(c: Context) -> str:
     limit_m2 = c.profile.safety.flight_variance_m2
     return f"the position's variance is {c.variance_m2:.2g} m^2, at most {limit_m2:g} allowed"
+
+
+def is_beside_magnet(c: Context) -> bool:
+    """Contact, but farther aside than the magnet reaches, or so far that nobody knows."""
+    if c.held(Condition.CONTACT) < c.profile.planner.perch.contact_dwell_s:
+        return False
+    aside_m, sigma_m = contact_aside_m(c)
+    return not aside_m + sigma_m <= c.profile.planner.perch.contact_xy_m
+
+
+def why_beside_magnet(c: Context) -> str:
+    aside_m, sigma_m = contact_aside_m(c)
+    if not math.isfinite(sigma_m):
+        return "contact, but how far aside of the target is not known"
+    return f"contact {1e3 * aside_m:.0f} +- {1e3 * sigma_m:.0f} mm aside of the target"
 
 
 def pressed_blindly(c: Context) -> bool:
@@ -208,9 +163,11 @@ def mounted_wrong(c: Context) -> bool:
 
 
 def why_contact(c: Context) -> str:
-    text = "contact proven by position, acceleration and thrust"
+    aside_m, sigma_m = contact_aside_m(c)
+    by = "position, acceleration and thrust"
     if not c.placed:
-        text = f"contact proven by acceleration and thrust, {unplaced(c)}"
+        by = f"acceleration and thrust, {unplaced(c)}"
+    text = f"contact proven by {by}; {1e3 * aside_m:.1f} +- {1e3 * sigma_m:.1f} mm off centre"
     if c.height_m >= CATCHABLE_M:
         return text
     return f"{text}; at {c.height_m:.1f} m, too low for a slip to be caught"
@@ -250,23 +207,6 @@ def why_astray(c: Context) -> str:
         f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: swapped axes "
         f"in the motion capture, or a body that is turned in it; perchctl check --lift tells"
     )
-
-
-def why_fell_unseen(c: Context) -> str:
-    if c.placed:
-        return "it is not where it hung before"
-    return f"whether it still hangs is not known ({unplaced(c)})"
-
-
-def why_landed(c: Context) -> str:
-    if c.placed or is_low_by_eye(c):
-        return "motors off"
-    return "motors off; without a position it is not known whether it stands or hangs"
-
-
-def is_low_by_eye(c: Context) -> bool:
-    """The camera, and nothing else, still tells that it is not at the ceiling."""
-    return c.tracked and c.far_below_target
 
 
 def why_not_found(c: Context) -> str:

@@ -45,7 +45,7 @@ def is_lost(c: Context) -> bool:
     """No position has come for so long that none is waited for any more: by the age of the last
     one, and of the target's, whose loss leaves nothing but the gyroscope, by the estimate's own
     variance too."""
-    if c.obs.position_age_s > c.profile.positioning.land_s:
+    if c.obs.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and is_unplaced(c) and c.variance_m2 > BLIND_VARIANCE_M2
 
@@ -62,6 +62,8 @@ def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
 
 def unplaced(c: Context) -> str:
     """For how long none was sent, and why."""
+    if c.is_blown:
+        return "pushed aside while the target was not seen"
     age_s, why = c.obs.position_age_s, c.obs.position_problem
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has come"
     return f"{text}: {why}" if why else text

@@ -7,19 +7,21 @@ One tick: remember what was observed, look up the table, act for the phase.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from perchctl.mission import budget
+from perchctl.mission import budget, lander
 from perchctl.mission.actions import act
-from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, hovers
-from perchctl.mission.context import PUT_RIGHT_S, Context
+from perchctl.mission.conditions import (
+    KEPT_OVER_A_CHANGE,
+    conditions_since,
+    contact_aside_m,
+    hovers,
+)
+from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
-from perchctl.mission.hold import hold_reason, is_lost
-from perchctl.mission.level import felt_climb_mps, is_felt_alone
+from perchctl.mission.hold import hold_reason
 from perchctl.mission.mounting import MountWatch, sight_of, watched
-from perchctl.mission.release import CATCH_STILL_ABOVE_M, catch_above_m, is_carried
+from perchctl.mission.release import catch_above_m, is_carried
 from perchctl.mission.row import Row, risen
 from perchctl.mission.safety import IN_THE_OPEN
 from perchctl.mission.state import (
@@ -32,12 +34,10 @@ from perchctl.mission.state import (
 from perchctl.mission.table import TABLE, first_match
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vehicle import Command, PositionSetpoint, Telemetry
+from perchctl.vehicle import Command
 
 HOVER_WITHIN = 0.2
-UNSEEN_S = 0.15
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
-Place = tuple[float, float, float]
 
 
 def start(obs: Observation) -> PlannerState:
@@ -64,7 +64,7 @@ def step(
         state = _enter(state, row, Context(state, obs, profile))
         state = replace(state, hold=hold_reason(Context(state, obs, profile)))
     new, command = act(Context(state, obs, profile))
-    return replace(new, t_s=obs.t_s), command
+    return replace(lander.ordered(new, command), t_s=obs.t_s), command
 
 
 def is_over(state: PlannerState) -> bool:
@@ -72,21 +72,8 @@ def is_over(state: PlannerState) -> bool:
 
 
 def _remember(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
-    state = _with_target(state, obs)
-    if obs.position_age_s > profile.positioning.hold_s:
-        state = replace(state, stale_s=obs.t_s)
-    if obs.jumped:
-        state = _jumped(state, obs)
-    if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
-        # Where no hover thrust was learned yet, the present one has to do.
-        hover = state.hover_thrust or obs.telemetry.thrust
-        state = replace(state, heading_lost=True, hover_thrust=hover)
+    state = lander.observed(_with_target(state, obs), obs, profile)
     context = Context(state, obs, profile)
-    # A landing of the vehicle's own is near its end, and goes on by the height, which is good yet.
-    sets_down = state.phase is Phase.LANDING and state.blind_s is None and not state.orders
-    if sets_down and context.by_sight and is_lost(context):
-        state = _blinded(state, obs, in_reach=state.contact_z_m is not None)
-        context = Context(state, obs, profile)
     state = replace(state, hold=hold_reason(context))
     since = conditions_since(context)
     if state.hold:
@@ -95,62 +82,9 @@ def _remember(state: PlannerState, obs: Observation, profile: Profile) -> Planne
     away = state.phase is not Phase.ASCEND or context.error_z_m > profile.planner.ascend.near_m
     if away and state.phase in _LEARNING and hovers(context):
         state = replace(state, hover_thrust=_learned_hover_thrust(state, obs))
-    felt_mps = felt_climb_mps(Context(state, obs, profile))
-    state = replace(state, last=obs.telemetry, felt_mps=felt_mps, energy=budget.watched(context))
+    state = replace(state, last=obs.telemetry, energy=budget.watched(context))
     state = replace(state, battery=budget.outlook(Context(state, obs, profile)))
     return replace(state, since=since, mount=_mount_watched(Context(state, obs, profile)))
-
-
-def _blinded(state: PlannerState, obs: Observation, *, in_reach: bool) -> PlannerState:
-    """Nothing but the gyroscope is left: level, and down by thrust. For good, since each change
-    of the mode costs height."""
-    hover = state.hover_thrust or _felt_hover_thrust(obs.telemetry)
-    return replace(state, blind_s=obs.t_s, blind_in_reach=in_reach, hover_thrust=hover)
-
-
-def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
-    """The estimate's world has moved, the vehicle has not: ground, contact and what else is
-    remembered are where the estimate has them now, and it is held where it is. Where samples
-    are missing before the step, it may be the vehicle that has moved, even to the floor; where
-    positions from outside have come again, the step ends a drift, and what was true before is."""
-    tel, last = obs.telemetry, state.last
-    if last is None:
-        return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
-    x, y, z = tel.position_m
-    vx, vy, vz = tel.velocity_mps
-    dt_s = tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
-    lx, ly, lz = last.position_m
-    step = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
-    put_right = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
-    if dt_s > UNSEEN_S or put_right:
-        step = (0.0, 0.0, 0.0)
-    setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
-    if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
-        # Its own landing goes on along a line in the world that was: it dives, or climbs.
-        state = replace(
-            state,
-            entered_s=obs.t_s,
-            orders=0,
-            ordered_s=None,
-            caught=False,
-            catch_above_m=CATCH_STILL_ABOVE_M,
-        )
-    if setpoint is not None:
-        z_m = z if contact_z_m is None else setpoint.z_m + step[2]
-        setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
-    return replace(
-        state,
-        setpoint=setpoint,
-        ground_m=None if state.ground_m is None else _moved(state.ground_m, step),
-        entry_m=_moved(state.entry_m, step),
-        contact_z_m=None if contact_z_m is None else contact_z_m + step[2],
-        blocked_z_m=None if blocked_z_m is None else blocked_z_m + step[2],
-        jump_s=obs.t_s if state.jump_s is None else state.jump_s,
-    )
-
-
-def _moved(place: Place, step: Place) -> Place:
-    return (place[0] + step[0], place[1] + step[1], place[2] + step[2])
 
 
 def _with_target(state: PlannerState, obs: Observation) -> PlannerState:
@@ -180,12 +114,6 @@ def _mount_watched(c: Context) -> MountWatch:
     if target is None or not target.measured or target.world_m is None:
         return mount
     return watched(mount, sight_of(c.obs.t_s, c.obs.telemetry, target.world_m))
-
-
-def _felt_hover_thrust(tel: Telemetry) -> float:
-    """In a climb, or sinking, the accelerometer tells by how much the thrust is beside the
-    weight."""
-    return tel.thrust / min(1.5, max(0.75, tel.acc_z_g))
 
 
 def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
@@ -225,19 +153,22 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         ordered_s=None,
         orders=0,
     )
-    if row.name == "position-astray":
-        new = replace(new, felt_alone=is_felt_alone(context))
-    if row.to is Phase.LANDING and context.by_sight and is_lost(context):
-        touched = state.contact_z_m is not None or state.phase in (Phase.PERCH, Phase.COMPLETE)
-        new = _blinded(new, obs, in_reach=touched)
-    return _started_phase(new, state, obs)
+    return _started_phase(new, state, context)
 
 
-def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> PlannerState:
+def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerState:
     """What a phase starts with, beyond the clock."""
+    obs = c.obs
     match new.phase:
         case Phase.COMPLETE:
-            return replace(new, contact_z_m=obs.telemetry.position_m[2], released_s=None)
+            aside_m, sigma_m = contact_aside_m(c)
+            return replace(
+                new,
+                contact_z_m=obs.telemetry.position_m[2],
+                contact_aside_m=aside_m,
+                contact_sigma_m=sigma_m,
+                released_s=None,
+            )
         case Phase.RECOVER:
             z_m = obs.telemetry.position_m[2]
             blocked_z_m = z_m if new.row == "blocked" else old.blocked_z_m
@@ -252,15 +183,13 @@ def _started_phase(new: PlannerState, old: PlannerState, obs: Observation) -> Pl
                 catch_above_m=catch_above_m(old.hover_thrust, obs.telemetry.thrust),
                 blocked_z_m=blocked_z_m,
             )
-        case Phase.LANDING if old.phase is Phase.PERCH:
-            # It may be in the magnet's reach: it has to be seen below before it counts as free.
-            return replace(new, contact_z_m=obs.telemetry.position_m[2])
-        case Phase.LANDING if new.row == "position-astray":
-            hover = old.hover_thrust or _felt_hover_thrust(obs.telemetry)
-            return replace(new, heading_lost=True, astray=True, hover_thrust=hover)
-        case Phase.LANDING if new.row == "mounting":
-            # The setpoint is ahead, and every centimetre there is one in a wrong direction.
-            return replace(new, setpoint=None)
+        case Phase.LANDING:
+            if new.row == "position-astray":
+                new = replace(new, astray=True)
+            if new.row == "mounting":
+                # The setpoint is ahead, and every centimetre there is one in a wrong direction.
+                new = replace(new, setpoint=None)
+            return lander.started(new, old, obs, c.profile)
         case Phase.ASCEND:
             return replace(new, searches=0)
         case Phase.SEARCH if old.setpoint is not None:

@@ -19,6 +19,9 @@ Acted = tuple[PlannerState, Command]
 
 STILL_THRUST = 1000
 """Raw thrust at which the motors stand still and the stream lives (5000 and less)."""
+UNREAD_S = 1.5
+"""Longer than that the weight has to hang where the thrust is not read: orders that do not arrive
+end in the firmware's cut after 2 s, and whatever was flying falls."""
 THRUST_MIN = 20000
 """What position mode leaves."""
 STOPS, STOP_PERIOD_S, STOP_AGAIN_S = 5, 0.1, 0.5
@@ -39,7 +42,7 @@ def lower(c: Context) -> Acted:
     step = min(complete.steps, 1 + int(c.in_phase_s / complete.release_s * complete.steps))
     part = step / complete.steps
     if perch.mode == "raw":
-        if not c.proves:
+        if not c.imu_proves:
             return ready(c)
         # The lowest step stays below what could carry the vehicle, above the idle cut.
         lowest = 0.9 * complete.hold_ratio * state.hover_thrust
@@ -60,14 +63,15 @@ def let_go(c: Context) -> Acted:
     long enough. Without fresh telemetry it begins anew; a landing goes on while it is only
     late, for else what hangs would end there by its own landing."""
     late_s = c.profile.safety.telemetry_hold_s if c.state.phase is Phase.LANDING else 0.0
-    if not c.proves and c.telemetry_age_s > late_s:
+    if not c.imu_proves and c.attitude_age_s > late_s:
         return ready(c)
     complete, state = c.profile.planner.complete, c.state
     if state.released_s is None:
         z_m = c.obs.telemetry.position_m[2]
         state = replace(state, released_s=c.obs.t_s, contact_z_m=state.contact_z_m or z_m)
     assert state.released_s is not None
-    if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s:
+    unread_s = 0.0 if c.thrust_is_known else UNREAD_S
+    if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s + unread_s:
         return stop_motors(c)
     part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
     start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN
@@ -122,10 +126,10 @@ def catch(c: Context) -> Acted | None:
     is caught, or nothing new is known of it. (A setpoint below would cost the change of mode
     its height.)"""
     state, tel = c.state, c.obs.telemetry
-    if state.caught or not c.proves:
+    if state.caught or not c.imu_proves:
         return None
     begun = c.in_phase_s < CATCH_LEAST_S
-    if begun or (tel.velocity_mps[2] < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
+    if begun or (c.climb_mps < CAUGHT_MPS and c.in_phase_s < CATCH_LIMIT_S):
         x, y, _ = state.entry_m
         setpoint = PositionSetpoint(
             x, y, tel.position_m[2] + state.catch_above_m, state.entry_yaw_rad

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from perchctl.mission.guards import (
     fence_broken,
-    hangs_stopped,
     is_astray,
     left_jump_hold,
     mounted_wrong,
@@ -15,6 +14,7 @@ from perchctl.mission.guards import (
     why_unplaced,
 )
 from perchctl.mission.hold import is_lost
+from perchctl.mission.lander import hangs_stopped
 from perchctl.mission.row import Row
 from perchctl.mission.state import (
     FLYING_PHASES,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
 from perchctl.mission.energy import EnergyState
+from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
 from perchctl.vision.types import TargetEstimate
@@ -129,6 +131,7 @@ class Observation:
         position_age_s: of the newest position from outside that was sent to the vehicle; 0 where
             its decks measure it.
         position_problem: why none is sent, None while they are.
+        imu: the motion that accelerometer and attitude tell, by all samples up to `telemetry`.
     """
 
     t_s: float
@@ -149,6 +152,7 @@ class Observation:
     target_refused: str | None = None
     position_age_s: float = 0.0
     position_problem: str | None = None
+    imu: ImuMotion = field(default_factory=ImuMotion)
 
 
 @dataclass(frozen=True)
@@ -212,10 +216,19 @@ class PlannerState:
     last: Telemetry | None = None  # of the turn before
     energy: EnergyState = field(default_factory=EnergyState)  # fitted to the battery
     battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
-    felt_mps: float = 0.0  # how fast it climbs, by its accelerometer
-    felt_alone: bool = False  # astray, and its vertical speed with it
+    reckoning: Reckoning = field(default_factory=Reckoning)  # speed and place by the accelerometer
+    reach_s: float | None = None  # within the magnet's reach since
+    contact_aside_m: float | None = None  # gear to the target's axis, as contact was proven
+    contact_sigma_m: float = 0.0  # standard deviation of that
     heading_lost: bool = False  # position control would lead away from its setpoint
-    blind_s: float | None = None  # down by thrust alone since: the target that measured is lost
-    blind_in_reach: bool = False  # of the magnet, as that began
+    blind_s: float | None = None  # accelerometer and attitude are all there is, since
+    blind_height_m: float = 0.0  # above the ground, as reckoned since then
+    level_hover: float = 0.0  # hover thrust as the way down began
+    level_within: float = 0.12  # the share of it that a level way down may correct
     level_thrust: float = 0.0  # raw thrust of a level way down
+    level_sample_s: float = -math.inf  # of the newest sample at its last tick
+    under_way_mps: float = 0.0  # climb that its last orders give, and no sample shows yet
+    touch_s: float | None = None  # a level way down felt the floor
+    raw_order: int | None = None  # raw thrust that was ordered last, None in position mode
+    unanswered_s: float | None = None  # the thrust that is read is not what is ordered, since
     hold: str = ""  # why the vehicle is held in place, empty when it is not

@@ -8,15 +8,11 @@ from __future__ import annotations
 from perchctl.mission.budget import why_short
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.guards import (
-    HANGS_OR_STANDS,
-    LOOKED_S,
     attempts_used,
-    hangs_in_landing,
-    hangs_or_stands,
-    hangs_where_it_did,
     has_recovered,
     has_slipped,
     is_aligned,
+    is_beside_magnet,
     is_blocked,
     is_watched,
     pressed_blindly,
@@ -24,11 +20,19 @@ from perchctl.mission.guards import (
     settling_too_long,
     too_little_left,
     too_weak,
+    why_beside_magnet,
     why_contact,
-    why_fell_unseen,
-    why_landed,
     why_not_found,
     why_pressed_blindly,
+)
+from perchctl.mission.lander import (
+    LOOKED_S,
+    Finding,
+    finding,
+    hangs_where_it_did,
+    why_fell_unseen,
+    why_landed,
+    why_unknown,
 )
 from perchctl.mission.row import Row
 from perchctl.mission.safety import BY_CAMERA, SAFETY, only
@@ -142,6 +146,10 @@ TABLE: tuple[Row, ...] = (
     ),
     # --- phase 6: perch ------------------------------------------------------
     Row(
+        "beside-the-magnet", only(P.PERCH), is_beside_magnet, P.RECOVER, why_beside_magnet,
+        S.BACK_OFF, counts_attempt=True,
+    ),
+    Row(
         "contact", only(P.PERCH),
         lambda c: c.held(C.CONTACT) >= c.profile.planner.perch.contact_dwell_s, P.COMPLETE,
         why_contact,
@@ -196,16 +204,16 @@ TABLE: tuple[Row, ...] = (
     # --- landing ---------------------------------------------------------------
     Row(
         "hung", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and hangs_in_landing(c), P.PERCHED,
+        lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.HANGS, P.PERCHED,
         "the magnet holds: hanging with the motors off",
     ),
     Row(
         "landed", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and not hangs_or_stands(c), P.LANDED, why_landed,
+        lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.STANDS, P.LANDED, why_landed,
     ),
     Row(
         "hangs-or-stands", only(P.LANDING), lambda c: c.held(C.DOWN) >= LOOKED_S, P.ABORTED,
-        HANGS_OR_STANDS, S.LAND, O.SAFETY,
+        why_unknown, S.LAND, O.SAFETY,
     ),
     Row(
         "landing-timeout", only(P.LANDING),

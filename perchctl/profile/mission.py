@@ -92,6 +92,9 @@ class PerchConfig(Section):
     contact_z_m: float = Field(
         0.05, gt=0, le=0.3, description="contact: the gear's distance from the target"
     )
+    contact_xy_m: float = Field(
+        0.025, gt=0, le=0.5, description="contact: its distance from the axis, the magnet's radius"
+    )
     contact_speed_mps: float = Field(0.06, gt=0, le=1, description="contact: vertical speed")
     contact_acc_g: float = Field(
         0.12, gt=0, le=1, description="contact: acceleration differs from 1 g by at most this"

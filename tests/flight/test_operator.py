@@ -10,9 +10,11 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from perchctl.errors import Interrupted
-from perchctl.flight.operator import AGAIN_S, HELD_S, OperatorSwitch
+from perchctl.flight.operator import AGAIN_S, DELAY_S, HELD_S, INSIST_S, OperatorSwitch
 from perchctl.mission.state import Operator
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,29 +51,63 @@ def test_a_second_press_within_half_a_second_does_not_count() -> None:
     assert it.at(9.0) is Operator.LAND
 
 
-def test_a_second_press_after_half_a_second_stops() -> None:
+@given(again_s=st.floats(AGAIN_S, 60.0))
+def test_a_second_press_stops_within_half_a_second(again_s: float) -> None:
+    """The loop asks 50 times a second, the link's guard every 50 ms: they need the rest."""
     it = Pressed()
-    it.press(0.0, AGAIN_S)
-    assert it.at(AGAIN_S + HELD_S + 0.001) is Operator.STOP
-    assert it.at(9.0) is Operator.STOP
+    it.press(0.0, again_s)
+    assert it.at(again_s + 0.4) is Operator.STOP
+    assert it.at(99.0) is Operator.STOP
 
 
-def test_presses_one_after_the_other_stop_after_half_a_second() -> None:
+def test_after_a_long_silence_it_stops_at_once() -> None:
     it = Pressed()
-    it.press(0.0, 0.2, 0.4, 0.6, 0.8)
-    assert it.at(0.8) is Operator.STOP
+    it.press(0.0, DELAY_S + 0.01)
+    assert it.at(DELAY_S + 0.01) is Operator.STOP
 
 
-@pytest.mark.parametrize("delay_s", [0.03, 0.25, 0.5, 0.66])
-@pytest.mark.parametrize("period_s", [0.03, 0.04, 0.092])
-def test_a_key_held_down_is_one_press(delay_s: float, period_s: float) -> None:
-    """However long a keyboard waits before it repeats."""
+def held(delay_s: float, period_s: float, for_s: float) -> list[float]:
+    """When a key held down for so long presses: once, and from `delay_s` on once a period."""
+    repeats = int((for_s - delay_s) / period_s) + 1 if for_s >= delay_s else 0
+    return [0.0, *(delay_s + period_s * i for i in range(repeats))]
+
+
+PERIODS_S = st.floats(0.005, HELD_S - 0.001)
+DELAYS_S = st.floats(0.0, DELAY_S)
+
+
+@given(DELAYS_S, PERIODS_S, st.floats(0.0, INSIST_S - 0.001))
+def test_a_key_held_down_is_one_press(delay_s: float, period_s: float, for_s: float) -> None:
+    """However long the keyboard waits before it repeats, and however fast it does."""
     it = Pressed()
-    it.press(0.0, *(delay_s + period_s * i for i in range(60)))
-    assert it.at(delay_s + period_s * 60) is Operator.LAND
-    assert it.at(60.0) is Operator.LAND
-    it.press(61.0)
-    assert it.at(61.2) is Operator.STOP
+    for t_s in held(delay_s, period_s, for_s):
+        it.press(t_s)
+        assert it.at(t_s) is Operator.LAND
+    # Let go just after its first repetition it cannot be told from two presses.
+    if delay_s < HELD_S or for_s >= delay_s + period_s or for_s < delay_s:
+        assert it.at(60.0) is Operator.LAND
+        it.press(61.0)
+        assert it.at(61.0) is Operator.STOP
+
+
+@given(DELAYS_S, PERIODS_S)
+def test_two_seconds_of_holding_or_hammering_stop(delay_s: float, period_s: float) -> None:
+    it = Pressed()
+    it.press(*held(delay_s, period_s, INSIST_S + period_s))
+    assert it.at(INSIST_S + period_s) is Operator.STOP
+
+
+@given(st.lists(st.floats(0.001, 1.5), min_size=1, max_size=20), st.floats(0.01, 0.1))
+def test_how_often_it_is_read_changes_nothing(silences_s: list[float], every_s: float) -> None:
+    """The loop, the link's guard and a rescue all read the one switch."""
+    often, once, t_s = Pressed(), Pressed(), 0.0
+    for silence_s in silences_s:
+        often.press(t_s)
+        once.press(t_s)
+        for i in range(int(silence_s / every_s)):
+            often.at(t_s + every_s * i)
+        t_s += silence_s
+    assert often.at(t_s + HELD_S) is once.at(t_s + HELD_S)
 
 
 def test_before_the_flight_a_signal_leaves() -> None:
@@ -89,7 +125,7 @@ from perchctl.commands.output import say
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.watchdog import Watchdog
 from perchctl.link.sender import Sender
-from perchctl.mission.state import Phase, PlannerState
+from perchctl.mission.state import Observation, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import telemetry
@@ -103,8 +139,9 @@ def send(command):
 with signals_to_operator(switch, say):
     sender = Sender(send, lambda: dog.poll(time.monotonic(), telemetry(time.monotonic())))
     now = time.monotonic()
-    state = PlannerState(phase=Phase.ALIGN)
-    dog.turn(now, now + float(sys.argv[1]), state, PositionSetpoint(0, 0, 1, 0), telemetry(now))
+    state = PlannerState(phase=Phase.ALIGN, t_s=now, hover_thrust=50000.0)
+    obs = Observation(now, telemetry(now))
+    dog.tick(now + float(sys.argv[1]), state, PositionSetpoint(0, 0, 1, 0), obs)
     # A call into a library that no signal interrupts; it lets the other threads run.
     hashlib.pbkdf2_hmac("sha256", b"", b"", 1 << 25)
 print("woke up", flush=True)

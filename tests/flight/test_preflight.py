@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -94,6 +95,21 @@ def test_a_vehicle_that_lies_askew_or_is_carried_is_waited_for(
     assert it.link.now_s == pytest.approx(PROFILE.safety.estimator_wait_s, abs=0.2)
 
 
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"battery_v": 3.797}, SafetyAbort, r"rests at 3\.797 V, at least 3\.800 V"),
+        ({"battery_v": 3.5}, SafetyAbort, r"rests at 3\.50 V, at least 3\.80 V"),
+        ({"roll_rad": math.radians(10.2)}, TimedOut, r"by 10\.2 deg, at most 10\.0"),
+        ({"position_variance_m2": 0.0103}, TimedOut, r"variance 0\.0103 .*at most 0\.0100"),
+    ],
+)
+def test_what_is_found_does_not_look_like_what_is_needed(
+    changes: dict[str, Any], error: type[Exception], words: str
+) -> None:
+    rig(**changes).refused(error, words)
+
+
 def test_a_vehicle_that_is_put_down_flies() -> None:
     it = Rig(Vehicle(lambda s: replace(s, roll_rad=0.3 if s.t_s < 3.0 else 0.0)))
     it.operator = lambda: Operator.LAND if it.link.said(PositionSetpoint) else Operator.NONE
@@ -143,10 +159,14 @@ def test_a_mirrored_picture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         return state, replace(output, detections=seen)
 
     monkeypatch.setattr(senses, "step", mirrored)
-    report = Rig().fly()
-    assert report.outcome is Outcome.TARGET_NOT_FOUND
-    assert "mirrored" in report.reason
-    assert "camera.mirrored" in report.reason
+    for is_set in (False, True):
+        camera = PROFILE.camera.model_copy(update={"mirrored": is_set})
+        it = Rig(profile=PROFILE.model_copy(update={"camera": camera}))
+        report = it.fly()
+        assert report.outcome is Outcome.TARGET_NOT_FOUND
+        assert "the picture is mirrored" in report.reason
+        advice = "take camera.mirrored out" if is_set else "set camera.mirrored"
+        assert advice in report.reason
 
 
 def test_a_mirrored_picture_once_is_a_chance(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from perchctl.flight.history import History
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
-from perchctl.mission.state import Operator
+from perchctl.mission import lander, planner
+from perchctl.mission.state import Observation, Operator, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.positioning.feed import FeedStatus
@@ -235,9 +237,21 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry | None, **more: Any) -> None:
-        landing = self.profile.planner.landing
-        rescue(self.link, self.clock or Clock(self.link), landing, self.operator, known, **more)
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> lander.Finding | None:
+        """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
+        ground = replace(known, position_m=(0.0, 0.0, 0.0))
+        told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state
+        before = replace(planner.start(Observation(known.t_s, ground)), **told)
+        began_s = self.link.now_s
+        return rescue(
+            self.link,
+            self.clock or Clock(self.link),
+            self.profile,
+            self.operator,
+            before,
+            History((known,)),
+            lambda now_s: age_s + now_s - began_s if age_s else 0.0,
+        )
 
     def refused(self, error: type[Exception], words: str) -> None:
         with pytest.raises(error, match=words):

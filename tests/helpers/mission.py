@@ -8,6 +8,7 @@ import numpy as np
 
 from perchctl.mission import planner
 from perchctl.mission.energy import EnergyState
+from perchctl.mission.imu import ImuMotion, moved
 from perchctl.mission.state import Observation, Phase, PlannerState, Severity
 from perchctl.mission.watch import Event, EventKind
 from perchctl.profile import Profile
@@ -91,6 +92,29 @@ def observation(t_s: float, z_m: float = 1.0, **changes: object) -> Observation:
         new_frame=True,  # type: ignore[arg-type]
     )
     return replace(obs, **changes)  # type: ignore[arg-type]
+
+
+class Felt:
+    """Adds to each observation what the accelerometer has told by then, as the loop does."""
+
+    def __init__(self) -> None:
+        self._motion = ImuMotion()
+        self._last: Telemetry | None = None
+
+    def __call__(self, obs: Observation) -> Observation:
+        sample = obs.telemetry
+        if self._last is None or sample.t_s > self._last.t_s:
+            self._motion = moved(self._motion, self._last, sample)
+            self._last = sample
+        return replace(obs, imu=self._motion)
+
+    def at_rest(self, until_s: float, acc_z_g: float = 1.0) -> Felt:
+        """Has stood on the ground for two seconds before."""
+        for i in range(200):
+            t_s = until_s - 0.01 * (200 - i)
+            rests = telemetry(t_s, 0.0, thrust=0.0, supervisor=READY, acc_z_g=acc_z_g)
+            self(Observation(t_s, rests))
+        return self
 
 
 def entered(t_s: float, phase: Phase, reason: str) -> Event:

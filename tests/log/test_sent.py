@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from perchctl.flight.history import History
 from perchctl.flight.loop import fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
@@ -24,7 +25,7 @@ from perchctl.log.shown import show_record, show_text
 from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission.sent import Sent
-from perchctl.mission.state import Outcome, Phase
+from perchctl.mission.state import Operator, Outcome, Phase
 from perchctl.mission.watch import FlightReport
 from perchctl.profile import load_profile
 from perchctl.report.story import story_of
@@ -126,8 +127,8 @@ def test_a_hung_loop_s_log_says_what_the_watchdog_sent(tmp_path: Path) -> None:
 
 def test_a_rescue_s_orders_are_told() -> None:
     link, told = ScriptedLink([]), []
-    landing = PROFILE.planner.landing
-    rescue(link, Clock(link), landing, lambda: 0, telemetry(0.0, 1.0), told=told.append)  # type: ignore[arg-type,return-value]
+    flown = History((telemetry(0.0, 1.0),))
+    rescue(link, Clock(link), PROFILE, lambda: Operator.NONE, None, flown, told=told.append)
     assert told
     assert [(each.t_s, each.command) for each in told] == link.sent
     assert {each.by for each in told} == {"rescue"}

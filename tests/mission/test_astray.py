@@ -8,13 +8,15 @@ from typing import Any
 import pytest
 
 from perchctl.mission import planner
-from perchctl.mission.state import Phase
+from perchctl.mission.imu import Reckoning
+from perchctl.mission.state import Phase, PlannerState
 from perchctl.vehicle import RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
     HOVER_THRUST,
     PROFILE,
     READY,
+    Felt,
     observation,
     state_in,
     target_at,
@@ -31,7 +33,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
     """A world with its y up: the vehicle rises, its position slides, its height and its vertical
     speed stand. It is let down by what its accelerometer feels, one with an offset too."""
     state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0, last=None)
-    z_m, up_mps, thrust, highest_m = 0.0, 0.0, 1.15 * hover, 0.0
+    z_m, up_mps, thrust, highest_m, felt = 0.0, 0.0, 1.15 * hover, 0.0, Felt()
     for t_s in times(5.0):
         acc_g = thrust / hover
         up_mps += 9.81 * (acc_g - 1.0) * TURN_S
@@ -42,7 +44,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
             acc_z_g=acc_g + felt_too_much_g,
         )  # fmt: skip
         obs = observation(t_s, telemetry=tel, target=target_at(t_s, body_m=tel.position_m))
-        state, command = planner.step(state, obs, MOCAP)
+        state, command = planner.step(state, felt(obs), MOCAP)
         if isinstance(command, RawThrust):
             thrust = float(command.thrust)
         if z_m <= 0.0:
@@ -56,22 +58,23 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
 
 def test_what_is_astray_and_unfelt_for_a_moment_keeps_the_speed_that_it_had() -> None:
     """A gap in telemetry tells nothing: neither that it stands still nor the estimate's speed."""
+    felt = Felt()
+    began = felt(observation(10.0, telemetry=telemetry(10.0)))
     state = replace(
-        state_in(Phase.LANDING), astray=True, heading_lost=True, row="position-astray",
-        felt_mps=-0.4, last=telemetry(10.0),
+        state_in(Phase.LANDING), astray=True, row="position-astray", last=began.telemetry,
+        reckoning=Reckoning(imu=began.imu, velocity_mps=(0.0, 0.0, -0.4)),
     )  # fmt: skip
     tel = telemetry(10.3, velocity_mps=(0.0, 0.0, 0.8))
-    after, _ = planner.step(state, observation(10.3, telemetry=tel), MOCAP)
-    assert after.felt_mps == -0.4
-    again, _ = planner.step(
-        after, observation(10.32, telemetry=telemetry(10.32, acc_z_g=1.1)), MOCAP
-    )
-    assert -0.4 < again.felt_mps < -0.38
+    after, _ = planner.step(state, felt(observation(10.3, telemetry=tel)), MOCAP)
+    assert after.reckoning.velocity_mps[2] == pytest.approx(-0.4)
+    tel = telemetry(10.32, velocity_mps=(0.0, 0.0, 0.8), acc_z_g=1.1)
+    again, _ = planner.step(after, felt(observation(10.32, telemetry=tel)), MOCAP)
+    assert -0.4 < again.reckoning.velocity_mps[2] < -0.38
 
 
 def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
     """On the floor, by a height that says 0.6 m: the motors are stopped all the same, in time."""
-    state = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0)
+    state, felt = replace(state_in(Phase.APPROACH, z_m=0.2), hover_thrust=0.0), Felt()
     thrust = 60000.0
     for t_s in times(14.0):
         down = t_s > BEGIN_S + 2.0
@@ -79,7 +82,7 @@ def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
         tel = telemetry(
             t_s, position_m=body_m, thrust=thrust, supervisor=READY if thrust == 0 else AIRBORNE
         )
-        obs = observation(t_s, telemetry=tel, target=None)
+        obs = felt(observation(t_s, telemetry=tel, target=None))
         state, command = planner.step(state, obs, MOCAP)
         if isinstance(command, RawThrust):
             thrust = float(command.thrust)
@@ -132,14 +135,12 @@ def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
     assert "swapped axes" in state.reason
 
 
-@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.02, -0.02])
-@pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
-def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: float) -> None:
-    """Axes swapped in the plane alone: the estimate's vertical speed is its own, and corrects
-    what an accelerometer's offset would sum up to on the longer way."""
+def come_down(height_m: float, felt: Felt, felt_too_much_g: float) -> tuple[PlannerState, float]:
+    """A vehicle in a world whose axes are swapped in the plane alone, until it meets the floor:
+    with what speed, 0 if it does not."""
     state = state_in(Phase.ALIGN, z_m=height_m)
     z_m, up_mps, thrust = height_m, 0.0, state.hover_thrust
-    for t_s in times(9.0):
+    for t_s in times(12.0):
         acc_g = thrust / HOVER_THRUST
         up_mps += 9.81 * (acc_g - 1.0) * TURN_S
         z_m += up_mps * TURN_S
@@ -148,11 +149,26 @@ def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: 
             t_s, position_m=(aside_m, 0.0, z_m), velocity_mps=(2.0, 0.0, up_mps), thrust=thrust,
             acc_z_g=acc_g + felt_too_much_g,
         )  # fmt: skip
-        state, command = planner.step(state, observation(t_s, telemetry=tel, target=None), MOCAP)
+        obs = felt(observation(t_s, telemetry=tel, target=None))
+        state, command = planner.step(state, obs, MOCAP)
         if isinstance(command, RawThrust):
             thrust = float(command.thrust)
         if z_m <= 0.0:
-            break
+            return state, up_mps
+    return state, 0.0
+
+
+@pytest.mark.parametrize("felt_too_much_g", [0.0, 0.02, -0.02])
+@pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
+def test_from_high_up_it_comes_down_as_softly(height_m: float, felt_too_much_g: float) -> None:
+    """The accelerometer's offset, which would sum up on the longer way, was learned at rest."""
+    felt = Felt().at_rest(BEGIN_S, 1.0 + felt_too_much_g)
+    state, up_mps = come_down(height_m, felt, felt_too_much_g)
     assert state.row == "position-astray"
-    assert z_m <= 0.0
-    assert -1.0 < up_mps < 0.0
+    assert -0.9 < up_mps < 0.0
+
+
+def test_a_felt_speed_that_has_drifted_keeps_nothing_up() -> None:
+    """By an accelerometer whose offset nobody knows it seems to sink faster and faster, and is
+    braked more and more: for so long as the way takes, and no longer."""
+    assert come_down(1.0, Felt(), -0.02)[1] < 0.0

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
+from perchctl.mission.lander import SINK_MPS
 from perchctl.mission.safety import BEFORE_CONTACT
 from perchctl.mission.state import Phase, PlannerState
 from perchctl.vehicle import Land, PositionSetpoint, RawThrust, StopMotors
@@ -46,8 +47,10 @@ def test_it_brakes_what_sinks_fast_and_lets_sink_what_does_not(speed_mps: float)
     tel = telemetry(10.02, 1.0, velocity_mps=(0.0, 0.0, speed_mps))
     _, command = planner.step(lost(), observation(10.02, telemetry=tel), PROFILE)
     assert isinstance(command, RawThrust)
-    assert (command.thrust > HOVER_THRUST) == (speed_mps < -0.31) or abs(speed_mps + 0.3) < 0.02
+    beside = abs(speed_mps + SINK_MPS) < 0.02
+    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_MPS)
     assert command.thrust <= 60000  # more is clipped
+    assert (command.roll_rad, command.pitch_rad) == (0.0, 0.0)
 
 
 def test_what_does_not_sink_gets_less_until_the_floor_proves_itself() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from perchctl.mission import planner
-from perchctl.mission.state import Condition, Observation, Outcome, Phase, PlannerState
+from perchctl.mission.state import Observation, Outcome, Phase, PlannerState
 from perchctl.vehicle import LOCKED, Command, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
@@ -18,6 +18,7 @@ from tests.helpers.mission import (
     HOVER_THRUST,
     PROFILE,
     READY,
+    Felt,
     observation,
     state_in,
     telemetry,
@@ -155,6 +156,7 @@ class Hangs:
         self.carries, self.hover = carries, hover
         self.fell_s: float | None = None
         self.estimated_m = HANG_Z_M
+        self.felt = Felt()
 
     def look(self, t_s: float) -> Observation:
         lifted = self.thrust / self.hover
@@ -170,7 +172,8 @@ class Hangs:
             velocity_mps=(0.0, 0.0, -self.drift_mps - sinks_mps),
             supervisor=READY if off else AIRBORNE,
         )  # fmt: skip
-        return observation(t_s, telemetry=tel, target=None, **hidden(t_s - BEGIN_S + 1.0))
+        obs = observation(t_s, telemetry=tel, target=None, **hidden(t_s - BEGIN_S + 1.0))
+        return self.felt(obs)
 
     def obeys(self, command: Command) -> None:
         match command:
@@ -194,7 +197,8 @@ def released(it: Hangs, state: PlannerState, lasts_s: float = 12.0) -> tuple[Pla
 
 
 def at_the_magnet(phase: Phase = Phase.COMPLETE) -> PlannerState:
-    return replace(state_in(phase, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
+    state = state_in(phase, z_m=HANG_Z_M)
+    return replace(state, contact_z_m=HANG_Z_M, reach_s=BEGIN_S - 5.0)
 
 
 @pytest.mark.parametrize("drift_mps", [0.0, 0.2, -0.2])
@@ -239,38 +243,41 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
     assert command.z_m > it.look(t_s).telemetry.position_m[2] + 0.15  # caught
 
 
-def test_what_nobody_saw_hang_has_not_perched() -> None:
+STOPPED: dict[str, Any] = {"stopped_s": BEGIN_S - 1.0, "released_s": BEGIN_S - 3.0, "orders": 5}
+
+
+def off(t_s: float, supervisor: int = READY) -> Observation:
+    """Motors off, no position."""
+    tel = telemetry(t_s, HANG_Z_M, thrust=0.0, supervisor=supervisor)
+    return observation(t_s, telemetry=tel, target=None, **hidden(5.0))
+
+
+@pytest.mark.parametrize(("silence_s", "ends"), [(0.1, Phase.PERCHED), (0.5, Phase.ABORTED)])
+def test_what_nobody_saw_hang_has_not_perched(silence_s: float, ends: Phase) -> None:
     """Motors off, no position, and a gap in the telemetry: it may lie on the floor."""
-    state = replace(at_the_magnet(), stopped_s=BEGIN_S - 1.0, released_s=BEGIN_S - 3.0, orders=5)
-    ends = None
-    for t_s in times(3.0):
-        tel = telemetry(t_s, HANG_Z_M, thrust=0.0, supervisor=READY)
-        if t_s < BEGIN_S + 0.3:
-            tel = replace(tel, t_s=BEGIN_S - 0.5)
-        obs = observation(t_s, telemetry=tel, target=None, **hidden(5.0))
-        state, command = planner.step(state, obs, MOCAP)
+    state, felt = replace(at_the_magnet(), **STOPPED), Felt()
+    felt(off(BEGIN_S))
+    reasons = []
+    for t_s in times(4.0):
+        obs = felt(off(t_s if t_s > BEGIN_S + silence_s else BEGIN_S))
+        state, command = planner.step(state, replace(obs, t_s=t_s), MOCAP)
         assert not isinstance(command, Land | PositionSetpoint)
+        reasons.append(state.reason)
         if planner.is_over(state):
             break
-        ends = state.reason
-    assert state.phase is Phase.LANDED
-    assert ends is not None
-    assert "not known" in ends
-    assert "not known whether it stands or hangs" in state.reason
+    assert state.phase is ends
+    if ends is Phase.ABORTED:
+        assert any("still hangs is not known" in reason for reason in reasons)
+        assert "not known" in state.reason
 
 
-@pytest.mark.parametrize("hung_s", [None, BEGIN_S - 3.0])
-def test_a_locked_vehicle_hangs_where_it_was_seen_to_all_the_time(hung_s: float | None) -> None:
-    from perchctl.mission.state import Condition
-
-    state = replace(
-        at_the_magnet(), stopped_s=BEGIN_S - 1.0, released_s=BEGIN_S - 4.0,
-        since={} if hung_s is None else {Condition.WEIGHT_HANGS: hung_s},
-    )  # fmt: skip
-    tel = telemetry(10.02, HANG_Z_M, thrust=0.0, supervisor=READY | LOCKED)
-    obs = observation(10.02, telemetry=tel, target=None, **hidden(5.0))
-    state, _ = planner.step(state, obs, MOCAP)
-    assert state.phase is (Phase.ABORTED if hung_s is None else Phase.PERCHED)
+@pytest.mark.parametrize("silence_s", [0.02, 0.5])
+def test_a_locked_vehicle_hangs_where_it_has_not_fallen_from(silence_s: float) -> None:
+    state, felt = replace(at_the_magnet(), **STOPPED), Felt()
+    felt(off(BEGIN_S - 0.02))
+    locked = felt(off(BEGIN_S + silence_s, READY | LOCKED))
+    state, _ = planner.step(state, locked, MOCAP)
+    assert state.phase is (Phase.ABORTED if silence_s > 0.2 else Phase.PERCHED)
 
 
 # --- On the way down ---------------------------------------------------------------------
@@ -278,17 +285,18 @@ def test_a_locked_vehicle_hangs_where_it_was_seen_to_all_the_time(hung_s: float 
 
 @pytest.mark.parametrize("contact", [True, False])
 def test_what_something_carries_is_put_down_gently_whatever_that_is(contact: bool) -> None:
-    """Magnet or floor: without a position nothing tells them apart. A stop at half of the
-    weight would drop it from a weak magnet; a slow release under watch suits both."""
+    """Magnet or floor. A stop at half of the weight would drop it from a weak magnet; a slow
+    release under watch suits both. What had touched the magnet and has not fallen hangs."""
     it = Hangs(-0.1)
     it.thrust = 20000.0
-    state = replace(at_the_magnet(Phase.LANDING), contact_z_m=HANG_Z_M if contact else None)
+    state = at_the_magnet(Phase.LANDING)
+    if not contact:
+        state = replace(state, contact_z_m=None, reach_s=None)
     state, sent = released(it, state)
     first = next(i for i, (_, command) in enumerate(sent) if isinstance(command, StopMotors))
     still = [c for _, c in sent[:first] if isinstance(c, RawThrust) and c.thrust <= 5000]
     assert len(still) * TURN_S >= PROFILE.planner.complete.hang_s - 0.05
-    assert state.phase is Phase.LANDED
-    assert "not known whether it stands or hangs" in state.reason
+    assert state.phase is (Phase.PERCHED if contact else Phase.LANDED)
 
 
 def test_a_drifting_descent_is_no_floor() -> None:
@@ -319,13 +327,14 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     state = state_in(Phase.LANDING, z_m=1.0)
     state = replace(
         state, entered_s=8.0, contact_z_m=0.6, released_s=9.0, stopped_s=9.9, stale_s=BEGIN_S,
-        since={Condition.WEIGHT_HANGS: 9.5},
+        reach_s=8.0,
     )  # fmt: skip
-    locked = telemetry(BEGIN_S, 0.6, thrust=0.0, supervisor=READY | LOCKED)
-    seen = observation(BEGIN_S, telemetry=locked, target=None, **hidden(3.0))
-    assert planner.step(state, seen, MOCAP)[0].phase is Phase.ABORTED
+    felt = Felt()
+    felt(off(BEGIN_S - TURN_S))
+    locked = felt(off(BEGIN_S, READY | LOCKED))
+    assert planner.step(state, locked, MOCAP)[0].phase is Phase.ABORTED
     hung = replace(state, phase=Phase.COMPLETE)
-    assert planner.step(hung, seen, MOCAP)[0].phase is Phase.PERCHED
+    assert planner.step(hung, locked, MOCAP)[0].phase is Phase.PERCHED
 
 
 def test_a_release_that_is_held_goes_by_where_the_estimate_is_now() -> None:

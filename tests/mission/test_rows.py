@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
+from perchctl.mission.imu import ImuMotion
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.row import Row, risen
 from perchctl.mission.state import (
@@ -111,12 +112,12 @@ def unseen(z_m: float = 1.0) -> Look:
     return look
 
 
-def aside(x_m: float, z_m: float = 1.0) -> Look:
+def aside(x_m: float, z_m: float = 1.0, **changes: Any) -> Look:
     """The vehicle beside the target."""
 
     def look(t_s: float) -> Observation:
         body_m = (x_m, 0.0, z_m)
-        tel = telemetry(t_s, position_m=body_m)
+        tel = telemetry(t_s, position_m=body_m, **changes)
         return observation(t_s, telemetry=tel, target=target_at(t_s, body_m=body_m))
 
     return look
@@ -138,8 +139,9 @@ def blind(look: Look) -> Look:
 
 
 def unknown(t_s: float) -> Observation:
-    """Motors off, and neither the target nor a position of late."""
-    return replace(flown(CONTACT_Z_M, **OFF)(t_s), position_age_s=3.0, target=None)
+    """Motors off, neither the target nor a position of late, and a silence not long ago."""
+    obs = replace(flown(CONTACT_Z_M, **OFF)(t_s), position_age_s=3.0, target=None)
+    return replace(obs, imu=ImuMotion(t_s=t_s, gap_s=START_S))
 
 
 BY_TARGET = Profile.model_validate({"positioning": "target"})
@@ -239,6 +241,9 @@ CASES: dict[str, Case] = {
     "outside-cone": Case(P.ASCEND, P.ALIGN, aside(0.4)),
     "ascend-timeout": Case(P.ASCEND, P.RECOVER, seen(), state={"entered_s": -50.0}),
     "settled": Case(P.ASCEND, P.PERCH, seen(STANDOFF_Z_M), 0.5, z_m=STANDOFF_Z_M),
+    "beside-the-magnet": Case(
+        P.PERCH, P.RECOVER, aside(0.06, CONTACT_Z_M, thrust=PRESSED), 0.5, z_m=CONTACT_Z_M
+    ),
     "contact": Case(
         P.PERCH, P.COMPLETE, flown(CONTACT_Z_M, thrust=PRESSED), 0.5, z_m=CONTACT_Z_M
     ),
@@ -287,7 +292,7 @@ CASES: dict[str, Case] = {
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={
             "outcome": O.SAFETY, "stopped_s": START_S, "contact_z_m": CONTACT_Z_M,
-            "blind_in_reach": True,
+            "reach_s": START_S - 1.0,
         },
         z_m=CONTACT_Z_M, profile=BY_TARGET,
     ),

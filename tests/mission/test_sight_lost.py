@@ -7,17 +7,26 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
-from perchctl.mission.context import PUT_RIGHT_S
+from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
-from perchctl.mission.level import BLIND_SINK_MPS, MOST_BRAKE_RAD
-from perchctl.mission.state import Condition, Observation, Operator, Phase, PlannerState, Severity
+from perchctl.mission.imu import GAP_S, ImuMotion, Reckoning
+from perchctl.mission.lander import BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD, SINK_MPS
+from perchctl.mission.state import Observation, Operator, Phase, PlannerState, Severity
 from perchctl.profile import Profile
-from perchctl.vehicle import Command, Land, PositionSetpoint, RawThrust, StopMotors
-from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, observation, state_in, telemetry
+from perchctl.vehicle import Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
+from tests.helpers.mission import (
+    AIRBORNE,
+    HOVER_THRUST,
+    READY,
+    Felt,
+    observation,
+    state_in,
+    telemetry,
+)
 
 PROFILE = Profile.model_validate({"positioning": "target"})
 HOLD_S, LAND_S = PROFILE.positioning.hold_s, PROFILE.positioning.land_s
@@ -43,6 +52,18 @@ def flown(
         state, command = planner.step(state, unseen(t_s, z_m, TURN_S * i, telemetry=tel), PROFILE)
         turns.append((state, command))
     return turns
+
+
+def blind(
+    z_m: float, velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0), **changes: object
+) -> PlannerState:
+    """On its way down by accelerometer and attitude alone, with that reckoned speed."""
+    reckoning = Reckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=velocity_mps)
+    state = replace(
+        state_in(Phase.LANDING, z_m=z_m), blind_s=BEGIN_S, blind_height_m=z_m,
+        severity=Severity.LAND, reckoning=reckoning,
+    )  # fmt: skip
+    return replace(state, **changes)  # type: ignore[arg-type]
 
 
 def test_a_target_has_its_own_patience() -> None:
@@ -127,67 +148,92 @@ def test_once_blind_it_stays_so_though_the_target_is_seen_again() -> None:
     vx_mps=st.floats(-1.5, 1.5),
     vy_mps=st.floats(-1.5, 1.5),
     yaw_rad=st.floats(-math.pi, math.pi),
-    pushed=st.booleans(),
+    age_s=st.sampled_from([0.05, 2.0]),
 )
-def test_seen_again_it_brakes_what_carries_it_aside(
-    vx_mps: float, vy_mps: float, yaw_rad: float, pushed: bool
+def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
+    vx_mps: float, vy_mps: float, yaw_rad: float, age_s: float
 ) -> None:
-    """A blow may have thrown it, and its attitude been wrong as it hung: level it would fly on
-    aside, 2 m and more until the floor. Without a sight nothing is known of that: level."""
-    state = flown(state_in(Phase.ALIGN), LAND_S + 0.2)[-1][0]
-    for i in range(1, 60):
-        t_s = BEGIN_S + LAND_S + 0.2 + TURN_S * i
-        tel = telemetry(t_s, 1.0, velocity_mps=(vx_mps, vy_mps, -0.5), yaw_rad=yaw_rad)
-        age_s = LAND_S + 0.2 + TURN_S * i if pushed else 0.05
-        obs = observation(t_s, telemetry=tel, position_age_s=age_s)
-        state, command = planner.step(state, obs, PROFILE)
-        assert isinstance(command, RawThrust)
-        if pushed or TURN_S * i < PUT_RIGHT_S:
-            assert command == RawThrust(command.thrust)
-    if pushed:
-        return
+    """A blow may have thrown it: level it would fly on aside, 2 m and more until the floor. A
+    speed that the attitude leaves unsure is left alone."""
+    assume(math.hypot(vx_mps, vy_mps) > 0.1)
+    state = blind(1.0, (vx_mps, vy_mps, -SINK_MPS))
+    tel = telemetry(BEGIN_S + TURN_S, 1.0, velocity_mps=(0.0, 0.0, -0.5), yaw_rad=yaw_rad)
+    obs = observation(tel.t_s, telemetry=tel, position_age_s=age_s)
+    _, command = planner.step(state, obs, PROFILE)
+    assert isinstance(command, RawThrust)
     # Nose down is forwards, roll to the right is to the right (docs/firmware.md).
     ahead, left = command.pitch_rad, -command.roll_rad
     cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
     x, y = ahead * cos - left * sin, ahead * sin + left * cos
     speed_mps = math.hypot(vx_mps, vy_mps)
-    assert math.hypot(x, y) <= math.sqrt(2.0) * MOST_BRAKE_RAD + 1e-9
-    assert x * vx_mps + y * vy_mps <= -0.05 * min(speed_mps, 1.0) * speed_mps
-    if speed_mps < 1.0:
+    assert max(abs(ahead), abs(left)) <= MOST_BRAKE_RAD + 1e-9
+    assert x * vx_mps + y * vy_mps <= -0.1 * min(speed_mps, 1.0) * speed_mps
+    if speed_mps * BRAKE_RAD_PER_MPS < MOST_BRAKE_RAD:
         assert x * vy_mps - y * vx_mps == pytest.approx(0.0, abs=1e-9)
 
 
-def test_what_was_stopped_as_it_hung_and_is_carried_since_hangs() -> None:
-    """The operator lands what is being watched after its stop: nothing is taken from the magnet,
-    and without a position of its own it is no landing. With a gap it may lie on the floor."""
-    for hangs_s, ends in ((BEGIN_S - 3.0, Phase.PERCHED), (BEGIN_S - 0.5, Phase.ABORTED)):
-        state = replace(
-            state_in(Phase.LANDING, z_m=1.9),
-            contact_z_m=1.9, released_s=BEGIN_S - 4.0, stopped_s=BEGIN_S - 1.0,
-            orders=5, since={Condition.WEIGHT_HANGS: hangs_s},
+@given(aside_g=st.floats(-1.0, 1.0), ahead_g=st.floats(-1.0, 1.0), yaw_rad=st.floats(-3.1, 3.1))
+def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked(
+    aside_g: float, ahead_g: float, yaw_rad: float
+) -> None:
+    """For 0.1 s without a sight: sideways the estimate feels none of it."""
+    felt, state, blows_s = Felt(), state_in(Phase.ALIGN), (0.2, 0.3)
+    gained_mps = 9.81 * 0.1 * math.hypot(aside_g, ahead_g)
+    for i in range(1, 30):
+        passed_s = TURN_S * i
+        blown = blows_s[0] < passed_s <= blows_s[1] + 1e-9
+        tel = telemetry(
+            BEGIN_S + passed_s, yaw_rad=yaw_rad,
+            acc_x_g=ahead_g if blown else 0.0, acc_y_g=aside_g if blown else 0.0,
         )  # fmt: skip
-        for i in range(1, 150):
-            t_s = BEGIN_S + TURN_S * i
-            tel = telemetry(t_s, 1.9, thrust=0.0, supervisor=READY)
-            obs = unseen(t_s, 1.9, 0.6 + TURN_S * i, telemetry=tel)
-            state, command = planner.step(state, obs, PROFILE)
-            if planner.is_over(state):
-                break
-            assert not isinstance(command, Land | PositionSetpoint | RawThrust)
-        assert state.phase is ends, state.reason
+        obs = unseen(tel.t_s, 1.0, max(0.01, passed_s - 0.1), telemetry=tel)
+        state, command = planner.step(state, felt(obs), PROFILE)
+        if state.phase is Phase.LANDING:
+            break
+    if abs(gained_mps - BLOWN_MPS) < 0.05:
+        return
+    assert (state.phase is Phase.LANDING) is (gained_mps > BLOWN_MPS)
+    if state.phase is Phase.LANDING:
+        assert state.row == "position-lost"
+        assert passed_s >= 0.1 + CORRECTED_S
+        assert isinstance(command, RawThrust)
+        assert command.pitch_rad * ahead_g <= 1e-3
+        assert command.roll_rad * aside_g >= -1e-3
+
+
+@pytest.mark.parametrize(("silence_s", "ends"), [(0.1, Phase.PERCHED), (0.3, Phase.ABORTED)])
+def test_what_was_stopped_as_it_hung_and_has_not_fallen_since_hangs(
+    silence_s: float, ends: Phase
+) -> None:
+    """The operator lands what is being watched after its stop: nothing is taken from the magnet,
+    and without a position of its own it is no landing. A silence may hide a fall."""
+    state, felt = replace(
+        state_in(Phase.LANDING, z_m=1.9),
+        contact_z_m=1.9, released_s=BEGIN_S - 4.0, stopped_s=BEGIN_S - 1.0, orders=5,
+        reach_s=BEGIN_S - 6.0,
+    ), Felt()  # fmt: skip
+    for i in range(1, 150):
+        t_s = BEGIN_S + TURN_S * i
+        heard_s = t_s if not 0.5 < TURN_S * i <= 0.5 + silence_s else BEGIN_S + 0.5
+        tel = telemetry(heard_s, 1.9, thrust=0.0, supervisor=READY)
+        obs = unseen(t_s, 1.9, 0.6 + TURN_S * i, telemetry=tel, target=None)
+        if TURN_S * i < 0.6:
+            obs = replace(obs, telemetry=replace(tel, thrust=1.0))  # not seen to be off yet
+        state, command = planner.step(state, felt(obs), PROFILE)
+        if planner.is_over(state):
+            break
+        assert not isinstance(command, Land | PositionSetpoint | RawThrust)
+    assert (silence_s > GAP_S) is (ends is Phase.ABORTED)
+    assert state.phase is ends, state.reason
 
 
 def test_what_slips_off_the_magnet_has_its_whole_way_down_before_it() -> None:
     """Blind for long while it hung, it would have less and less thrust at once, and fall."""
-    hung = replace(
-        state_in(Phase.LANDING, z_m=2.0),
-        blind_s=BEGIN_S - 6.0, entered_s=BEGIN_S - 1.0, hover_thrust=HOVER_THRUST, caught=True,
-    )  # fmt: skip
+    hung = blind(1.5, (0.0, 0.0, -SINK_MPS), blind_s=BEGIN_S - 8.0, level_thrust=HOVER_THRUST)
     thrusts = []
-    for state in (hung, replace(hung, entered_s=BEGIN_S - 6.0)):
-        tel = telemetry(BEGIN_S + TURN_S, 1.5, velocity_mps=(0.0, 0.0, -0.5))
-        obs = unseen(BEGIN_S + TURN_S, 1.5, 6.0, telemetry=tel)
-        _, command = planner.step(replace(state, level_thrust=HOVER_THRUST), obs, PROFILE)
+    for entered_s in (BEGIN_S - 1.0, BEGIN_S - 8.0):
+        obs = unseen(BEGIN_S + TURN_S, 1.5, 6.0)
+        _, command = planner.step(replace(hung, entered_s=entered_s), obs, PROFILE)
         assert isinstance(command, RawThrust)
         thrusts.append(command.thrust)
     assert thrusts[0] == pytest.approx(HOVER_THRUST, abs=0.02 * HOVER_THRUST)
@@ -207,25 +253,19 @@ def test_a_landing_that_loses_it_goes_on_blindly() -> None:
 
 def test_a_landing_of_its_own_near_the_floor_is_left_to_its_end() -> None:
     """A change of the mode a hand above the floor would drop it."""
+    mocap = Profile.model_validate({"positioning": "mocap"})
     state = replace(
         state_in(Phase.LANDING, z_m=0.3), entered_s=BEGIN_S - 6.0, orders=1, ordered_s=BEGIN_S
     )
     for i in range(1, 40):
         obs = unseen(BEGIN_S + TURN_S * i, 0.25, LAND_S + TURN_S * i)
-        state, command = planner.step(state, obs, PROFILE)
-        assert not isinstance(command, RawThrust)
-    assert state.blind_s is None
+        state, command = planner.step(state, obs, mocap)
+        assert isinstance(command, Land | Idle)
 
 
 def test_how_long_it_may_take_counts_from_the_loss_and_not_from_the_landing() -> None:
-    state = replace(
-        state_in(Phase.LANDING),
-        entered_s=BEGIN_S - 20.0,
-        blind_s=BEGIN_S,
-        level_thrust=HOVER_THRUST,
-    )
-    tel = telemetry(BEGIN_S + 1.0, 0.8, velocity_mps=(0.0, 0.0, -BLIND_SINK_MPS))
-    _, command = planner.step(state, unseen(BEGIN_S + 1.0, 0.8, 2.5, telemetry=tel), PROFILE)
+    state = blind(0.8, (0.0, 0.0, -SINK_MPS), entered_s=BEGIN_S - 20.0, level_thrust=HOVER_THRUST)
+    _, command = planner.step(state, unseen(BEGIN_S + TURN_S, 0.8, 2.5), PROFILE)
     assert isinstance(command, RawThrust)
     assert command.thrust > 0.97 * HOVER_THRUST
 
@@ -253,37 +293,47 @@ def test_a_hover_thrust_that_was_not_learned_yet_is_felt(felt_g: float) -> None:
 
 @given(speed_mps=st.floats(-1.2, 0.3))
 def test_blind_it_brakes_what_sinks_faster_than_it_should(speed_mps: float) -> None:
-    state = replace(state_in(Phase.LANDING), blind_s=BEGIN_S)
-    tel = telemetry(BEGIN_S + TURN_S, 1.0, velocity_mps=(0.0, 0.0, speed_mps))
-    _, command = planner.step(state, unseen(BEGIN_S + TURN_S, 1.0, 2.0, telemetry=tel), PROFILE)
+    """By the felt speed, whatever the estimate says."""
+    state = blind(1.0, (0.0, 0.0, speed_mps))
+    tel = telemetry(BEGIN_S + TURN_S, 1.0, velocity_mps=(0.0, 0.0, 0.5))
+    _, command = planner.step(state, unseen(tel.t_s, 1.0, 2.0, telemetry=tel), PROFILE)
     assert isinstance(command, RawThrust)
-    beside = abs(speed_mps + BLIND_SINK_MPS) < 0.02
-    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -BLIND_SINK_MPS)
+    beside = abs(speed_mps + SINK_MPS) < 0.02
+    assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_MPS)
 
 
-@pytest.mark.parametrize(("in_reach", "ends"), [(False, Phase.LANDED), (True, Phase.ABORTED)])
-def test_a_blind_way_down_whose_speed_has_drifted_ends_on_the_floor_all_the_same(
-    in_reach: bool, ends: Phase
+@pytest.mark.parametrize(
+    ("in_reach", "silence_s", "ends"),
+    [(False, 0.0, Phase.LANDED), (True, 0.0, Phase.PERCHED), (True, 0.3, Phase.ABORTED)],
+)
+def test_a_blind_way_down_whose_speed_has_drifted_ends_all_the_same(
+    in_reach: bool, silence_s: float, ends: Phase
 ) -> None:
-    """By its estimate it sinks for ever, at the speed that is wanted; it has stood for long. What
-    carries it may be the magnet only where it began in its reach."""
-    state = replace(state_in(Phase.LANDING), blind_s=BEGIN_S, blind_in_reach=in_reach)
+    """By its reckoning it sinks for ever, at the speed that is wanted; something has carried it
+    for long. That may be the magnet only where it began in its reach, and is, as long as no fall
+    is felt and no silence could hide one."""
+    state, felt = blind(1.0, contact_z_m=1.0 if in_reach else None), Felt()
+    began = felt(unseen(BEGIN_S, 1.0, 2.0))
+    reckoning = Reckoning(imu=began.imu, velocity_mps=(0.0, 0.0, -SINK_MPS))
+    state = replace(state, reckoning=reckoning, reach_s=BEGIN_S if in_reach else None)
     thrust, stopped = HOVER_THRUST, False
     for i in range(1, 1000):
         t_s = BEGIN_S + TURN_S * i
+        heard_s = t_s if not 1.0 < TURN_S * i <= 1.0 + silence_s else BEGIN_S + 1.0
         tel = telemetry(
-            t_s, 1.0 - 0.01 * i, thrust=thrust, velocity_mps=(0.0, 0.0, -BLIND_SINK_MPS),
+            heard_s, 1.0 - 0.01 * i, thrust=thrust, velocity_mps=(0.0, 0.0, -SINK_MPS),
             supervisor=READY if stopped else AIRBORNE,
         )  # fmt: skip
-        obs = unseen(t_s, 1.0, 2.0, telemetry=tel, target=None)
+        obs = felt(unseen(t_s, 1.0, 2.0, telemetry=tel, target=None))
         state, command = planner.step(state, obs, PROFILE)
+        assert not isinstance(command, Land)
         stopped |= isinstance(command, StopMotors)
         thrust = float(command.thrust) if isinstance(command, RawThrust) else thrust
         thrust = 0.0 if stopped else thrust
         if planner.is_over(state):
             break
     assert stopped
-    assert state.phase is ends
+    assert state.phase is ends, state.reason
 
 
 # --- the last centimetres ------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.mission import planner
 from perchctl.mission.guards import CATCHABLE_M
-from perchctl.mission.landing import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
+from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
 from perchctl.mission.state import Outcome, Phase, PlannerState
 from perchctl.vehicle import (
     FULL_THRUST,
@@ -28,6 +28,7 @@ from tests.helpers.mission import (
     HOVER_THRUST,
     PROFILE,
     READY,
+    Felt,
     observation,
     state_in,
     telemetry,
@@ -80,31 +81,33 @@ def test_a_raw_release_waits_for_telemetry_too() -> None:
 # --- after the stop -------------------------------------------------------------------
 
 
-def stopped(seen_since_s: float | None) -> PlannerState:
-    state = replace(released(), stopped_s=4.0, orders=5)
-    since = {} if seen_since_s is None else {planner.Condition.WEIGHT_HANGS: seen_since_s}
-    return replace(state, since=since)
+def stopped(**changes: object) -> PlannerState:
+    state = replace(released(), stopped_s=4.0, orders=5, reach_s=3.0)
+    return replace(state, **changes)  # type: ignore[arg-type]
 
 
-def after(state: PlannerState, z_m: float, lasts_s: float = 1.0) -> PlannerState:
-    for i in range(1, round(lasts_s / 0.02)):
-        t_s = 10.0 + 0.02 * i
+def after(state: PlannerState, z_m: float, silence_s: float = 0.0) -> PlannerState:
+    """A second later. A fall that nobody has heard of may be in that silence."""
+    felt = Felt()
+    felt(observation(10.0, telemetry=telemetry(10.0, thrust=0.0, supervisor=READY)))
+    for i in range(1, 50):
+        t_s = 10.0 + silence_s + 0.02 * i
         off = telemetry(t_s, z_m, thrust=0.0, supervisor=READY)
-        state, _ = ticked(state, t_s, off)
+        state, _ = planner.step(state, felt(observation(t_s, telemetry=off)), PROFILE)
     return state
 
 
 def test_what_lies_on_the_floor_has_not_perched() -> None:
-    state = after(stopped(seen_since_s=None), z_m=0.02)
+    state = after(stopped(), z_m=0.02, silence_s=0.7)
     assert (state.phase, state.outcome) == (Phase.LANDED, Outcome.SAFETY)
 
 
 def test_what_hangs_where_it_did_has_perched() -> None:
-    assert after(stopped(seen_since_s=None), HANG_Z_M - 0.1).phase is Phase.PERCHED
+    assert after(stopped(), HANG_Z_M - 0.1, silence_s=0.7).phase is Phase.PERCHED
 
 
 def test_an_estimate_that_drifts_while_it_is_watched_is_no_fall() -> None:
-    assert after(stopped(seen_since_s=4.0), HANG_Z_M - 0.6).phase is Phase.PERCHED
+    assert after(stopped(), HANG_Z_M - 0.6).phase is Phase.PERCHED
 
 
 # --- the estimate ---------------------------------------------------------------------
@@ -200,7 +203,7 @@ def test_a_landing_that_takes_too_long_is_left_to_the_vehicle_in_time() -> None:
     """At its time's end nothing is sent any more, and setpoints that end are cut."""
     slow_s = PROFILE.planner.landing.timeout_s
     state = replace(state_in(Phase.LANDING, z_m=3.0), entered_s=10.0 - 0.6 * slow_s)
-    assert isinstance(ticked(state, 10.0, telemetry(10.0, 3.0))[1], Land)
+    assert isinstance(ticked(state, 10.0, telemetry(10.0, 3.0), target=None)[1], Land)
 
 
 def test_motors_that_stand_still_in_a_fall_are_no_landing() -> None:

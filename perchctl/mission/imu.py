@@ -1,0 +1,221 @@
+"""What accelerometer and attitude tell of the vehicle's motion where no position does.
+
+`ImuMotion` is fed with each sample of the telemetry: it integrates the specific force, and notes
+when the vehicle fell, sank or was not heard of. `Reckoning` is the planner's: the speed and the
+place under the target, carried on from the last position that was good.
+
+In flight the firmware's own estimator feels accelerations along the thrust only
+(docs/firmware.md, "Target as position"): a blow or a gust from the side moves the vehicle and not
+its estimate. The accelerometer's other two axes tell of both.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from perchctl.geometry import GRAVITY_MPS2
+from perchctl.values import replace
+from perchctl.vehicle import FLYING, Telemetry
+
+Vector = tuple[float, float, float]
+ZERO: Vector = (0.0, 0.0, 0.0)
+
+GAP_S = 0.2
+"""A silence in which a vehicle falls by 20 cm, or more than it may and still hang."""
+FALL_G, FALL_S = 0.6, 0.1
+"""Specific force of a fall, and how long it lasts before it counts: an impact is shorter."""
+SINK_MPS = -0.25
+"""Speed of a vehicle that begins to come down, whatever the offsets of its accelerometer."""
+SINK_MEMORY_S, OFFSET_MEMORY_S = 1.5, 3.0
+IMPACT_G = -0.3
+"""What brakes a climb harder is an impact on the ceiling, and no way down."""
+BLOW_MPS, BLOW_S = 0.22, 0.1
+"""A speed upwards gained within that time: more than any thrust gives, so the floor was met."""
+STEADY_MPS = 0.06
+"""Vertical speeds so near to each other are one speed."""
+REST_MEMORY_S = 0.5
+"""At rest on the ground the accelerometer's offsets are learned in so long."""
+SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
+"""In so long the reckoned speed is drawn to the estimate's while that is believed, and what is
+left of the offsets sideways is learned, a wrong attitude's too. Wrong or late pictures lead the
+estimate astray within a second."""
+MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5
+"""More at a time is a blow, or a correction of the estimate."""
+CLIMB_SPARE_MPS = 0.1
+"""Reckoned, the vehicle may have come nearer to the target by so much each second."""
+BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
+"""Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
+the share of the way itself, since the samples of a blow come each 10 ms."""
+
+
+@dataclass(frozen=True)
+class ImuMotion:
+    """The vehicle's motion by its accelerometer and attitude alone.
+
+    Attributes:
+        t_s: of the newest sample.
+        velocity_mps: integral of the acceleration since the first sample, world axes. It drifts:
+            only differences over some seconds mean anything.
+        fell_s: when it last fell, or came down and met the floor; `-inf` if it never did.
+        gap_s: end of the newest silence that a fall could hide in.
+        steady_s: since when the vertical speed has stayed what it is.
+        offset_g: what the accelerometer read too much at rest on the ground, body axes.
+    """
+
+    t_s: float = -math.inf
+    velocity_mps: Vector = ZERO
+    offset_g: Vector = ZERO
+    fell_s: float = -math.inf
+    gap_s: float = -math.inf
+    steady_s: float = math.inf
+    steady_mps: float = 0.0
+    light_since_s: float = math.inf
+    sink_mps: float = 0.0
+    offset_mps2: float = 0.0
+    blow_mps: float = 0.0
+    blow_s: float = -math.inf
+
+
+def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
+    """The motion with one more sample; `last` is the one before, None at the first."""
+    dt_s = math.inf if last is None else new.t_s - last.t_s
+    if last is None or not 0.0 < dt_s <= GAP_S:
+        gap_s = motion.gap_s if last is None else new.t_s
+        return replace(
+            motion, t_s=new.t_s, gap_s=gap_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
+            steady_mps=motion.velocity_mps[2], light_since_s=math.inf,
+        )  # fmt: skip
+    offset_g = motion.offset_g
+    if new.thrust < 1 and not new.has(FLYING):
+        offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
+    before, after = acceleration_mps2(last, offset_g), acceleration_mps2(new, offset_g)
+    dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
+    x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
+    up_mps2 = dv[2] / dt_s
+    offset = motion.offset_mps2 + (
+        max(IMPACT_G * GRAVITY_MPS2, min(-IMPACT_G * GRAVITY_MPS2, up_mps2)) - motion.offset_mps2
+    ) * min(1.0, dt_s / OFFSET_MEMORY_S)
+    felt_mps2 = max(up_mps2, IMPACT_G * GRAVITY_MPS2) - offset
+    sink = motion.sink_mps + felt_mps2 * dt_s
+    sink = min(0.0, sink - sink * dt_s / SINK_MEMORY_S)
+    blow = max(0.0, motion.blow_mps * math.exp(-dt_s / BLOW_S) + up_mps2 * dt_s)
+    light = min(motion.light_since_s, new.t_s) if new.acc_z_g < FALL_G else math.inf
+    fell = sink < SINK_MPS or new.t_s - light >= FALL_S
+    steady_s, steady_mps = motion.steady_s, motion.steady_mps
+    if abs(z - steady_mps) > STEADY_MPS:
+        steady_s, steady_mps = new.t_s, z
+    return ImuMotion(
+        t_s=new.t_s,
+        velocity_mps=(x, y, z),
+        offset_g=offset_g,
+        fell_s=new.t_s if fell else motion.fell_s,
+        gap_s=motion.gap_s,
+        steady_s=steady_s,
+        steady_mps=steady_mps,
+        light_since_s=light,
+        sink_mps=sink,
+        offset_mps2=offset,
+        blow_mps=blow,
+        blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
+    )
+
+
+def _offset_at_rest(old: Vector, sample: Telemetry, share: float) -> Vector:
+    cr, sr = math.cos(sample.roll_rad), math.sin(sample.roll_rad)
+    cp, sp = math.cos(sample.pitch_rad), math.sin(sample.pitch_rad)
+    x, y, z = sample.acc_x_g + sp, sample.acc_y_g - cp * sr, sample.acc_z_g - cp * cr
+    ox, oy, oz = old
+    return (ox + share * (x - ox), oy + share * (y - oy), oz + share * (z - oz))
+
+
+def acceleration_mps2(sample: Telemetry, offset_g: Vector = ZERO) -> Vector:
+    """Acceleration in world axes by the specific force and the attitude of one sample."""
+    cr, sr = math.cos(sample.roll_rad), math.sin(sample.roll_rad)
+    cp, sp = math.cos(sample.pitch_rad), math.sin(sample.pitch_rad)
+    cy, sy = math.cos(sample.yaw_rad), math.sin(sample.yaw_rad)
+    fx, fy = sample.acc_x_g - offset_g[0], sample.acc_y_g - offset_g[1]
+    fz = sample.acc_z_g - offset_g[2]
+    level_x = cp * fx + sp * (sr * fy + cr * fz)
+    level_y = cr * fy - sr * fz
+    up = -sp * fx + cp * (sr * fy + cr * fz)
+    g = GRAVITY_MPS2
+    return (g * (cy * level_x - sy * level_y), g * (sy * level_x + cy * level_y), g * (up - 1.0))
+
+
+@dataclass(frozen=True)
+class Reckoning:
+    """Speed, and place under the target, carried on by the accelerometer.
+
+    Attributes:
+        imu: the motion up to which it is reckoned; None before the first tick.
+        velocity_mps: world axes.
+        bias_mps2: what the accelerometer and the attitude give too much sideways, world axes, as
+            learned beside the estimate.
+        below_m: how far the gear is below the target at the least; inf before the first sight.
+        aside_m: from the gear to the target's axis, world axes.
+        aside_sigma_m: standard deviation of that; inf where it is unknown.
+        sight_s: exposure of the sight that it is carried on from.
+    """
+
+    imu: ImuMotion | None = None
+    velocity_mps: Vector = ZERO
+    bias_mps2: Vector = ZERO
+    estimated_mps: Vector = ZERO
+    below_m: float = math.inf
+    aside_m: tuple[float, float] = (0.0, 0.0)
+    aside_sigma_m: float = math.inf
+    sight_s: float = -math.inf
+
+
+def reckoned(
+    old: Reckoning, imu: ImuMotion, sample: Telemetry, *, believed: bool, astray: bool = False
+) -> Reckoning:
+    """One tick on. `believed`: the sample's estimated velocity is true; `astray`: it may be
+    another axis', and after a silence, too, the reckoned one is better."""
+    estimated = sample.velocity_mps
+    if old.imu is None or imu.gap_s > old.imu.t_s:
+        velocity_mps = estimated if believed else ZERO
+        if astray:
+            velocity_mps = old.velocity_mps
+        unknown = replace(old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated)
+        return unknown if old.imu is None else replace(unknown, aside_sigma_m=math.inf)
+    dt_s = imu.t_s - old.imu.t_s
+    if not dt_s > 0.0:
+        return old
+    velocity, bias = [], []
+    for i in range(3):
+        gained = imu.velocity_mps[i] - old.imu.velocity_mps[i]
+        v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
+        if believed:
+            v += (estimated[i] - v) * min(1.0, dt_s / SPEED_MEMORY_S)
+            wrong = (gained - (estimated[i] - old.estimated_mps[i])) / dt_s
+            wrong = max(-MOST_WRONG_MPS2, min(MOST_WRONG_MPS2, wrong))
+            b += (wrong - b) * min(1.0, dt_s / BIAS_MEMORY_S)
+            b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b)) if i < 2 else 0.0
+        velocity.append(v)
+        bias.append(b)
+    vx, vy, vz = velocity
+    unseen_s = max(0.0, imu.t_s - old.sight_s)
+    fell = imu.fell_s > max(old.imu.fell_s, old.sight_s)
+    step_m = math.hypot(vx, vy) * dt_s
+    growth_m = (SPEED_SIGMA_MPS + BIAS_SIGMA_MPS2 * unseen_s) * dt_s + BLOW_SHARE * step_m
+    ex, ey = old.aside_m
+    return replace(
+        old,
+        imu=imu,
+        velocity_mps=(vx, vy, vz),
+        bias_mps2=(bias[0], bias[1], bias[2]),
+        estimated_mps=estimated,
+        below_m=math.inf if fell else old.below_m - (vz + CLIMB_SPARE_MPS) * dt_s,
+        aside_m=(ex - vx * dt_s, ey - vy * dt_s),
+        aside_sigma_m=old.aside_sigma_m + growth_m,
+    )
+
+
+def sighted(
+    old: Reckoning, t_s: float, aside_m: tuple[float, float], below_m: float, sigma_m: float
+) -> Reckoning:
+    """With a sight of the target: `aside_m` from the gear to its axis, world axes, `below_m`
+    from the gear up to it."""
+    return replace(old, sight_s=t_s, aside_m=aside_m, below_m=below_m, aside_sigma_m=sigma_m)

@@ -1,0 +1,792 @@
+"""The one way down, for the planner's LANDING, for the watchdog while the loop is silent, and for
+the rescue after an exception: `step(state, observation, profile) -> (state, command)`, pure.
+
+What it does follows from three things (`MANOEUVRES`, the table of docs/architecture.md):
+
+- the `Evidence` that is fresh: a position from outside the picture, a position by the target,
+  height alone, accelerometer and attitude alone, or nothing;
+- the `Reach`: whether the vehicle may be where the magnet holds it;
+- the `Stage`: coming down, landing by itself, the weight put on the magnet, or stopped.
+
+Two proofs go before the table: what falls off the magnet is caught, and what stands on the floor
+is stopped. The vehicle's own landing follows a trajectory by its clock and then stops the motors,
+wherever it is by then: it is ordered only where a position that does not rest on pictures tells
+that it is away from the ceiling, and in flight.
+
+Before each command: if it is the last packet, a position setpoint or a raw thrust ends in the
+firmware's level-out after 0.5 s and its cut after 2 s, an own landing goes on by itself
+(docs/firmware.md, "When setpoints stop"). Nothing here climbs but a catch.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+
+from perchctl.geometry import GRAVITY_MPS2
+from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since
+from perchctl.mission.context import HANGING_S, PUT_RIGHT_S, Context
+from perchctl.mission.guards import has_slipped
+from perchctl.mission.guidance import hold_here, limited, presses, unpressed, walk
+from perchctl.mission.imu import reckoned, sighted
+from perchctl.mission.release import (
+    CATCH_STILL_ABOVE_M,
+    STILL_THRUST,
+    THRUST_MIN,
+    Acted,
+    catch,
+    catch_above_m,
+    left_contact,
+    let_go,
+    stop_motors,
+)
+from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
+from perchctl.profile import LandingConfig, Profile
+from perchctl.values import replace
+from perchctl.vehicle import (
+    FULL_THRUST,
+    HL_ACTIVE,
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    Telemetry,
+)
+
+
+class Evidence(Enum):
+    """The best of what is known and fresh."""
+
+    POSITION = "position"  # measured by decks or motion capture
+    SIGHT = "position by the target"
+    HEIGHT = "height"  # and vertical speed; the heading is lost
+    IMU = "attitude and acceleration"
+    ONBOARD = "the vehicle's own"  # it has a position; telemetry, link or loop cannot be relied on
+    NOTHING = "nothing"
+
+
+class Reach(Enum):
+    """Whether the magnet may hold the vehicle."""
+
+    FREE = "free"
+    MAGNET = "within the magnet's reach"
+
+
+class Stage(Enum):
+    """How far the way down has come."""
+
+    DOWN = "coming down"
+    ORDERED = "landing by itself"
+    RELEASED = "weight on the magnet"
+    STOPPED = "motors stopped"
+
+
+class Manoeuvre(Enum):
+    """What is commanded."""
+
+    SETPOINTS = "position setpoints, then its own landing"
+    SETPOINTS_LEVEL = "position setpoints, then level"
+    PEEL = "a setpoint below, then the weight on the magnet"
+    LEVEL = "level, by thrust"
+    OWN_LANDING = "its own landing"
+    WEIGHT_ON_MAGNET = "the weight on the magnet"
+    STOP = "stop the motors"
+
+
+_E, _R, _S, _M = Evidence, Reach, Stage, Manoeuvre
+MANOEUVRES: dict[tuple[Evidence, Reach, Stage], Manoeuvre] = {
+    (_E.POSITION, _R.FREE, _S.DOWN): _M.SETPOINTS,
+    (_E.POSITION, _R.MAGNET, _S.DOWN): _M.PEEL,
+    (_E.SIGHT, _R.FREE, _S.DOWN): _M.SETPOINTS_LEVEL,
+    (_E.SIGHT, _R.MAGNET, _S.DOWN): _M.PEEL,
+    (_E.HEIGHT, _R.FREE, _S.DOWN): _M.LEVEL,
+    (_E.HEIGHT, _R.MAGNET, _S.DOWN): _M.LEVEL,
+    (_E.IMU, _R.FREE, _S.DOWN): _M.LEVEL,
+    (_E.IMU, _R.MAGNET, _S.DOWN): _M.LEVEL,
+    (_E.ONBOARD, _R.FREE, _S.DOWN): _M.OWN_LANDING,
+    (_E.ONBOARD, _R.MAGNET, _S.DOWN): _M.PEEL,
+    (_E.NOTHING, _R.FREE, _S.DOWN): _M.LEVEL,
+    (_E.NOTHING, _R.MAGNET, _S.DOWN): _M.LEVEL,
+    # A landing of its own goes on, whatever is known: to change it costs height.
+    **{(e, r, _S.ORDERED): _M.OWN_LANDING for e in _E for r in _R},
+    **{(e, r, _S.RELEASED): _M.WEIGHT_ON_MAGNET for e in _E for r in _R},
+    **{(e, r, _S.STOPPED): _M.STOP for e in _E for r in _R},
+}
+"""Evidence x reach x stage -> manoeuvre."""
+
+
+class Finding(Enum):
+    """Where a vehicle with its motors off is."""
+
+    HANGS = "hangs"
+    STANDS = "stands"
+    UNKNOWN = "not known"
+
+
+LOOKED_S = 2.0
+"""For so long it is looked whether a target that is seen far above tells where it is."""
+HUNG_WITHIN_M = 0.3
+REPEAT_ORDER_S = 0.3
+LEAST_ORDERS, MAX_ORDERS = 3, 6
+"""An order without its notify shows *HL active* and is not flown, and 2 s later the vehicle
+is cut (docs/firmware.md, "Order without notify"): no telemetry tells a lost notify, so the
+pair is sent three times, and more often while nothing shows."""
+PLANNED_MPS, SETTLING_S = 0.35, 1.8
+"""The quintic's largest speed, and time added for its begin: it starts at rest, while the
+vehicle comes sinking, and what the vehicle then catches up with must be slow."""
+MOST_DRIFT_M = 1.0
+BLIND_DRIFT_MPS = 0.08
+"""Of a height that no position from outside corrects: the most that 40 simulated landings had."""
+UNKNOWN_M = 1.0
+"""The height to come down from where none is known."""
+PEELED_M = 0.1
+"""Below the contact by so much, the magnet has let go."""
+PEEL_BELOW_M, PEEL_S = 0.35, 4.0
+DROPPING_MPS = -0.35
+OVERDUE = 0.5
+"""Of the landing's time: what is up there by then is left to its own landing."""
+FALLING_G, FALLEN_MPS = 0.5, 1.0
+"""A landing that ends 5 cm above the floor drops it no faster, and is over."""
+FALLEN_BELOW_M = 0.4
+"""By an estimate that is placed, such an end is not higher up: that is a cut in the air."""
+_PEAK_OF_MEAN = 1.875
+"""Of a quintic from rest to rest: its largest speed over its mean."""
+
+REACH_M = 0.04
+"""A gear so near below the target may have been caught by its magnet since."""
+HIGH_M, LOW_M, STAYED_M = 0.45, 0.3, 0.15
+SINK_MPS, LOW_SINK_MPS, SLOW_BELOW_M = 0.7, 0.4, 0.6
+"""Level it comes down fast from high up: sideways it goes with the third power of the time, by
+the gyroscope's offset, 2 m in 4 s."""
+MOST_GAIN_S_PER_M, LEAST_GAIN_S_PER_M, GAIN_AGE_S2_PER_M = 0.5, 0.2, 0.06
+"""Part of the hover thrust for each m/s. A speed of long ago wants less, or it swings."""
+HOVER_MEMORY_S, HOVER_WITHIN, UNLEARNED_WITHIN = 0.3, 0.12, 0.35
+"""The hover thrust is what the thrust is for each g that is felt, in free flight."""
+LATEST_S, UNHEARD_PART = 1.0, 0.98
+"""Telemetry so late still tells how fast it sank, and what was ordered since adds to that. Where
+nothing is heard, a little less than what should be right: it has to come down."""
+RAMP_PER_S, STILL_MPS = 0.25, 0.05
+"""What does not sink gets less and less thrust."""
+LEAST_PART, MOST_RAW = 0.4, 60000.0
+BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD = 0.25, 0.22
+"""Sideways speed goes down by 1/e in 0.4 s, several times the age of what is known of it; so much
+tilt takes 2.5 % of the thrust."""
+BRAKED_AGE_S = 0.2
+"""An older speed is braked the less, or it swings."""
+UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
+"""Of the reckoned speed so much is left alone: an attitude that is 0.01 rad wrong makes 0.1 m/s of
+it each second, and braking that would drive the vehicle aside."""
+STOP_BELOW_M, STANDS_BELOW_M, RESTS_MPS = 0.05, 0.01, 0.1
+UNANSWERED_PART = 0.12
+"""Of full thrust: farther from the order no ramp leads in the time that an order takes."""
+CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
+TOUCH_PART, TOUCH_S, TOUCH_BELOW_M = 0.5, 0.25, 0.7
+"""A blow from below so near to the floor is the floor: half of the hover thrust proves it, since
+what is in the air falls with it."""
+LEVEL_SPARE_S, LEVEL_MEAN_MPS = 2.0, 0.35
+
+
+def step(state: PlannerState, obs: Observation, profile: Profile) -> tuple[PlannerState, Command]:
+    """One tick of the way down without the mission's table: for who lands in the loop's place."""
+    state = observed(begun(state, obs, profile), obs, profile)
+    state = replace(state, since=conditions_since(Context(state, obs, profile)))
+    state, command = act(Context(state, obs, profile))
+    return replace(ordered(state, command), t_s=obs.t_s, last=obs.telemetry), command
+
+
+def begun(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+    """The state with its way down begun; as it is where that has."""
+    if state.phase is Phase.LANDING:
+        return state
+    c = Context(state, obs, profile)
+    new = replace(
+        state, phase=Phase.LANDING, entered_s=obs.t_s, severity=max(state.severity, Severity.LAND),
+        since={name: s for name, s in state.since.items() if name in KEPT_OVER_A_CHANGE},
+        entry_m=obs.telemetry.position_m, entry_yaw_rad=obs.telemetry.yaw_rad,
+        pressed=state.caught and presses(c), ordered_s=None, orders=0,
+    )  # fmt: skip
+    return started(new, state, obs, profile)
+
+
+def started(
+    new: PlannerState, old: PlannerState, obs: Observation, profile: Profile
+) -> PlannerState:
+    """What a way down that `old` leads to starts with, beyond its entry."""
+    tel, stopped_s = obs.telemetry, old.stopped_s
+    heard = obs.t_s - tel.t_s <= profile.safety.proof_age_s
+    if heard and tel.has(HL_ACTIVE) and profile.positioning.by != "target":
+        new = replace(new, orders=LEAST_ORDERS, ordered_s=obs.t_s)
+    elif heard and tel.thrust < 1 and stopped_s is None:
+        # Somebody has stopped the motors, or they never turned: nothing spins them up again.
+        new = replace(new, stopped_s=obs.t_s)
+    contact_z_m = old.contact_z_m
+    if old.phase is Phase.PERCH and contact_z_m is None:
+        # It may be in the magnet's reach: it has to be seen below before it counts as free.
+        contact_z_m = tel.position_m[2]
+    c = Context(new, obs, profile)
+    hover = old.hover_thrust or felt_hover_thrust(tel)
+    new = replace(
+        new, contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
+        level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
+    )  # fmt: skip
+    return blinded(new, obs) if c.by_sight and not _is_sighted(c) else new
+
+
+# --- What is known ------------------------------------------------------------------------------
+
+
+def evidence_of(c: Context) -> Evidence:
+    """The best that is fresh in this tick."""
+    heard = c.attitude_age_s <= c.profile.safety.telemetry_hold_s
+    if c.by_sight or c.state.astray:
+        if not heard:
+            return Evidence.NOTHING
+        if c.state.blind_s is not None or c.state.astray or not _is_sighted(c):
+            return Evidence.IMU
+        return Evidence.HEIGHT if c.state.heading_lost else Evidence.SIGHT
+    if heard and c.state.heading_lost:
+        fresh = c.telemetry_age_s <= c.profile.safety.telemetry_hold_s
+        return Evidence.HEIGHT if fresh and c.placed else Evidence.IMU
+    return Evidence.ONBOARD if _is_doubtful(c) else Evidence.POSITION
+
+
+def _is_doubtful(c: Context) -> bool:
+    """Whether the height, the stream or this loop cannot be relied on."""
+    safety = c.profile.safety
+    return (
+        c.obs.link_problem is not None
+        or c.telemetry_age_s > safety.telemetry_hold_s
+        or c.state.jump_s is not None
+        or c.obs.loop_late_s > safety.loop_late_hold_s
+    )
+
+
+def _is_sighted(c: Context) -> bool:
+    """Whether the position by the target is one to come down by."""
+    return c.located and not c.is_blown and not _is_doubtful(c)
+
+
+def reach_of(c: Context) -> Reach:
+    within = c.state.contact_z_m is not None or c.state.reach_s is not None
+    return Reach.MAGNET if within else Reach.FREE
+
+
+def stage_of(c: Context) -> Stage:
+    if c.state.stopped_s is not None:
+        return Stage.STOPPED
+    if c.state.released_s is not None:
+        return Stage.RELEASED
+    return Stage.ORDERED if c.state.orders else Stage.DOWN
+
+
+def finding(c: Context) -> Finding:
+    """Where the vehicle is, once its motors are off.
+
+    What was within the magnet's reach and has not fallen since hangs, as long as no silence of
+    the telemetry could hide a fall. Else a position tells, or the picture of a target far above.
+    """
+    tel, state = c.obs.telemetry, c.state
+    if c.by_sight or not c.placed:
+        if c.tracked and c.far_below_target:
+            return Finding.STANDS
+        if state.reach_s is None or state.reckoning.imu is None:
+            return Finding.STANDS
+        return _by_fall(c, state.reach_s)
+    ground_m = state.ground_m[2] if state.ground_m else 0.0
+    high = state.entry_m[2] - ground_m > HIGH_M
+    stayed = high and not c.far_below_target and state.entry_m[2] - tel.position_m[2] < STAYED_M
+    if stayed or (c.height_m > LOW_M and not c.far_below_target and state.contact_z_m is not None):
+        return Finding.HANGS
+    return Finding.STANDS
+
+
+def _by_fall(c: Context, since_s: float) -> Finding:
+    imu = c.obs.imu
+    if imu.fell_s > since_s:
+        return Finding.STANDS
+    return Finding.UNKNOWN if imu.gap_s > since_s else Finding.HANGS
+
+
+def hangs_where_it_did(c: Context) -> bool:
+    """At its contact by a position; or, wherever the estimate has it, felt to have hung all the
+    time. What telemetry did not show for as long as a fall takes may lie on the floor by now."""
+    if not c.by_sight and c.placed and _is_at_contact(c):
+        return True
+    return c.state.reach_s is not None and _by_fall(c, c.state.reach_s) is Finding.HANGS
+
+
+def hangs_stopped(c: Context) -> bool:
+    """The motors were stopped where it hung, and there it still is."""
+    stopped_s, landing = c.state.stopped_s, c.state.phase is Phase.LANDING
+    if stopped_s is None or (landing and stopped_s >= c.state.entered_s and c.state.orders == 0):
+        return False
+    return hangs_where_it_did(c)
+
+
+def _is_at_contact(c: Context) -> bool:
+    """Where the magnet has it: a slip ends the contact at once, and what the estimate drifts while
+    it hangs is less than this."""
+    contact_z_m, tel = c.state.contact_z_m, c.obs.telemetry
+    if contact_z_m is None:
+        return False
+    falls = tel.velocity_mps[2] < -c.profile.planner.complete.slip_mps
+    return not falls and contact_z_m - tel.position_m[2] <= HUNG_WITHIN_M
+
+
+def why_landed(c: Context) -> str:
+    if c.state.blind_s is not None:
+        return "motors off; it was felt to come down to the floor"
+    return "motors off"
+
+
+def why_unknown(c: Context) -> str:
+    return (
+        "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
+        "whether it hangs or stands: look before you touch it"
+    )
+
+
+def why_fell_unseen(c: Context) -> str:
+    if c.placed or c.state.reach_s is None or c.obs.imu.fell_s > c.state.reach_s:
+        return "it is not where it hung before"
+    return "the telemetry was silent: whether it still hangs is not known"
+
+
+# --- What is remembered -------------------------------------------------------------------------
+
+
+def observed(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
+    """The state with what one more observation tells: whoever notices a hang, a jump or a loss
+    of positions, it is noticed here."""
+    if state.last is not None and obs.t_s - state.t_s > profile.positioning.hold_s:
+        # After a hang everything from before is stale; dwell times begin anew.
+        kept = {name: s for name, s in state.since.items() if name in KEPT_OVER_A_CHANGE}
+        stale_s = obs.t_s if profile.positioning.by == "target" else state.stale_s
+        state = replace(state, since=kept, stale_s=stale_s, caught=True)
+    if obs.position_age_s > profile.positioning.hold_s:
+        state = replace(state, stale_s=obs.t_s)
+    if obs.jumped:
+        state = _jumped(state, obs)
+    if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
+        # Where no hover thrust was learned yet, the present one has to do.
+        hover = state.hover_thrust or felt_hover_thrust(obs.telemetry)
+        state = replace(state, heading_lost=True, hover_thrust=hover)
+    state = _reckon(Context(_answered(state, obs), obs, profile))
+    c = Context(state, obs, profile)
+    comes_down = state.phase is Phase.LANDING and stage_of(c) in (Stage.DOWN, Stage.ORDERED)
+    if comes_down and c.by_sight and state.blind_s is None and not _is_sighted(c):
+        return blinded(state, obs)
+    return state
+
+
+def ordered(state: PlannerState, command: Command) -> PlannerState:
+    """With what was commanded: the thrust that is read has to follow it."""
+    match command:
+        case RawThrust(thrust):
+            return replace(state, raw_order=thrust)
+        case Idle():
+            return state
+        case _:
+            return replace(state, raw_order=None, unanswered_s=None)
+
+
+def _answered(state: PlannerState, obs: Observation) -> PlannerState:
+    """A reading that stands still under a changed order says nothing of the thrust."""
+    if state.raw_order is None:
+        return state
+    wanted = 0.0 if state.raw_order < STILL_THRUST else min(MOST_RAW, state.raw_order)
+    apart = abs(obs.telemetry.thrust - wanted) > UNANSWERED_PART * FULL_THRUST
+    since_s = obs.t_s if state.unanswered_s is None else state.unanswered_s
+    return replace(state, unanswered_s=since_s if apart else None)
+
+
+def blinded(state: PlannerState, obs: Observation) -> PlannerState:
+    """Accelerometer and attitude are all that is left, for good: no sight is believed again on
+    this way down, since each change of the mode costs height."""
+    hover = state.hover_thrust or felt_hover_thrust(obs.telemetry)
+    height_m = obs.telemetry.position_m[2] - (state.ground_m[2] if state.ground_m else 0.0)
+    return replace(state, blind_s=obs.t_s, blind_height_m=height_m, hover_thrust=hover)
+
+
+def _reckon(c: Context) -> PlannerState:
+    state, obs = c.state, c.obs
+    believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
+    new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=state.astray)
+    target = obs.target
+    if target is not None:
+        seen = obs.new_frame and target.measured
+        if seen or (c.placed and not c.by_sight):
+            yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
+            cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+            sigma_m = float(max(target.sigma_m[:2]))
+            aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
+            new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
+    reach_s = state.reach_s
+    if stage_of(c) in (Stage.DOWN, Stage.ORDERED):  # what is released or stopped moves no more
+        within = state.contact_z_m is not None or new.below_m < REACH_M
+        reach_s = (obs.t_s if reach_s is None else reach_s) if within else None
+    down_m = 0.0
+    if state.blind_s is not None and state.reckoning.imu is not None:
+        dt_s = max(0.0, min(0.5, obs.imu.t_s - state.reckoning.imu.t_s))
+        down_m = new.velocity_mps[2] * dt_s
+    return replace(
+        state, reckoning=new, reach_s=reach_s, blind_height_m=state.blind_height_m + down_m
+    )
+
+
+UNSEEN_S = 0.15
+Place = tuple[float, float, float]
+
+
+def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
+    """The estimate's world has moved, the vehicle has not: ground, contact and what else is
+    remembered are where the estimate has them now, and it is held where it is. Where samples
+    are missing before the step, it may be the vehicle that has moved, even to the floor; where
+    positions from outside have come again, the step ends a drift, and what was true before is."""
+    tel, last = obs.telemetry, state.last
+    if last is None:
+        return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
+    x, y, z = tel.position_m
+    vx, vy, vz = tel.velocity_mps
+    dt_s = tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
+    lx, ly, lz = last.position_m
+    moved_m = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
+    put_right = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
+    if dt_s > UNSEEN_S or put_right:
+        moved_m = (0.0, 0.0, 0.0)
+    setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
+    if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
+        # Its own landing goes on along a line in the world that was: it dives, or climbs.
+        state = replace(
+            state,
+            entered_s=obs.t_s,
+            orders=0,
+            ordered_s=None,
+            caught=False,
+            catch_above_m=CATCH_STILL_ABOVE_M,
+        )
+    if setpoint is not None:
+        z_m = z if contact_z_m is None else setpoint.z_m + moved_m[2]
+        setpoint = PositionSetpoint(x, y, z_m, tel.yaw_rad)
+    return replace(
+        state,
+        setpoint=setpoint,
+        ground_m=None if state.ground_m is None else _moved(state.ground_m, moved_m),
+        entry_m=_moved(state.entry_m, moved_m),
+        contact_z_m=None if contact_z_m is None else contact_z_m + moved_m[2],
+        blocked_z_m=None if blocked_z_m is None else blocked_z_m + moved_m[2],
+        jump_s=obs.t_s if state.jump_s is None else state.jump_s,
+    )
+
+
+def _moved(place: Place, by_m: Place) -> Place:
+    return (place[0] + by_m[0], place[1] + by_m[1], place[2] + by_m[2])
+
+
+def felt_hover_thrust(tel: Telemetry) -> float:
+    """In a climb, or sinking, the accelerometer tells by how much the thrust is beside the
+    weight. Motors that stand still tell nothing, and nothing hovers on the least of position mode.
+    """
+    return max(THRUST_MIN, tel.thrust / min(1.5, max(0.75, tel.acc_z_g)))
+
+
+# --- What is commanded --------------------------------------------------------------------------
+
+
+def act(c: Context) -> Acted:
+    """One tick: the two proofs, then the table."""
+    state = c.state
+    if _falls_free(c):
+        return _caught_again(c)
+    if state.stopped_s is None and not state.caught:
+        if (caught := _catch(c)) is not None:
+            return caught
+        c = Context(replace(state, caught=True), c.obs, c.profile)
+    if c.state.stopped_s is None and _stands(c):
+        return stop_motors(c)
+    if c.held(Condition.HANGING) >= HANGING_S and stage_of(c) is Stage.DOWN:
+        return let_go(c)
+    manoeuvre = MANOEUVRES[evidence_of(c), reach_of(c), stage_of(c)]
+    return ACTIONS[manoeuvre](c)
+
+
+def _falls_free(c: Context) -> bool:
+    """What hung has come off: it was released or stopped up there, or peeled with too little
+    thrust left to go on down slowly."""
+    if not c.imu_proves or stage_of(c) is Stage.ORDERED:
+        return False
+    if c.state.released_s is not None or c.state.stopped_s is not None:
+        return reach_of(c) is Reach.MAGNET and has_slipped(c)
+    return c.state.contact_z_m is not None and c.state.caught and c.sinks(-DROPPING_MPS)
+
+
+def _stands(c: Context) -> bool:
+    """On the floor, by proof."""
+    if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
+        return True
+    # Where height is measured, it stops instead of sliding: as soon as it sinks no more.
+    low = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
+    resting = c.climb_mps > -RESTS_MPS or c.height_m < STANDS_BELOW_M
+    return low and resting and c.height_m < STOP_BELOW_M and reach_of(c) is Reach.FREE
+
+
+def _caught_again(c: Context) -> Acted:
+    """It is free of the magnet, and falls: the landing begins anew below."""
+    tel = c.obs.telemetry
+    state = replace(
+        c.state, released_s=None, stopped_s=None, contact_z_m=None, reach_s=None, caught=False,
+        pressed=False, catch_above_m=catch_above_m(c.state.hover_thrust, tel.thrust),
+        setpoint=None, ordered_s=None, orders=0, level_thrust=0.0,
+        entered_s=c.obs.t_s, entry_m=tel.position_m, entry_yaw_rad=tel.yaw_rad,
+        reckoning=replace(c.state.reckoning, below_m=math.inf),
+    )  # fmt: skip
+    c = Context(state, c.obs, c.profile)
+    return _catch(c) or ACTIONS[MANOEUVRES[evidence_of(c), Reach.FREE, Stage.DOWN]](c)
+
+
+def _catch(c: Context) -> Acted | None:
+    """By position, which without a heading, or astray, would lead away from where it is: there the
+    raw thrust of the level descent brakes the fall."""
+    return None if c.state.heading_lost or c.state.astray else catch(c)
+
+
+def _setpoints(c: Context) -> Acted:
+    """Down by setpoints to the hand-over, the rest by the vehicle's own landing."""
+    state, away = unpressed(c)
+    if away is not None:
+        return state, away
+    c = Context(state, c.obs, c.profile)
+    # When its time is over nothing is sent any more: by then it must be landing by itself.
+    overdue = c.in_phase_s > OVERDUE * c.profile.planner.landing.timeout_s
+    if overdue or c.height_m <= c.profile.planner.landing.handover_m:
+        return _own_landing(c)
+    return _by_setpoints(c)
+
+
+def _setpoints_level(c: Context) -> Acted:
+    """Down by setpoints to the hand-over, the rest level: the vehicle's own landing would go by an
+    estimate that rests on pictures, to a floor that nobody measures."""
+    state, away = unpressed(c)
+    if away is not None:
+        return state, away
+    c = Context(state, c.obs, c.profile)
+    if c.state.level_thrust or c.height_m <= c.profile.planner.landing.handover_m:
+        return _level(c)
+    return _by_setpoints(c)
+
+
+def _peel(c: Context) -> Acted:
+    """A setpoint below takes the thrust to its least. What that has not moved is given to the
+    magnet; where nobody can watch that, the setpoint goes on down to the floor."""
+    watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
+    if c.in_phase_s > PEEL_S and watched:
+        return let_go(c)
+    return _by_setpoints(c)
+
+
+def _by_setpoints(c: Context) -> Acted:
+    """Straight down at the landing's speed, where it was when the landing began."""
+    landing, state = c.profile.planner.landing, c.state
+    here = hold_here(c)
+    start = state.setpoint if state.caught and state.setpoint is not None else here
+    # A setpoint far above (the press, a search step) must not be walked down slowly.
+    start = replace(start, z_m=min(start.z_m, here.z_m))
+    x, y, _ = state.entry_m
+    ground_z = state.ground_m[2] if state.ground_m else 0.0
+    goal = replace(start, x_m=x, y_m=y, z_m=ground_z + 0.5 * landing.handover_m)
+    setpoint = walk(
+        start,
+        goal,
+        c.obs.t_s - state.t_s,
+        xy_mps=c.profile.planner.align.speed_mps,
+        up_mps=0.0,
+        down_mps=landing.speed_mps,
+        yaw_rate_radps=0.0,
+    )
+    # A vehicle that does not follow is not pulled by a setpoint that runs away from it,
+    # beyond what takes the thrust down to its least.
+    if c.telemetry_age_s <= c.profile.safety.telemetry_hold_s:
+        setpoint = replace(setpoint, z_m=max(setpoint.z_m, here.z_m - PEEL_BELOW_M))
+    state = replace(left_contact(c, PEELED_M).state, setpoint=setpoint, caught=True)
+    return state, limited(c, setpoint)
+
+
+def own_landing(
+    landing: LandingConfig,
+    ground_z_m: float,
+    flown_s: float,
+    newest: Telemetry | None,
+    blind_s: float = 0.0,
+) -> Land:
+    """The order for the vehicle's own landing, which follows a quintic from rest to rest.
+
+    It aims below the ground, and the lower the longer the estimate has had to drift: the
+    motors stop at the trajectory's end, and over a floor that lies lower they would drop it.
+    It never aims above where the estimate has the vehicle, which may be far below the ground by
+    now: that would be a climb. `blind_s`: for how long no position from outside has come; until
+    the floor none will, so it aims deeper in the same time, which is faster.
+    """
+    z_m = math.nan if newest is None else newest.position_m[2]
+    below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
+    known = math.isfinite(z_m)
+    aim_m = (min(ground_z_m, z_m) if known else ground_z_m) - below_m
+    way_m = z_m - aim_m if known else UNKNOWN_M
+    lasts_s = SETTLING_S + _PEAK_OF_MEAN * way_m / PLANNED_MPS
+    if blind_s > 0.0:
+        aim_m -= min(MOST_DRIFT_M, BLIND_DRIFT_MPS * (blind_s + lasts_s))
+    return Land(aim_m, lasts_s)
+
+
+def _own_landing(c: Context) -> Acted:
+    """The vehicle's own landing, given again while it shows no effect."""
+    landing, state, tel = c.profile.planner.landing, c.state, c.obs.telemetry
+    state, away = unpressed(c)
+    if away is not None and not _is_doubtful(c) and not state.orders:
+        return state, away
+    # Where it has been given often enough, a short fall is its end, and not that it was lost:
+    # near the floor, or where nothing tells how near that is.
+    ends = state.orders >= LEAST_ORDERS and not (c.placed and c.height_m >= FALLEN_BELOW_M)
+    carried = tel.acc_z_g > FALLING_G or (ends and tel.velocity_mps[2] > -FALLEN_MPS)
+    if c.imu_proves and tel.thrust < 1 and carried and (state.orders or not c.flying):
+        return state, Idle()  # on the floor: another order would spin the motors up again
+    ground_z = state.ground_m[2] if state.ground_m else 0.0
+    waited = math.inf if state.ordered_s is None else c.obs.t_s - state.ordered_s
+    seen = state.orders >= LEAST_ORDERS and c.imu_proves and c.high_level_active
+    if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
+        flown_s = c.obs.t_s - state.started_s
+        blind_s = 0.0 if c.placed else c.obs.position_age_s
+        order = own_landing(landing, ground_z, flown_s, tel, blind_s)
+        return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
+    return state, Idle()
+
+
+def _level(c: Context) -> Acted:
+    """Level by raw thrust, on the vertical speed that the accelerometer and, where it is believed,
+    the estimate tell. What does not sink gets less and less thrust: a hovering vehicle begins to
+    sink, the ceiling lets go or proves that it holds, and the floor is proven by what carries
+    the vehicle. Tilted against the sideways speed that it has."""
+    state, tel = c.state, c.obs.telemetry
+    dt_s = max(0.0, min(0.1, c.obs.t_s - state.t_s))
+    age_s = max(dt_s, c.attitude_age_s)
+    unheard = age_s > LATEST_S
+    climb_mps = c.climb_mps + state.under_way_mps
+    hover = _learned_hover(c, dt_s)
+    height_m = c.height_m if state.blind_s is None else state.blind_height_m
+    height_m += min(0.0, climb_mps) * age_s
+    sink_mps = SINK_MPS if height_m > SLOW_BELOW_M else LOW_SINK_MPS
+    gain = GAIN_AGE_S2_PER_M / max(1e-3, c.attitude_age_s)
+    gain = max(LEAST_GAIN_S_PER_M, min(MOST_GAIN_S_PER_M, gain))
+    thrust = hover * (1.0 - gain * (climb_mps + sink_mps)) / max(0.8, math.cos(c.tilt_rad))
+    touch_s = state.touch_s
+    if touch_s is None and c.obs.t_s - c.obs.imu.blow_s < TOUCH_S and height_m < TOUCH_BELOW_M:
+        touch_s = c.obs.t_s
+    if unheard:
+        thrust *= UNHEARD_PART
+    touched_s = math.inf if touch_s is None else c.obs.t_s - touch_s
+    if touched_s >= TOUCH_S and c.imu_proves and tel.acc_z_g < CARRIED_G:
+        touch_s = None  # it falls with its thrust: that was no floor
+    # With less thrust than that the accelerometer reads one g on something only.
+    carried = c.imu_proves and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover
+    # What is in the air falls with its thrust, however long it takes.
+    overdue = _is_overdue(c) and not (c.imu_proves and tel.acc_z_g < AIRBORNE_G)
+    before = state.level_thrust or hover
+    if touched_s < TOUCH_S:
+        thrust = TOUCH_PART * hover
+    elif touch_s is not None or carried or climb_mps > -STILL_MPS or overdue:
+        thrust = min(thrust, before - RAMP_PER_S * hover * dt_s)
+    thrust = max(LEAST_PART * hover, min(MOST_RAW, thrust))
+    # What the orders give since the newest sample; without a new one all of it goes on counting.
+    shown_s = 0.0 if state.last is None else max(0.0, tel.t_s - state.level_sample_s)
+    gained_mps = GRAVITY_MPS2 * (thrust / hover - 1.0) * dt_s
+    under_way_mps = state.under_way_mps * max(0.0, 1.0 - shown_s / age_s) + gained_mps
+    state = replace(
+        left_level(c).state, hover_thrust=hover, level_thrust=thrust, touch_s=touch_s,
+        level_hover=state.level_hover or state.hover_thrust,
+        under_way_mps=under_way_mps, level_sample_s=tel.t_s, setpoint=None, orders=0, caught=True,
+    )  # fmt: skip
+    roll_rad, pitch_rad = (0.0, 0.0) if touch_s is not None else _braking(c)
+    return state, RawThrust(int(thrust), roll_rad, pitch_rad)
+
+
+def left_level(c: Context) -> Context:
+    """Away from the contact: seen below it by a position, or felt to have come down."""
+    if c.placed and c.state.blind_s is None:
+        return left_contact(c, PEELED_M)
+    reach_s = c.state.reach_s
+    if reach_s is not None and c.obs.imu.fell_s > max(reach_s, c.state.entered_s):
+        reckoning = replace(c.state.reckoning, below_m=math.inf)
+        blind_s = None if c.state.blind_s is None else c.obs.t_s
+        state = replace(
+            c.state, contact_z_m=None, reach_s=None, reckoning=reckoning, blind_s=blind_s
+        )
+        return Context(state, c.obs, c.profile)
+    return c
+
+
+def _learned_hover(c: Context, dt_s: float) -> float:
+    """The hover thrust, drawn to what the thrust gives for each g: learned in a climb, or not at
+    all, it is several per cent beside the true one. Only in free flight, where both are known."""
+    state, tel = c.state, c.obs.telemetry
+    first = state.level_hover or state.hover_thrust
+    within = state.level_within
+    if c.attitude_age_s > LATEST_S or not 0.7 <= tel.acc_z_g <= 1.3 or tel.thrust < 0.5 * first:
+        return state.hover_thrust
+    if reach_of(c) is Reach.MAGNET or state.touch_s is not None:
+        return state.hover_thrust
+    felt = tel.thrust / tel.acc_z_g
+    memory_s = HOVER_MEMORY_S if within == HOVER_WITHIN else 0.5 * HOVER_MEMORY_S
+    hover = state.hover_thrust + (felt - state.hover_thrust) * min(1.0, dt_s / memory_s)
+    return min((1.0 + within) * first, max((1.0 - within) * first, hover))
+
+
+def _is_overdue(c: Context) -> bool:
+    """Blind for so long, it has come down, or hangs, or its reckoned speed has drifted away."""
+    if c.state.blind_s is None and not c.state.astray:
+        return False
+    ground_m = c.state.ground_m[2] if c.state.ground_m else 0.0
+    way_m = max(0.0, c.state.entry_m[2] - ground_m)
+    # What hung on the magnet, and slipped, begins anew.
+    began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
+    return c.obs.t_s - began_s > LEVEL_SPARE_S + way_m / LEVEL_MEAN_MPS
+
+
+def _braking(c: Context) -> tuple[float, float]:
+    """Roll and pitch against the sideways speed, unless the heading is lost."""
+    if c.state.heading_lost or reach_of(c) is Reach.MAGNET:
+        return 0.0, 0.0
+    yaw_rad = c.obs.telemetry.yaw_rad
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    x_mps, y_mps, _ = c.state.reckoning.velocity_mps
+    speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
+    blind_s = 0.0 if c.state.blind_s is None else c.obs.t_s - c.state.blind_s
+    unsure_mps = min(MOST_UNSURE_MPS, UNSURE_MPS + UNSURE_MPS2 * blind_s)
+    part = max(0.0, 1.0 - unsure_mps / speed_mps)
+    part *= min(1.0, BRAKED_AGE_S / max(1e-3, c.attitude_age_s))
+    x_mps, y_mps = part * x_mps, part * y_mps
+    ahead_mps, left_mps = x_mps * cos + y_mps * sin, y_mps * cos - x_mps * sin
+    return _against(-left_mps), _against(ahead_mps)
+
+
+def _against(mps: float) -> float:
+    return max(-MOST_BRAKE_RAD, min(MOST_BRAKE_RAD, -BRAKE_RAD_PER_MPS * mps))
+
+
+def _weight_on_magnet(c: Context) -> Acted:
+    """The whole weight is put on whatever carries it, and watched; unwatched for long, what would
+    carry most of it is ordered: what hangs stays, what has fallen does not rise."""
+    if c.attitude_age_s <= c.profile.safety.telemetry_hold_s:
+        return let_go(c)
+    thrust = int(max(STILL_THRUST, min(THRUST_MIN, LEAST_PART * c.state.hover_thrust)))
+    return replace(c.state, released_s=c.obs.t_s), RawThrust(thrust)
+
+
+ACTIONS = {
+    Manoeuvre.SETPOINTS: _setpoints,
+    Manoeuvre.SETPOINTS_LEVEL: _setpoints_level,
+    Manoeuvre.PEEL: _peel,
+    Manoeuvre.LEVEL: _level,
+    Manoeuvre.OWN_LANDING: _own_landing,
+    Manoeuvre.WEIGHT_ON_MAGNET: _weight_on_magnet,
+    Manoeuvre.STOP: stop_motors,
+}

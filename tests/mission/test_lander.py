@@ -1,0 +1,472 @@
+"""The one way down: each cell of its table, and the laws that no cell breaks."""
+
+from __future__ import annotations
+
+import ast
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import perchctl
+from perchctl.mission import actions, lander, planner
+from perchctl.mission.context import Context
+from perchctl.mission.imu import ImuMotion, Reckoning
+from perchctl.mission.lander import (
+    MANOEUVRES,
+    PEEL_S,
+    Evidence,
+    Finding,
+    Manoeuvre,
+    Reach,
+    Stage,
+    evidence_of,
+    reach_of,
+    stage_of,
+)
+from perchctl.mission.state import FLYING_PHASES, Observation, Operator, Phase, PlannerState
+from perchctl.profile import Profile
+from perchctl.vehicle import (
+    HL_ACTIVE,
+    Command,
+    Idle,
+    Land,
+    PositionSetpoint,
+    RawThrust,
+    StopMotors,
+)
+from tests.helpers.mission import (
+    AIRBORNE,
+    CEILING_M,
+    HANG_Z_M,
+    HOVER_THRUST,
+    READY,
+    Felt,
+    observation,
+    state_in,
+    target_at,
+    telemetry,
+)
+
+PROFILES = {by: Profile.model_validate({"positioning": by}) for by in ("deck", "mocap", "target")}
+DECKS, MOCAP, BY_TARGET = PROFILES["deck"], PROFILES["mocap"], PROFILES["target"]
+NOW_S, TURN_S = 10.0, 0.02
+HIGH_M, LOW_M = 1.5, 0.2
+PERCHCTL = Path(perchctl.__file__).parent
+
+Cell = tuple[Evidence, Reach, Stage]
+
+# --- The table -----------------------------------------------------------------------------
+
+EVIDENCE: dict[Evidence, tuple[Profile, dict[str, Any], dict[str, Any]]] = {
+    # profile; what is observed, and what is remembered, beyond a hover that all is known of
+    Evidence.POSITION: (DECKS, {}, {}),
+    Evidence.SIGHT: (BY_TARGET, {"position_age_s": 0.05}, {}),
+    Evidence.HEIGHT: (DECKS, {}, {"heading_lost": True}),
+    Evidence.IMU: (BY_TARGET, {"position_age_s": 3.0}, {"blind_s": NOW_S - 1.0}),
+    Evidence.ONBOARD: (DECKS, {"link_problem": "gone"}, {}),
+    Evidence.NOTHING: (BY_TARGET, {"position_age_s": 3.0, "age_s": 0.6}, {"blind_s": NOW_S - 1.0}),
+}
+STAGES: dict[Stage, dict[str, Any]] = {
+    Stage.DOWN: {},
+    Stage.ORDERED: {"orders": 1, "ordered_s": NOW_S - 1.0},
+    Stage.RELEASED: {"released_s": NOW_S - 0.5},
+    Stage.STOPPED: {"stopped_s": NOW_S - 0.05, "orders": 1, "ordered_s": NOW_S - 0.05},
+}
+KINDS: dict[Manoeuvre, tuple[type, ...]] = {
+    Manoeuvre.SETPOINTS: (PositionSetpoint,),
+    Manoeuvre.SETPOINTS_LEVEL: (PositionSetpoint,),
+    Manoeuvre.PEEL: (PositionSetpoint,),
+    Manoeuvre.LEVEL: (RawThrust,),
+    Manoeuvre.OWN_LANDING: (Land,),
+    Manoeuvre.WEIGHT_ON_MAGNET: (RawThrust,),
+    Manoeuvre.STOP: (StopMotors, Idle),
+}
+
+
+def comes_about(cell: Cell) -> bool:
+    """By the target no landing of its own is ordered, and what is released had its contact."""
+    evidence, reach, stage = cell
+    ordered_by_sight = (evidence, stage) == (Evidence.SIGHT, Stage.ORDERED)
+    return not ordered_by_sight and (reach, stage) != (Reach.FREE, Stage.RELEASED)
+
+
+CELLS = [cell for cell in MANOEUVRES if comes_about(cell)]
+
+
+def named(cell: Cell) -> str:
+    return "-".join(part.name.lower() for part in cell)
+
+
+def context(cell: Cell, z_m: float | None = None, since_s: float = 0.5) -> Context:
+    """A vehicle in that cell, `since_s` after its way down began."""
+    evidence, reach, stage = cell
+    profile, observed, remembered = EVIDENCE[evidence]
+    if stage is Stage.ORDERED and profile is BY_TARGET:
+        # What once had positions from outside, and was found astray, knows as little.
+        profile, remembered = MOCAP, {"astray": True}
+    held = reach is Reach.MAGNET
+    z_m = z_m if z_m is not None else HANG_Z_M if held else HIGH_M
+    observed = dict(observed)
+    tel = telemetry(NOW_S - observed.pop("age_s", 0.01), z_m)
+    obs = observation(NOW_S, telemetry=tel, target=None, **observed)
+    state = replace(
+        state_in(Phase.LANDING, NOW_S - since_s, z_m),
+        t_s=NOW_S - TURN_S, last=tel, blind_height_m=z_m,
+        contact_z_m=z_m if held else None, reach_s=NOW_S - 2.0 if held else None,
+        reckoning=Reckoning(imu=ImuMotion(t_s=tel.t_s)),
+        **remembered, **STAGES[stage],
+    )  # fmt: skip
+    return Context(state, obs, profile)
+
+
+def test_the_table_has_a_cell_for_all_that_can_be() -> None:
+    every = {(e, r, s) for e in Evidence for r in Reach for s in Stage}
+    assert set(MANOEUVRES) == every
+    assert set(lander.ACTIONS) == set(Manoeuvre) == set(MANOEUVRES.values())
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=named)
+def test_each_cell_commands_its_manoeuvre(cell: Cell) -> None:
+    c = context(cell)
+    assert (evidence_of(c), reach_of(c), stage_of(c)) == cell
+    state, command = lander.act(c)
+    assert isinstance(command, KINDS[MANOEUVRES[cell]])
+    assert state.severity >= c.state.severity
+    if isinstance(command, PositionSetpoint):
+        assert command.z_m < c.obs.telemetry.position_m[2]
+    if isinstance(command, RawThrust):
+        assert command.thrust < HOVER_THRUST
+    if MANOEUVRES[cell] is Manoeuvre.WEIGHT_ON_MAGNET:
+        assert command.thrust <= 20000
+
+
+@pytest.mark.parametrize(
+    ("evidence", "kind"),
+    [
+        (Evidence.POSITION, Land),
+        (Evidence.SIGHT, RawThrust),
+        (Evidence.HEIGHT, RawThrust),
+        (Evidence.IMU, RawThrust),
+        (Evidence.ONBOARD, Land),
+        (Evidence.NOTHING, RawThrust),
+    ],
+)
+def test_below_the_hand_over_it_lands_by_itself_or_level(evidence: Evidence, kind: type) -> None:
+    assert DECKS.planner.landing.handover_m > LOW_M
+    command = lander.act(context((evidence, Reach.FREE, Stage.DOWN), LOW_M))[1]
+    assert isinstance(command, kind)
+
+
+@pytest.mark.parametrize("evidence", [Evidence.POSITION, Evidence.SIGHT, Evidence.ONBOARD])
+def test_what_does_not_peel_off_is_given_to_the_magnet(evidence: Evidence) -> None:
+    """By no landing of its own, whose trajectory ends while the magnet still holds."""
+    cell = (evidence, Reach.MAGNET, Stage.DOWN)
+    assert isinstance(lander.act(context(cell, since_s=PEEL_S - 0.1))[1], PositionSetpoint)
+    state, command = lander.act(context(cell, since_s=PEEL_S + 0.1))
+    assert isinstance(command, RawThrust)
+    assert state.released_s == NOW_S
+
+
+def test_a_deaf_peeling_goes_on_by_setpoints() -> None:
+    """Nobody can watch what the weight does."""
+    c = context((Evidence.ONBOARD, Reach.MAGNET, Stage.DOWN), since_s=PEEL_S + 0.1)
+    deaf = Context(c.state, replace(c.obs, telemetry=replace(c.obs.telemetry, t_s=8.0)), DECKS)
+    state, command = lander.act(deaf)
+    assert isinstance(command, PositionSetpoint)
+    assert state.released_s is None
+
+
+# --- What each kind of evidence takes ----------------------------------------------------------
+
+
+def judged(profile: Profile, state: dict[str, Any], **observed: Any) -> Evidence:
+    began = replace(state_in(Phase.LANDING, NOW_S - 1.0, HIGH_M), t_s=NOW_S - TURN_S, **state)
+    age_s, behind_s = observed.pop("age_s", 0.01), observed.pop("behind_s", 0.0)
+    tel = telemetry(NOW_S - age_s, HIGH_M, behind_s=behind_s)
+    obs = observation(NOW_S, telemetry=tel, **observed)
+    return evidence_of(Context(lander.observed(began, obs, profile), obs, profile))
+
+
+@pytest.mark.parametrize(
+    ("observed", "with_decks", "by_target"),
+    [
+        ({}, Evidence.POSITION, Evidence.SIGHT),
+        ({"position_age_s": 0.6}, Evidence.POSITION, Evidence.IMU),
+        ({"jumped": True}, Evidence.ONBOARD, Evidence.IMU),
+        ({"loop_late_s": 0.5}, Evidence.ONBOARD, Evidence.IMU),
+        ({"link_problem": "gone"}, Evidence.ONBOARD, Evidence.IMU),
+        ({"behind_s": 0.5}, Evidence.ONBOARD, Evidence.IMU),
+        ({"age_s": 0.6}, Evidence.ONBOARD, Evidence.NOTHING),
+        ({"jumped": True, "turned_rad": 1.5}, Evidence.HEIGHT, Evidence.IMU),
+        ({"jumped": True, "turned_rad": 1.5, "behind_s": 0.5}, Evidence.IMU, Evidence.IMU),
+    ],
+)
+def test_each_part_of_what_is_known_has_its_own_age(
+    observed: dict[str, Any], with_decks: Evidence, by_target: Evidence
+) -> None:
+    """A dead position block leaves acceleration and thrust fresh; and what a picture carries is
+    doubted sooner than what decks measure."""
+    assert judged(DECKS, {}, **observed) is with_decks
+    assert judged(BY_TARGET, {}, **observed) is by_target
+
+
+def test_a_sight_is_believed_no_more_once_it_came_down_blindly() -> None:
+    assert judged(BY_TARGET, {"blind_s": NOW_S - 1.0}) is Evidence.IMU
+
+
+def test_what_went_astray_is_believed_no_more() -> None:
+    assert judged(MOCAP, {"astray": True}) is Evidence.IMU
+    assert judged(MOCAP, {"astray": True}, age_s=0.6) is Evidence.NOTHING
+
+
+@pytest.mark.parametrize("positioning", PROFILES)
+def test_after_a_hang_everything_from_before_is_stale(positioning: str) -> None:
+    """Whoever notices: what was debounced before begins anew, a catch is over, and a sight of
+    before is none."""
+    profile = PROFILES[positioning]
+    hold_s = profile.positioning.hold_s
+    for hung_s, stale in ((0.9 * hold_s, False), (1.1 * hold_s, True)):
+        state = replace(
+            state_in(Phase.LANDING, z_m=HIGH_M), last=telemetry(NOW_S, HIGH_M), caught=False,
+            since={planner.Condition.DOWN: 0.0, planner.Condition.BATTERY_LOW: 1.0},
+        )  # fmt: skip
+        obs = observation(NOW_S + hung_s, HIGH_M)
+        after = lander.observed(state, obs, profile)
+        assert (planner.Condition.DOWN in after.since) is not stale
+        assert planner.Condition.BATTERY_LOW in after.since
+        assert after.caught is stale
+        if positioning == "target":
+            assert (after.blind_s is not None) is stale
+
+
+# --- Where it is, in the end --------------------------------------------------------------------
+
+
+def ended(reach_s: float | None, imu: ImuMotion, **observed: Any) -> Finding:
+    tel = telemetry(NOW_S, HANG_Z_M, thrust=0.0, supervisor=READY)
+    obs = observation(
+        NOW_S, telemetry=tel, **{"target": None, "position_age_s": 3.0, "imu": imu, **observed}
+    )
+    state = replace(
+        state_in(Phase.LANDING, NOW_S - 5.0, HANG_Z_M),
+        stopped_s=NOW_S - 1.0, reach_s=reach_s, reckoning=Reckoning(imu=imu),
+    )  # fmt: skip
+    return lander.finding(Context(state, obs, BY_TARGET))
+
+
+@pytest.mark.parametrize(
+    ("reach_s", "fell_s", "gap_s", "found"),
+    [
+        (4.0, -math.inf, -math.inf, Finding.HANGS),
+        (4.0, 3.0, 3.5, Finding.HANGS),  # before it came there
+        (4.0, 6.0, -math.inf, Finding.STANDS),
+        (4.0, 6.0, 7.0, Finding.STANDS),
+        (4.0, -math.inf, 6.0, Finding.UNKNOWN),
+        (None, -math.inf, 6.0, Finding.STANDS),
+    ],
+)
+def test_what_was_in_reach_and_has_not_fallen_since_hangs(
+    reach_s: float | None, fell_s: float, gap_s: float, found: Finding
+) -> None:
+    assert ended(reach_s, ImuMotion(t_s=NOW_S, fell_s=fell_s, gap_s=gap_s)) is found
+
+
+def test_a_target_seen_far_above_tells_that_it_stands() -> None:
+    seen = target_at(NOW_S, body_m=(0.0, 0.0, CEILING_M - 1.0))
+    silent = ImuMotion(t_s=NOW_S, gap_s=6.0)
+    assert ended(4.0, silent, target=seen) is Finding.STANDS
+    near = target_at(NOW_S, body_m=(0.0, 0.0, HANG_Z_M))
+    assert ended(4.0, silent, target=near) is Finding.UNKNOWN
+
+
+# --- No cell, and no state that can be reached, breaks these -------------------------------------
+
+BIT = st.fixed_dictionaries(
+    {
+        "ticks": st.integers(1, 25),
+        "z_m": st.sampled_from([-0.2, 0.02, 0.3, 1.0, HANG_Z_M - 0.05, HANG_Z_M]),
+        "climb_mps": st.sampled_from([0.0, 0.0, -0.3, -1.5, 0.4]),
+        "acc_z_g": st.sampled_from([1.0, 1.0, 1.1, 0.3, 0.0]),
+        "thrust": st.sampled_from([0.0, 1000.0, 20000.0, 33000.0, HOVER_THRUST, 65535.0]),
+        "supervisor": st.sampled_from([AIRBORNE, AIRBORNE, READY, AIRBORNE | HL_ACTIVE]),
+        "age_s": st.sampled_from([0.01, 0.01, 0.15, 0.3, 0.7]),
+        "behind_s": st.sampled_from([0.0, 0.0, 0.5]),
+        "position_age_s": st.sampled_from([0.02, 0.02, 0.6, 2.0, math.inf]),
+        "target": st.sampled_from(["seen", "unseen", "none"]),
+        "once": st.sampled_from(
+            [
+                {},
+                {},
+                {"jumped": True},
+                {"jumped": True, "turned_rad": 1.5},
+                {"loop_late_s": 1.2},
+                {"link_problem": "gone"},
+                {"operator": Operator.LAND},
+            ]
+        ),
+    }
+)
+REMEMBERED = st.sampled_from(
+    [
+        {},
+        {"contact_z_m": HANG_Z_M, "reach_s": 9.0},
+        {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.9},
+        {"contact_z_m": HANG_Z_M, "reach_s": 9.0, "released_s": 9.0, "stopped_s": 9.8, "orders": 2},
+        {"caught": False, "catch_above_m": 1.0},
+        {"pressed": True},
+        {"hover_thrust": 0.0},
+        {"blind_s": 9.0, "blind_height_m": 1.0},
+    ]
+)
+
+
+def began(phase: Phase, remembered: dict[str, Any], profile: Profile) -> PlannerState:
+    """In that phase; a way down has begun as it does."""
+    flies = state_in(Phase.ALIGN if phase is Phase.LANDING else phase, z_m=1.0)
+    state = replace(flies, hover_thrust=remembered.get("hover_thrust", HOVER_THRUST))
+    if phase is Phase.LANDING:
+        state = lander.begun(state, observation(NOW_S, 1.0), profile)
+    return replace(state, **{k: v for k, v in remembered.items() if k != "hover_thrust"})
+
+
+def observed(bits: list[dict[str, Any]]) -> Iterator[Observation]:
+    felt, t_s = Felt(), NOW_S
+    for bit in bits:
+        for i in range(bit["ticks"]):
+            t_s += TURN_S
+            tel = telemetry(
+                t_s - bit["age_s"], bit["z_m"], velocity_mps=(0.0, 0.0, bit["climb_mps"]),
+                acc_z_g=bit["acc_z_g"], thrust=bit["thrust"], supervisor=bit["supervisor"],
+                behind_s=bit["behind_s"],
+            )  # fmt: skip
+            seen = bit["target"] == "seen"
+            target = target_at(t_s, body_m=tel.position_m, measured=seen, tracked=seen)
+            obs = observation(
+                t_s, telemetry=tel, target=None if bit["target"] == "none" else target,
+                new_frame=seen, position_age_s=bit["position_age_s"],
+                **(bit["once"] if i == 0 else {}),
+            )  # fmt: skip
+            yield felt(obs)
+
+
+def flown(
+    state: PlannerState, bits: list[dict[str, Any]], profile: Profile, *, alone: bool
+) -> Iterator[tuple[PlannerState, PlannerState, Command, Observation]]:
+    """Tick by tick: before, after, command, observation. `alone`: without the mission's table, as
+    watchdog and rescue fly it."""
+    for obs in observed(bits):
+        before = state
+        step = lander.step if alone else planner.step
+        state, command = step(state, obs, profile)
+        yield before, state, command, obs
+        if planner.is_over(state):
+            return
+
+
+BITS = st.lists(BIT, min_size=1, max_size=5)
+
+
+@settings(max_examples=80)
+@given(
+    phase=st.sampled_from(sorted(FLYING_PHASES | {Phase.LANDING}, key=lambda p: p.value)),
+    remembered=REMEMBERED, bits=BITS, alone=st.booleans(),
+)  # fmt: skip
+def test_by_the_target_no_landing_of_its_own_is_ever_ordered(
+    phase: Phase, remembered: dict[str, Any], bits: list[dict[str, Any]], alone: bool
+) -> None:
+    """It would go by an estimate that rests on pictures, to a floor that nobody measures."""
+    state = began(phase, remembered, BY_TARGET)
+    for _, _, command, _ in flown(state, bits, BY_TARGET, alone=alone):
+        assert not isinstance(command, Land)
+
+
+@settings(max_examples=80)
+@given(
+    positioning=st.sampled_from(sorted(PROFILES)), remembered=REMEMBERED, bits=BITS,
+    alone=st.booleans(),
+)  # fmt: skip
+def test_nothing_climbs_but_a_catch_and_severity_only_rises(
+    positioning: str, remembered: dict[str, Any], bits: list[dict[str, Any]], alone: bool
+) -> None:
+    profile = PROFILES[positioning]
+    state = began(Phase.LANDING, remembered, profile)
+    for before, after, command, obs in flown(state, bits, profile, alone=alone):
+        assert after.severity >= before.severity
+        if after.phase is not Phase.LANDING:
+            return
+        z_m, ground_m = obs.telemetry.position_m[2], after.ground_m
+        floor_m = ground_m[2] if ground_m else 0.0
+        if isinstance(command, PositionSetpoint) and after.caught:
+            assert command.z_m <= max(z_m, floor_m + 0.05) + 1e-9
+        if isinstance(command, Land):
+            assert command.height_m < z_m
+
+
+# --- One home --------------------------------------------------------------------------------
+
+
+def imported(path: str) -> dict[str, set[str]]:
+    """Module -> names that the file takes from it."""
+    found: dict[str, set[str]] = {}
+    for node in ast.walk(ast.parse((PERCHCTL / path).read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found.setdefault(node.module, set()).update(alias.name for alias in node.names)
+    return found
+
+
+def of_mission(path: str) -> set[str]:
+    """What a file takes from the mission: its modules."""
+    modules = set()
+    for module, names in imported(path).items():
+        if module == "perchctl.mission":
+            modules |= names
+        elif module.startswith("perchctl.mission."):
+            modules.add(module.removeprefix("perchctl.mission."))
+    return modules
+
+
+def builds_a_landing(path: Path) -> bool:
+    text = path.read_text()
+    if "Land(" not in text:
+        return False
+    calls = [n.func for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Call)]
+    return "Land" in {getattr(func, "id", getattr(func, "attr", "")) for func in calls}
+
+
+def test_only_the_lander_orders_a_landing() -> None:
+    builds = [path for path in PERCHCTL.rglob("*.py") if builds_a_landing(path)]
+    assert builds == [PERCHCTL / "mission" / "lander.py"]
+
+
+@pytest.mark.parametrize("path", ["flight/watchdog.py", "flight/rescue.py"])
+def test_who_lands_in_the_loop_s_place_has_no_landing_of_its_own(path: str) -> None:
+    assert of_mission(path) <= {"lander", "planner", "context", "state", "sent"}
+    names = imported(path)["perchctl.vehicle"]
+    assert not names & {"Land", "StopMotors", "HL_ACTIVE"}
+    tree = ast.parse((PERCHCTL / path).read_text())
+    used = {
+        node.attr
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "planner"
+    }
+    assert used <= {"start"}
+
+
+def test_the_planner_s_landing_is_the_lander() -> None:
+    assert actions.ACTIONS[Phase.LANDING] is lander.act
+    takers = {
+        path.stem
+        for path in (PERCHCTL / "mission").glob("*.py")
+        for module in imported(f"mission/{path.name}")
+        if module == "perchctl.mission.lander"
+    }
+    assert takers == {"safety", "table"}
+    assert not imported("mission/planner.py")["perchctl.vehicle"] & {"Land", "StopMotors"}
