@@ -8,6 +8,20 @@ allowed and what to do, in one sentence.
 from __future__ import annotations
 
 import sys
+from decimal import Decimal
+
+MOST_DECIMALS = 9
+
+
+def distinct_figures(found: float, limit: float, decimals: int) -> tuple[str, str]:
+    """A number that was found and its limit, for a message: `decimals` or as many as the limit
+    has, and more where both would look the same."""
+    own = -int(Decimal(f"{limit:g}").as_tuple().exponent)
+    for count in range(min(max(decimals, own), MOST_DECIMALS), MOST_DECIMALS + 1):
+        texts = f"{found:.{count}f}", f"{limit:.{count}f}"
+        if texts[0] != texts[1]:
+            break
+    return texts
 
 
 class PerchError(Exception):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from perchctl.errors import distinct_figures
 from perchctl.geometry import (
     Array,
     quaternion_from_rotation,
@@ -88,9 +89,9 @@ class Judge:
             self.problem = self._missing(now_s)
             return None
         if now_s - arrived_s > STALE_S:
+            age, allowed = distinct_figures(now_s - arrived_s, STALE_S, 2)
             self.problem = (
-                f"{self._who} is {now_s - arrived_s:.2f} s old when it is read; at most "
-                f"{STALE_S:g} s may pass"
+                f"{self._who} is {age} s old when it is read; at most {allowed} s may pass"
             )
             return None
         if not _is_pose(pose):

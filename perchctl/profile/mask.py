@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, NotFound, distinct_figures
 
 MOST_COVERED = 0.75
 """Of the picture; with more of it covered there is no room for a target."""
@@ -42,10 +42,10 @@ def read_mask(name: str, size_px: tuple[int, int]) -> NDArray[np.bool_]:
     covered = np.asarray(image > _WHITE)
     share = float(covered.mean())
     if share > MOST_COVERED:
+        covers, allowed = distinct_figures(100.0 * share, 100.0 * MOST_COVERED, 0)
         raise InvalidValue(
-            f"camera.mask: {path} covers {100 * share:.0f} % of the picture, at most "
-            f"{100 * MOST_COVERED:.0f} % are allowed: white is what the vehicle covers, "
-            f"black is free"
+            f"camera.mask: {path} covers {covers} % of the picture, at most {allowed} % are "
+            f"allowed: white is what the vehicle covers, black is free"
         )
     if share == 0.0:
         raise InvalidValue(
