@@ -19,7 +19,6 @@ HOMES: dict[str, tuple[str, ...]] = {
     "click": (),
     "rich": ("perchctl.cli", "perchctl.commands", "perchctl.display"),
     "filterpy": ("perchctl.vision.filter",),
-    "scipy": ("perchctl.flight.rates", "perchctl.flight.compared"),
     "mujoco": ("perchctl.sim",),
     "matplotlib": ("*.plot",),
     "motioncapture": ("perchctl.positioning",),
@@ -79,11 +78,6 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.__main__",),
 )
 FACE = "perchctl"  # the package itself: version and public names, taken from all rooms
-
-MOST_LINES_OF_A_FILE = 350
-MOST_LINES_OF_A_FUNCTION = 60
-LONG = "# long: "
-"""Stands, with the reason, on the line above a function that is longer."""
 
 
 @dataclass(frozen=True)
@@ -224,21 +218,6 @@ def cycle(imports: list[Import]) -> list[str]:
     return next((found for name in sorted(needs) if (found := walk(name, []))), [])
 
 
-def long_functions(name: str, source: str) -> list[str]:
-    """Functions beyond the limit with no reason on the line above."""
-    lines = source.splitlines()
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) or node.end_lineno is None:
-            continue
-        first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
-        length = node.end_lineno - node.lineno + 1
-        excused = first > 1 and lines[first - 2].strip().startswith(LONG)
-        if length > MOST_LINES_OF_A_FUNCTION and not excused:
-            found.append(f"{name}.{node.name} has {length} lines")
-    return found
-
-
 def test_the_walk_sees_the_project() -> None:
     assert {"perchctl.geometry", "perchctl.mission.planner", "perchctl.cli"} <= set(MODULES)
     assert len(IMPORTS) > 100
@@ -261,32 +240,20 @@ def test_no_module_needs_itself() -> None:
     assert cycle(IMPORTS) == []
 
 
-@pytest.mark.parametrize("name", sorted(MODULES))
-def test_rooms_are_small(name: str) -> None:
-    """A long file is two rooms that share a wall."""
-    source = MODULES[name].read_text(encoding="utf-8")
-    assert len(source.splitlines()) <= MOST_LINES_OF_A_FILE
-    assert long_functions(name, source) == []
-
-
 def test_no_clock_where_time_is_an_argument() -> None:
     assert clocks(IMPORTS) == []
 
 
 def test_only_the_command_line_loads_typer_and_nothing_heavy() -> None:
-    """`perchctl --help` stays quick: a subcommand loads libraries when it runs, and of
-    perchctl only the command of its own name."""
+    """`perchctl --help` stays quick: a subcommand loads libraries when it runs."""
     allowed = ("perchctl.errors", "perchctl.startup", "perchctl.cli")
     heavy = ("numpy", "cv2", "cflib", "matplotlib", "mujoco", "filterpy", "pydantic", "scipy")
     for i in IMPORTS:
-        if not is_under(i.importer, ("perchctl.cli",)):
+        if not i.at_load or not is_under(i.importer, ("perchctl.cli",)):
             continue
-        if i.at_load:
-            assert i.imported.split(".")[0] not in heavy, str(i)
-            if i.imported.startswith("perchctl."):
-                assert is_under(i.imported, allowed), str(i)
-        else:
-            assert i.imported == i.importer.replace(".cli.", ".commands."), str(i)
+        assert i.imported.split(".")[0] not in heavy, str(i)
+        if i.imported.startswith("perchctl."):
+            assert is_under(i.imported, allowed), str(i)
 
 
 BROKEN = {
@@ -313,12 +280,6 @@ def test_a_broken_rule_is_seen(name: str) -> None:
     faults = rule(imports_of(name, source, False, set(MODULES)))
     assert len(faults) == 1
     assert named in faults[0]
-
-
-def test_a_long_function_is_seen() -> None:
-    body = "    x = 1\n" * MOST_LINES_OF_A_FUNCTION
-    assert long_functions("m", f"def f():\n{body}") == ["m.f has 61 lines"]
-    assert long_functions("m", f"{LONG}one table\n@wrapped\ndef f():\n{body}") == []
 
 
 def test_a_cycle_is_seen() -> None:

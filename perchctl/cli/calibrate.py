@@ -19,7 +19,6 @@ from perchctl.cli.app import (
 from perchctl.cli.complete import complete_profile, complete_source
 
 
-# long: a list of options
 def calibrate(
     source: Annotated[
         list[str] | None,
@@ -164,7 +163,8 @@ def calibrate(
     (carry), then tilted around the tip of its gear (pivot). Nothing arms.
     """
     with reported(as_json):
-        from perchctl.commands.calibrate import CalibrateRequest, MountRequest, run
+        from perchctl.commands.calibrate import CalibrateRequest, run
+        from perchctl.commands.calibrate_mount_request import MountRequest
 
         request = CalibrateRequest(
             sources=tuple(source or ()),

@@ -10,7 +10,6 @@ import typer
 from perchctl.cli.app import ProfileOption, SourceOption, UriOption, perform, reported
 
 
-# long: a list of options
 def check(
     profile: ProfileOption = "sim",
     uri: UriOption = None,

@@ -11,7 +11,6 @@ from perchctl.cli.app import ForceOption, JsonOption, ProfileOption, perform, re
 from perchctl.cli.complete import complete_source
 
 
-# long: a list of options
 def fit_weights(
     data: Annotated[
         list[Path] | None,

@@ -50,7 +50,7 @@ def fly(
     """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
 
     Without options it flies the simulated vehicle. Ctrl-C once lands, again after half
-    a second cuts the motors.
+    a second, or held for two, cuts the motors.
     """
     with reported(as_json):
         from perchctl.commands.fly import FlyRequest, run

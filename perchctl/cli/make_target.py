@@ -11,7 +11,6 @@ from perchctl.cli.app import CamOption, ForceOption, JsonOption, perform, report
 from perchctl.cli.complete import complete_profile
 
 
-# long: a list of options
 def make_target(
     profile: Annotated[
         str | None,

@@ -11,7 +11,6 @@ from perchctl.cli.app import ForceOption, JsonOption, perform, reported
 from perchctl.cli.complete import complete_source
 
 
-# long: a list of options
 def new_profile(
     output: Annotated[Path, typer.Option("--output", "-o", help="Profile to write.")] = Path(
         "my_vehicle.yaml"

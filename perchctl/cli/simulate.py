@@ -18,7 +18,6 @@ from perchctl.cli.app import (
 from perchctl.cli.complete import complete_profile
 
 
-# long: a parameter for each option
 def simulate(
     flights: Annotated[
         int | None,

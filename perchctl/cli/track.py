@@ -19,7 +19,6 @@ from perchctl.cli.app import (
 from perchctl.cli.complete import complete_source
 
 
-# long: a list of options
 def track(
     source: Annotated[
         str,

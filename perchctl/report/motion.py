@@ -120,7 +120,8 @@ def _angular_rate(log: FlightLog, velocity_mps: Array) -> Array:
     moves = -level - np.cross(turns, place)
     z = np.where(place[:, 2] > NEAREST_M, place[:, 2], np.nan)
     flow = moves[:, :2] / z[:, None] - place[:, :2] * (moves[:, 2] / z**2)[:, None]
-    return np.linalg.norm(flow, axis=1)
+    rate: Array = np.linalg.norm(flow, axis=1)
+    return rate
 
 
 def _to_camera(header: Mapping[str, Any]) -> tuple[float, float, float]:

@@ -78,7 +78,7 @@ def decisions_of(track: Track) -> tuple[Decision, ...]:
 
 
 def _frame_before(track: Track, t_s: float) -> dict[str, Any] | None:
-    for record in reversed(track.log.records[: track.index_at(t_s) + 1]):
+    for record in track.log.records[track.index_at(t_s) :: -1]:
         if record.get("frame") is not None:
             return record
     return None

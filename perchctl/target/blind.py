@@ -102,7 +102,8 @@ def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m:
     half_m = target.large.side_m / 2.0
 
     def centre(range_m: float) -> Array:
-        return R @ np.array([0.0, 0.0, range_m]) + offset
+        at_m: Array = R @ np.array([0.0, 0.0, range_m]) + offset
+        return at_m
 
     def whole(range_m: float) -> bool:
         return any(_holds(view, outline, R, centre(range_m)) for outline in outlines)

@@ -155,7 +155,7 @@ def process_noise(dt_s: float, position_m: Array, setup: FilterSetup) -> Array:
     pushed = _pushed(noise, position_m) * dt_s
     # Of a value and its rate, which follow each other in the state.
     pair = np.array([[dt_s * dt_s / 3.0, dt_s / 2.0], [dt_s / 2.0, 1.0]])
-    Q = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
+    Q: Array = (pushed[:, None, :, None] * pair[:, None, :]).reshape(8, 8)
     if noise.wanders:
         Q[MEASURED, MEASURED] += _WANDER * dt_s
     return Q

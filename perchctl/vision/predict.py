@@ -95,9 +95,11 @@ def _moves(then: Attitude, now: Attitude, setup: PoseSetup) -> tuple[Array, Arra
 
 
 def _R_world_cam(attitude: Attitude, setup: PoseSetup) -> Array:
-    return attitude.R_world_body.dot(setup.T_body_cam[:3, :3])
+    R_world_cam: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, :3])
+    return R_world_cam
 
 
 def _ahead_m(attitude: Attitude, setup: PoseSetup) -> Array:
     """From the vehicle's place to the camera, in the world (3,)."""
-    return attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
+    ahead_m: Array = attitude.R_world_body.dot(setup.T_body_cam[:3, 3])
+    return ahead_m

@@ -160,7 +160,8 @@ def covariance(points: Points, scored: Scored) -> tuple[Array, float, Array]:
 
 def _curl(points: Points, scored: Scored) -> Array:
     lift = np.zeros((len(points.whitening), 2)) if points.lift is None else points.lift
-    return points.whitening.dot(moved_by(lift, scored.rvec, scored.jacobian))
+    curl: Array = points.whitening.dot(moved_by(lift, scored.rvec, scored.jacobian))
+    return curl
 
 
 def mirror_solution(rvec: Array, tvec: Array) -> Array | None:

@@ -79,4 +79,6 @@ def _hashes(values: Array) -> NDArray[np.uint64]:
         [pow(_MIX, k, 1 << 64) for k in range(1, values.shape[1] + 1)], dtype=np.uint64
     )
     bits = values.view(np.uint64)
-    return np.asarray((bits ^ (bits >> np.uint64(29))) * factors).sum(axis=1, dtype=np.uint64)
+    mixed: NDArray[np.uint64] = (bits ^ (bits >> np.uint64(29))) * factors
+    sums: NDArray[np.uint64] = mixed.sum(axis=1, dtype=np.uint64)
+    return sums

@@ -88,7 +88,8 @@ def seen_rpy_deg(attitudes: Sequence[AttitudeSample], poses: Sequence[SeenPose])
     rpy = np.unwrap([(a.roll_rad, a.pitch_rad, a.yaw_rad) for a in attitudes], axis=0)
     at_s = np.array([p.t_s for p in poses])
     at_s = at_s[(at_s >= t_s[0]) & (at_s <= t_s[-1] + _MOST_LATE_S)]
-    return np.degrees(np.stack([np.interp(at_s, t_s, angle) for angle in rpy.T], axis=1))
+    rpy_deg: Array = np.degrees(np.stack([np.interp(at_s, t_s, angle) for angle in rpy.T], axis=1))
+    return rpy_deg
 
 
 def tilts_rad(poses: Sequence[SeenPose]) -> Array:

@@ -65,7 +65,8 @@ class Comparison:
         """The tip in body axes; the profile's where no pivot was done."""
         if self.pivoted is None:
             return np.array(self.profile.vehicle.gear_body_m)
-        return self.cam_body_m + self.R_body_cam @ np.array(self.pivoted.gear_cam_m)
+        tip_m: Array = self.cam_body_m + self.R_body_cam @ np.array(self.pivoted.gear_cam_m)
+        return tip_m
 
     def profile_values(self) -> dict[str, float | tuple[float, ...]]:
         """What the profile should say, by dotted key: what was measured, but for a latency that

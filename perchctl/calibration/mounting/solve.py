@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from perchctl.calibration.mounting import carry, pivot
-from perchctl.calibration.mounting.felt import felt
+from perchctl.calibration.mounting.felt import felt, sum_up
 from perchctl.calibration.mounting.motion import missing, tilts_rad
 from perchctl.calibration.mounting.place import camera_place
 from perchctl.calibration.mounting.recording import Part, Recording, SeenPose
@@ -45,7 +45,7 @@ def solve_carry(recording: Recording) -> Carried:
     """
     check(recording, "carry")
     turned, seen = felt(recording.attitudes), _carry_poses(recording)
-    start = first_guess(carry.sum_up(turned, np.zeros(3), np.zeros(3)), seen.t_s, seen.R_cam_target)
+    start = first_guess(sum_up(turned, np.zeros(3), np.zeros(3)), seen.t_s, seen.R_cam_target)
     if start is None:
         raise InvalidValue(f"the target was not seen twice within half a second: {_AGAIN['carry']}")
     solved = carry.solve(turned, seen, start.R_body_cam, start.latency_s)

@@ -27,11 +27,13 @@ class Grid:
 
     @property
     def u(self) -> Array:
-        return self.uv1[0]
+        u: Array = self.uv1[0]
+        return u
 
     @property
     def v(self) -> Array:
-        return self.uv1[1]
+        v: Array = self.uv1[1]
+        return v
 
 
 @dataclass(frozen=True, eq=False)
