@@ -162,7 +162,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("operator-once", (16,), "Ctrl-C", AIR, draws.pressed_once),
     Fault("operator-twice", (16,), "Ctrl-C, and again 0.6 to 10 s later", AIR,
           draws.pressed_twice, (OPERATOR_STOPS,)),
-    Fault("operator-held", (16,), "Ctrl-C held for 0.1 to 3 s: it repeats every 30 ms", AIR,
+    Fault("operator-held", (16,), "Ctrl-C held for 0.1 to 1.8 s: it repeats every 30 ms", AIR,
           draws.held),
     Fault("hang-up", (16,), "the terminal is closed", AIR, draws.hang_up),
     # --- the program ------------------------------------------------------------------
@@ -171,6 +171,37 @@ FAULTS: tuple[Fault, ...] = (
     Fault("hung", (18, 19, 20), "the loop is stuck for 0.3 s to ever", AIR, draws.hung),
     Fault("slow", (20,), "turns take 0.1 to 0.4 s", AIR, draws.slow),
     Fault("disk-full", (44,), "the log cannot be written", AIR, draws.disk_full),
+    # --- readings that stand still, though their packets come -------------------------
+    Fault("position-frozen", (12,), "position and velocity are logged as they were", AIR,
+          draws.frozen(*draws.STATE_NAMES)),
+    Fault("attitude-frozen", (12,), "roll, pitch and yaw are logged as they were", AIR,
+          draws.frozen("stateEstimate.roll", "stateEstimate.pitch", "stateEstimate.yaw")),
+    Fault("acceleration-frozen", (12,), "the acceleration is logged as it was", AIR,
+          draws.frozen("acc.x", "acc.y", "acc.z")),
+    Fault("thrust-frozen", (12,), "the thrust is logged as it was", AIR,
+          draws.frozen("stabilizer.thrust")),
+    Fault("supervisor-frozen", (12,), "the supervisor's word is logged as it was", AIR,
+          draws.frozen("supervisor.info")),
+    # --- what nothing announces --------------------------------------------------------
+    Fault("thrust-changed", (37,), "hovering takes up to 8 % more or less thrust", AIR,
+          draws.thrust_changed),
+    Fault("external-mirrored", (11,), "positions come mirrored", AIR,
+          draws.external_wrong("mirrored")),
+    Fault("exception", (18,), "an unforeseen exception ends the loop", AIR, draws.raises),
+    Fault("operator-hammers", (16,), "Ctrl-C every 80 to 250 ms, for 2.5 to 4 s", AIR,
+          draws.hammered, (OPERATOR_STOPS,)),
+    # --- two at once ------------------------------------------------------------------
+    Fault("covered-and-kick", (27, 37), "a blow, and the target is hidden from then on",
+          BY_CAMERA, draws.together(draws.camera("covered"), draws.kick)),
+    Fault("covered-and-gust", (27, 37), "a gust, and the target is hidden from then on",
+          BY_CAMERA, draws.together(draws.camera("covered"), draws.gust)),
+    Fault("covered-and-operator", (16, 27), "Ctrl-C, and the target is hidden from then on",
+          BY_CAMERA, draws.together(draws.camera("covered"), draws.pressed_once)),
+    Fault("weak-magnet-uplink", (14, 39), "the magnet carries 0.2 to 1.1 of the weight, and no "
+          "command arrives for a time", (P.PERCH, P.COMPLETE),
+          draws.together(draws.weak_magnet, draws.silence(up=True, down=False)), (TOO_LOW, CUT)),
+    Fault("hung-and-packet-lost", (14, 20), "the loop is stuck, and one or two packets of what is "
+          "sent in its place are lost", AIR, draws.hung_and_packet_lost),
 )  # fmt: skip
 
 BY_NAME = {fault.name: fault for fault in FAULTS}

@@ -113,6 +113,11 @@ def not_a_number(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.LogReads(STATE_NAMES, math.nan, lasting_s(rng, 0.02)),)
 
 
+def frozen(*names: str) -> Draw:
+    """Log variables whose values stand still while their packets go on coming."""
+    return lambda rng, scenario: (e.LogReads(names, None, lasting_s(rng)),)
+
+
 def external(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     how = "frozen" if rng.uniform() < 0.5 else "silent"
     return (e.ExternalPositions(how, lasting_s(rng)),)
@@ -149,6 +154,11 @@ def reading_low(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 def weak_motor(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.MotorWeak(int(rng.integers(1, 5)), 0.85),)
+
+
+def thrust_changed(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    """So that hovering takes 8 % more or less at most."""
+    return (e.ThrustChanged(round(1.0 / between(rng, 0.92, 1.08), 4)),)
 
 
 def kick(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
@@ -221,9 +231,17 @@ def pressed_twice(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 
 def held(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
-    """A key that repeats every 30 ms: one press, however long."""
-    times = np.arange(0.0, log_between(rng, 0.1, 3.0), 0.03)
-    return (e.Operator(tuple(round(float(t), 2) for t in times)),)
+    """A key that repeats every 30 ms: one press, for less than the 2 s that are a stop."""
+    return (_presses_every(0.03, log_between(rng, 0.1, 1.8)),)
+
+
+def hammered(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    """By a hand that wants the motors stopped."""
+    return (_presses_every(between(rng, 0.08, 0.25), between(rng, 2.5, 4.0)),)
+
+
+def _presses_every(period_s: float, for_s: float) -> e.Operator:
+    return e.Operator(tuple(round(float(t), 3) for t in np.arange(0.0, for_s, period_s)))
 
 
 def hang_up(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
@@ -244,6 +262,21 @@ def hung(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 def slow(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.Slow(between(rng, 0.1, 0.4), lasting_s(rng, 0.5)),)
+
+
+def raises(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    return (e.Raises(),)
+
+
+def hung_and_packet_lost(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    """The loop is stuck, and the first packets of what is sent in its place are lost."""
+    order = ("raw", "stop", "land")[int(rng.integers(3))]
+    return (*hung(rng, scenario), e.PacketLost(order, 1 if rng.uniform() < 0.6 else 2))
+
+
+def together(*parts: Draw) -> Draw:
+    """Faults that begin in the same moment."""
+    return lambda rng, scenario: tuple(effect for part in parts for effect in part(rng, scenario))
 
 
 def disk_full(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:

@@ -71,7 +71,7 @@ class EstimateError:
 @dataclass(frozen=True)
 class ExternalPositions:
     """The vehicle has no deck but a motion capture; what goes wrong in it is `how`: frozen,
-    silent, occluded, swapped, millimetres, or late by `late_s`."""
+    silent, occluded, swapped, millimetres, mirrored, or late by `late_s`."""
 
     how: str
     for_s: float
@@ -99,6 +99,13 @@ class BatterySags:
 class MotorWeak:
     motor: int  # 1 to 4
     strength: float
+
+
+@dataclass(frozen=True)
+class ThrustChanged:
+    """All motors give this part of what they gave: another air, another set of propellers."""
+
+    to: float
 
 
 @dataclass(frozen=True)
@@ -175,13 +182,18 @@ class Slow:
 
 
 @dataclass(frozen=True)
+class Raises:
+    """An exception that the program does not foresee, in the loop's thread."""
+
+
+@dataclass(frozen=True)
 class DiskFull:
     for_s: float
 
 
 Effect = (
     Silence | PacketLost | PacketTwice | BlockDead | TelemetryDelayed | CameraFault
-    | EstimateError | ExternalPositions | LogReads | BatterySags | MotorWeak | Push
-    | MagnetHolds | MagnetLetsGo | Room | TargetMoves | Operator | Killed | Suspended
-    | Hung | Slow | DiskFull
+    | EstimateError | ExternalPositions | LogReads | BatterySags | MotorWeak | ThrustChanged
+    | Push | MagnetHolds | MagnetLetsGo | Room | TargetMoves | Operator | Killed | Suspended
+    | Hung | Slow | Raises | DiskFull
 )  # fmt: skip

@@ -29,12 +29,14 @@ from perchctl.faults.effects import (
     PacketLost,
     PacketTwice,
     Push,
+    Raises,
     Room,
     Silence,
     Slow,
     Suspended,
     TargetMoves,
     TelemetryDelayed,
+    ThrustChanged,
 )
 from perchctl.faults.program import FaultyClock
 from perchctl.faults.radio import FaultyRadio
@@ -52,6 +54,7 @@ CAPTURE_FAULTS = {
     "occluded": CaptureFault(occluded=True),
     "swapped": CaptureFault(swapped=True),
     "millimetres": CaptureFault(scale=MILLIMETRES),
+    "mirrored": CaptureFault(mirrored=True),
     "late": CaptureFault(),
 }
 
@@ -203,7 +206,7 @@ class Injector:
                 edges.radio.begin(effect, t_s)
             case CameraFault():
                 edges.camera.begin(effect, t_s)
-            case Killed() | Suspended() | Hung() | Slow():
+            case Killed() | Suspended() | Hung() | Slow() | Raises():
                 edges.clock.begin(effect, t_s)
             case Operator():
                 act = edges.hang_up if effect.hang_up else edges.press
@@ -227,6 +230,10 @@ class Injector:
                 strength[effect.motor - 1] = effect.strength
                 s1, s2, s3, s4 = strength
                 vehicle.world.powertrain.strength = (s1, s2, s3, s4)
+            case ThrustChanged(to):
+                powertrain = vehicle.world.powertrain
+                s1, s2, s3, s4 = powertrain.strength or (1.0,) * 4
+                powertrain.strength = (s1 * to, s2 * to, s3 * to, s4 * to)
             case Push():
                 vehicle.world.external_force_n = effect.force_n
                 self._at(t_s + effect.for_s, self._leave_alone)

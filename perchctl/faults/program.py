@@ -1,11 +1,11 @@
-"""Faults of the program itself: killed, suspended, hung, slow. Simulated time passes while
+"""Faults of the program itself: killed, suspended, hung, slow, raising. Simulated time passes while
 the loop does not run."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from perchctl.faults.effects import FOR_EVER, Hung, Killed, Slow, Suspended
+from perchctl.faults.effects import FOR_EVER, Hung, Killed, Raises, Slow, Suspended
 from perchctl.link.mock import MockLink
 
 LONGEST_S = 60.0
@@ -30,14 +30,14 @@ class FaultyClock:
         self._link = link
         self._on_killed = on_killed
         self._stop_s = stop_s
-        self._pending: Killed | Suspended | Hung | None = None
+        self._pending: Killed | Suspended | Hung | Raises | None = None
         self._slow: Slow | None = None
         self._slow_until_s = 0.0
         self._gone = False
         self.endless = False
         self.killed_s: float | None = None
 
-    def begin(self, effect: Killed | Suspended | Hung | Slow, now_s: float) -> None:
+    def begin(self, effect: Killed | Suspended | Hung | Slow | Raises, now_s: float) -> None:
         if isinstance(effect, Slow):
             self._slow, self._slow_until_s = effect, now_s + effect.for_s
         else:
@@ -65,6 +65,8 @@ class FaultyClock:
                 self._link.advance_to(self._link.now_s + min(for_s, LONGEST_S))
                 if for_s >= FOR_EVER:
                     self._kill()
+            case Raises():
+                raise PlantedError("an exception that the fault raised")
         if self._link.now_s > self._stop_s:
             self.endless = True
             self._kill()

@@ -43,7 +43,8 @@ PROMISES = (
         "camera silent, frozen, snowing, dark, late, lossy; target covered",
         "held after 0.5 s, landed after 3 s; in the ascent it backs off down",
         ("camera-silent", "camera-frozen", "camera-snow", "camera-dark", "camera-late",
-         "camera-out-of-order", "camera-lossy", "target-covered"),
+         "camera-out-of-order", "camera-lossy", "target-covered", "covered-and-kick",
+         "covered-and-gust"),
     ),
     Promise(
         "picture mirrored",
@@ -57,18 +58,19 @@ PROMISES = (
         ("camera-turned",), names="camera.mount",
     ),
     Promise(
-        "telemetry old, or a part of it; loop late or hanging",
+        "telemetry old or standing still, or a part of it; loop late or hanging",
         "held after 0.3 s (a late loop after 0.25 s), landed after 1 s; nothing old proves a "
         "contact or a landing",
         ("downlink-silent", "state-block-dead", "attitude-block-dead", "telemetry-delayed",
-         "slow", "hung"),
+         "position-frozen", "attitude-frozen", "acceleration-frozen", "thrust-frozen",
+         "supervisor-frozen", "slow", "hung", "hung-and-packet-lost"),
         unseen=True,
     ),
     Promise(
         "link lost",
         "a landing is ordered, for which the link is opened once more; a silent vehicle levels "
         "out at 0.5 s and cuts at 2 s by itself, except in its own landing",
-        ("uplink-silent", "link-silent"), CUT,
+        ("uplink-silent", "link-silent", "weak-magnet-uplink"), CUT,
     ),
     Promise(
         "a packet lost or sent twice, at any order",
@@ -91,7 +93,7 @@ PROMISES = (
         "motion capture hides the body, freezes, ends, takes another body for it, is late",
         "what cannot be true is not sent; held after 0.15 s, landed after 0.7 s without a position",
         ("external-position", "external-occluded", "external-swapped", "external-scaled",
-         "external-late"),
+         "external-mirrored", "external-late"),
         unseen=True,
     ),
     Promise(
@@ -100,9 +102,9 @@ PROMISES = (
         ("heading-jumps",),
     ),
     Promise(
-        "a blow, a gust, a weak motor",
+        "a blow, a gust, a weak motor, another hover thrust",
         "flown out; back to the alignment when it is beside the target",
-        ("kick", "gust", "motor-weak"),
+        ("kick", "gust", "motor-weak", "thrust-changed"),
     ),
     Promise(
         "no magnet, a weak one, a slip",
@@ -122,12 +124,12 @@ PROMISES = (
     Promise(
         "Ctrl-C once, held, terminal closed",
         "landed; where the magnet holds on, left hanging and said so",
-        ("operator-once", "operator-held", "hang-up"),
+        ("operator-once", "operator-held", "covered-and-operator", "hang-up"),
     ),
     Promise(
-        "Ctrl-C twice",
+        "Ctrl-C twice, or hammered for 2 s",
         "motors cut and locked, repeated until it shows",
-        ("operator-twice", "emergency-stop-lost"), CUT,
+        ("operator-twice", "operator-hammers", "emergency-stop-lost"), CUT,
     ),
     Promise(
         "disk full, or hanging",
@@ -141,8 +143,8 @@ PROMISES = (
         ("suspended", "killed"), CUT | {"gone"},
     ),
     Promise(
-        "perchctl itself fails", "the vehicle is landed first, whatever was raised", (),
-        DOWN | {"failed"},
+        "perchctl itself fails", "the vehicle is landed first, whatever was raised",
+        ("exception",), DOWN | {"failed"},
     ),
     Promise("tumbled, crashed, locked", "stop; the message says to inspect and restart", ()),
 )  # fmt: skip

@@ -12,6 +12,7 @@ import pytest
 from perchctl.errors import UsageError
 from perchctl.faults.catalogue import (
     AIR,
+    BY_NAME,
     FAULTS,
     USUAL_S,
     Fault,
@@ -19,6 +20,10 @@ from perchctl.faults.catalogue import (
     draw_case,
     selected,
 )
+from perchctl.faults.effects import Operator
+from perchctl.faults.oracle import second_press_s
+from perchctl.flight.operator import OperatorSwitch
+from perchctl.mission.state import Operator as OperatorWord
 from perchctl.mission.state import Phase
 from perchctl.sim.scenario import Scenario
 
@@ -57,6 +62,23 @@ def test_a_seed_draws_the_same_fault_again_and_others_draw_others() -> None:
     cases = [draw_case(seed, SCENARIO) for seed in range(200)]
     assert len({case.fault.name for case in cases}) > 0.9 * len(FAULTS)
     assert {case.phase for case in cases} == set(AIR)
+
+
+@pytest.mark.parametrize(("name", "stops"), [("operator-held", False), ("operator-hammers", True)])
+def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, stops: bool) -> None:
+    """By the oracle's reading of the law and by the program's."""
+    for seed in range(50):
+        (operator,) = case_of(
+            BY_NAME[name], Phase.ALIGN, np.random.default_rng(seed), SCENARIO
+        ).effects
+        assert isinstance(operator, Operator)
+        # It is asked the time at each press, and once more when it is read.
+        times_s = iter((*operator.presses_s, operator.presses_s[-1]))
+        switch = OperatorSwitch(listening=True, clock=times_s.__next__)
+        for _ in operator.presses_s:
+            switch.press()
+        assert (switch.read() is OperatorWord.STOP) is stops
+        assert (second_press_s(operator.presses_s) is not None) is stops
 
 
 def test_a_selection_by_name() -> None:

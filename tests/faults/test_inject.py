@@ -108,7 +108,7 @@ def test_it_never_begins_where_the_phase_never_comes() -> None:
     [
         e.Silence(1.0, True, True), e.PacketLost("land", 1), e.PacketTwice("land"),
         e.BlockDead("state", 1.0), e.TelemetryDelayed(0.1, 1.0), e.CameraFault("snow", 1.0),
-        e.Killed(), e.Suspended(1.0), e.Hung(1.0), e.Slow(0.1, 1.0),
+        e.Killed(), e.Suspended(1.0), e.Hung(1.0), e.Slow(0.1, 1.0), e.Raises(),
     ],
 )  # fmt: skip
 def test_what_the_edges_are_handed(effect: e.Effect) -> None:
@@ -132,7 +132,7 @@ def test_the_estimate_steps_turns_and_slides() -> None:
     assert rig.injector.drifted_m == pytest.approx(0.1, abs=0.01)  # where it has led the vehicle
 
 
-@pytest.mark.parametrize("how", sorted(CAPTURE_FAULTS))
+@pytest.mark.parametrize("how", sorted({*CAPTURE_FAULTS} - {"mirrored"}))
 def test_the_motion_capture_goes_wrong_for_its_time(how: str) -> None:
     effect = e.ExternalPositions(how, 1.0, 0.1 if how == "late" else 0.0)
     scenario = changed_scenario(replace(SCENARIO, acc_bias_mps2=(0.1, 0.0, 0.0)), (effect,))
@@ -163,6 +163,19 @@ def test_the_motion_capture_goes_wrong_for_its_time(how: str) -> None:
     healed = capture.take()[-1].bodies["crazyflie"]
     assert math.hypot(*healed.position_m) < 0.05
     assert rig.injector.drifted_m > 0.02  # nobody sends any position here
+
+
+def test_positions_come_mirrored() -> None:
+    effect = e.ExternalPositions("mirrored", 5.0)
+    rig = Rig((effect,), changed_scenario(SCENARIO, (effect,)), capture=CaptureSettings())
+    capture, world = rig.vehicle.capture, rig.vehicle.world
+    assert capture is not None
+    for y_m in (0.3, -0.3):
+        world.set_pose((0.1, 0.3, 0.02), hold=True)
+        rig.wait(0.1)
+        x_m, found_y_m, _ = capture.take()[-1].bodies["crazyflie"].position_m
+        assert (x_m, found_y_m) == pytest.approx((0.1, y_m), abs=0.01)
+        rig.injector.begin_now()
 
 
 def test_a_log_variable_reads_wrongly() -> None:
@@ -200,6 +213,11 @@ def test_a_motor_is_weak() -> None:
     f1, f2, f3, f4 = world.powertrain.forces_n
     assert f1 == f3 == f4
     assert f2 == pytest.approx(0.85 * f1)
+
+
+def test_all_motors_give_less_or_more() -> None:
+    rig = begun(e.MotorWeak(2, 0.85), e.ThrustChanged(1.08))
+    assert rig.vehicle.world.powertrain.strength == pytest.approx((1.08, 0.918, 1.08, 1.08))
 
 
 def test_a_push_ends() -> None:

@@ -40,6 +40,7 @@ class CaptureFault:
         gone: no frame is sent.
         swapped: the vehicle's body and the first other one have changed names.
         scale: of all positions; 1000 is millimetres.
+        mirrored: positions with y's sign turned, as a left-handed program sends them.
         axes: the capture's axes in the world's, such as `+x+z-y`; None: as in the settings.
         late_s: more than the settings' delay.
         rate_hz: at most so many frames a second.
@@ -50,6 +51,7 @@ class CaptureFault:
     gone: bool = False
     swapped: bool = False
     scale: float = 1.0
+    mirrored: bool = False
     axes: str | None = None
     late_s: float = 0.0
     rate_hz: float = math.inf

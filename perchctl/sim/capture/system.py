@@ -122,6 +122,8 @@ class SimCapture:
         turn = axes_matrix(axes)
         # A system defines a body's axes along its own: a level body's attitude is none at all.
         x, y, z = (scale * float(v) for v in turn @ place)
+        if any(fault.mirrored for fault in faults):
+            y = -y
         return BodyPose((x, y, z), quaternion_from_rotation(turn @ R @ turn.T))
 
 
