@@ -34,7 +34,7 @@ BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, 
 IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
 NO_PICTURE = ("silent", "frozen", "snow")
 """The camera's faults that leave no picture to look at; without a `NO_SIGHT` there is no target."""
-NO_SIGHT = (*NO_PICTURE, "covered", "dark")
+NO_SIGHT = (*NO_PICTURE, "covered")  # in the dark a target that is near is found
 NO_POSITION = ("silent", "frozen", "occluded", "swapped", "millimetres")
 LASTS_S = 0.5
 """A loss that ends so soon after its limit may have been waited out."""

@@ -31,6 +31,8 @@ class Promise:
         """Whether the flight ended as promised, and nothing avoidable went wrong in it."""
         if result.counted:
             return False
+        if result.end == "refused":  # nothing took off
+            return True
         if self.unseen and result.row == UNCONFIRMED:
             return True
         if result.end != "perched" and self.names not in result.reason:

@@ -235,7 +235,7 @@ def _aborted(c: Context) -> Acted:
         case MotorStop.PLAIN:
             return state, StopMotors()
         case MotorStop.NONE:
-            return state, StopMotors() if is_still(c) else Idle()
+            return state, StopMotors() if is_still(c) or lander.is_spent(c) else Idle()
 
 
 ACTIONS: dict[Phase, Callable[[Context], Acted]] = {

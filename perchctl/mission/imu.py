@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.values import replace
-from perchctl.vehicle import FLYING, Telemetry
+from perchctl.vehicle import FLYING, FULL_THRUST, Telemetry
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -49,6 +49,11 @@ BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
 the share of the way itself, since the samples of a blow come each 10 ms."""
 
 
+HOVER_MEMORY_S, LEAST_FLYING, SATURATED = 0.5, 0.4, 0.95
+"""Of the felt hover thrust; with less of the full thrust nothing flies, with more it tells
+nothing."""
+
+
 @dataclass(frozen=True)
 class ImuMotion:
     """The vehicle's motion by its accelerometer and attitude alone.
@@ -61,6 +66,7 @@ class ImuMotion:
         gap_s: end of the newest silence that a fall could hide in.
         steady_s: since when the vertical speed has stayed what it is.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
+        hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
     """
 
     t_s: float = -math.inf
@@ -75,6 +81,7 @@ class ImuMotion:
     offset_mps2: float = 0.0
     blow_mps: float = 0.0
     blow_s: float = -math.inf
+    hover_thrust: float = 0.0
 
 
 def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
@@ -118,7 +125,17 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         offset_mps2=offset,
         blow_mps=blow,
         blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
+        hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
     )
+
+
+def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
+    """Neither at a standstill nor pressed against anything, as far as this sample tells."""
+    flies = sample.has(FLYING) and sample.thrust < SATURATED * FULL_THRUST
+    if not flies or sample.thrust < LEAST_FLYING * FULL_THRUST or not 0.8 <= sample.acc_z_g <= 1.2:
+        return old
+    felt = sample.thrust / sample.acc_z_g
+    return felt if old == 0.0 else old + (felt - old) * min(1.0, dt_s / HOVER_MEMORY_S)
 
 
 def _offset_at_rest(old: Vector, sample: Telemetry, share: float) -> Vector:

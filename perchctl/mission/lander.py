@@ -221,11 +221,12 @@ def started(
         # Somebody has stopped the motors, or they never turned: nothing spins them up again.
         new = replace(new, stopped_s=obs.t_s)
     contact_z_m = old.contact_z_m
-    if old.phase is Phase.PERCH and contact_z_m is None:
-        # It may be in the magnet's reach: it has to be seen below before it counts as free.
-        contact_z_m = tel.position_m[2]
     c = Context(new, obs, profile)
-    hover = old.hover_thrust or felt_hover_thrust(tel)
+    if contact_z_m is None and (old.phase is Phase.PERCH or (new.pressed and c.by_sight)):
+        # It may be in the magnet's reach, below the sheet too, where that hangs above a ceiling
+        # that the camera does not see: it has to be seen below before it counts as free.
+        contact_z_m = tel.position_m[2]
+    hover = _hover_thrust(old, obs)
     new = replace(
         new, contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
@@ -370,9 +371,9 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
         state = _jumped(state, obs)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
         # Where no hover thrust was learned yet, the present one has to do.
-        hover = state.hover_thrust or felt_hover_thrust(obs.telemetry)
+        hover = _hover_thrust(state, obs)
         state = replace(state, heading_lost=True, hover_thrust=hover)
-    state = _reckon(Context(_answered(state, obs), obs, profile))
+    state = _reckon(Context(_answered(state, obs, profile), obs, profile))
     c = Context(state, obs, profile)
     comes_down = state.phase is Phase.LANDING and stage_of(c) in (Stage.DOWN, Stage.ORDERED)
     if comes_down and c.by_sight and state.blind_s is None and not _is_sighted(c):
@@ -391,20 +392,22 @@ def ordered(state: PlannerState, command: Command) -> PlannerState:
             return replace(state, raw_order=None, unanswered_s=None)
 
 
-def _answered(state: PlannerState, obs: Observation) -> PlannerState:
+def _answered(state: PlannerState, obs: Observation, profile: Profile) -> PlannerState:
     """A reading that stands still under a changed order says nothing of the thrust."""
     if state.raw_order is None:
         return state
     wanted = 0.0 if state.raw_order < STILL_THRUST else min(MOST_RAW, state.raw_order)
     apart = abs(obs.telemetry.thrust - wanted) > UNANSWERED_PART * FULL_THRUST
     since_s = obs.t_s if state.unanswered_s is None else state.unanswered_s
-    return replace(state, unanswered_s=since_s if apart else None)
+    new = replace(state, unanswered_s=since_s if apart else None)
+    known = Context(new, obs, profile).thrust_is_known
+    return new if known else replace(new, unread_s=obs.t_s)
 
 
 def blinded(state: PlannerState, obs: Observation) -> PlannerState:
     """Accelerometer and attitude are all that is left, for good: no sight is believed again on
     this way down, since each change of the mode costs height."""
-    hover = state.hover_thrust or felt_hover_thrust(obs.telemetry)
+    hover = _hover_thrust(state, obs)
     height_m = obs.telemetry.position_m[2] - (state.ground_m[2] if state.ground_m else 0.0)
     return replace(state, blind_s=obs.t_s, blind_height_m=height_m, hover_thrust=hover)
 
@@ -482,6 +485,10 @@ def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
 
 def _moved(place: Place, by_m: Place) -> Place:
     return (place[0] + by_m[0], place[1] + by_m[1], place[2] + by_m[2])
+
+
+def _hover_thrust(state: PlannerState, obs: Observation) -> float:
+    return state.hover_thrust or obs.imu.hover_thrust or felt_hover_thrust(obs.telemetry)
 
 
 def felt_hover_thrust(tel: Telemetry) -> float:
@@ -579,6 +586,11 @@ def _setpoints_level(c: Context) -> Acted:
 def _peel(c: Context) -> Acted:
     """A setpoint below takes the thrust to its least. What that has not moved is given to the
     magnet; where nobody can watch that, the setpoint goes on down to the floor."""
+    if c.by_sight:
+        state, away = unpressed(c)
+        if away is not None:
+            return state, away
+        c = Context(state, c.obs, c.profile)
     watched = evidence_of(c) is not Evidence.ONBOARD or c.imu_proves
     if c.in_phase_s > PEEL_S and watched:
         return let_go(c)
@@ -707,6 +719,12 @@ def _level(c: Context) -> Acted:
     )  # fmt: skip
     roll_rad, pitch_rad = (0.0, 0.0) if touch_s is not None else _braking(c)
     return state, RawThrust(int(thrust), roll_rad, pitch_rad)
+
+
+def is_spent(c: Context) -> bool:
+    """Whether a level way down has come to its least thrust: nothing flies on that for long. What
+    only ended the stream would be cut and locked by the firmware 2 s later."""
+    return 0.0 < c.state.level_thrust <= LEAST_PART * c.state.hover_thrust + 1.0
 
 
 def left_level(c: Context) -> Context:

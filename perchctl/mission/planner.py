@@ -120,7 +120,7 @@ def _learned_hover_thrust(state: PlannerState, obs: Observation) -> float:
     """Slow mean of the thrust in quiet flight: the reference of the contact proof."""
     thrust = obs.telemetry.thrust
     if state.hover_thrust == 0.0:
-        return thrust
+        return obs.imu.hover_thrust or thrust
     if abs(thrust / state.hover_thrust - 1.0) > HOVER_WITHIN:
         return state.hover_thrust  # held by the ceiling, or by a hand: nothing hovers on that
     part = min(1.0, (obs.t_s - state.t_s) / 1.5)

@@ -70,8 +70,9 @@ def let_go(c: Context) -> Acted:
         z_m = c.obs.telemetry.position_m[2]
         state = replace(state, released_s=c.obs.t_s, contact_z_m=state.contact_z_m or z_m)
     assert state.released_s is not None
-    unread_s = 0.0 if c.thrust_is_known else UNREAD_S
-    if c.held(Condition.WEIGHT_HANGS) >= complete.hang_s + unread_s:
+    hung_s = c.held(Condition.WEIGHT_HANGS)
+    unread_s = UNREAD_S if state.unread_s >= c.obs.t_s - hung_s else 0.0
+    if hung_s >= complete.hang_s + unread_s:
         return stop_motors(c)
     part = min(1.0, (c.obs.t_s - state.released_s) / complete.ramp_s)
     start = c.profile.planner.perch.thrust if state.setpoint is None else THRUST_MIN

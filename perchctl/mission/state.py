@@ -231,4 +231,5 @@ class PlannerState:
     touch_s: float | None = None  # a level way down felt the floor
     raw_order: int | None = None  # raw thrust that was ordered last, None in position mode
     unanswered_s: float | None = None  # the thrust that is read is not what is ordered, since
+    unread_s: float = -math.inf  # when that last had lasted too long
     hold: str = ""  # why the vehicle is held in place, empty when it is not

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
+from perchctl.mission.release import UNREAD_S
 from perchctl.mission.state import (
     Observation,
     Operator,
@@ -127,8 +128,12 @@ def on_the_floor(seen: list[Observation], ground_z_m: dict[float, float], entry_
 
 
 def on_the_ceiling(seen: list[Observation]) -> bool:
-    """The whole weight for as long as it takes, where the target is or the contact was."""
-    recent = _was_fresh(seen, PROFILE.planner.complete.hang_s)
+    """The whole weight for as long as it takes, where the target is or the contact was; longer
+    where the thrust that is read does not follow what is ordered."""
+    hang_s = PROFILE.planner.complete.hang_s
+    recent, longer = _was_fresh(seen, hang_s), _was_fresh(seen, hang_s + UNREAD_S)
+    if longer is not None and all(_at_rest(o.telemetry) for o in longer):
+        return True
     return recent is not None and all(
         _at_rest(o.telemetry) and o.telemetry.thrust <= 5000.0 for o in recent
     )

@@ -47,7 +47,7 @@ KINDS = (b"header", b"turn", b"sent", b"event", b"summary")
 KEPT = tuple(b'{"kind":"' + kind + b'"' for kind in KINDS)
 
 
-PICTURES = 38
+PICTURES = 37
 """So many are kept: from the first before take-off until only the small marker is in view."""
 SMALL = {"link.telemetry_period_s": 0.02, "link.loop_hz": 25}
 """Half the turns, and half the samples."""
