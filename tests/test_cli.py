@@ -22,7 +22,8 @@ from perchctl import __version__
 from perchctl.calibration.files import load_calibration
 from perchctl.cli import app
 from perchctl.cli.app import reported
-from perchctl.errors import EXIT_CODES
+from perchctl.commands.output import confirmed
+from perchctl.errors import EXIT_CODES, Interrupted
 from perchctl.flight.session import PLAIN_SEED
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.handle import SimProcess
@@ -176,20 +177,67 @@ def test_nobody_to_ask_is_no_consent() -> None:
     assert NOWHERE in said.complaint
 
 
-@pytest.mark.parametrize(("answer", "asked"), [("n", True), ("", True), ("y", False)])
-def test_only_a_yes_is_consent(
-    answer: str, asked: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A yes goes on, here to the missing camera."""
-    monkeypatch.setattr("builtins.input", lambda: answer)
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
+
+
+@pytest.mark.usefixtures("terminal")
+def test_nobody_is_asked_before_the_camera_answers(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("builtins.input", pytest.fail)
     with pytest.raises(SystemExit) as left:
         app(["fly", "--uri", NOWHERE, "--source", "camera:9"])
-    assert left.value.code == (2 if asked else 20)
+    assert left.value.code == 20
+    assert "clear?" not in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("terminal")
+@pytest.mark.parametrize(("answer", "flies"), [("n", False), ("", False), ("y", True)])
+def test_only_a_yes_is_consent(
+    answer: str, flies: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def flown(*_: object) -> None:
+        raise Interrupted("it would fly")
+
+    camera = load_calibration("example_640x480.yaml")
+    with SimProcess.start(camera=camera) as vehicle:
+        monkeypatch.setattr("builtins.input", lambda: answer)
+        monkeypatch.setattr("perchctl.flight.session.fly", flown)
+        with pytest.raises(SystemExit) as left:
+            app(["fly", "--uri", vehicle.uri, "--source", vehicle.stream_url])
+    assert left.value.code == (130 if flies else 2)
     said = capsys.readouterr()
-    assert ("not confirmed" in said.err) is asked
     assert "Is the space under the target clear?" in said.err
+    assert ("not confirmed" in said.err) is not flies
+    assert ("it would fly" in said.err) is flies
     assert said.out == ""
+
+
+def test_what_was_typed_before_the_question_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    pty = pytest.importorskip("pty", reason="Windows has no terminals of this kind")
+    keyboard, screen = pty.openpty()
+    os.write(keyboard, b"y\n")
+
+    class Reader:
+        """Types no as soon as the question has appeared."""
+
+        def write(self, text: str) -> int:
+            if "?" in text:
+                os.write(keyboard, b"n\n")
+            return len(text)
+
+        def flush(self) -> None:
+            return None
+
+    with open(screen, encoding="utf-8") as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        monkeypatch.setattr("sys.stderr", Reader())
+        assert not confirmed("Is it clear?")
+        os.write(keyboard, b"yes\n")
+        assert stdin.readline() == "yes\n"  # nothing of before is left
+    os.close(keyboard)
 
 
 @pytest.mark.parametrize("where", ["a file", "a folder that may not be made"])

@@ -14,7 +14,7 @@ from perchctl.check.session import Wanted, check, found_by_scan
 from perchctl.commands.check_cameras import list_cameras
 from perchctl.commands.fly import FlyRequest, resolve
 from perchctl.commands.interrupt import interruptible, unheeded
-from perchctl.commands.output import say
+from perchctl.commands.output import confirmed, say
 from perchctl.errors import (
     ConnectionFailed,
     Interrupted,
@@ -117,14 +117,7 @@ def _wanted(request: CheckRequest) -> Wanted:
 
 
 def _confirmed() -> bool:
-    question = "About to turn each propeller. Is it free, the vehicle held by nobody? [y/N] "
-    # On stderr: stdout is for the result.
-    print(question, end="", file=sys.stderr, flush=True)
-    try:
-        answer = input()
-    except EOFError:
-        return False
-    return answer.strip().lower() in ("y", "yes")
+    return confirmed("About to turn each propeller. Is it free, the vehicle held by nobody?")
 
 
 def exit_code(rows: Sequence[Row]) -> int:

@@ -6,6 +6,7 @@ import contextlib
 import sys
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from perchctl.check import quick
 from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.fly_plan import plan, plan_text, weights_text
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
-from perchctl.commands.output import print_record, say, tell
+from perchctl.commands.output import confirmed, print_record, say, tell
 from perchctl.commands.page import page_port
 from perchctl.commands.positioning import positioned
 from perchctl.display.page.flight import FlightPage, flight_page
@@ -89,9 +90,10 @@ def run(request: FlyRequest) -> int:
     for warning in quick.warnings(options):
         say(f"check: {warning}")
     check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
-    if not (request.yes or options.simulated):
-        ask_before_arming(options.uri)
-    return fly(options, request.as_json, page_port(request.view, request.view_port))
+    asks = not (request.yes or options.simulated)
+    if asks and not sys.stdin.isatty():
+        raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")
+    return fly(options, request.as_json, page_port(request.view, request.view_port), asks)
 
 
 def resolve(request: FlyRequest) -> FlyOptions:
@@ -116,21 +118,13 @@ def resolve(request: FlyRequest) -> FlyOptions:
 
 def ask_before_arming(uri: str) -> None:
     """Raises UsageError without a yes from the terminal."""
-    if not sys.stdin.isatty():
-        raise UsageError(f"about to arm {uri}, and there is nobody to ask: add --yes")
-    # On stderr: stdout is for the result.
-    question = f"About to arm and fly {uri}. Is the space under the target clear? [y/N] "
-    print(question, end="", file=sys.stderr, flush=True)
-    try:
-        answer = input()
-    except EOFError:
-        answer = ""
-    if answer.strip().lower() not in ("y", "yes"):
+    if not confirmed(f"About to arm and fly {uri}. Is the space under the target clear?"):
         raise UsageError("not confirmed: nothing was started")
 
 
-def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
-    """Fly, log, plot, report how it ended; returns the exit code. `port` of the live page."""
+def fly(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False) -> int:
+    """Fly, log, plot, report how it ended; returns the exit code. `port` of the live page; `asks`:
+    somebody at the terminal has to say yes before it arms."""
     simulated_seed = options.seed if options.simulated else None
     log = LogWatcher.real_time(
         options.log_dir, options.profile, options.uri, options.source, simulated_seed,
@@ -147,7 +141,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None) -> int:
     with unheeded(), contextlib.ExitStack() as stack:
         try:
             page = stack.enter_context(live_page(options, port, switch))
-            result = _session(options, log, DisplayWatcher(reporter), switch, page)
+            result = _session(options, log, DisplayWatcher(reporter), switch, page, asks)
         except BaseException as error:
             # The page first: a disk that hangs holds up the log's end, and STOP would seem ready.
             if page is not None:
@@ -197,6 +191,7 @@ def _session(
     display: Watcher,
     switch: OperatorSwitch,
     page: FlightPage | None,
+    asks: bool,
 ) -> SessionResult:
     """The session with the signals on its switch, and with the live page where there is one."""
     watchers: tuple[Watcher, ...] = (log, display)
@@ -205,7 +200,8 @@ def _session(
         watchers = (*watchers, page)
         watched = lambda source: page.watched(log.watched(source))  # noqa: E731
     with signals_to_operator(switch, say):
-        return fly_session(options, watchers, switch, watched, log.remarks)
+        ask = partial(ask_before_arming, options.uri) if asks else None
+        return fly_session(options, watchers, switch, watched, log.remarks, ask)
 
 
 def live_page(

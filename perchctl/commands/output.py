@@ -26,6 +26,22 @@ def tell(text: str) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
 
 
+def confirmed(question: str) -> bool:
+    """Whether somebody at the terminal says yes, now: what was typed before the question appeared
+    is no answer to it."""
+    with contextlib.suppress(ImportError, OSError, ValueError, AttributeError):
+        import termios  # which Windows lacks
+
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    # On stderr: stdout is for the result.
+    print(f"{question} [y/N] ", end="", file=sys.stderr, flush=True)
+    try:
+        answer = input()
+    except EOFError:
+        return False
+    return answer.strip().lower() in ("y", "yes")
+
+
 def print_record(record: Mapping[str, Any]) -> None:
     """The one JSON object of `--json` on stdout."""
     print(json.dumps(record))

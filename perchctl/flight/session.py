@@ -92,11 +92,13 @@ def fly_session(
     switch: OperatorSwitch | None = None,
     watch_source: Callable[[FrameSource], FrameSource] = lambda source: source,
     remarks: Callable[[], Sequence[str]] = tuple,
+    before_arming: Callable[[], None] | None = None,
 ) -> SessionResult:
     """Fly once, in real time through cflib. Errors: the tree of `perchctl.errors`.
 
     `switch` carries the operator's commands. `watch_source` may put a source around the camera's,
-    to look at its frames on their way. `remarks`: as `FlightParts` has them.
+    to look at its frames on their way. `remarks`: as `FlightParts` has them. `before_arming` is
+    called once vehicle and camera have answered; what it raises ends the session on the ground.
     """
     check_options(options)
     check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
@@ -121,6 +123,8 @@ def fly_session(
         link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
             link.connect()
+            if before_arming is not None:
+                before_arming()
             positions = started_feed(stack, capture, link, positioning, clock, profile)
             switch.listening = True
             pace, lag_s = PaceWatcher(), _lag_s(simulated, clock)
