@@ -696,7 +696,8 @@ def _level(c: Context) -> Acted:
     if unheard:
         thrust *= UNHEARD_PART
     touched_s = math.inf if touch_s is None else c.obs.t_s - touch_s
-    if touched_s >= TOUCH_S and c.imu_proves and tel.acc_z_g < CARRIED_G:
+    # In the air it would read what the thrust gives, on the floor one g: nearer to which it is.
+    if touched_s >= TOUCH_S and c.imu_proves and tel.acc_z_g < 0.5 * (1.0 + tel.thrust / hover):
         touch_s = None  # it falls with its thrust: that was no floor
     # With less thrust than that the accelerometer reads one g on something only.
     carried = c.imu_proves and tel.acc_z_g > CARRIED_G and tel.thrust < CARRIED_PART * hover

@@ -184,7 +184,10 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
                 blocked_z_m=blocked_z_m,
             )
         case Phase.LANDING:
-            if new.row == "position-astray":
+            # The mounting may be right, and the motion capture's axes wrong: nothing tells which,
+            # and by such positions the landing would speed up until it tilts over.
+            capture = c.profile.positioning.by == "mocap" and old.mount.wrong
+            if new.row == "position-astray" or (new.row == "mounting" and capture):
                 new = replace(new, astray=True)
             if new.row == "mounting":
                 # The setpoint is ahead, and every centimetre there is one in a wrong direction.
