@@ -29,6 +29,7 @@ from perchctl.mission.lander import (
     reach_of,
     stage_of,
 )
+from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.state import FLYING_PHASES, Observation, Operator, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -223,6 +224,73 @@ def test_a_sight_is_believed_no_more_once_it_came_down_blindly() -> None:
 def test_what_went_astray_is_believed_no_more() -> None:
     assert judged(MOCAP, {"astray": True}) is Evidence.IMU
     assert judged(MOCAP, {"astray": True}, age_s=0.6) is Evidence.NOTHING
+
+
+@pytest.mark.parametrize(("acc_z_g", "stands"), [(0.93, True), (0.8, True), (0.55, False)])
+def test_a_floor_that_was_felt_is_one_unless_it_falls_with_its_thrust(
+    acc_z_g: float, stands: bool
+) -> None:
+    """On half of the hover thrust: in the air the accelerometer reads half a g."""
+    c = context((Evidence.IMU, Reach.FREE, Stage.DOWN), z_m=0.02)
+    tel = replace(c.obs.telemetry, acc_z_g=acc_z_g, thrust=0.5 * HOVER_THRUST)
+    aside = replace(c.state.reckoning, velocity_mps=(0.8, 0.0, 0.0))
+    felt = replace(c.state, touch_s=NOW_S - 0.5, level_thrust=tel.thrust, reckoning=aside)
+    state, command = lander.act(Context(felt, replace(c.obs, telemetry=tel), c.profile))
+    assert (state.touch_s is not None) is stands
+    assert isinstance(command, RawThrust)
+    assert (command.pitch_rad == 0.0) is stands  # tilted on the floor, it would slide
+
+
+@pytest.mark.parametrize(("positioning", "astray"), [("mocap", True), ("deck", False)])
+def test_a_mounting_that_seems_turned_may_be_the_capture_s_axes(
+    positioning: str, astray: bool
+) -> None:
+    """By such positions a landing would speed up until it tilts over."""
+    watch = MountWatch(against=SIGHTS_IN_A_ROW)
+    begin = replace(state_in(Phase.ALIGN, NOW_S), mount=watch)
+    obs = observation(NOW_S + TURN_S)
+    state, command = planner.step(begin, obs, PROFILES[positioning])
+    assert (state.phase, state.row) == (Phase.LANDING, "mounting")
+    assert state.astray is astray
+    assert isinstance(command, RawThrust if astray else PositionSetpoint)
+
+
+@pytest.mark.parametrize(("positioning", "within"), [("target", True), ("deck", False)])
+def test_what_presses_by_the_target_may_be_in_the_magnet_s_reach(
+    positioning: str, within: bool
+) -> None:
+    """Under a sheet that hangs above a ceiling which the camera does not see."""
+    profile = PROFILES[positioning]
+    tel = telemetry(NOW_S, 1.2, thrust=65535.0)
+    state = lander.begun(
+        replace(state_in(Phase.ASCEND), caught=True), observation(NOW_S, telemetry=tel), profile
+    )
+    assert state.pressed
+    assert (state.contact_z_m == 1.2) is within
+
+
+@pytest.mark.parametrize("part", [0.4, 0.9])
+def test_an_end_on_the_least_thrust_does_not_lock(part: float) -> None:
+    """Nothing flies on that for long; on more it may, and motors stop on proof only."""
+    c = context((Evidence.NOTHING, Reach.FREE, Stage.DOWN))
+    state = replace(c.state, phase=Phase.ABORTED, level_thrust=part * c.state.hover_thrust)
+    _, command = actions.ACTIONS[Phase.ABORTED](Context(state, c.obs, c.profile))
+    assert isinstance(command, StopMotors if part == 0.4 else Idle)
+
+
+def test_a_hover_thrust_that_was_not_learned_is_felt() -> None:
+    """In a climb that speeds up by 0.07 g the thrust is 7 % above it; one sample is noise."""
+    felt, obs = Felt(), observation(NOW_S)
+    for i in range(60):
+        acc_z_g = 1.0 if i == 59 else 1.07
+        tel = telemetry(NOW_S + 0.01 * i, 1.0, thrust=1.07 * HOVER_THRUST, acc_z_g=acc_z_g)
+        obs = felt(observation(tel.t_s, telemetry=tel))
+    unlearned = replace(state_in(Phase.APPROACH), hover_thrust=0.0)
+    state = lander.begun(unlearned, obs, BY_TARGET)
+    assert state.level_hover == pytest.approx(HOVER_THRUST, rel=0.01)
+    hovering = replace(unlearned, phase=Phase.ALIGN, t_s=obs.t_s - TURN_S, last=None)
+    state, _ = planner.step(hovering, obs, DECKS)
+    assert state.hover_thrust == pytest.approx(HOVER_THRUST, rel=0.01)
 
 
 @pytest.mark.parametrize("positioning", PROFILES)
