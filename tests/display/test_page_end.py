@@ -272,7 +272,9 @@ def test_the_page_of_a_flight_ends_with_its_card(
         display: Watcher,
         switch: OperatorSwitch,
         page: FlightPage,
+        asks: bool,
     ) -> SessionResult:
+        assert not asks
         for watcher in (log, display, page):
             watcher.event(BEGUN[0])
             watcher.tick(tick(START_S))
