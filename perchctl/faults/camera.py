@@ -33,9 +33,12 @@ class FaultyCamera:
         self._last: Frame | None = None
         self._queue: deque[Frame] = deque()
         self._overtaken: Frame | None = None
+        self.late_s = 0.0  # until a fault begins, and known to the profile
 
     def begin(self, fault: CameraFault, now_s: float) -> None:
         self._fault, self._begin_s = fault, now_s
+        self.late_s = 0.0
+        self._queue.clear()
 
     @property
     def live(self) -> bool:
@@ -47,6 +50,8 @@ class FaultyCamera:
 
     def poll(self, now_s: float) -> Frame | None:
         frame = self._inner.poll(now_s)
+        if self.late_s:
+            frame = self._late(frame, self.late_s, now_s)
         fault = self._fault
         if fault is None or not self._begin_s <= now_s < self._begin_s + fault.for_s:
             self._last = frame or self._last

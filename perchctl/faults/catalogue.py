@@ -15,6 +15,7 @@ from perchctl.faults import draws
 from perchctl.faults.draws import Draw
 from perchctl.faults.effects import Effect
 from perchctl.faults.expected_outcomes import (
+    BROWN_OUT,
     CUT,
     LEFT_LANDING,
     LETS_GO_LATER,
@@ -188,6 +189,10 @@ FAULTS: tuple[Fault, ...] = (
     Fault("external-mirrored", (11,), "positions come mirrored", AIR,
           draws.external_wrong("mirrored")),
     Fault("exception", (18,), "an unforeseen exception ends the loop", AIR, draws.raises),
+    Fault("latency-falls", (24,), "pictures come 100 to 200 ms sooner than before", AIR,
+          draws.camera_sooner),
+    Fault("brown-out", (6, 13), "the voltage breaks down, and the vehicle starts again", AIR,
+          draws.reboots, (BROWN_OUT,)),
     Fault("operator-hammers", (16,), "Ctrl-C every 80 to 250 ms, for 2.5 to 4 s", AIR,
           draws.hammered, (OPERATOR_STOPS,)),
     # --- two at once ------------------------------------------------------------------

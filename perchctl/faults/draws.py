@@ -78,6 +78,10 @@ def camera_late(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.CameraFault("late", lasting_s(rng, 1.0), log_between(rng, 0.05, 0.6)),)
 
 
+def camera_sooner(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    return (e.CameraFault("sooner", e.FOR_EVER, between(rng, 0.1, 0.2)),)
+
+
 def camera_mirrored(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.CameraFault("mirrored", e.FOR_EVER),)
 
@@ -140,6 +144,10 @@ def external_late(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 def sags(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.BatterySags(log_between(rng, 0.01, 0.1), between(rng, 0.2, 0.7)),)
+
+
+def reboots(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    return (e.Reboots(between(rng, 0.5, 1.5)),)
 
 
 def reading_frozen(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:

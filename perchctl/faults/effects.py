@@ -50,8 +50,8 @@ class TelemetryDelayed:
 
 @dataclass(frozen=True)
 class CameraFault:
-    """`kind`: silent, frozen, snow, dark, covered, lossy, late, out-of-order or mirrored; `late_s`
-    of late."""
+    """`kind`: silent, frozen, snow, dark, covered, lossy, late, out-of-order, mirrored, or sooner:
+    late before, as the profile says, and no more; `late_s` of late and sooner."""
 
     kind: str
     for_s: float
@@ -93,6 +93,14 @@ class BatterySags:
 
     rate_vps: float
     by_v: float
+
+
+@dataclass(frozen=True)
+class Reboots:
+    """The voltage breaks down and the vehicle starts again: its motors stop, for `boots_s` it hears
+    nothing, and its log blocks are gone."""
+
+    boots_s: float
 
 
 @dataclass(frozen=True)
@@ -193,7 +201,7 @@ class DiskFull:
 
 Effect = (
     Silence | PacketLost | PacketTwice | BlockDead | TelemetryDelayed | CameraFault
-    | EstimateError | ExternalPositions | LogReads | BatterySags | MotorWeak | ThrustChanged
-    | Push | MagnetHolds | MagnetLetsGo | Room | TargetMoves | Operator | Killed | Suspended
-    | Hung | Slow | Raises | DiskFull
+    | EstimateError | ExternalPositions | LogReads | BatterySags | Reboots | MotorWeak
+    | ThrustChanged | Push | MagnetHolds | MagnetLetsGo | Room | TargetMoves | Operator | Killed
+    | Suspended | Hung | Slow | Raises | DiskFull
 )  # fmt: skip

@@ -114,6 +114,13 @@ SAGS_TOO_FAST = ExpectedOutcome(
     "has less time than the way down takes",
 )  # fmt: skip
 
+BROWN_OUT = ExpectedOutcome(
+    "started again", lambda facts: facts.rebooted_s, 4.0,
+    _flags("fell", "slid", "strayed"),
+    "a vehicle that starts again in the air stops its motors; nothing that the program sends can "
+    "be flown", chosen=True,
+)  # fmt: skip
+
 EXPECTED_OUTCOMES = (
-    CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT, SAGS_TOO_FAST,
+    BROWN_OUT, CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT, SAGS_TOO_FAST,
 )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from perchctl.faults.effects import Effect
+from perchctl.faults.effects import Effect, Reboots
 from perchctl.faults.oracle import Sample
 from perchctl.faults.truth import WatchedVehicle
 from perchctl.geometry import GRAVITY_MPS2
@@ -30,6 +30,7 @@ class Facts:
         muted_s: when nothing of the program had reached the vehicle for so long that the firmware
             cuts; `own_landing`: the vehicle's own landing ran as that silence began.
         killed_s: when the program was killed.
+        rebooted_s: when the vehicle started again.
         stop_s: second Ctrl-C.
         let_go_s: when the magnet let go for good; `watched`: by then the whole weight had hung on
             it, motors off, for as long as the program is to watch it.
@@ -43,6 +44,7 @@ class Facts:
     muted_s: float | None = None
     own_landing: bool = False
     killed_s: float | None = None
+    rebooted_s: float | None = None
     stop_s: float | None = None
     let_go_s: float | None = None
     watched: bool = False
@@ -133,6 +135,7 @@ class FactsRecorder:
             muted_s=self.muted_s,
             own_landing=self.own_landing,
             killed_s=killed_s,
+            rebooted_s=begin_s if any(isinstance(e, Reboots) for e in effects) else None,
             stop_s=stop_s,
             let_go_s=self.let_go_s,
             watched=self.watched,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from perchctl.faults.bounds import DescentBound, PlaceBound, drifted_m
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
 from perchctl.faults.claims import claims_of, claims_of_rescue, last_row
-from perchctl.faults.effects import Effect, ExternalPositions, Suspended
+from perchctl.faults.effects import CameraFault, Effect, ExternalPositions, Suspended
 from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.expected_outcomes import unexpected
 from perchctl.faults.facts import FactsRecorder
@@ -75,6 +76,8 @@ class FaultyFlight:
     ) -> None:
         if any(isinstance(effect, ExternalPositions) for effect in case.effects):
             profile = by_mocap(profile)
+        sooner_s = _sooner_s(case.effects)
+        profile = _with_latency(profile, sooner_s)
         self._profile, self._case, self._log = profile, case, log
         self._scenario = scenario = _scenario_of(case, scenario)
         camera = camera_of(profile.camera)
@@ -84,6 +87,7 @@ class FaultyFlight:
         radio.serves(vehicle.firmware)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
         source = FaultyCamera(lockstep_source(vehicle, profile), scenario.seed)
+        source.late_s = sooner_s
         self._clock = FaultyClock(self._link, lambda: _cut(radio), LONGEST_FLIGHT_S)
         self._switch = OperatorSwitch(listening=True, clock=self._clock.now)
         disk = Disk()
@@ -282,6 +286,20 @@ def _scenario_of(case: Case, scenario: Scenario) -> Scenario:
         hold_n = case.first_hold * scenario.mass_kg * GRAVITY_MPS2
         scenario = replace(scenario, first_contact_force_n=hold_n)
     return changed_scenario(scenario, case.effects)
+
+
+def _sooner_s(effects: Sequence[Effect]) -> float:
+    """By how much the pictures will come sooner than the profile is told."""
+    found = [e.late_s for e in effects if isinstance(e, CameraFault) and e.kind == "sooner"]
+    return max(found, default=0.0)
+
+
+def _with_latency(profile: Profile, more_s: float) -> Profile:
+    if more_s == 0.0:
+        return profile
+    latency_s = profile.camera.start_latency_s + more_s
+    camera = profile.camera.model_copy(update={"latency_s": latency_s})
+    return profile.model_copy(update={"camera": camera})
 
 
 def _parameters(case: Case) -> dict[str, Any]:

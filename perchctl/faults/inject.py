@@ -30,6 +30,7 @@ from perchctl.faults.effects import (
     PacketTwice,
     Push,
     Raises,
+    Reboots,
     Room,
     Silence,
     Slow,
@@ -202,6 +203,9 @@ class Injector:
         edges = self._edges
         vehicle = edges.vehicle
         match effect:
+            case Reboots():
+                vehicle.firmware.reboot()
+                edges.radio.begin(effect, t_s)
             case Silence() | PacketLost() | PacketTwice() | BlockDead() | TelemetryDelayed():
                 edges.radio.begin(effect, t_s)
             case CameraFault():

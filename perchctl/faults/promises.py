@@ -43,9 +43,10 @@ class Promise:
 PROMISES = (
     Promise(
         "camera silent, frozen, snowing, dark, late, lossy; target covered",
-        "held after 0.5 s, landed after 3 s; in the ascent it backs off down",
+        "held after 0.5 s, landed after 3 s; in the ascent it backs off down; landed where the latency "
+        "changes by 0.1 s, and named",
         ("camera-silent", "camera-frozen", "camera-snow", "camera-dark", "camera-late",
-         "camera-out-of-order", "camera-lossy", "target-covered", "covered-and-kick",
+         "latency-falls", "camera-out-of-order", "camera-lossy", "target-covered", "covered-and-kick",
          "covered-and-gust"),
     ),
     Promise(
@@ -55,8 +56,8 @@ PROMISES = (
     ),
     Promise(
         "camera mounted 90 or 180 deg off",
-        "stopped and landed within 0.3 m, as soon as the target moves with the vehicle, and the "
-        "turn that fits named; by the target alone it strays by more than a metre",
+        "stopped and landed within 0.3 m (0.6 m by the target alone), as soon as the target moves "
+        "with the vehicle, and the turn that fits named",
         ("camera-turned",), names="camera.mount",
     ),
     Promise(
@@ -69,10 +70,10 @@ PROMISES = (
         unseen=True,
     ),
     Promise(
-        "link lost",
+        "link lost, or the vehicle starts again",
         "a landing is ordered, for which the link is opened once more; a silent vehicle levels "
         "out at 0.5 s and cuts at 2 s by itself, except in its own landing",
-        ("uplink-silent", "link-silent", "weak-magnet-uplink"), CUT,
+        ("uplink-silent", "link-silent", "weak-magnet-uplink", "brown-out"), CUT,
     ),
     Promise(
         "a packet lost or sent twice, at any order",

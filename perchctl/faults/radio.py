@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from perchctl.faults.effects import BlockDead, PacketLost, PacketTwice, Silence, TelemetryDelayed
+from perchctl.faults.effects import (
+    FOR_EVER,
+    BlockDead,
+    PacketLost,
+    PacketTwice,
+    Reboots,
+    Silence,
+    TelemetryDelayed,
+)
 from perchctl.link.mock import Radio
 from perchctl.sim.crtp.codec import Packet, Port
 from perchctl.sim.crtp.commands import CommandService
@@ -12,7 +20,7 @@ from perchctl.sim.firmware import Firmware
 ORDERS = ("setpoint", "raw", "land", "notify", "stop", "emergency-stop")
 """The packets that faults can name."""
 
-RadioEffect = Silence | PacketLost | PacketTwice | BlockDead | TelemetryDelayed
+RadioEffect = Silence | PacketLost | PacketTwice | BlockDead | TelemetryDelayed | Reboots
 
 
 def order_of(packet: Packet) -> str:
@@ -41,7 +49,7 @@ class FaultyRadio(Radio):
     def __init__(self, air: Radio | None = None) -> None:
         self._air = air or Radio()
         self.cut = False
-        self._begun: list[tuple[RadioEffect, float]] = []
+        self._begun: list[tuple[Silence | BlockDead | TelemetryDelayed, float]] = []
         self._left: dict[str, int] = {}  # packets of an order still to be lost
         self._twice: set[str] = set()
         self._service: CommandService | None = None
@@ -56,7 +64,10 @@ class FaultyRadio(Radio):
                 self._left[order] = count
             case PacketTwice(order):
                 self._twice.add(order)
-            case _:
+            case Reboots(boots_s):
+                self._begun.append((Silence(boots_s, up=True, down=True), now_s))
+                self._begun.append((Silence(FOR_EVER, up=False, down=True), now_s))
+            case Silence() | BlockDead() | TelemetryDelayed():
                 self._begun.append((effect, now_s))
 
     def up(self, packet: Packet, now_s: float) -> bool:
@@ -79,7 +90,7 @@ class FaultyRadio(Radio):
         if delay_s is None:
             return None
         for effect, begin_s in self._begun:
-            if isinstance(effect, (PacketLost, PacketTwice)) or now_s >= begin_s + effect.for_s:
+            if now_s >= begin_s + effect.for_s:
                 continue
             if isinstance(effect, Silence) and effect.down:
                 return None

@@ -240,7 +240,7 @@ def _flown(report: FlightReport, vehicle: SimulatedVehicle, truth: Truth) -> Loc
         hanging=hanging,
         fell=fell,
         locked=bool(vehicle.firmware.supervisor_info & LOCKED),
-        simulated_s=vehicle.firmware.t_s,
+        simulated_s=vehicle.t_s,
         touchdown_mps=truth.touchdown_mps,
         scenario=vehicle.scenario,
     )

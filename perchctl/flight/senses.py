@@ -20,6 +20,7 @@ from perchctl.flight.history import (
 )
 from perchctl.flight.noticed import Noticed, noticed
 from perchctl.flight.sights import Sights
+from perchctl.mission.felt import FeltWatch, felt
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
@@ -41,6 +42,7 @@ ENDED = " has ended"
 SENSED = (
     "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
     "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
+    "mismatch",
 )  # fmt: skip
 """The fields of an `Observation` that come from here; the others are the loop's."""
 
@@ -75,6 +77,7 @@ class Senses:
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     noticed: Noticed = field(default_factory=Noticed)
+    felt: FeltWatch = field(default_factory=FeltWatch)
     send: Send = lambda place: True
     recorded: bool = False  # the turns are: with the pictures' checksums and the present's spread
     sights: Sights | None = field(init=False, default=None)
@@ -168,6 +171,7 @@ class Senses:
             delay_s=self.noticed.used_s,
             target_refused=self.refused,
             imu=self.history.imu,
+            mismatch=self.felt.mismatch,
         )
 
     @property
@@ -179,6 +183,13 @@ class Senses:
     def _notice(self, output: PipelineOutput, used_s: float) -> None:
         """Latency and mounting, from a picture whose pose was taken for the target's."""
         pose = surest_of(self.state.measured)
+        if pose is not None and pose.t_s == output.detections.t_s:
+            T_body_cam = self.pipeline.pose.T_body_cam
+            x_m, y_m, z_m = (T_body_cam[:3, :3] @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
+            history = self.history
+            self.felt = felt(
+                self.felt, pose.t_s, (x_m, y_m, z_m), history.samples, history.imu.offset_g
+            )
         if pose is None or output.target is None or not output.target.measured:
             return
         self.noticed = noticed(

@@ -84,7 +84,7 @@ class MockLink:
 
     @property
     def now_s(self) -> float:
-        return self.vehicle.firmware.t_s
+        return self.vehicle.t_s
 
     def advance_to(self, t_s: float) -> None:
         """Step the vehicle until `t_s`, sending its telemetry on the way."""
@@ -172,7 +172,7 @@ class MockLink:
         delay_s = self.radio.down(block, self.now_s)
         if delay_s is not None:
             values = firmware.log_values(BLOCKS[block])
-            packet = (self.now_s + delay_s, next(self._count), block, firmware.t_s, values)
+            packet = (self.now_s + delay_s, next(self._count), block, self.now_s, values)
             heapq.heappush(self._under_way, packet)
 
 

@@ -82,8 +82,11 @@ class Context:
 
     @property
     def located(self) -> bool:
-        """Whether the estimated position and speed are believed: not where they come from outside
-        and do not, or have only just come again. With decks always."""
+        """Whether the estimated position and speed are believed. With decks always; not where they
+        come from outside and do not, or have only just come again, nor by pictures that do not fit
+        the motion that is felt."""
+        if self.by_sight and self.obs.mismatch is not None:
+            return False
         if self.state.astray or self.obs.position_age_s > self.profile.positioning.hold_s:
             return False
         stale_s = self.state.stale_s

@@ -159,7 +159,27 @@ def pressed_blindly(c: Context) -> bool:
 
 def mounted_wrong(c: Context) -> bool:
     """The target moves with the vehicle, or seems to lie below it."""
-    return c.state.mount.wrong or c.held(Condition.TARGET_BELOW) >= BELOW_S
+    return (
+        c.state.mount.wrong or _felt_turn_rad(c) != 0.0 or c.held(Condition.TARGET_BELOW) >= BELOW_S
+    )
+
+
+def _felt_turn_rad(c: Context) -> float:
+    return 0.0 if c.obs.mismatch is None else c.obs.mismatch.turn_rad
+
+
+def latency_changed(c: Context) -> bool:
+    """The pictures show the vehicle's motion, but later or earlier than they are taken to."""
+    return c.obs.mismatch is not None and c.obs.mismatch.later_s != 0.0
+
+
+def why_latency(c: Context) -> str:
+    taken_s = c.profile.camera.start_latency_s + c.obs.delay_s
+    found_s = taken_s + (0.0 if c.obs.mismatch is None else c.obs.mismatch.later_s)
+    return (
+        f"the pictures are {1e3 * found_s:.0f} ms old, not {1e3 * taken_s:.0f} as "
+        f"camera.latency_s has it: find what delays them"
+    )
 
 
 def why_contact(c: Context) -> str:
@@ -174,10 +194,12 @@ def why_contact(c: Context) -> str:
 
 
 def why_mounted_wrong(c: Context) -> str:
+    if turn_rad := _felt_turn_rad(c):
+        return explained(turn_rad)
     if c.state.mount.wrong and c.profile.positioning.by == "mocap":
-        return f"{explained(c.state.mount)}; or swapped axes in the motion capture"
+        return f"{explained(c.state.mount.turn_rad)}; or swapped axes in the motion capture"
     if c.state.mount.wrong:
-        return explained(c.state.mount)
+        return explained(c.state.mount.turn_rad)
     return (
         f"the target seems to lie {-c.error_z_m:.1f} m below the vehicle: camera.mount does not "
         f"look up"

@@ -416,6 +416,13 @@ def _reckon(c: Context) -> PlannerState:
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=state.astray)
+    felt = obs.mismatch
+    if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
+        new = replace(
+            new,
+            velocity_mps=(*felt.velocity_mps, new.velocity_mps[2]),
+            bias_mps2=(*felt.bias_mps2, 0.0),
+        )
     target = obs.target
     if target is not None:
         seen = obs.new_frame and target.measured
@@ -723,8 +730,14 @@ def _level(c: Context) -> Acted:
 
 
 def is_spent(c: Context) -> bool:
-    """Whether a level way down has come to its least thrust: nothing flies on that for long. What
-    only ended the stream would be cut and locked by the firmware 2 s later."""
+    """Whether a way down is over, whatever became of it: a level one has come to its least thrust,
+    on which nothing flies for long, or the setpoint to the floor. What only ended the stream would
+    be cut and locked by the firmware 2 s later."""
+    setpoint, ground_m = c.state.setpoint, c.state.ground_m
+    if setpoint is not None and ground_m is not None:
+        landing = c.profile.planner.landing
+        if c.state.row == "landing-timeout" and setpoint.z_m <= ground_m[2] + landing.handover_m:
+            return True
     return 0.0 < c.state.level_thrust <= LEAST_PART * c.state.hover_thrust + 1.0
 
 

@@ -161,9 +161,9 @@ def _judged(watch: MountWatch, against: int) -> MountWatch:
     return watch
 
 
-def explained(watch: MountWatch) -> str:
+def explained(turn_rad: Turn) -> str:
     """In words, the turn to the nearest quarter where it is about one, else to 10 degrees."""
-    turn_deg = math.degrees(watch.turn_rad)
+    turn_deg = math.degrees(turn_rad)
     quarter = 90.0 * round(turn_deg / 90.0)
     near = abs(turn_deg - quarter) <= 35.0 and quarter != 0.0
     shown = quarter if near else 10.0 * round(turn_deg / 10.0)

@@ -6,10 +6,12 @@ from __future__ import annotations
 from perchctl.mission.guards import (
     fence_broken,
     is_astray,
+    latency_changed,
     left_jump_hold,
     mounted_wrong,
     unsure,
     why_astray,
+    why_latency,
     why_mounted_wrong,
     why_unplaced,
 )
@@ -116,6 +118,9 @@ SAFETY: tuple[Row, ...] = (
         "battery-unknown", BEFORE_CONTACT,
         lambda c: c.obs.battery_age_s > c.profile.safety.battery_stale_s, P.LANDING,
         "the battery's reading stands still", S.LAND, O.SAFETY,
+    ),
+    Row(
+        "latency", IN_THE_OPEN, latency_changed, P.LANDING, why_latency, S.LAND, O.SAFETY,
     ),
     Row(
         "mounting", IN_THE_OPEN, mounted_wrong, P.LANDING, why_mounted_wrong, S.LAND, O.SAFETY,

@@ -8,6 +8,7 @@ from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
 from perchctl.mission.energy import EnergyState
+from perchctl.mission.felt import Mismatch
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
@@ -132,6 +133,7 @@ class Observation:
             its decks measure it.
         position_problem: why none is sent, None while they are.
         imu: the motion that accelerometer and attitude tell, by all samples up to `telemetry`.
+        mismatch: what the pictures show otherwise than `imu` feels it; None while they agree.
     """
 
     t_s: float
@@ -153,6 +155,7 @@ class Observation:
     position_age_s: float = 0.0
     position_problem: str | None = None
     imu: ImuMotion = field(default_factory=ImuMotion)
+    mismatch: Mismatch | None = None
 
 
 @dataclass(frozen=True)

@@ -65,20 +65,21 @@ class SimulatedVehicle:
 
     @property
     def t_s(self) -> float:
-        return self.firmware.t_s
+        """Simulated time since the start; unlike the firmware's, no reboot resets it."""
+        return self.world.t_s
 
     def advance_to(self, t_s: float) -> None:
         """Step until `t_s` (to the nearest control period)."""
         end_s = t_s - CONTROL_PERIOD_S / 2
         if self.camera is None or not self.watched:
-            while self.firmware.t_s < end_s:
+            while self.world.t_s < end_s:
                 self.step_blindly()
             return
         exposed_s = self.camera.exposed_s + 2.0 * CONTROL_PERIOD_S
-        due_s, t_s = self.camera.next_s - _TICK_S, self.firmware.t_s
+        due_s, t_s = self.camera.next_s - _TICK_S, self.world.t_s
         while t_s < end_s:
             self.step_blindly()
-            t_s = self.firmware.t_s
+            t_s = self.world.t_s
             if t_s >= due_s - exposed_s:
                 self._remember()
                 if t_s >= due_s:
@@ -91,7 +92,7 @@ class SimulatedVehicle:
         self.step_blindly()
         if self.camera is not None and self.watched:
             self._remember()
-            self.camera.advance(self.firmware.t_s, self._state_at)
+            self.camera.advance(self.world.t_s, self._state_at)
 
     def step_blindly(self) -> None:
         """One control period without the camera, which somebody else exposes."""

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.mission import planner
 from perchctl.mission.imu import ImuMotion
+from perchctl.mission.felt import Mismatch
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.row import Row, risen
 from perchctl.mission.state import (
@@ -190,6 +191,10 @@ CASES: dict[str, Case] = {
     ),
     "battery-low": Case(P.ASCEND, P.LANDING, flown(battery_v=2.8), 1.8, O.SAFETY),
     "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
+    "latency": Case(
+        P.ALIGN, P.LANDING,
+        seen(mismatch=Mismatch(START_S, 0.15, 0.0, (0.0, 0.0), (0.0, 0.0))), 0.1, O.SAFETY,
+    ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,
         state={"mount": MountWatch(against=SIGHTS_IN_A_ROW)},

@@ -1,0 +1,163 @@
+"""Whether the pictures show the motion that the vehicle feels.
+
+The target stands still. Its way from the body, turned by the attitude at the picture's exposure,
+and the body's own motion by its accelerometer add up to one place, but for what the
+accelerometer cannot know: the speed at the window's begin, and a constant offset. Where pictures
+are later than they are taken to be, or the camera is turned about the upward axis, the sum wanders;
+with the right delay or turn it comes to rest. The vehicle's estimate has no part in it: by the
+target alone it goes by the pictures itself.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from perchctl.geometry import Array
+from perchctl.mission.imu import Vector, acceleration_mps2
+from perchctl.values import replace
+from perchctl.vehicle import Telemetry
+
+WINDOW_S, LEAST_S, LEAST_SIGHTS = 1.2, 0.6, 10
+EVERY_S, AGREED = 0.05, 3
+"""It is judged so often, and so many judgements in a row have to agree."""
+STEP_S = 0.02
+_DELAYS_S, _QUARTERS_RAD = np.arange(-8, 26) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
+LATER_S = np.concatenate([_DELAYS_S, np.zeros(len(_QUARTERS_RAD))])
+TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
+AS_IT_IS = int(np.argmin(np.abs(LATER_S)))
+"""What is tried: delays beyond the one that is taken off the pictures' times, and turns."""
+OFFSET_MPS2, SIGMA_M = 0.2, 0.003
+"""Standard deviations: of the offset, an attitude's error of 1 deg with it, and of a sight."""
+LEAST_LATER_S = 0.1
+"""A lesser change swings an alignment by centimetres, and is told after the flight."""
+WANDERS_M, WANDERS_MORE = 0.005, 3.0
+"""The sum wanders: by so much, and by so much more than with the right delay or turn."""
+ALIKE_S = 3 * STEP_S
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """What would bring the target to rest: the pictures are `later_s` later than they are taken
+    to be, or the camera is turned by `turn_rad` about the vehicle's upward axis; the other is 0.
+
+    The vehicle's true motion at `t_s`, of the newest telemetry, sideways in world axes:
+    `velocity_mps`, and the `bias_mps2` of what accelerometer and attitude give too much.
+    """
+
+    t_s: float
+    later_s: float
+    turn_rad: float
+    velocity_mps: tuple[float, float]
+    bias_mps2: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FeltWatch:
+    """`sights` of the last `WINDOW_S`, each its time and the way from body to target in body
+    axes, m. `found`: the newest judgement, and `agreed`: how many in a row say the same."""
+
+    sights: tuple[tuple[float, Vector], ...] = ()
+    judged_s: float = -math.inf
+    found: Mismatch | None = None
+    agreed: int = 0
+
+    @property
+    def mismatch(self) -> Mismatch | None:
+        return self.found if self.agreed >= AGREED else None
+
+
+def felt(
+    old: FeltWatch, t_s: float, way_m: Vector, samples: tuple[Telemetry, ...], offset_g: Vector
+) -> FeltWatch:
+    """With one more sight. `samples`: the telemetry of the last 2 s, oldest first; `offset_g`: what
+    the accelerometer reads too much."""
+    kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
+    new = replace(old, sights=(*kept, (t_s, way_m)))
+    short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
+    if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
+        return new
+    judged = explained(new.sights, samples, offset_g)
+    if old.mismatch is not None:  # which stays, with the newest motion that it gives
+        return replace(new, judged_s=t_s, found=_followed(old.mismatch, *judged, samples[-1].t_s))
+    found = _found(*judged, samples[-1].t_s)
+    agrees = found is not None and old.found is not None and _alike(found, old.found)
+    agreed = 0 if found is None else old.agreed + 1 if agrees else 1
+    return replace(new, judged_s=t_s, found=found, agreed=agreed)
+
+
+def _alike(a: Mismatch, b: Mismatch) -> bool:
+    return a.turn_rad == b.turn_rad and abs(a.later_s - b.later_s) <= ALIKE_S
+
+
+def _found(wanders_m: Array, velocity_mps: Array, bias_mps2: Array, t_s: float) -> Mismatch | None:
+    """What explains the pictures where the profile does not."""
+    best = int(np.argmin(wanders_m))
+    if float(wanders_m[AS_IT_IS]) < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
+        return None
+    later_s = float(LATER_S[best])
+    if TURNS_RAD[best] == 0.0 and abs(later_s) < LEAST_LATER_S:
+        return None
+    return _mismatch(best, velocity_mps, bias_mps2, t_s)
+
+
+def _followed(
+    old: Mismatch, wanders_m: Array, velocity_mps: Array, bias_mps2: Array, t_s: float
+) -> Mismatch:
+    """The same, by newer sights that it explains."""
+    i = int(np.argmin(np.abs(LATER_S - old.later_s) + np.abs(TURNS_RAD - old.turn_rad)))
+    rests = float(wanders_m[i]) <= WANDERS_M
+    return _mismatch(i, velocity_mps, bias_mps2, t_s) if rests else old
+
+
+def _mismatch(i: int, velocity_mps: Array, bias_mps2: Array, t_s: float) -> Mismatch:
+    (vx, vy), (bx, by) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
+    return Mismatch(t_s, float(LATER_S[i]), float(TURNS_RAD[i]), (vx, vy), (bx, by))
+
+
+def explained(
+    sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
+) -> tuple[Array, Array, Array]:
+    """For each pair of `LATER_S` and `TURNS_RAD`, (n,): by how much the target moves, rms in m;
+    and with that the vehicle's speed at the newest sample and the offset, x and y, (2, n)."""
+    stamps_s = np.array([s.t_s for s in samples])
+    attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
+    attitudes[:, 2] = np.unwrap(attitudes[:, 2])
+    forces = np.array([acceleration_mps2(s, offset_g)[:2] for s in samples])
+    speeds = _integral(stamps_s, forces)
+    moved = _integral(stamps_s, speeds)
+
+    seen_s = np.array([t_s for t_s, _ in sights])
+    x, y, z = np.array([way_m for _, way_m in sights]).T
+    then_s = seen_s - LATER_S[:, None]
+    roll, pitch, yaw = (np.interp(then_s, stamps_s, column) for column in attitudes.T)
+    x, y = _turned(x, y, TURNS_RAD[:, None])
+    y, z = _turned(y, z, roll)
+    z, x = _turned(z, x, pitch)
+    x, y = _turned(x, y, yaw)
+    x = x + np.interp(then_s, stamps_s, moved[:, 0])
+    y = y + np.interp(then_s, stamps_s, moved[:, 1])
+
+    # What is left of both beyond a place, a speed and an offset.
+    u = seen_s - seen_s.mean()
+    unknown = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
+    known = np.diag([0.0, 0.0, (SIGMA_M / OFFSET_MPS2) ** 2])
+    sums = np.stack([x, y])  # (2, n, sights)
+    found = sums @ np.linalg.solve(unknown.T @ unknown + known, unknown.T).T
+    left = ((sums - found @ unknown.T) * sums).sum(axis=(0, 2))
+    newest_u = stamps_s[-1] + LATER_S - seen_s.mean()
+    velocity = speeds[-1][:, None] - found[..., 1] - found[..., 2] * newest_u
+    return np.sqrt(np.maximum(left, 0.0) / len(u)), velocity, found[..., 2]
+
+
+def _turned(a: Array, b: Array, by_rad: Array) -> tuple[Array, Array]:
+    c, s = np.cos(by_rad), np.sin(by_rad)
+    return c * a - s * b, s * a + c * b
+
+
+def _integral(t_s: Array, values: Array) -> Array:
+    """By trapezia, 0 at the first, (n, k)."""
+    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t_s)[:, None]
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])

@@ -1,0 +1,133 @@
+"""Pictures that are late, or of a camera that is turned, against the motion that is felt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
+from perchctl.mission.felt import LEAST_LATER_S, STEP_S, FeltWatch, felt
+from perchctl.vehicle import Telemetry
+
+TARGET_M = np.array([0.3, -0.2, 1.9])
+RATE_HZ = 30.0
+LATENCY_S = 0.2  # so much newer is the telemetry than the exposure is taken to be
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A level vehicle that swings about a place 1 m below the target, as its tilt leads it."""
+
+    size_m: float = 0.05
+    rate_radps: float = 4.5  # a pendulum of 1 m, 3.1, would keep the target in the line of sight
+    heading_rad: float = 0.4
+    jump_mps: float = 0.0  # a blow that the accelerometer misses, at 1 s
+
+    def position_m(self, t_s: float) -> Array:
+        a = self.rate_radps * t_s
+        x_m = self.size_m * math.sin(a) + self.jump_mps * max(0.0, t_s - 1.0)
+        return np.array([x_m, 0.5 * self.size_m * math.sin(1.3 * a), 0.9])
+
+    def velocity_mps(self, t_s: float) -> Array:
+        return (self.position_m(t_s + 1e-4) - self.position_m(t_s - 1e-4)) / 2e-4
+
+    def sample(self, t_s: float, offset_g: float) -> Telemetry:
+        w = self.rate_radps
+        a_x = -(w**2) * self.size_m * math.sin(w * t_s)
+        a_y = -((1.3 * w) ** 2) * 0.5 * self.size_m * math.sin(1.3 * w * t_s)
+        c, s = math.cos(self.heading_rad), math.sin(self.heading_rad)
+        ahead, left = c * a_x + s * a_y, c * a_y - s * a_x
+        pitch_rad, roll_rad = ahead / GRAVITY_MPS2, -left / GRAVITY_MPS2
+        R = rotation_from_rpy(roll_rad, pitch_rad, self.heading_rad)
+        force = R.T @ np.array([a_x, a_y, GRAVITY_MPS2]) / GRAVITY_MPS2
+        x_m, y_m, z_m = self.position_m(t_s).tolist()
+        return Telemetry(
+            t_s=t_s, position_m=(x_m, y_m, z_m), velocity_mps=(0.0, 0.0, 0.0),
+            roll_rad=roll_rad, pitch_rad=pitch_rad, yaw_rad=self.heading_rad,
+            acc_x_g=float(force[0]) + offset_g, acc_y_g=float(force[1]), acc_z_g=float(force[2]),
+            thrust=30000.0, battery_v=3.9, supervisor=0,
+        )  # fmt: skip
+
+    def way_m(self, t_s: float, turned_rad: float) -> tuple[float, float, float]:
+        """From the body to the target, as a camera sees it that is turned by so much."""
+        sample = self.sample(t_s, 0.0)
+        R = rotation_from_rpy(sample.roll_rad, sample.pitch_rad, sample.yaw_rad)
+        x, y, z = (rot_z(-turned_rad) @ R.T @ (TARGET_M - self.position_m(t_s))).tolist()
+        return x, y, z
+
+
+def watched(
+    swing: Swing,
+    *,
+    later_s: float = 0.0,
+    turned_rad: float = 0.0,
+    offset_g: float = 0.0,
+    for_s: float = 1.5,
+    seed: int = 0,
+) -> FeltWatch:
+    rng = np.random.default_rng(seed)
+    watch = FeltWatch()
+    flown = [swing.sample(0.01 * k, offset_g) for k in range(int((for_s + 2.2) * 100) + 1)]
+    for i in range(int(for_s * RATE_HZ)):
+        t_s = 2.0 + i / RATE_HZ
+        newest = int((t_s + LATENCY_S) * 100.0)
+        samples = tuple(flown[newest - 200 : newest + 1])
+        x, y, z = swing.way_m(t_s - later_s, turned_rad)
+        x, y = x + float(rng.normal(0.0, 1e-3)), y + float(rng.normal(0.0, 1e-3))
+        watch = felt(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0))
+    return watch
+
+
+@settings(deadline=None, max_examples=12)
+@given(
+    later_s=st.floats(LEAST_LATER_S + STEP_S, 0.4) | st.floats(-0.15, -LEAST_LATER_S - STEP_S),
+    size_m=st.floats(0.02, 0.06),
+    offset_g=st.floats(-0.02, 0.02),
+    heading_rad=st.floats(-3.0, 3.0),
+)
+def test_a_delay_is_found_and_the_speed_with_it(
+    later_s: float, size_m: float, offset_g: float, heading_rad: float
+) -> None:
+    swing = Swing(size_m, heading_rad=heading_rad)
+    mismatch = watched(swing, later_s=later_s, offset_g=offset_g).mismatch
+    assert mismatch is not None
+    assert mismatch.turn_rad == 0.0
+    assert mismatch.later_s == pytest.approx(later_s, abs=1.5 * STEP_S)
+    true_mps = swing.velocity_mps(mismatch.t_s)[:2]
+    assert mismatch.velocity_mps == pytest.approx(true_mps, abs=0.05)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, -1])
+def test_a_turned_camera_is_found(quarters: int) -> None:
+    turned_rad = 0.5 * math.pi * quarters
+    swing = Swing()
+    mismatch = watched(swing, turned_rad=turned_rad).mismatch
+    assert mismatch is not None
+    assert mismatch.later_s == 0.0
+    assert mismatch.turn_rad == pytest.approx(turned_rad)
+    assert mismatch.velocity_mps == pytest.approx(swing.velocity_mps(mismatch.t_s)[:2], abs=0.03)
+
+
+@settings(deadline=None, max_examples=12)
+@given(
+    size_m=st.floats(0.0, 0.06),
+    later_s=st.floats(-0.04, 0.04),
+    jump_mps=st.floats(-1.0, 1.0),
+    offset_g=st.floats(-0.02, 0.02),
+)
+def test_a_camera_as_the_profile_has_it_fits(
+    size_m: float, later_s: float, jump_mps: float, offset_g: float
+) -> None:
+    """Also through a blow that no sample of the accelerometer shows."""
+    swing = Swing(size_m, jump_mps=jump_mps)
+    assert watched(swing, later_s=later_s, offset_g=offset_g).mismatch is None
+
+
+def test_at_rest_nothing_is_known() -> None:
+    assert watched(Swing(0.0), later_s=0.3).mismatch is None
+    assert watched(Swing(0.0), turned_rad=math.pi).mismatch is None
