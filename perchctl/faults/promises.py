@@ -43,11 +43,11 @@ class Promise:
 PROMISES = (
     Promise(
         "camera silent, frozen, snowing, dark, late, lossy; target covered",
-        "held after 0.5 s, landed after 3 s; in the ascent it backs off down; landed where the latency "
-        "changes by 0.1 s, and named",
+        "held after 0.5 s, landed after 3 s; in the ascent it backs off down; landed "
+        "where the latency changes by 0.1 s, and named",
         ("camera-silent", "camera-frozen", "camera-snow", "camera-dark", "camera-late",
-         "latency-falls", "camera-out-of-order", "camera-lossy", "target-covered", "covered-and-kick",
-         "covered-and-gust"),
+         "latency-falls", "camera-out-of-order", "camera-lossy", "target-covered",
+         "covered-and-kick", "covered-and-gust"),
     ),
     Promise(
         "picture mirrored",

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.mission import planner
-from perchctl.mission.imu import ImuMotion
 from perchctl.mission.felt import Mismatch
+from perchctl.mission.imu import ImuMotion
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
 from perchctl.mission.row import Row, risen
 from perchctl.mission.state import (
