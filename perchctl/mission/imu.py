@@ -66,6 +66,7 @@ class ImuMotion:
         gap_s: end of the newest silence that a fall could hide in.
         steady_s: since when the vertical speed has stayed what it is.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
+        frozen_s: for how long the accelerometer has read the very same: what lives never does.
         hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
     """
 
@@ -81,6 +82,7 @@ class ImuMotion:
     offset_mps2: float = 0.0
     blow_mps: float = 0.0
     blow_s: float = -math.inf
+    frozen_s: float = 0.0
     hover_thrust: float = 0.0
 
 
@@ -125,8 +127,13 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         offset_mps2=offset,
         blow_mps=blow,
         blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
+        frozen_s=motion.frozen_s + dt_s if _reads_the_same(last, new) else 0.0,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
     )
+
+
+def _reads_the_same(a: Telemetry, b: Telemetry) -> bool:
+    return (a.acc_x_g, a.acc_y_g, a.acc_z_g) == (b.acc_x_g, b.acc_y_g, b.acc_z_g)
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
