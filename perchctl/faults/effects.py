@@ -98,7 +98,7 @@ class BatterySags:
 @dataclass(frozen=True)
 class Reboots:
     """The voltage breaks down and the vehicle starts again: its motors stop, for `boots_s` it hears
-    nothing, and its log blocks are gone."""
+    nothing, and its log blocks are gone until the link starts them again."""
 
     boots_s: float
 

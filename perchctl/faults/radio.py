@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from perchctl.faults.effects import (
-    FOR_EVER,
     BlockDead,
     PacketLost,
     PacketTwice,
@@ -11,6 +10,7 @@ from perchctl.faults.effects import (
     Silence,
     TelemetryDelayed,
 )
+from perchctl.link.log_blocks import FORGOTTEN_S, RESUME_PERIOD_S
 from perchctl.link.mock import Radio
 from perchctl.sim.crtp.codec import Packet, Port
 from perchctl.sim.crtp.commands import CommandService
@@ -66,7 +66,8 @@ class FaultyRadio(Radio):
                 self._twice.add(order)
             case Reboots(boots_s):
                 self._begun.append((Silence(boots_s, up=True, down=True), now_s))
-                self._begun.append((Silence(FOR_EVER, up=False, down=True), now_s))
+                unasked_s = boots_s + FORGOTTEN_S + RESUME_PERIOD_S
+                self._begun.append((Silence(unasked_s, up=False, down=True), now_s))
             case Silence() | BlockDead() | TelemetryDelayed():
                 self._begun.append((effect, now_s))
 

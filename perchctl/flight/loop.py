@@ -110,6 +110,7 @@ def fly(parts: FlightParts) -> FlightReport:
             senses.history,
             parts.position_age_s,
             told,
+            senses.felt.motion,
         )
         with contextlib.suppress(Exception):  # the log may be what failed
             turns.failed(senses, error)

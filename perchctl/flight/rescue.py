@@ -11,6 +11,7 @@ from perchctl.flight.history import History, extended
 from perchctl.link.protocol import Link, ToldSent, tell_nobody
 from perchctl.mission import lander
 from perchctl.mission.context import Context
+from perchctl.mission.felt import FeltMotion
 from perchctl.mission.lander import Finding
 from perchctl.mission.sent import Sent
 from perchctl.mission.state import Condition, Observation, Operator, PlannerState
@@ -30,13 +31,14 @@ def rescue(
     history: History,
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     told: ToldSent = tell_nobody,
+    felt: FeltMotion | None = None,
 ) -> Finding | None:
     """Fly the way down without the planner, the camera and the log, bounded by the landing's
     time. Returns where the vehicle is, once its motors have been seen off; else None.
 
     `state` is the planner's last, None before its first tick; `history` the telemetry so far;
     `position_age_s` how old the newest position from outside is at a time. By the target none is
-    sent any more. `told` is given what was sent.
+    sent any more. `told` is given what was sent; `felt` is the motion that pictures last agreed on.
     """
 
     def send(command: Command) -> None:
@@ -63,6 +65,7 @@ def rescue(
                     math.inf if profile.positioning.by == "target" else position_age_s(now_s)
                 ),
                 imu=history.imu,
+                felt=felt,
             )
             state, command = lander.step(state or _before_take_off(obs), obs, profile)
             if not isinstance(command, Idle):

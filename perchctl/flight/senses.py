@@ -42,7 +42,7 @@ ENDED = " has ended"
 SENSED = (
     "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
     "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
-    "mismatch",
+    "felt", "mismatch",
 )  # fmt: skip
 """The fields of an `Observation` that come from here; the others are the loop's."""
 
@@ -171,6 +171,7 @@ class Senses:
             delay_s=self.noticed.used_s,
             target_refused=self.refused,
             imu=self.history.imu,
+            felt=self.felt.motion,
             mismatch=self.felt.mismatch,
         )
 

@@ -10,7 +10,7 @@ loop's place.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from perchctl.flight.history import History, extended
@@ -105,7 +105,9 @@ class Watchdog:
 
     # --- the link's side ---------------------------------------------------------------
 
-    def poll(self, now_s: float, newest: Telemetry | None) -> Command | None:
+    def poll(
+        self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
+    ) -> Command | None:
         """What has to be sent now in the loop's place, if anything."""
         last = self._last
         if self._cut_ordered:
@@ -125,7 +127,7 @@ class Watchdog:
         overruled = operator is Operator.LAND or late_s > self._land_s
         if overruled:
             self.overruled_s = max(self.overruled_s, late_s)
-        obs = self._observed(now_s, last, newest)
+        obs = self._observed(now_s, last, newest, waiting)
         if overruled or self._way_down is not None or _is_on_its_way_down(last.state):
             return self._land(obs, last)
         return self._hold(now_s, last, newest)
@@ -138,11 +140,17 @@ class Watchdog:
         self._cut_s, self._cuts = now_s, self._cuts + 1
         return EmergencyStop()
 
-    def _observed(self, now_s: float, last: LastTick, newest: Telemetry | None) -> Observation:
+    def _observed(
+        self,
+        now_s: float,
+        last: LastTick,
+        newest: Telemetry | None,
+        waiting: Sequence[Telemetry],
+    ) -> Observation:
         """What is known now: the newest telemetry, and no picture."""
         if self._history is None:
             self._history = History((last.obs.telemetry,), imu=last.obs.imu)
-        new = [] if newest is None else [newest]
+        new = [*waiting, *([] if newest is None else [newest])]
         self._history = history = extended(self._history, new, self._profile.safety)
         age_s = self._position_age_s(now_s)
         if self._profile.positioning.by == "target":  # no sight is sent without the loop
@@ -155,6 +163,8 @@ class Watchdog:
             loop_late_s=now_s - last.obs.t_s,
             position_age_s=age_s,
             imu=history.imu,
+            felt=last.obs.felt,
+            mismatch=last.obs.mismatch,
         )
 
     def _land(self, obs: Observation, last: LastTick) -> Command | None:

@@ -206,7 +206,7 @@ class CflibLink:
         """In the thread of the sender's that never touches cflib."""
         if self._guard is None:
             return None
-        return self._guard.poll(self._clock(), self._blocks.newest)
+        return self._guard.poll(self._clock(), self._blocks.newest, self._blocks.waiting)
 
     def _hand_over(self, packet: Packet) -> bool:
         """In the sender's thread."""

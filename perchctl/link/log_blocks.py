@@ -79,6 +79,11 @@ class LogBlocks:
             arrived.append(self._samples.popleft())
         return arrived
 
+    @property
+    def waiting(self) -> list[Telemetry]:
+        """Samples that the next `take` gives, from any thread."""
+        return list(self._samples.copy())
+
     def resume(self, send: Callable[[Packet], bool]) -> bool:
         """Start the blocks again that come no more: one packet, whether it went out.
 

@@ -133,7 +133,7 @@ class MockLink:
             return
         self._watched_s = self.now_s
         self._collect()
-        command = self._guard.poll(self.now_s, self._newest)
+        command = self._guard.poll(self.now_s, self._newest, self._arrived)
         if command is not None:
             self.send(command)
             self._told(Sent(self.now_s, "watchdog", command))

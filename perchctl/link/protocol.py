@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from perchctl.mission.sent import Sent
@@ -19,11 +19,14 @@ def tell_nobody(sent: Sent) -> None:
 class Guard(Protocol):
     """Who looks after the vehicle while the flight loop is silent."""
 
-    def poll(self, now_s: float, newest: Telemetry | None) -> Command | None:
+    def poll(
+        self, now_s: float, newest: Telemetry | None, waiting: Sequence[Telemetry] = ()
+    ) -> Command | None:
         """What the link has to send now of itself, None almost always.
 
         Called about every 50 ms, in a thread of the link's own where it has one, but not while a
-        command waits that cannot go out; `newest` is the newest telemetry that has arrived."""
+        command waits that cannot go out; `newest` is the newest telemetry that has arrived,
+        and `waiting` what the loop has not taken in yet, oldest first."""
 
 
 class Link(Protocol):

@@ -110,11 +110,10 @@ class Context:
     @property
     def climb_mps(self) -> float:
         """Vertical speed: the estimate's where that is believed and fresh, else as reckoned by the
-        accelerometer, as long as that lives."""
+        accelerometer."""
         blind = self.state.blind_s is not None or not self.placed
         reckoning = self.state.reckoning
-        lives = self.obs.imu.frozen_s <= self.profile.safety.proof_age_s
-        if blind and reckoning.imu is not None and lives:
+        if blind and reckoning.imu is not None:
             return reckoning.velocity_mps[2]
         return self.obs.telemetry.velocity_mps[2]
 

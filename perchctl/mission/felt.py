@@ -27,7 +27,6 @@ STEP_S = 0.02
 _DELAYS_S, _QUARTERS_RAD = np.arange(-8, 26) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
 LATER_S = np.concatenate([_DELAYS_S, np.zeros(len(_QUARTERS_RAD))])
 TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
-AS_IT_IS = int(np.argmin(np.abs(LATER_S)))
 """What is tried: delays beyond the one that is taken off the pictures' times, and turns."""
 OFFSET_MPS2, SIGMA_M = 0.2, 0.003
 """Standard deviations: of the offset, an attitude's error of 1 deg with it, and of a sight."""
@@ -41,15 +40,18 @@ ALIKE_S = 3 * STEP_S
 @dataclass(frozen=True)
 class Mismatch:
     """What would bring the target to rest: the pictures are `later_s` later than they are taken
-    to be, or the camera is turned by `turn_rad` about the vehicle's upward axis; the other is 0.
+    to be, or the camera is turned by `turn_rad` about the vehicle's upward axis; the other is 0."""
 
-    The vehicle's true motion at `t_s`, of the newest telemetry, sideways in world axes:
-    `velocity_mps`, and the `bias_mps2` of what accelerometer and attitude give too much.
-    """
+    later_s: float = 0.0
+    turn_rad: float = 0.0
+
+
+@dataclass(frozen=True)
+class FeltMotion:
+    """The vehicle's motion sideways, world axes, by pictures and accelerometer: its speed at `t_s`,
+    and by how much the accelerometer and the attitude give too much."""
 
     t_s: float
-    later_s: float
-    turn_rad: float
     velocity_mps: tuple[float, float]
     bias_mps2: tuple[float, float]
 
@@ -57,12 +59,14 @@ class Mismatch:
 @dataclass(frozen=True)
 class FeltWatch:
     """`sights` of the last `WINDOW_S`, each its time and the way from body to target in body
-    axes, m. `found`: the newest judgement, and `agreed`: how many in a row say the same."""
+    axes, m. `found`: the newest judgement, and `agreed`: how many in a row say the same. `motion`:
+    the newest that the sights are sure of."""
 
     sights: tuple[tuple[float, Vector], ...] = ()
     judged_s: float = -math.inf
     found: Mismatch | None = None
     agreed: int = 0
+    motion: FeltMotion | None = None
 
     @property
     def mismatch(self) -> Mismatch | None:
@@ -79,42 +83,37 @@ def felt(
     short = t_s - new.sights[0][0] < LEAST_S or len(new.sights) < LEAST_SIGHTS
     if short or len(samples) < LEAST_SIGHTS or t_s - old.judged_s < EVERY_S:
         return new
-    judged = explained(new.sights, samples, offset_g)
-    if old.mismatch is not None:  # which stays, with the newest motion that it gives
-        return replace(new, judged_s=t_s, found=_followed(old.mismatch, *judged, samples[-1].t_s))
-    found = _found(*judged, samples[-1].t_s)
-    agrees = found is not None and old.found is not None and _alike(found, old.found)
-    agreed = 0 if found is None else old.agreed + 1 if agrees else 1
-    return replace(new, judged_s=t_s, found=found, agreed=agreed)
+    wanders_m, velocity_mps, bias_mps2 = explained(new.sights, samples, offset_g)
+    if old.mismatch is None:  # else it stays
+        found = _found(wanders_m)
+        agrees = found is not None and old.found is not None and _alike(found, old.found)
+        agreed = 0 if found is None else old.agreed + 1 if agrees else 1
+        new = replace(new, found=found, agreed=agreed)
+    i = _nearest(new.mismatch or Mismatch())
+    if wanders_m[i] <= WANDERS_M:
+        (vx, vy), (bx, by) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
+        new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by)))
+    return replace(new, judged_s=t_s)
 
 
 def _alike(a: Mismatch, b: Mismatch) -> bool:
     return a.turn_rad == b.turn_rad and abs(a.later_s - b.later_s) <= ALIKE_S
 
 
-def _found(wanders_m: Array, velocity_mps: Array, bias_mps2: Array, t_s: float) -> Mismatch | None:
+def _nearest(mismatch: Mismatch) -> int:
+    """Which of those that are tried."""
+    later_s, turn_rad = mismatch.later_s, mismatch.turn_rad
+    return int(np.argmin(np.abs(LATER_S - later_s) + np.abs(TURNS_RAD - turn_rad)))
+
+
+def _found(wanders_m: Array) -> Mismatch | None:
     """What explains the pictures where the profile does not."""
     best = int(np.argmin(wanders_m))
-    if float(wanders_m[AS_IT_IS]) < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
+    as_it_is = float(wanders_m[_nearest(Mismatch())])
+    if as_it_is < max(WANDERS_M, WANDERS_MORE * float(wanders_m[best])):
         return None
-    later_s = float(LATER_S[best])
-    if TURNS_RAD[best] == 0.0 and abs(later_s) < LEAST_LATER_S:
-        return None
-    return _mismatch(best, velocity_mps, bias_mps2, t_s)
-
-
-def _followed(
-    old: Mismatch, wanders_m: Array, velocity_mps: Array, bias_mps2: Array, t_s: float
-) -> Mismatch:
-    """The same, by newer sights that it explains."""
-    i = int(np.argmin(np.abs(LATER_S - old.later_s) + np.abs(TURNS_RAD - old.turn_rad)))
-    rests = float(wanders_m[i]) <= WANDERS_M
-    return _mismatch(i, velocity_mps, bias_mps2, t_s) if rests else old
-
-
-def _mismatch(i: int, velocity_mps: Array, bias_mps2: Array, t_s: float) -> Mismatch:
-    (vx, vy), (bx, by) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
-    return Mismatch(t_s, float(LATER_S[i]), float(TURNS_RAD[i]), (vx, vy), (bx, by))
+    found = Mismatch(float(LATER_S[best]), float(TURNS_RAD[best]))
+    return found if found.turn_rad or abs(found.later_s) >= LEAST_LATER_S else None
 
 
 def explained(

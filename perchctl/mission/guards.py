@@ -211,9 +211,7 @@ def why_pressed_blindly(c: Context) -> str:
 
 
 def why_unplaced(c: Context) -> str:
-    if c.by_sight:
-        return f"{unplaced(c)}; down level, by thrust alone"
-    return f"{unplaced(c)}; landing by what is left of the estimate"
+    return f"{unplaced(c)}; down level, by thrust alone"
 
 
 def why_astray(c: Context) -> str:

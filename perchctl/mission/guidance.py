@@ -176,4 +176,4 @@ def unpressed(c: Context) -> tuple[PlannerState, PositionSetpoint | None]:
     if tel.velocity_mps[2] < FALLING_MPS:
         below_m = 0.0
     setpoint = PositionSetpoint(x, y, tel.position_m[2] - below_m, state.entry_yaw_rad)
-    return state, setpoint
+    return state, limited(c, setpoint)

@@ -23,6 +23,8 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 
 GAP_S = 0.2
 """A silence in which a vehicle falls by 20 cm, or more than it may and still hang."""
+FROZEN_S = 0.2
+"""An accelerometer that reads the very same for so long is a silence, too."""
 FALL_G, FALL_S = 0.6, 0.1
 """Specific force of a fall, and how long it lasts before it counts: an impact is shorter."""
 SINK_MPS = -0.25
@@ -66,7 +68,7 @@ class ImuMotion:
         gap_s: end of the newest silence that a fall could hide in.
         steady_s: since when the vertical speed has stayed what it is.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
-        frozen_s: for how long the accelerometer has read the very same: what lives never does.
+        frozen_s: for how long the accelerometer has read the very same, as none that lives does.
         hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
     """
 
@@ -89,11 +91,13 @@ class ImuMotion:
 def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """The motion with one more sample; `last` is the one before, None at the first."""
     dt_s = math.inf if last is None else new.t_s - last.t_s
-    if last is None or not 0.0 < dt_s <= GAP_S:
+    same = last is not None and _reads_the_same(last, new)
+    frozen_s = motion.frozen_s + max(0.0, dt_s) if same else 0.0
+    if last is None or not 0.0 < dt_s <= GAP_S or frozen_s > FROZEN_S:
         gap_s = motion.gap_s if last is None else new.t_s
         return replace(
             motion, t_s=new.t_s, gap_s=gap_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
-            steady_mps=motion.velocity_mps[2], light_since_s=math.inf,
+            steady_mps=motion.velocity_mps[2], light_since_s=math.inf, frozen_s=frozen_s,
         )  # fmt: skip
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has(FLYING):
@@ -127,7 +131,7 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         offset_mps2=offset,
         blow_mps=blow,
         blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
-        frozen_s=motion.frozen_s + dt_s if _reads_the_same(last, new) else 0.0,
+        frozen_s=frozen_s,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
     )
 
@@ -202,6 +206,13 @@ def reckoned(
         velocity_mps = estimated if believed else ZERO
         if astray:
             velocity_mps = old.velocity_mps
+        elif not believed and old.imu is not None:
+            # No position corrects the estimate in a silence: its change is what was felt on board.
+            vx, vy, vz = (
+                v + e - o
+                for v, e, o in zip(old.velocity_mps, estimated, old.estimated_mps, strict=True)
+            )
+            velocity_mps = (vx, vy, vz)
         unknown = replace(old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated)
         return unknown if old.imu is None else replace(unknown, aside_sigma_m=math.inf)
     dt_s = imu.t_s - old.imu.t_s

@@ -136,8 +136,6 @@ PLANNED_MPS, SETTLING_S = 0.35, 1.8
 """The quintic's largest speed, and time added for its begin: it starts at rest, while the
 vehicle comes sinking, and what the vehicle then catches up with must be slow."""
 MOST_DRIFT_M = 1.0
-BLIND_DRIFT_MPS = 0.08
-"""Of a height that no position from outside corrects: the most that 40 simulated landings had."""
 UNKNOWN_M = 1.0
 """The height to come down from where none is known."""
 PEELED_M = 0.1
@@ -163,7 +161,7 @@ MOST_GAIN_S_PER_M, LEAST_GAIN_S_PER_M, GAIN_AGE_S2_PER_M = 0.5, 0.2, 0.06
 """Part of the hover thrust for each m/s. A speed of long ago wants less, or it swings."""
 HOVER_MEMORY_S, HOVER_WITHIN, UNLEARNED_WITHIN = 0.3, 0.12, 0.35
 """The hover thrust is what the thrust is for each g that is felt, in free flight."""
-LATEST_S, UNHEARD_PART = 1.0, 0.98
+LATEST_S, UNHEARD_PART, OWN_ESTIMATE_S = 1.0, 0.98, 1.5
 """Telemetry so late still tells how fast it sank, and what was ordered since adds to that. Where
 nothing is heard, a little less than what should be right: it has to come down."""
 RAMP_PER_S, STILL_MPS = 0.25, 0.05
@@ -177,7 +175,9 @@ BRAKED_AGE_S = 0.2
 UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
 """Of the reckoned speed so much is left alone: an attitude that is 0.01 rad wrong makes 0.1 m/s of
 it each second, and braking that would drive the vehicle aside."""
-STOP_BELOW_M, STANDS_BELOW_M, RESTS_MPS = 0.05, 0.01, 0.1
+LEVEL_FELT_S = 2.0
+"""An attitude's error that pictures told is not the present one for longer."""
+STOP_BELOW_M, RESTS_MPS = 0.05, 0.1
 UNANSWERED_PART = 0.12
 """Of full thrust: farther from the order no ramp leads in the time that an order takes."""
 CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
@@ -231,7 +231,7 @@ def started(
         new, contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
     )  # fmt: skip
-    return blinded(new, obs) if c.by_sight and not _is_sighted(c) else new
+    return blinded(new, obs) if _has_lost_its_position(c) else new
 
 
 # --- What is known ------------------------------------------------------------------------------
@@ -240,7 +240,7 @@ def started(
 def evidence_of(c: Context) -> Evidence:
     """The best that is fresh in this tick."""
     heard = c.attitude_age_s <= c.profile.safety.telemetry_hold_s
-    if c.by_sight or c.state.astray:
+    if c.by_sight or c.state.astray or c.state.blind_s is not None:
         if not heard:
             return Evidence.NOTHING
         if c.state.blind_s is not None or c.state.astray or not _is_sighted(c):
@@ -266,6 +266,13 @@ def _is_doubtful(c: Context) -> bool:
 def _is_sighted(c: Context) -> bool:
     """Whether the position by the target is one to come down by."""
     return c.located and not c.is_blown and not _is_doubtful(c)
+
+
+def _has_lost_its_position(c: Context) -> bool:
+    """Whether accelerometer and attitude are what is left: nothing from outside places it."""
+    if c.by_sight:
+        return not _is_sighted(c)
+    return c.profile.positioning.by == "mocap" and not (c.located or c.state.astray)
 
 
 def reach_of(c: Context) -> Reach:
@@ -376,7 +383,7 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
     state = _reckon(Context(_answered(state, obs, profile), obs, profile))
     c = Context(state, obs, profile)
     comes_down = state.phase is Phase.LANDING and stage_of(c) in (Stage.DOWN, Stage.ORDERED)
-    if comes_down and c.by_sight and state.blind_s is None and not _is_sighted(c):
+    if comes_down and state.blind_s is None and _has_lost_its_position(c):
         return blinded(state, obs)
     return state
 
@@ -416,7 +423,7 @@ def _reckon(c: Context) -> PlannerState:
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=state.astray)
-    felt = obs.mismatch
+    felt = obs.felt
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         new = replace(
             new,
@@ -540,9 +547,9 @@ def _stands(c: Context) -> bool:
     if c.proves and c.held(Condition.ON_FLOOR) >= 0.5:
         return True
     # Where height is measured, it stops instead of sliding: as soon as it sinks no more.
-    low = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
-    resting = c.climb_mps > -RESTS_MPS or c.height_m < STANDS_BELOW_M
-    return low and resting and c.height_m < STOP_BELOW_M and reach_of(c) is Reach.FREE
+    level = c.by_sight and c.placed and c.state.blind_s is None and c.state.level_thrust > 0.0
+    low = c.height_m < STOP_BELOW_M and reach_of(c) is Reach.FREE
+    return level and low and c.climb_mps > -RESTS_MPS
 
 
 def _caught_again(c: Context) -> Acted:
@@ -636,15 +643,13 @@ def own_landing(
     ground_z_m: float,
     flown_s: float,
     newest: Telemetry | None,
-    blind_s: float = 0.0,
 ) -> Land:
     """The order for the vehicle's own landing, which follows a quintic from rest to rest.
 
     It aims below the ground, and the lower the longer the estimate has had to drift: the
     motors stop at the trajectory's end, and over a floor that lies lower they would drop it.
     It never aims above where the estimate has the vehicle, which may be far below the ground by
-    now: that would be a climb. `blind_s`: for how long no position from outside has come; until
-    the floor none will, so it aims deeper in the same time, which is faster.
+    now: that would be a climb.
     """
     z_m = math.nan if newest is None else newest.position_m[2]
     below_m = landing.undershoot_m + min(MOST_DRIFT_M, landing.drift_mps * max(0.0, flown_s))
@@ -652,8 +657,6 @@ def own_landing(
     aim_m = (min(ground_z_m, z_m) if known else ground_z_m) - below_m
     way_m = z_m - aim_m if known else UNKNOWN_M
     lasts_s = SETTLING_S + _PEAK_OF_MEAN * way_m / PLANNED_MPS
-    if blind_s > 0.0:
-        aim_m -= min(MOST_DRIFT_M, BLIND_DRIFT_MPS * (blind_s + lasts_s))
     return Land(aim_m, lasts_s)
 
 
@@ -674,8 +677,7 @@ def _own_landing(c: Context) -> Acted:
     seen = state.orders >= LEAST_ORDERS and c.imu_proves and c.high_level_active
     if not seen and waited > REPEAT_ORDER_S and state.orders < MAX_ORDERS:
         flown_s = c.obs.t_s - state.started_s
-        blind_s = 0.0 if c.placed else c.obs.position_age_s
-        order = own_landing(landing, ground_z, flown_s, tel, blind_s)
+        order = own_landing(landing, ground_z, flown_s, tel)
         return replace(state, ordered_s=c.obs.t_s, orders=state.orders + 1, setpoint=None), order
     return state, Idle()
 
@@ -687,8 +689,11 @@ def _level(c: Context) -> Acted:
     the vehicle. Tilted against the sideways speed that it has."""
     state, tel = c.state, c.obs.telemetry
     dt_s = max(0.0, min(0.1, c.obs.t_s - state.t_s))
-    age_s = max(dt_s, c.attitude_age_s)
+    age_s = max(1e-3, dt_s, c.attitude_age_s)
     unheard = age_s > LATEST_S
+    unlearned = state.level_thrust == 0.0 and state.level_within == UNLEARNED_WITHIN
+    if unheard and unlearned and c.in_phase_s < OWN_ESTIMATE_S:
+        return _by_setpoints(c)  # the vehicle's own estimate is nearer than an unknown thrust
     climb_mps = c.climb_mps + state.under_way_mps
     hover = _learned_hover(c, dt_s)
     height_m = c.height_m if state.blind_s is None else state.blind_height_m
@@ -784,7 +789,8 @@ def _is_overdue(c: Context) -> bool:
 
 
 def _braking(c: Context) -> tuple[float, float]:
-    """Roll and pitch against the sideways speed, unless the heading is lost."""
+    """Roll and pitch against the sideways speed, and against the attitude's error where pictures
+    tell it, unless the heading is lost."""
     if c.state.heading_lost or reach_of(c) is Reach.MAGNET:
         return 0.0, 0.0
     yaw_rad = c.obs.telemetry.yaw_rad
@@ -792,10 +798,13 @@ def _braking(c: Context) -> tuple[float, float]:
     x_mps, y_mps, _ = c.state.reckoning.velocity_mps
     speed_mps = max(1e-6, math.hypot(x_mps, y_mps))
     blind_s = 0.0 if c.state.blind_s is None else c.obs.t_s - c.state.blind_s
-    unsure_mps = min(MOST_UNSURE_MPS, UNSURE_MPS + UNSURE_MPS2 * blind_s)
+    felt_s = math.inf if c.obs.felt is None else c.obs.t_s - c.obs.felt.t_s
+    unsure_mps = min(MOST_UNSURE_MPS, UNSURE_MPS + UNSURE_MPS2 * min(blind_s, felt_s))
     part = max(0.0, 1.0 - unsure_mps / speed_mps)
     part *= min(1.0, BRAKED_AGE_S / max(1e-3, c.attitude_age_s))
-    x_mps, y_mps = part * x_mps, part * y_mps
+    level_s = max(0.0, 1.0 - felt_s / LEVEL_FELT_S) / (GRAVITY_MPS2 * BRAKE_RAD_PER_MPS)
+    bx_mps2, by_mps2, _ = c.state.reckoning.bias_mps2
+    x_mps, y_mps = part * x_mps - level_s * bx_mps2, part * y_mps - level_s * by_mps2
     ahead_mps, left_mps = x_mps * cos + y_mps * sin, y_mps * cos - x_mps * sin
     return _against(-left_mps), _against(ahead_mps)
 

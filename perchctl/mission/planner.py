@@ -148,8 +148,11 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         entry_yaw_rad=obs.telemetry.yaw_rad,
         search_step_s=obs.t_s,
         confirmed=0,
-        # A fall that is just being caught turns at full thrust, in the air.
-        pressed=row.to in (Phase.RECOVER, Phase.LANDING) and state.caught and presses(context),
+        # A fall that is just being caught turns at full thrust, in the air. A press that was
+        # ordered has wound the integrators up, whatever thrust is read.
+        pressed=row.to in (Phase.RECOVER, Phase.LANDING)
+        and state.caught
+        and (state.phase is Phase.PERCH or presses(context)),
         ordered_s=None,
         orders=0,
     )

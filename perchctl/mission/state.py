@@ -8,7 +8,7 @@ from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
 from perchctl.mission.energy import EnergyState
-from perchctl.mission.felt import Mismatch
+from perchctl.mission.felt import FeltMotion, Mismatch
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
@@ -133,6 +133,7 @@ class Observation:
             its decks measure it.
         position_problem: why none is sent, None while they are.
         imu: the motion that accelerometer and attitude tell, by all samples up to `telemetry`.
+        felt: the motion sideways that pictures and accelerometer last agreed on.
         mismatch: what the pictures show otherwise than `imu` feels it; None while they agree.
     """
 
@@ -155,6 +156,7 @@ class Observation:
     position_age_s: float = 0.0
     position_problem: str | None = None
     imu: ImuMotion = field(default_factory=ImuMotion)
+    felt: FeltMotion | None = None
     mismatch: Mismatch | None = None
 
 

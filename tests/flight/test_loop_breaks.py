@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from perchctl.flight import loop, senses
-from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, PEEL_S, Finding, own_landing
+from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, PEEL_S, Finding
 from perchctl.mission.state import Operator, Phase
 from perchctl.mission.watch import Tick
 from perchctl.profile import Profile
@@ -183,12 +183,12 @@ def test_a_rescue_lands_on_the_ground_that_it_started_from() -> None:
     assert -1.0 < aims[0] <= 0.0
 
 
-def test_a_rescue_without_positions_from_outside_aims_as_the_planner_does() -> None:
-    known = telemetry(-1.0, 1.5)
-    rig = Rig(Vehicle(lambda s: None), profile=Profile.model_validate({"positioning": "mocap"}))
-    rig.rescue(known, 2.0, started_s=0.0)
-    expected = own_landing(PROFILE.planner.landing, 0.0, 0.0, known, 2.0)
-    assert orders(rig)[0].height_m == pytest.approx(expected.height_m, abs=0.01)
+def test_a_rescue_without_positions_from_outside_comes_down_level() -> None:
+    still = Vehicle(lambda s: replace(s, supervisor=AIRBORNE, thrust=HOVER_THRUST))
+    rig = Rig(still, profile=Profile.model_validate({"positioning": "mocap"}))
+    rig.rescue(telemetry(0.0, 1.5), 2.0, started_s=0.0)
+    assert rig.link.said(RawThrust)
+    assert not orders(rig)
 
 
 def test_a_rescue_steers_by_no_number_that_is_none() -> None:

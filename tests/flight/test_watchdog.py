@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from perchctl.flight.watchdog import CUT_PERIOD_S, MAX_CUTS, REPEAT_AFTER_S, Watchdog
-from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S, own_landing
+from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, REPEAT_ORDER_S
 from perchctl.mission.release import CATCH_STILL_ABOVE_M, STILL_THRUST, STOPS
 from perchctl.mission.state import Observation, Operator, Phase, PlannerState
 from perchctl.profile import Profile
@@ -343,22 +343,14 @@ def test_an_emergency_stop_is_repeated_a_limited_number_of_times() -> None:
 # --- a position from outside that has stopped coming -------------------------------------
 
 
-def test_a_silent_loop_s_landing_knows_for_how_long_it_is_blind() -> None:
-    """As the planner's: its age goes on while the loop hangs."""
-    profile = Profile.model_validate({"positioning": "mocap"})
-    dog = Watchdog(profile, lambda: Operator.NONE, lambda now_s: now_s - T_S + 0.7)
-    obs = Observation(T_S, telemetry(T_S, 1.0), position_age_s=0.7)
-    dog.tick(T_S + PERIOD_S, replace(IN_AIR, last=obs.telemetry), HOVER, obs)
-    late_s = LAND_S + 0.1
-    newest = telemetry(T_S + late_s - 0.02, 1.0)
-    order = own_landing(profile.planner.landing, 0.0, T_S + late_s, newest, 0.7 + late_s)
-    assert dog.poll(T_S + late_s, newest) == order
-
-
-def test_by_the_target_a_silent_loop_is_followed_by_a_level_descent() -> None:
+@pytest.mark.parametrize(("by", "age_s"), [("target", 0.05), ("mocap", 0.7)])
+def test_without_positions_a_silent_loop_is_followed_by_a_level_descent(
+    by: str, age_s: float
+) -> None:
     """No sight comes without the loop, and its own landing would fly by none."""
-    dog = Watchdog(Profile.model_validate({"positioning": "target"}), lambda: Operator.NONE)
-    obs = Observation(T_S, telemetry(T_S, 1.0), position_age_s=0.05)
+    profile = Profile.model_validate({"positioning": by})
+    dog = Watchdog(profile, lambda: Operator.NONE, lambda now_s: now_s - T_S + age_s)
+    obs = Observation(T_S, telemetry(T_S, 1.0), position_age_s=age_s)
     dog.tick(T_S + PERIOD_S, replace(IN_AIR, last=obs.telemetry), HOVER, obs)
     for i in range(60):
         now_s = T_S + LAND_S + 0.1 + 0.05 * i

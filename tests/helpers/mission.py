@@ -47,6 +47,7 @@ def telemetry(t_s: float, z_m: float = 1.0, **changes: object) -> Telemetry:
         roll_rad=0.0,
         pitch_rad=0.0,
         yaw_rad=0.0,
+        acc_x_g=1e-6 * (round(t_s * 1000) % 7),  # alive
         acc_z_g=1.0,
         thrust=HOVER_THRUST,
         battery_v=3.9 + 0.001 * (round(t_s * 100) % 7),

@@ -193,7 +193,7 @@ CASES: dict[str, Case] = {
     "battery-unknown": Case(P.ALIGN, P.LANDING, seen(battery_age_s=99.0), 0.1, O.SAFETY),
     "latency": Case(
         P.ALIGN, P.LANDING,
-        seen(mismatch=Mismatch(START_S, 0.15, 0.0, (0.0, 0.0), (0.0, 0.0))), 0.1, O.SAFETY,
+        seen(mismatch=Mismatch(later_s=0.15)), 0.1, O.SAFETY,
     ),
     "mounting": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.SAFETY,

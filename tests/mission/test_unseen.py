@@ -237,33 +237,13 @@ def test_a_cut_in_the_air_is_answered_at_once(z_m: float, age_s: float, again: b
 
 
 @pytest.mark.parametrize("z_m", [-2.0, -0.3, 0.0, 0.3, 2.0])
-@pytest.mark.parametrize("blind_s", [0.0, 0.7, 1e3, math.inf])
-def test_no_landing_of_its_own_goes_up(z_m: float, blind_s: float) -> None:
+def test_no_landing_of_its_own_goes_up(z_m: float) -> None:
     """Wherever the estimate has drifted to: below the ground it would climb to the ground."""
     config = PROFILE.planner.landing
-    order = own_landing(config, 0.0, 10.0, telemetry(1.0, z_m), blind_s)
+    order = own_landing(config, 0.0, 10.0, telemetry(1.0, z_m))
     assert order.height_m <= min(0.0, z_m) - config.undershoot_m
     assert order.height_m >= min(0.0, z_m) - config.undershoot_m - 2.0 * MOST_DRIFT_M
     assert 1.0 < order.duration_s < 20.0
-
-
-def test_a_blind_landing_aims_below_what_its_height_drifts_by() -> None:
-    """0.08 m/s, from the last position until it is down; by setpoints of the old world else."""
-    config = PROFILE.planner.landing
-    seeing, blind = (own_landing(config, 0.0, 0.0, telemetry(1.0, 0.3), s) for s in (0.0, 2.0))
-    assert seeing.height_m - blind.height_m == pytest.approx(0.08 * (2.0 + seeing.duration_s))
-    assert 15 / 8 * (0.3 - blind.height_m) / blind.duration_s < 0.5  # and is not fast
-
-
-def test_the_order_of_a_blind_landing_knows_for_how_long_it_is_blind() -> None:
-    state = replace(state_in(Phase.LANDING, z_m=0.6), entered_s=5.0)
-    low = telemetry(10.0, 0.2)
-    aims = []
-    for age_s in (0.02, 2.0):
-        _, command = ticked(state, 10.0, low, position_age_s=age_s)
-        assert isinstance(command, Land)
-        aims.append(command.height_m)
-    assert aims[1] < aims[0] - 0.3
 
 
 def test_a_landing_aims_the_lower_the_longer_the_estimate_may_have_drifted() -> None:
