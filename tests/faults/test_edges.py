@@ -13,6 +13,7 @@ from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.program import LONGEST_S, FaultyClock, ProgramKilled
 from perchctl.faults.radio import ORDERS, FaultyRadio, order_of
 from perchctl.link.encode import UNLOCK_THRUST, encode
+from perchctl.link.log_blocks import FORGOTTEN_S
 from perchctl.link.mock import TELEMETRY_DELAY_S
 from perchctl.sim.crtp.codec import Packet
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
@@ -96,6 +97,15 @@ def test_telemetry_comes_late() -> None:
     assert radio.down("battery", 2.5) == TELEMETRY_DELAY_S
 
 
+def test_a_vehicle_that_starts_again_is_silent_until_its_blocks_are_asked_for() -> None:
+    radio = FaultyRadio()
+    radio.begin(e.Reboots(0.8), 0.0)
+    assert not radio.up(SETPOINT, 0.7)
+    assert radio.up(SETPOINT, 0.9)
+    assert radio.down("state", 0.9 + FORGOTTEN_S) is None
+    assert radio.down("state", 1.1 + FORGOTTEN_S) is not None
+
+
 def test_a_cut_uplink_is_cut_for_good() -> None:
     radio = FaultyRadio()
     radio.cut = True
@@ -133,6 +143,23 @@ class Pictures:
 
     def close(self) -> None:
         return None
+
+
+def test_pictures_that_come_sooner_were_late_before() -> None:
+    """By what the profile is told: their times are true until the fault begins."""
+    camera, seen = FaultyCamera(Pictures(), 1), []
+    camera.late_s = 0.2
+    for k in range(100):
+        if k == 50:
+            camera.begin(e.CameraFault("sooner", e.FOR_EVER, 0.2), 1.0)
+        if (frame := camera.poll(k * 0.02)) is not None:
+            seen.append((k * 0.02, 0.05 * frame.index))
+    late = [now_s - taken_s for now_s, taken_s in seen if 0.5 < now_s < 1.0]
+    assert late == pytest.approx([0.2] * len(late), abs=0.03)
+    soon = [now_s - taken_s for now_s, taken_s in seen if now_s > 1.0]
+    assert soon == pytest.approx([0.0] * len(soon), abs=0.03)
+    assert len(late) > 5
+    assert len(soon) > 15
 
 
 def looked(kind: str, late_s: float = 0.0) -> list[tuple[float, Frame]]:

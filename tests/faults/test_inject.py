@@ -25,6 +25,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.state import Phase, PlannerState
 from perchctl.profile import TargetConfig
 from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.sim.firmware.commands import RawSetpoint
 from perchctl.sim.powertrain import most_thrust_n
 from perchctl.sim.scenario import Neighbour, Scenario
 
@@ -225,6 +226,26 @@ def test_a_push_ends() -> None:
     assert rig.vehicle.world.external_force_n == (0.1, 0.0, 0.0)
     rig.wait(0.3)
     assert rig.vehicle.world.external_force_n == (0.0, 0.0, 0.0)
+
+
+def test_a_vehicle_that_starts_again_stops_its_motors_and_time_goes_on() -> None:
+    """The world's clock is not the firmware's."""
+    rig = Rig((e.Reboots(0.5),))
+    firmware, times_s = rig.vehicle.firmware, []
+    rig.vehicle.each = times_s.append
+    rig.wait(0.1)
+    for thrust in (0, 30000, 30000):
+        firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, thrust))
+        rig.wait(0.3)
+    assert max(firmware.motors) > 0.0
+    rig.injector.begin_now()
+    assert rig.begun == [e.Reboots(0.5)]
+    rig.wait(0.1)
+    assert max(firmware.motors) == 0.0
+    assert firmware.t_s == pytest.approx(0.1)
+    assert rig.vehicle.t_s == pytest.approx(1.1)
+    assert times_s == sorted(times_s)
+    assert len(times_s) == pytest.approx(110, abs=2)
 
 
 def test_the_magnet_lets_go_after_the_contact() -> None:

@@ -356,3 +356,24 @@ def test_without_positions_a_silent_loop_is_followed_by_a_level_descent(
         now_s = T_S + LAND_S + 0.1 + 0.05 * i
         command = dog.poll(now_s, telemetry(now_s - 0.02, 1.0, supervisor=AIRBORNE))
         assert isinstance(command, RawThrust)
+
+
+def test_what_has_waited_for_the_loop_is_felt_too() -> None:
+    """The blow of the floor lasts for a hundredth of a second, and it is asked every twentieth."""
+    profile = Profile.model_validate({"positioning": "target"})
+    felt = []
+    for waits in (True, False):
+        dog = Watchdog(profile, lambda: Operator.NONE)
+        obs = Observation(T_S, telemetry(T_S, 0.1), position_age_s=0.05)
+        low = replace(IN_AIR, phase=Phase.LANDING, last=obs.telemetry)
+        dog.tick(T_S + PERIOD_S, low, RawThrust(HOVER_THRUST), obs)
+        samples: list[Telemetry] = []
+        for i in range(1, 121):
+            t_s = T_S + 0.01 * i
+            blow_g = 4.0 if 80 <= i < 82 else 1.0
+            samples.append(telemetry(t_s, 0.1, acc_z_g=blow_g, supervisor=AIRBORNE))
+            if i % 5 == 4:
+                command = dog.poll(t_s + 0.01, samples[-1], samples if waits else ())
+        assert isinstance(command, RawThrust)
+        felt.append(command.thrust)
+    assert felt[0] < 0.75 * felt[1]

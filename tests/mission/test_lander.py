@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 import perchctl
 from perchctl.mission import actions, lander, planner
 from perchctl.mission.context import Context
+from perchctl.mission.felt import FeltMotion, Mismatch
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.lander import (
     MANOEUVRES,
@@ -199,6 +200,7 @@ def judged(profile: Profile, state: dict[str, Any], **observed: Any) -> Evidence
     [
         ({}, Evidence.POSITION, Evidence.SIGHT),
         ({"position_age_s": 0.6}, Evidence.POSITION, Evidence.IMU),
+        ({"mismatch": Mismatch(later_s=0.2)}, Evidence.POSITION, Evidence.IMU),
         ({"jumped": True}, Evidence.ONBOARD, Evidence.IMU),
         ({"loop_late_s": 0.5}, Evidence.ONBOARD, Evidence.IMU),
         ({"link_problem": "gone"}, Evidence.ONBOARD, Evidence.IMU),
@@ -219,6 +221,13 @@ def test_each_part_of_what_is_known_has_its_own_age(
 
 def test_a_sight_is_believed_no_more_once_it_came_down_blindly() -> None:
     assert judged(BY_TARGET, {"blind_s": NOW_S - 1.0}) is Evidence.IMU
+
+
+def test_a_capture_that_gives_no_positions_leaves_what_is_felt() -> None:
+    """Its last ones have the vehicle stand still, whatever pushes it."""
+    assert judged(MOCAP, {}) is Evidence.POSITION
+    assert judged(MOCAP, {}, position_age_s=0.6) is Evidence.IMU
+    assert judged(MOCAP, {"blind_s": NOW_S - 1.0}) is Evidence.IMU
 
 
 def test_what_went_astray_is_believed_no_more() -> None:
@@ -276,6 +285,92 @@ def test_an_end_on_the_least_thrust_does_not_lock(part: float) -> None:
     state = replace(c.state, phase=Phase.ABORTED, level_thrust=part * c.state.hover_thrust)
     _, command = actions.ACTIONS[Phase.ABORTED](Context(state, c.obs, c.profile))
     assert isinstance(command, StopMotors if part == 0.4 else Idle)
+
+
+@pytest.mark.parametrize(("z_m", "spent"), [(0.1, True), (1.0, False)])
+def test_a_setpoint_to_the_floor_that_nobody_saw_obeyed_ends_without_a_lock(
+    z_m: float, spent: bool
+) -> None:
+    """What only ended the stream would be cut and locked by the firmware."""
+    c = context((Evidence.ONBOARD, Reach.MAGNET, Stage.DOWN))
+    state = replace(
+        c.state, phase=Phase.ABORTED, row="landing-timeout",
+        setpoint=PositionSetpoint(0.0, 0.0, z_m, 0.0),
+    )  # fmt: skip
+    _, command = actions.ACTIONS[Phase.ABORTED](Context(state, c.obs, c.profile))
+    assert isinstance(command, StopMotors if spent else Idle)
+
+
+def test_below_5_cm_it_stops_only_at_rest() -> None:
+    """The height may be wrong by as much: what sinks still is not on the floor."""
+    for vz_mps, stops in ((-0.35, False), (-0.05, True)):
+        c = context((Evidence.SIGHT, Reach.FREE, Stage.DOWN), z_m=0.0)
+        tel = replace(c.obs.telemetry, velocity_mps=(0.0, 0.0, vz_mps))
+        state = replace(c.state, level_thrust=0.9 * HOVER_THRUST)
+        _, command = lander.act(Context(state, replace(c.obs, telemetry=tel), c.profile))
+        assert isinstance(command, StopMotors if stops else RawThrust)
+
+
+def test_unheard_with_a_hover_thrust_never_felt_its_own_estimate_is_nearer() -> None:
+    cell = (Evidence.NOTHING, Reach.FREE, Stage.DOWN)
+    for since_s, unlearned, kind in (
+        (0.5, True, PositionSetpoint),
+        (0.5, False, RawThrust),
+        (2.0, True, RawThrust),
+    ):
+        c = context(cell, since_s=since_s)
+        tel = replace(c.obs.telemetry, t_s=NOW_S - 1.5)
+        within = lander.UNLEARNED_WITHIN if unlearned else lander.HOVER_WITHIN
+        state = replace(c.state, level_within=within)
+        _, command = lander.act(Context(state, replace(c.obs, telemetry=tel), c.profile))
+        assert isinstance(command, kind)
+
+
+def test_a_press_that_was_ordered_is_unwound_whatever_thrust_is_read() -> None:
+    """By a reading that stands still nothing presses."""
+    begin = replace(state_in(Phase.PERCH, NOW_S - 60.0, HANG_Z_M), hover_thrust=HOVER_THRUST)
+    quiet = telemetry(NOW_S + TURN_S, HANG_Z_M, thrust=HOVER_THRUST, acc_z_g=1.3)
+    state, command = planner.step(begin, observation(quiet.t_s, telemetry=quiet), DECKS)
+    assert (state.phase, state.row) == (Phase.RECOVER, "no-contact")
+    assert state.pressed
+    assert isinstance(command, PositionSetpoint)
+    assert command.z_m < HANG_Z_M - 0.1
+
+
+# --- What pictures and accelerometer agree on ---------------------------------------------------
+
+
+def felt_at(c: Context, age_s: float, bias_mps2: tuple[float, float]) -> Context:
+    """With a motion that was felt so long ago: at rest, by an attitude that is wrong."""
+    reckoning = replace(c.state.reckoning, bias_mps2=(*bias_mps2, 0.0))
+    felt = FeltMotion(NOW_S - age_s, (0.0, 0.0), bias_mps2)
+    return Context(replace(c.state, reckoning=reckoning), replace(c.obs, felt=felt), c.profile)
+
+
+def test_level_is_what_pictures_show_to_be_level() -> None:
+    """An attitude that is 0.02 rad wrong makes 0.2 m/s of speed a second: pitched forward as it
+    seems to hover, it would slide forward."""
+    c = context((Evidence.IMU, Reach.FREE, Stage.DOWN))
+    tilts = []
+    for age_s in (0.05, 1.0, 5.0):
+        command = lander.act(felt_at(c, age_s, (-0.2, 0.0)))[1]
+        assert isinstance(command, RawThrust)
+        assert command.roll_rad == 0.0
+        tilts.append(command.pitch_rad)
+    assert tilts[0] == pytest.approx(-0.2 / 9.81, rel=0.05)  # nose up, against it
+    assert tilts[0] < tilts[1] < tilts[2] == 0.0
+
+
+def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
+    c = context((Evidence.IMU, Reach.FREE, Stage.DOWN))
+    motion = FeltMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0))
+    obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
+    before = replace(c.state, reckoning=Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
+    state = lander.observed(before, obs, c.profile)
+    assert state.reckoning.velocity_mps[:2] == (0.3, 0.0)
+    later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
+    moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
+    assert lander.observed(moved, later, c.profile).reckoning.velocity_mps[0] < 0.2
 
 
 def test_a_hover_thrust_that_was_not_learned_is_felt() -> None:
