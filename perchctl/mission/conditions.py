@@ -26,6 +26,8 @@ BELOW_M = 0.3
 """A target on the ceiling that seems so far below the vehicle is not there."""
 KNOCKED_MPS = 0.5
 """Sideways, under the target: no draught gives a held vehicle so much."""
+FELT_ASTRAY_MPS, FELT_S = 0.4, 0.1
+"""Late positions make less: 0.15 s at 2 m/s2."""
 SATURATED = 0.98
 """Of the largest thrust: from here on nothing tells how much more it takes."""
 LITTLE_LEFT = 0.93
@@ -63,6 +65,16 @@ def _settled(c: Context) -> bool:
 def _near_standoff(c: Context) -> bool:
     ascend = c.profile.planner.ascend
     return c.tracked and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
+
+
+def beside_felt_mps(c: Context) -> float:
+    """By how much the speed of a motion capture's positions is beside the one that pictures and
+    accelerometer agree on; 0 where they have not just now."""
+    felt = c.obs.felt
+    if c.by_sight or felt is None or c.obs.t_s - felt.t_s > FELT_S:
+        return 0.0
+    (x, y), (ex, ey, _) = felt.velocity_mps, c.obs.telemetry.velocity_mps
+    return math.hypot(x - ex, y - ey)
 
 
 def _contact(c: Context) -> bool:
@@ -287,12 +299,14 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
     Condition.BATTERY_LOW: lambda c: c.battery_is_low,
+    Condition.OTHERWISE: lambda c: beside_felt_mps(c) > FELT_ASTRAY_MPS,
 }
 KEPT_OVER_A_CHANGE = (
     Condition.BATTERY_LOW,
     Condition.TILTED,
     Condition.UNSURE,
     Condition.SATURATED,
+    Condition.OTHERWISE,
 )
 """The vehicle's own, whatever the phase, and however it is held."""
 

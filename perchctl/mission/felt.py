@@ -24,7 +24,7 @@ WINDOW_S, LEAST_S, LEAST_SIGHTS = 1.2, 0.6, 10
 EVERY_S, AGREED = 0.05, 3
 """It is judged so often, and so many judgements in a row have to agree."""
 STEP_S = 0.02
-_DELAYS_S, _QUARTERS_RAD = np.arange(-8, 26) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
+_DELAYS_S, _QUARTERS_RAD = np.arange(-8, 32) * STEP_S, np.array([0.5, 1.0, -0.5]) * math.pi
 LATER_S = np.concatenate([_DELAYS_S, np.zeros(len(_QUARTERS_RAD))])
 TURNS_RAD = np.concatenate([np.zeros(len(_DELAYS_S)), _QUARTERS_RAD])
 """What is tried: delays beyond the one that is taken off the pictures' times, and turns."""

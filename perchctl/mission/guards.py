@@ -5,7 +5,13 @@ from __future__ import annotations
 import math
 
 from perchctl.mission import budget
-from perchctl.mission.conditions import SATURATED, contact_aside_m, press_thrust
+from perchctl.mission.conditions import (
+    FELT_ASTRAY_MPS,
+    SATURATED,
+    beside_felt_mps,
+    contact_aside_m,
+    press_thrust,
+)
 from perchctl.mission.context import Context
 from perchctl.mission.hold import unplaced
 from perchctl.mission.mounting import explained
@@ -21,6 +27,8 @@ LOW_M, ASTRAY_LOW_M, ASTRAY_LANDING_M, ASTRAY_M = 0.3, 0.22, 0.4, 0.8
 place (7 cm in simulated flights); later a setpoint is walked ahead of it, and a blow may carry it
 half a metre. A landing goes straight down."""
 ABOVE_START_M = 0.1
+OTHERWISE_S = 0.3
+"""A blow is over sooner."""
 ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
 BELOW_S = 0.3
 WEAK_S = 2.0
@@ -84,7 +92,11 @@ def is_astray(c: Context) -> bool:
     Positions from outside in other axes than the vehicle's do that: those that a vehicle at rest
     does not tell from true ones (fault 11)."""
     setpoint = c.state.setpoint
-    if c.profile.positioning.by == "deck" or setpoint is None or not c.placed:
+    if c.profile.positioning.by == "deck" or not c.placed:
+        return False
+    if c.held(Condition.OTHERWISE) >= OTHERWISE_S:
+        return True
+    if setpoint is None:
         return False
     touched = c.state.contact_z_m is not None or c.state.stopped_s is not None
     if c.state.phase is Phase.LANDING and touched:
@@ -223,8 +235,12 @@ def why_astray(c: Context) -> str:
             f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: does "
             f"camera.mount have the camera turned as it is?"
         )
+    beside_mps = beside_felt_mps(c)
+    what = f"the position goes {away_m:.2f} m aside"
+    if beside_mps > FELT_ASTRAY_MPS:
+        what = f"pictures and accelerometer tell a speed that is {beside_mps:.1f} m/s beside"
     return (
-        f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: swapped axes "
+        f"{what} at a height of {c.height_m:.2f} m: swapped axes "
         f"in the motion capture, or a body that is turned in it; perchctl check --lift tells"
     )
 

@@ -175,7 +175,7 @@ BRAKED_AGE_S = 0.2
 UNSURE_MPS, UNSURE_MPS2, MOST_UNSURE_MPS = 0.05, 0.1, 0.3
 """Of the reckoned speed so much is left alone: an attitude that is 0.01 rad wrong makes 0.1 m/s of
 it each second, and braking that would drive the vehicle aside."""
-LEVEL_FELT_S = 2.0
+LEVEL_FELT_S = 6.0
 """An attitude's error that pictures told is not the present one for longer."""
 STOP_BELOW_M, RESTS_MPS = 0.05, 0.1
 UNANSWERED_PART = 0.12
@@ -184,7 +184,7 @@ CARRIED_G, CARRIED_PART, AIRBORNE_G = 0.95, 0.88, 0.85
 TOUCH_PART, TOUCH_S, TOUCH_BELOW_M = 0.5, 0.25, 0.7
 """A blow from below so near to the floor is the floor: half of the hover thrust proves it, since
 what is in the air falls with it."""
-LEVEL_SPARE_S, LEVEL_MEAN_MPS = 2.0, 0.35
+LEVEL_SPARE_S, UNHEARD_SPARE_S, LEVEL_MEAN_MPS = 2.0, 0.8, 0.35
 
 
 def step(state: PlannerState, obs: Observation, profile: Profile) -> tuple[PlannerState, Command]:
@@ -442,7 +442,9 @@ def _reckon(c: Context) -> PlannerState:
     reach_s = state.reach_s
     if stage_of(c) in (Stage.DOWN, Stage.ORDERED):  # what is released or stopped moves no more
         within = state.contact_z_m is not None or new.below_m < REACH_M
-        reach_s = (obs.t_s if reach_s is None else reach_s) if within else None
+        # Caught below the magnet it may be drawn to it again: what fell before says nothing then.
+        again = reach_s is not None and obs.imu.fell_s > reach_s and new.below_m < REACH_M
+        reach_s = (obs.t_s if reach_s is None or again else reach_s) if within else None
     down_m = 0.0
     if state.blind_s is not None and state.reckoning.imu is not None:
         dt_s = max(0.0, min(0.5, obs.imu.t_s - state.reckoning.imu.t_s))
@@ -785,7 +787,9 @@ def _is_overdue(c: Context) -> bool:
     way_m = max(0.0, c.state.entry_m[2] - ground_m)
     # What hung on the magnet, and slipped, begins anew.
     began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
-    return c.obs.t_s - began_s > LEVEL_SPARE_S + way_m / LEVEL_MEAN_MPS
+    heard = c.attitude_age_s <= LATEST_S
+    spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
+    return c.obs.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
 
 def _braking(c: Context) -> tuple[float, float]:

@@ -28,6 +28,7 @@ from perchctl.mission.state import (
     TERMINALS,
     Condition,
     Observation,
+    Outcome,
     Phase,
     PlannerState,
 )
@@ -141,7 +142,7 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         row=row.name,
         severity=risen(state.severity, row.severity),
         motor_stop=row.motor_stop,
-        outcome=row.outcome or state.outcome,
+        outcome=_outcome(state, row),
         since=_kept(state.since),
         attempts=state.attempts + int(row.counts_attempt),
         entry_m=obs.telemetry.position_m,
@@ -157,6 +158,13 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
         orders=0,
     )
     return _started_phase(new, state, context)
+
+
+def _outcome(state: PlannerState, row: Row) -> Outcome | None:
+    """What hangs after all has found its target, by whatever it was brought there."""
+    if row.name == "hung" and state.outcome is Outcome.TARGET_NOT_FOUND:
+        return Outcome.ATTEMPTS_USED_UP
+    return row.outcome or state.outcome
 
 
 def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerState:

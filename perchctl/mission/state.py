@@ -94,6 +94,7 @@ class Condition(Enum):
     UNSURE = "unsure"
     TARGET_BELOW = "target below"
     BATTERY_LOW = "battery low"
+    OTHERWISE = "moves otherwise than its positions"
 
 
 class MotorStop(Enum):
