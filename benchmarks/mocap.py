@@ -5,7 +5,7 @@ OptiTrack's protocol, the real cflib, and the simulated Crazyflie without a deck
 
 Starts `perchctl fly --positioning mocap` once a seed and prints how each ended, how far from the
 target's centre, how many positions a second arrived and how old they were. Expected: all perched,
-exit code 0; a flight that the computer was too slow for says so and counts as not flown.
+exit code 0; on a busy computer the flights only take longer.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from pathlib import Path
 from perchctl.log.read import read_log
 
 TIMEOUT_S = 300.0
-TOO_SLOW = "too slow for a flight in real time"
 
 
 @dataclass(frozen=True)
@@ -55,12 +54,11 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="the first")
     parser.add_argument("-p", "--profile", default="sim")
     options = parser.parse_args()
-    perched, slow, misses = 0, 0, []
+    perched, misses = 0, []
     print(f"{'seed':>4}  {'ended':<16} {'miss':>8} {'oldest':>8}")
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(options.seed, options.seed + options.seeds):
             it = fly(options.profile, seed, Path(folder))
-            slow += TOO_SLOW in it.reason
             perched += it.outcome == "perched"
             miss = ""
             if it.outcome == "perched" and it.miss_m is not None:
@@ -70,11 +68,11 @@ def main() -> int:
             print(
                 f"{seed:>4}  {it.outcome:<16} {miss:>8} {1e3 * it.age_s:>5.0f} ms{why}", flush=True
             )
-    told = f"perched {perched} of {options.seeds - slow}"
+    told = f"perched {perched} of {options.seeds}"
     if misses:
         told += f", miss {statistics.median(misses):.1f} mm median, {max(misses):.1f} mm largest"
-    print(told + (f"; {slow} not flown: the computer was too slow" if slow else ""))
-    return 0 if perched == options.seeds - slow else 1
+    print(told)
+    return 0 if perched == options.seeds else 1
 
 
 if __name__ == "__main__":

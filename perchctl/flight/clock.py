@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
+import threading
 import time
+from collections.abc import Callable, Iterator
 from datetime import datetime
 from typing import Protocol
+
+from perchctl.sim.process.shared import MARGIN_S, SharedTime
+
+SIM_PATIENCE_S = 5.0
+"""The clock waits so long, on the wall's clock, for a simulator that does not go on: longer than
+the simulator waits for the loop, so that they never wait for each other."""
+SLOW_S = 1.0
+"""A flight that has fallen so far behind the wall's clock says that it is slow."""
+SLOW = (
+    "this computer is busy: the simulated flight runs slower than real time; its times are "
+    "simulated ones"
+)
+_POLL_S = 0.001
 
 
 class Clock(Protocol):
@@ -25,6 +42,66 @@ class WallClock:
         left_s = t_s - time.monotonic()
         if left_s > 0:
             time.sleep(left_s)
+
+
+class SimulatedClock:
+    """Simulated time in real time: it waits for the loop, and the loop for it.
+
+    The simulator advances it with the wall's clock. On a busy computer it stands still until the
+    slower of the two has caught up, so no age grows by that. `now` may be called from any thread.
+    `zero_s` is its reading at the simulator's start, such that it first agrees with
+    `time.monotonic`.
+    """
+
+    def __init__(
+        self,
+        shared: SharedTime,
+        wall: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._shared, self._wall, self._sleep = shared, wall, sleep
+        self._lock = threading.Lock()
+        self._reached_s, self._moved_s = shared.reached_s, wall()
+        self._now_s = self._moved_s
+        self.zero_s = self._now_s - self._reached_s
+        self._began_s: tuple[float, float] | None = None  # the wall's and this clock's
+        self._slow_told = False
+
+    def now(self) -> float:
+        with self._lock:
+            wall_s, reached_s = self._wall(), self._shared.reached_s
+            if reached_s != self._reached_s:
+                self._reached_s, self._moved_s = reached_s, wall_s
+                # What it went on without the simulator stays.
+                self.zero_s = max(self.zero_s, self._now_s - reached_s)
+            alone_s = max(0.0, wall_s - self._moved_s - SIM_PATIENCE_S)
+            self._now_s = max(self._now_s, self.zero_s + reached_s + alone_s)
+            return self._now_s
+
+    def wait_until(self, t_s: float) -> None:
+        if self._began_s is not None:
+            self._shared.limit_s = t_s - self.zero_s + MARGIN_S
+        while (left_s := t_s - self.now()) > 0:
+            self._sleep(max(left_s, _POLL_S))
+
+    @contextlib.contextmanager
+    def waiting_for_loop(self) -> Iterator[None]:
+        """Within it each `wait_until` is the loop's sign of life, and without one simulated time
+        goes on for `MARGIN_S` only."""
+        self._began_s = self._wall(), self.now()
+        try:
+            yield
+        finally:
+            self._began_s = None
+            self._shared.limit_s = math.inf
+
+    def remarks(self) -> list[str]:
+        """Says once that the flight is slow, when it has become so."""
+        if self._began_s is None or self._slow_told:
+            return []
+        wall_s, own_s = self._began_s
+        self._slow_told = self._wall() - wall_s - (self.now() - own_s) > SLOW_S
+        return [SLOW] if self._slow_told else []
 
 
 def wall_date() -> datetime:

@@ -14,10 +14,9 @@ from perchctl.camera.credentials import without_password
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
 from perchctl.camera.source import FrameSource
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError, no_simulator
-from perchctl.flight.clock import WallClock
+from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.pace import PaceWatcher, judged
 from perchctl.flight.positions import (
     at_hand,
     check_compared,
@@ -30,6 +29,7 @@ from perchctl.link.uri import check_uri
 from perchctl.mission.watch import Event, FlightReport, Watcher
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
+from perchctl.values import replace
 from perchctl.vision.types import CameraModel
 
 if TYPE_CHECKING:
@@ -102,14 +102,15 @@ def fly_session(
     """
     check_options(options)
     check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
-    profile, clock, switch = options.profile, WallClock(), switch or OperatorSwitch()
+    profile, switch = options.profile, switch or OperatorSwitch()
     camera = camera_of(profile.camera)
     pipeline = make_pipeline(profile, camera)
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
+        clock: WallClock | SimulatedClock = WallClock()
         if options.simulated:
             simulated = stack.enter_context(simulated_vehicle(options, camera))
-            uri = simulated.uri
+            clock, uri = SimulatedClock(simulated.shared_time), simulated.uri
             spec = simulated.stream_url if spec.startswith("sim:") else spec
         config = profile.camera
         source = open_source(
@@ -127,39 +128,31 @@ def fly_session(
                 before_arming()
             positions = started_feed(stack, capture, link, positioning, clock, profile)
             switch.listening = True
-            pace, lag_s = PaceWatcher(), _lag_s(simulated, clock)
-            watched = (*watchers, pace)
             parts = FlightParts(
-                link, source, clock, profile, pipeline, watched, switch.read,
-                _teller(options, lag_s), positions, remarks,
+                link, source, clock, profile, pipeline, watchers, switch.read,
+                _teller(options, clock), positions, remarks,
             )  # fmt: skip
-            report = fly(parts)
-            if simulated is not None:
-                behind_s = _lag_s(simulated, clock) - lag_s
-                report = judged(report, pace, behind_s, profile.simulation.camera_rate_hz)
+            if isinstance(clock, WallClock):
+                report = fly(parts)
+            else:
+                slow = clock.remarks
+                with clock.waiting_for_loop():
+                    report = fly(replace(parts, remarks=lambda: (*remarks(), *slow())))
         finally:
             switch.listening = True  # while closing, Ctrl-C must not cut the wait short
             link.close()
         return SessionResult(report, miss_m=_true_miss_m(simulated))
 
 
-def _lag_s(simulated: SimProcess | None, clock: WallClock) -> float:
-    """The wall's clock less the simulator's; only its change means something."""
-    if simulated is not None:
-        with contextlib.suppress(ConnectionFailed, TimedOut):
-            return clock.now() - float(simulated.truth()["t_s"])
-    return 0.0
-
-
-def _teller(options: FlyOptions, lag_s: float) -> Callable[[Event], str]:
+def _teller(options: FlyOptions, clock: Clock) -> Callable[[Event], str]:
     """What the simulated scenario did, by the time at which the simulation was then."""
-    if not options.simulated:
+    if not isinstance(clock, SimulatedClock):
         return lambda event: ""
     from perchctl.sim.draw import draw_scenario
     from perchctl.sim.told import Teller
 
     tell = Teller(draw_scenario(options.profile, options.seed))
-    return lambda event: tell(event, event.t_s - lag_s)
+    return lambda event: tell(event, event.t_s - clock.zero_s)
 
 
 def _true_miss_m(simulated: SimProcess | None) -> float | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 
-from perchctl.flight.clock import Clock, WallClock
+from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.senses import Senses
 from perchctl.mission.state import Observation, PlannerState
 from perchctl.mission.turn import Outside, Turn, TurnRole, TurnTiming
@@ -17,8 +18,13 @@ from perchctl.vehicle import Command
 class Turns:
     """Counts them. In lockstep there are no timings: the same seed gives the same turns."""
 
-    def __init__(self, clock: Clock, watchers: Iterable[Watcher]) -> None:
-        self._clock = clock if isinstance(clock, WallClock) else None
+    def __init__(
+        self,
+        clock: Clock,
+        watchers: Iterable[Watcher],
+        wall: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._wall = wall if isinstance(clock, (WallClock, SimulatedClock)) else None
         self._told = [w for w in watchers if isinstance(w, TurnWatcher)]
         self._count = 0
         self._began_s = 0.0
@@ -32,12 +38,13 @@ class Turns:
         return bool(self._told)
 
     def begin(self, now_s: float) -> None:
-        self._began_s, self._laps_s = now_s, [now_s]
+        self._began_s, self._laps_s = now_s, []
+        self.lap()
 
     def lap(self) -> None:
-        """Taken in; decided; sent."""
-        if self._clock is not None:
-            self._laps_s.append(self._clock.now())
+        """Begun; taken in; decided; sent."""
+        if self._wall is not None:
+            self._laps_s.append(self._wall())
 
     def waiting(self, senses: Senses, now_s: float, outside: FeedStatus | None) -> None:
         turn = Turn(
@@ -120,13 +127,13 @@ class Turns:
         )
 
     def _timing(self) -> TurnTiming | None:
-        if self._clock is None:
+        if self._wall is None:
             return None
         # Of a turn that was not sent, or not decided, that part took no time.
         laps_s = [*self._laps_s, *[self._laps_s[-1]] * 3]
         began_s, seen_s, decided_s, sent_s = laps_s[:4]
         return TurnTiming(
-            seen_s - began_s, decided_s - seen_s, sent_s - decided_s, self._clock.now() - began_s
+            seen_s - began_s, decided_s - seen_s, sent_s - decided_s, self._wall() - began_s
         )
 
     def _counted(self) -> int:

@@ -28,6 +28,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration.files import load_calibration
+from perchctl.flight.clock import SLOW
 from perchctl.log.read import FlightLog, read_log
 from perchctl.mission.state import SEVEN
 from perchctl.profile import find_calibration, load_profile
@@ -39,6 +40,8 @@ from tests.helpers.flights import ROOT, SEED, SHORT
 pytestmark = pytest.mark.long
 
 FLIGHT_LIMIT_S = 60.0
+SLOW_FLIGHT_LIMIT_S = 300.0
+"""Of sim://, whose clock waits for a busy computer."""
 LATE_S = 0.25
 """A loop, telemetry or vehicle that is later than this was starved of the processor."""
 
@@ -75,18 +78,12 @@ class Finished:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """`perchctl fly` on sim://, start to end, on pipes."""
 
-    def once() -> Finished:
-        folder = tmp_path_factory.mktemp("flight")
-        command, environment = say_fly("--seed", str(SEED), "--log-dir", str(folder), "--json")
-        done = subprocess.run(
-            command, env=environment, capture_output=True, text=True, timeout=FLIGHT_LIMIT_S
-        )
-        return Finished(done.returncode, done.stdout, done.stderr, folder)
-
-    flight = once()
-    if flight.code != 0 and starved(read_log(the_log(flight.folder))):
-        flight = once()
-    return flight
+    folder = tmp_path_factory.mktemp("flight")
+    command, environment = say_fly("--seed", str(SEED), "--log-dir", str(folder), "--json")
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=SLOW_FLIGHT_LIMIT_S
+    )
+    return Finished(done.returncode, done.stdout, done.stderr, folder)
 
 
 def test_fly_perches_in_real_time_through_cflib(whole: Finished) -> None:
@@ -303,11 +300,11 @@ def test_a_terminal_that_is_closed_in_flight_lands(tmp_path: Path) -> None:
     assert log.summary["cause"] == "operator"
 
 
-def test_a_simulator_that_is_starved_is_named_for_the_abort(tmp_path: Path) -> None:
+def test_a_flight_waits_for_a_simulator_that_is_starved(tmp_path: Path) -> None:
     """As on a busy computer: its process gets no time for a while."""
     command, environment = say_fly("--seed", str(SEED), "--log-dir", str(tmp_path))
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
-        guard = threading.Timer(FLIGHT_LIMIT_S, process.kill)
+        guard = threading.Timer(SLOW_FLIGHT_LIMIT_S, process.kill)
         guard.start()
         try:
             assert process.stderr is not None
@@ -319,9 +316,11 @@ def test_a_simulator_that_is_starved_is_named_for_the_abort(tmp_path: Path) -> N
             threading.Event().wait(2.5)
             os.kill(simulator, signal.SIGCONT)
             rest = process.stderr.read()
-            assert process.wait(FLIGHT_LIMIT_S) == 52, rest
+            assert process.wait(FLIGHT_LIMIT_S) == 0, rest
         finally:
             guard.cancel()
             process.kill()
-    (end,) = [line for line in rest.splitlines() if "this computer is too slow" in line]
-    assert re.search(r"simulator \d\.\d s behind", end)
+    assert rest.count(SLOW) == 1
+    log = read_log(the_log(tmp_path))
+    assert [event["reason"] for event in log.events].count(SLOW) == 1
+    assert log.column("tel_age_s").max() < LATE_S

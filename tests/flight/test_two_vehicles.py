@@ -22,7 +22,6 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration.files import camera_of
-from perchctl.flight.pace import FEWEST_HZ, LATEST_S, WINDOW_S
 from perchctl.log.read import FlightLog, read_log
 from perchctl.profile import Profile, load_profile
 from perchctl.sim.draw import draw_scenario
@@ -37,6 +36,8 @@ SAME_M = 2e-4
 """Of a setpoint in the log and on its way: the log rounds, a packet holds 32 bits."""
 WATCHDOG_M = 0.1
 FLIGHT_LIMIT_S = 120.0
+FEWEST_HZ, WINDOW_S, LATEST_S = 10.0, 2.0, 0.25
+"""Pictures and the latest turn of a flight that the computer was fast enough for."""
 CLOSE_START = {"simulation.start_offset_m": 0.25}  # nearer to the own target than to the other's
 
 
@@ -125,7 +126,7 @@ class Flown:
 
     @property
     def kept_up(self) -> bool:
-        """By the measure of `perchctl.flight.pace`; a flight that perched had all it needs."""
+        """Whether the computer was fast enough; a flight that perched had all it needs."""
         late_s = max(self.log.column("late_s").max(), self.log.column("tel_age_s").max())
         t_s = self.log.column("t_s")[np.isfinite(self.log.column("frame"))]
         windows = [np.sum((t_s >= s) & (t_s < s + WINDOW_S)) for s in self._looking_s()]

@@ -22,6 +22,7 @@ from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.process.control import START_TIMEOUT_S, HostSetup
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.process.runner import Runner
+from perchctl.sim.process.shared import SharedTime
 from perchctl.sim.scenario import Scenario
 
 
@@ -33,6 +34,7 @@ def serve_parent() -> None:
     setup = channel.receive(START_TIMEOUT_S)
     realtime = setup.pace == "realtime"
     try:
+        shared = SharedTime(setup.time_file)
         host = VehicleHost(setup, live=realtime)
     except (PerchError, OSError, ValueError) as error:
         channel.send(f"{type(error).__name__}: {error}")
@@ -40,7 +42,7 @@ def serve_parent() -> None:
     with contextlib.closing(host):
         stream_url = host.stream.url if host.stream is not None else ""
         channel.send((host.uri, stream_url, host.capture))
-        Runner(host, channel, realtime=realtime, linger_s=setup.linger_s).run()
+        Runner(host, channel, realtime=realtime, linger_s=setup.linger_s, shared=shared).run()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

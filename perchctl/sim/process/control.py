@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from perchctl.profile import TargetConfig
@@ -24,7 +25,8 @@ class HostSetup:
     by the operating system.
     `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
     parent has ended. `heard_file`: JSON lines of every packet that arrived, and who had sent it.
-    `linger_s`: how long the vehicle then runs on, in wall-clock time.
+    `linger_s`: how long the vehicle then runs on, in wall-clock time. `time_file`: a
+    `SharedTime` of the parent's; None: time runs freely.
     """
 
     scenario: Scenario = field(default_factory=Scenario)
@@ -39,3 +41,4 @@ class HostSetup:
     truth_file: str | None = None
     heard_file: str | None = None
     linger_s: float = LINGER_S
+    time_file: Path | None = None

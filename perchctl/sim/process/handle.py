@@ -13,6 +13,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, get_args
@@ -33,6 +34,7 @@ from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.carried import Stop
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.control import LINGER_S, START_TIMEOUT_S, HostSetup, Pace
+from perchctl.sim.process.shared import SharedTime
 from perchctl.sim.scenario import Scenario
 from perchctl.vision.types import CameraModel
 
@@ -47,15 +49,23 @@ class SimProcess:
     """Handle of a running simulated vehicle; a context manager.
 
     `uri` is for cflib, `stream_url` for a network camera ("" without a camera), `capture` the
-    motion capture's kind and address for `motioncapture` (None without one). All methods may be
+    motion capture's kind and address for `motioncapture` (None without one). `shared_time`
+    is how far simulated time has come in real time, and how far it may go. All methods may be
     called from any thread; they raise `ConnectionFailed` when the child is gone and `TimedOut`
     when it does not answer.
     """
 
-    def __init__(self, child: subprocess.Popen[bytes], channel: Channel, stderr: IO[bytes]) -> None:
+    def __init__(
+        self,
+        child: subprocess.Popen[bytes],
+        channel: Channel,
+        stderr: IO[bytes],
+        shared_time: SharedTime,
+    ) -> None:
         self._child = child
         self._channel = channel
         self._stderr = stderr
+        self.shared_time = shared_time
         self._lock = threading.Lock()
         self._stopped = False
         self.uri = ""
@@ -104,10 +114,13 @@ class SimProcess:
             heard_file=str(heard_file) if heard_file is not None else None,
             linger_s=linger_s,
         )
-        return cls._with(setup, timeout_s)
+        # Both processes have mapped the file once the child has answered.
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            shared = SharedTime.create(file := Path(folder, "time"))
+            return cls._with(replace(setup, time_file=file), shared, timeout_s)
 
     @classmethod
-    def _with(cls, setup: HostSetup, timeout_s: float) -> SimProcess:
+    def _with(cls, setup: HostSetup, shared: SharedTime, timeout_s: float) -> SimProcess:
         token = new_token()
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed by stop)
         with listen() as listener:
@@ -116,7 +129,7 @@ class SimProcess:
             channel = accept(listener, token, timeout_s, lambda: child.poll() is None)
         if channel is None:
             raise _gave_up(child, stderr, f"did not come up within {timeout_s:.0f} s")
-        process = cls(child, channel, stderr)
+        process = cls(child, channel, stderr, shared)
         try:
             channel.send(setup)
             answer = channel.receive(timeout_s)

@@ -73,6 +73,11 @@ class VehicleHost:
         """Simulated time since the start; unlike the firmware's, no reboot resets it."""
         return self._steps * CONTROL_PERIOD_S
 
+    @property
+    def picture_late_s(self) -> float:
+        """Simulated time that has passed since the renderer last began; 0 without a thread."""
+        return 0.0 if self._feed is None else self._feed.late_s
+
     def serve(self) -> None:
         """Answer what has arrived, without time passing; log data waits for the next step."""
         self.endpoint.serve(self.server, self.elapsed_s)
@@ -180,6 +185,10 @@ class _PictureFeed:
         self._waiting = 0
         self._thread = threading.Thread(target=self._run, name="picture-feed", daemon=True)
         self._thread.start()
+
+    @property
+    def late_s(self) -> float:
+        return self._waiting * CONTROL_PERIOD_S
 
     def add(self, state: TrueState) -> None:
         with self._changed:

@@ -1,6 +1,7 @@
 """How time passes in the simulated vehicle's process, and when it ends.
 
-- real time: paced by the wall clock; catches up after a hiccup, never runs ahead;
+- real time: paced by the wall clock; catches up after a hiccup, never runs ahead. While a flight
+  sets `SharedTime.limit_s`, it waits for the flight's loop and for its own pictures instead;
 - stepped: only the parent's `advance` moves time; between two of them the link is
   answered, so that cflib connects without simulated time passing.
 
@@ -10,6 +11,7 @@ When the parent is gone, however it went, the vehicle flies on in real time for
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import time
@@ -19,6 +21,7 @@ from typing import Any
 from perchctl.children import Channel
 from perchctl.sim.capture.settings import CaptureFault
 from perchctl.sim.process.host import VehicleHost
+from perchctl.sim.process.shared import LOOP_PATIENCE_S, MARGIN_S, SharedTime
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
 MAX_LAG_S = 1.0
@@ -38,12 +41,16 @@ class Runner:
         realtime: bool,
         linger_s: float,
         clock: Callable[[], float] = time.monotonic,
+        shared: SharedTime | None = None,
     ) -> None:
         self._host = host
         self._channel = channel
         self._realtime = realtime
         self._linger_s = linger_s
         self._clock = clock
+        self._shared = shared or SharedTime()
+        self._waiting_since_s: float | None = None
+        self._limit_s = math.inf
         self._parent = os.getppid()
         self._end_s: float | None = None
         self._stopped = False
@@ -73,15 +80,32 @@ class Runner:
     def catch_up(self) -> float:
         """Step up to now, some steps at most at once; how long to wait for the next step."""
         now_s = self._clock() - self._origin_s
-        if now_s - self._host.elapsed_s > MAX_LAG_S:
-            self._origin_s += now_s - self._host.elapsed_s - MAX_LAG_S
+        max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else MARGIN_S
+        if now_s - self._host.elapsed_s > max_lag_s:
+            self._origin_s += now_s - self._host.elapsed_s - max_lag_s
             now_s = self._clock() - self._origin_s
         for _ in range(_BATCH):
             if self._host.elapsed_s + CONTROL_PERIOD_S > now_s:
                 break
+            if self._must_wait():
+                return CONTROL_PERIOD_S
             self._host.step()
+            self._shared.reached_s = self._host.elapsed_s
         next_s = self._origin_s + self._host.elapsed_s + CONTROL_PERIOD_S
         return max(0.0, next_s - self._clock())
+
+    def _must_wait(self) -> bool:
+        """True while the flight's loop or the picture has not kept up, for `LOOP_PATIENCE_S` at
+        most: what hangs for good must not stop time."""
+        limit_s, before_s = self._shared.limit_s, self._limit_s
+        loop_late = self._host.elapsed_s >= limit_s
+        if math.isinf(limit_s) or not (loop_late or self._host.picture_late_s > MARGIN_S):
+            self._waiting_since_s = None
+            return False
+        now_s, self._limit_s = self._clock(), limit_s
+        if self._waiting_since_s is None or (loop_late and limit_s != before_s):
+            self._waiting_since_s = now_s  # the loop has given a sign of life
+        return now_s - self._waiting_since_s < LOOP_PATIENCE_S
 
     def _wait(self, timeout_s: float) -> None:
         sockets = [self._host.endpoint.socket]
@@ -121,6 +145,7 @@ class Runner:
             self._channel = None
         self._end_s = self._clock() + self._linger_s
         self._realtime = True
+        self._shared = SharedTime()
         self._restart_clock()
 
     # --- the parent's requests ------------------------------------------------------

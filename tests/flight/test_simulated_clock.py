@@ -1,0 +1,185 @@
+"""The clock of a simulated flight in real time: the simulator and the loop wait for each other."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.flight.clock import SIM_PATIENCE_S, SLOW, SLOW_S, SimulatedClock
+from perchctl.sim.process.runner import Runner
+from perchctl.sim.process.shared import LOOP_PATIENCE_S, MARGIN_S, SharedTime
+from perchctl.sim.scenario import CONTROL_PERIOD_S
+
+PERIOD_S = 0.02
+STEP_S = CONTROL_PERIOD_S
+NEAR_S = STEP_S + 1e-9
+
+
+class Host:
+    """Counts steps; stands in for a vehicle where only the time matters."""
+
+    elapsed_s = 0.0
+    picture_late_s = 0.0
+
+    def __getattr__(self, _: str) -> Any:
+        return self
+
+    def step(self) -> None:
+        self.elapsed_s += STEP_S
+
+
+class Rig:
+    """A loop and a simulator of one wall clock, which passes only where the test lets it."""
+
+    def __init__(self) -> None:
+        self.wall_s = 100.0
+        self.host, self.shared, self.runs = Host(), SharedTime(), True
+        self.runner = Runner(
+            self.host, None, realtime=True, linger_s=0.0, clock=lambda: self.wall_s,
+            shared=self.shared,
+        )  # type: ignore[arg-type] # fmt: skip
+        self.clock = SimulatedClock(self.shared, lambda: self.wall_s, self.let_pass)
+
+    def let_pass(self, for_s: float) -> None:
+        """On the wall's clock; the simulator does what it would do meanwhile."""
+        end_s = self.wall_s + for_s
+        while self.wall_s < end_s - 1e-9:
+            self.wall_s = min(self.wall_s + 0.001, end_s)
+            if self.runs:
+                self.runner.catch_up()
+
+    def turns(self, count: int, work_s: float) -> list[float]:
+        """Turns of a loop that computes for so long; how late each began."""
+        late_s, due_s = [], self.clock.now()
+        for _ in range(count):
+            now_s = self.clock.now()
+            late_s.append(now_s - due_s)
+            self.let_pass(work_s)
+            due_s += PERIOD_S
+            if due_s < now_s:
+                due_s = now_s + PERIOD_S
+            self.clock.wait_until(due_s)
+        return late_s
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_on_an_idle_computer_it_is_real_time(rig: Rig) -> None:
+    with rig.clock.waiting_for_loop():
+        late_s = rig.turns(100, work_s=0.01)
+        assert rig.clock.remarks() == []
+    assert max(late_s) <= NEAR_S
+    assert rig.host.elapsed_s == pytest.approx(100 * PERIOD_S, abs=NEAR_S)
+    assert rig.wall_s - 100.0 == pytest.approx(100 * PERIOD_S, abs=2 * NEAR_S)
+    assert rig.clock.now() == pytest.approx(rig.wall_s, abs=NEAR_S)
+
+
+def test_it_waits_for_a_busy_loop_and_says_so_once(rig: Rig) -> None:
+    said = []
+    with rig.clock.waiting_for_loop():
+        for _ in range(100):
+            rig.turns(1, work_s=0.1)
+            said += rig.clock.remarks()
+        late_s = rig.turns(100, work_s=0.1)
+    assert said == [SLOW]
+    assert max(late_s) <= MARGIN_S + NEAR_S
+    assert rig.host.elapsed_s < 0.5 * (rig.wall_s - 100.0)
+
+
+def test_what_the_computer_does_now_and_then_is_not_said(rig: Rig) -> None:
+    with rig.clock.waiting_for_loop():
+        rig.turns(10, work_s=0.01)
+        rig.turns(1, work_s=0.9 * SLOW_S)
+        rig.turns(10, work_s=0.01)
+        assert rig.clock.remarks() == []
+
+
+def test_a_loop_that_hangs_does_not_stop_time(rig: Rig) -> None:
+    with rig.clock.waiting_for_loop():
+        rig.turns(10, work_s=0.01)
+        before_s = rig.clock.now()
+        rig.let_pass(LOOP_PATIENCE_S)
+        assert rig.clock.now() - before_s <= MARGIN_S + NEAR_S
+        rig.let_pass(3.0)  # the watchdog lands in it
+        assert rig.clock.now() - before_s == pytest.approx(3.0, abs=0.1)
+        assert max(rig.turns(10, work_s=0.1)[2:]) <= MARGIN_S + NEAR_S
+
+
+def test_it_waits_for_the_picture_but_not_for_ever(rig: Rig) -> None:
+    with rig.clock.waiting_for_loop():
+        rig.turns(10, work_s=0.01)
+        rig.host.picture_late_s = MARGIN_S + STEP_S
+        stands_s = rig.host.elapsed_s
+        rig.let_pass(0.9 * LOOP_PATIENCE_S)
+        assert rig.host.elapsed_s == stands_s
+        rig.host.picture_late_s = 0.0
+        rig.turns(1, work_s=0.01)
+        assert rig.host.elapsed_s > stands_s
+        rig.host.picture_late_s = math.inf
+        began_s = rig.wall_s
+        rig.turns(100, work_s=0.01)
+        assert rig.wall_s - began_s < LOOP_PATIENCE_S + 100 * PERIOD_S + 0.1
+
+
+def test_it_waits_for_a_starved_simulator(rig: Rig) -> None:
+    rig.turns(10, work_s=0.01)
+    rig.runs, before_s = False, rig.clock.now()
+    rig.let_pass(0.9 * SIM_PATIENCE_S)
+    assert rig.clock.now() == before_s
+    rig.runs = True
+    rig.turns(10, work_s=0.01)
+    assert rig.clock.now() > before_s
+
+
+def test_a_simulator_that_is_gone_does_not_stop_time_nor_turn_it_back(rig: Rig) -> None:
+    with rig.clock.waiting_for_loop():
+        rig.turns(10, work_s=0.01)
+        rig.runs, before_s = False, rig.clock.now()
+        rig.let_pass(SIM_PATIENCE_S)
+        rig.turns(50, work_s=0.0)
+        alone_s = rig.clock.now()
+        assert alone_s - before_s == pytest.approx(50 * PERIOD_S, abs=NEAR_S)
+        rig.runs = True
+        rig.let_pass(0.01)
+        assert alone_s <= rig.clock.now() <= alone_s + 0.1 + NEAR_S
+        rig.turns(50, work_s=0.01)
+        assert rig.clock.now() - alone_s == pytest.approx(50 * PERIOD_S, abs=0.1 + NEAR_S)
+
+
+def test_before_and_after_the_loop_time_runs_freely(rig: Rig) -> None:
+    rig.turns(1, work_s=0.5)
+    assert math.isinf(rig.shared.limit_s)
+    assert rig.host.elapsed_s == pytest.approx(0.5, abs=NEAR_S)
+    with contextlib.suppress(ValueError), rig.clock.waiting_for_loop():
+        rig.turns(1, work_s=0.01)
+        assert math.isfinite(rig.shared.limit_s)
+        raise ValueError("the loop fails")
+    assert math.isinf(rig.shared.limit_s)
+    began_s = rig.clock.now()
+    rig.let_pass(1.0)
+    assert rig.clock.now() - began_s == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_vehicle_whose_parent_is_gone_flies_on(rig: Rig) -> None:
+    with rig.clock.waiting_for_loop():
+        rig.turns(10, work_s=0.01)
+        stands_s = rig.host.elapsed_s
+        rig.runner._lose_parent()
+        rig.let_pass(1.0)
+        assert rig.host.elapsed_s == pytest.approx(stands_s + 1.0, abs=0.05)
+
+
+def test_two_processes_map_the_same_numbers(tmp_path: Any) -> None:
+    mine = SharedTime.create(tmp_path / "time")
+    other = SharedTime(tmp_path / "time")
+    assert (other.reached_s, other.limit_s) == (0.0, math.inf)
+    mine.limit_s, other.reached_s = 1.5, 0.25
+    assert (mine.reached_s, other.limit_s) == (0.25, 1.5)
