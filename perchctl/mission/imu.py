@@ -12,6 +12,7 @@ its estimate. The accelerometer's other two axes tell of both.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.geometry import GRAVITY_MPS2
@@ -68,7 +69,8 @@ class ImuMotion:
         gap_s: end of the newest silence that a fall could hide in.
         steady_s: since when the vertical speed has stayed what it is.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
-        frozen_s: for how long the accelerometer has read the very same, as none that lives does.
+        frozen_s, attitude_frozen_s: for how long the accelerometer, and the attitude, have read
+            the very same, as none that lives does.
         hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
     """
 
@@ -85,19 +87,23 @@ class ImuMotion:
     blow_mps: float = 0.0
     blow_s: float = -math.inf
     frozen_s: float = 0.0
+    attitude_frozen_s: float = 0.0
     hover_thrust: float = 0.0
 
 
 def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """The motion with one more sample; `last` is the one before, None at the first."""
     dt_s = math.inf if last is None else new.t_s - last.t_s
-    same = last is not None and _reads_the_same(last, new)
-    frozen_s = motion.frozen_s + max(0.0, dt_s) if same else 0.0
+    frozen_s = _still_s(motion.frozen_s, last, new, lambda s: (s.acc_x_g, s.acc_y_g, s.acc_z_g))
+    attitude_frozen_s = _still_s(
+        motion.attitude_frozen_s, last, new, lambda s: (s.roll_rad, s.pitch_rad, s.yaw_rad)
+    )
     if last is None or not 0.0 < dt_s <= GAP_S or frozen_s > FROZEN_S:
         gap_s = motion.gap_s if last is None else new.t_s
         return replace(
             motion, t_s=new.t_s, gap_s=gap_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
             steady_mps=motion.velocity_mps[2], light_since_s=math.inf, frozen_s=frozen_s,
+            attitude_frozen_s=attitude_frozen_s,
         )  # fmt: skip
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has(FLYING):
@@ -132,12 +138,18 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         blow_mps=blow,
         blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
         frozen_s=frozen_s,
+        attitude_frozen_s=attitude_frozen_s,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
     )
 
 
-def _reads_the_same(a: Telemetry, b: Telemetry) -> bool:
-    return (a.acc_x_g, a.acc_y_g, a.acc_z_g) == (b.acc_x_g, b.acc_y_g, b.acc_z_g)
+def _still_s(
+    before_s: float, a: Telemetry | None, b: Telemetry, reading: Callable[[Telemetry], Vector]
+) -> float:
+    """For how long a reading has been the very same."""
+    if a is None or reading(a) != reading(b):
+        return 0.0
+    return before_s + max(0.0, b.t_s - a.t_s)
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
@@ -202,7 +214,8 @@ def reckoned(
     """One tick on. `believed`: the sample's estimated velocity is true; `astray`: it may be
     another axis', and after a silence, too, the reckoned one is better."""
     estimated = sample.velocity_mps
-    if old.imu is None or imu.gap_s > old.imu.t_s:
+    frozen = imu.attitude_frozen_s > FROZEN_S
+    if old.imu is None or imu.gap_s > old.imu.t_s or frozen:
         velocity_mps = estimated if believed else ZERO
         if astray:
             velocity_mps = old.velocity_mps

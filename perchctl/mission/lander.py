@@ -441,7 +441,9 @@ def _reckon(c: Context) -> PlannerState:
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
     reach_s = state.reach_s
     if stage_of(c) in (Stage.DOWN, Stage.ORDERED):  # what is released or stopped moves no more
-        within = state.contact_z_m is not None or new.below_m < REACH_M
+        # What has felt the floor climbs no more, whatever may have been reckoned since.
+        near = new.below_m < REACH_M and state.touch_s is None
+        within = state.contact_z_m is not None or near
         # Caught below the magnet it may be drawn to it again: what fell before says nothing then.
         again = reach_s is not None and obs.imu.fell_s > reach_s and new.below_m < REACH_M
         reach_s = (obs.t_s if reach_s is None or again else reach_s) if within else None

@@ -128,7 +128,7 @@ def sent_raw(link: CflibLink, sim: SimProcess) -> list[int]:
 class Nobody:
     """A guard that has nothing to send."""
 
-    def poll(self, now_s: float, newest: Telemetry | None) -> None:
+    def poll(self, now_s: float, newest: Telemetry | None, waiting: object = ()) -> None:
         return None
 
 

@@ -145,7 +145,7 @@ def flown(connected: Flown) -> Iterator[Flown]:
 class Nobody:
     """A guard that has nothing to send."""
 
-    def poll(self, now_s: float, newest: Telemetry | None) -> Command | None:
+    def poll(self, now_s: float, newest: Telemetry | None, waiting: object = ()) -> Command | None:
         return None
 
 
@@ -155,7 +155,7 @@ class Operator:
     def __init__(self) -> None:
         self.pressed = False
 
-    def poll(self, now_s: float, newest: Telemetry | None) -> Command | None:
+    def poll(self, now_s: float, newest: Telemetry | None, waiting: object = ()) -> Command | None:
         return EmergencyStop() if self.pressed else None
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from perchctl.mission.imu import FROZEN_S, ImuMotion, Reckoning, moved, reckoned
@@ -27,6 +29,18 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
     assert alive.frozen_s == 0.0
     assert alive.fell_s > 0.0
+
+
+def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> None:
+    """What it leans by is not known, and whether it falls still is."""
+    samples = [telemetry(0.01 * i, roll_rad=0.2, acc_z_g=1.0) for i in range(100)]
+    motion = flown(samples)
+    assert motion.gap_s < 0.0
+    before = Reckoning(flown(samples[:99]), (0.1, 0.2, 0.3), estimated_mps=(0.0, 0.0, 0.0))
+    after = replace(samples[-1], velocity_mps=(0.0, 0.1, 0.0))
+    assert reckoned(before, motion, after, believed=False).velocity_mps == (
+        pytest.approx((0.1, 0.3, 0.3))
+    )
 
 
 def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
