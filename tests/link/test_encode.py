@@ -113,7 +113,7 @@ class Calls:
 def in_lockstep(command: Command) -> list[tuple[str, tuple[Any, ...]]]:
     """What the lockstep link makes the firmware do."""
     firmware = Calls()
-    MockLink(SimpleNamespace(firmware=firmware)).send(command)  # type: ignore[arg-type]
+    MockLink(SimpleNamespace(firmware=firmware, t_s=0.0)).send(command)  # type: ignore[arg-type]
     return firmware.made
 
 
