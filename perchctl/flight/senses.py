@@ -237,7 +237,7 @@ class Senses:
         newest = self.history.newest
         attitude = None if newest is None else attitude_of(newest)
         target = estimate(self.state, now_s, attitude, self.pipeline, spread=self.recorded)
-        if self.sights is not None:
+        if self.sights is not None and self.sends_sights:  # else the estimate runs away
             target = self.sights.steered(target, self.history)
         stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
         if target is not None and (self.blind or stale):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +12,13 @@ from hypothesis import strategies as st
 
 from perchctl.calibration.files import camera_of
 from perchctl.flight.history import History, extended
+from perchctl.flight.senses import Senses
 from perchctl.flight.sights import CARRIED_FOR_S, Sights, is_carried
 from perchctl.pipeline import make_pipeline
 from perchctl.positioning.place import Place, touching
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry
-from tests.helpers.mission import telemetry
+from tests.helpers.mission import target_at, telemetry
 from tests.helpers.sights import TARGET_ONLY
 
 TARGET = Place(np.array([0.0, 0.0, 2.0]), 0.0)
@@ -101,3 +103,22 @@ def test_the_shaking_of_turning_motors_does_not_end_it() -> None:
         for i in range(20, len(samples))
     ]
     assert np.mean(held) > 0.98
+
+
+@pytest.mark.parametrize("sends", [True, False])
+def test_without_sights_to_send_the_target_is_where_it_is_seen(
+    monkeypatch: pytest.MonkeyPatch, sends: bool
+) -> None:
+    """The estimate runs away by then: by it what hangs would be seen far below its target."""
+    nobody: Any = None
+    senses = Senses(nobody, nobody, PIPELINE, TARGET_ONLY)
+    assert senses.sights is not None
+    senses.sights.feed.target = TARGET
+    drifted = [replace(sample, position_m=(0.0, 0.0, 1.2)) for sample in at_rest()]
+    senses.history, senses.sends_sights = history(drifted), sends
+    now_s = senses.last_good_frame_s = drifted[-1].t_s
+    seen = target_at(now_s, (0.0, 0.0, 2.0), (0.0, 0.0, 1.95))
+    monkeypatch.setattr("perchctl.flight.senses.estimate", lambda *_, **__: seen)
+    target = senses.target(now_s)
+    assert target is not None
+    assert bool(abs(target.e_m[2] - seen.e_m[2]) > 0.5) is sends
