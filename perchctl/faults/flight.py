@@ -74,10 +74,7 @@ class FaultyFlight:
     def __init__(
         self, profile: Profile, case: Case, scenario: Scenario, log: LogWatcher | None = None
     ) -> None:
-        if any(isinstance(effect, ExternalPositions) for effect in case.effects):
-            profile = by_mocap(profile)
-        sooner_s = _sooner_s(case.effects)
-        profile = _with_latency(profile, sooner_s)
+        profile, sooner_s = _flown_by(profile, case), _sooner_s(case.effects)
         self._profile, self._case, self._log = profile, case, log
         self._scenario = scenario = _scenario_of(case, scenario)
         camera = camera_of(profile.camera)
@@ -257,7 +254,8 @@ def fly_with_fault(
     record: bool = False,
 ) -> FaultResult:
     """Fly a case to its end and judge it. Errors: NotFound, InvalidValue (calibration, log)."""
-    watcher = None if log is None else LogWatcher.lockstep(log, profile, scenario.seed, record)
+    flown_by = _flown_by(profile, case)
+    watcher = None if log is None else LogWatcher.lockstep(log, flown_by, scenario.seed, record)
     return FaultyFlight(profile, case, scenario, watcher).fly()
 
 
@@ -294,7 +292,11 @@ def _sooner_s(effects: Sequence[Effect]) -> float:
     return max(found, default=0.0)
 
 
-def _with_latency(profile: Profile, more_s: float) -> Profile:
+def _flown_by(profile: Profile, case: Case) -> Profile:
+    """The profile as the case needs it."""
+    if any(isinstance(effect, ExternalPositions) for effect in case.effects):
+        profile = by_mocap(profile)
+    more_s = _sooner_s(case.effects)
     if more_s == 0.0:
         return profile
     latency_s = profile.camera.start_latency_s + more_s
