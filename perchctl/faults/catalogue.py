@@ -189,10 +189,6 @@ FAULTS: tuple[Fault, ...] = (
     Fault("external-mirrored", (11,), "positions come mirrored", AIR,
           draws.external_wrong("mirrored")),
     Fault("exception", (18,), "an unforeseen exception ends the loop", AIR, draws.raises),
-    Fault("latency-falls", (24,), "pictures come 100 to 200 ms sooner than before", AIR,
-          draws.camera_sooner),
-    Fault("brown-out", (6, 13), "the voltage breaks down, and the vehicle starts again", AIR,
-          draws.reboots, (BROWN_OUT,)),
     Fault("operator-hammers", (16,), "Ctrl-C every 80 to 250 ms, for 2.5 to 4 s", AIR,
           draws.hammered, (OPERATOR_STOPS,)),
     # --- two at once ------------------------------------------------------------------
@@ -207,6 +203,11 @@ FAULTS: tuple[Fault, ...] = (
           draws.together(draws.weak_magnet, draws.silence(up=True, down=False)), (TOO_LOW, CUT)),
     Fault("hung-and-packet-lost", (14, 20), "the loop is stuck, and one or two packets of what is "
           "sent in its place are lost", AIR, draws.hung_and_packet_lost),
+    # --- what comes at once, and stays --------------------------------------------------
+    Fault("latency-falls", (24,), "pictures come 100 to 200 ms sooner than before", AIR,
+          draws.camera_sooner),
+    Fault("brown-out", (6, 13), "the voltage breaks down, and the vehicle starts again", AIR,
+          draws.reboots, (BROWN_OUT,)),
 )  # fmt: skip
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
