@@ -46,6 +46,10 @@ estimate astray within a second."""
 MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5
 """More at a time is a blow, or a correction of the estimate."""
 CLIMB_SPARE_MPS = 0.1
+MOST_CLIMB_MPS = 1.0
+"""What the position mode's own limit lets a vehicle climb while nothing is heard of it."""
+REACH_M = 0.04
+"""A gear so near below the target may have been caught by its magnet since."""
 """Reckoned, the vehicle may have come nearer to the target by so much each second."""
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
 """Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
@@ -192,7 +196,11 @@ class Reckoning:
         velocity_mps: world axes.
         bias_mps2: what the accelerometer and the attitude give too much sideways, world axes, as
             learned beside the estimate.
-        below_m: how far the gear is below the target at the least; inf before the first sight.
+        below_m: how far the gear is below the target at the least, as far as the telemetry was
+            heard; inf before the first sight, and after a fall.
+        nearest_m: the same with what it may have climbed while nothing was heard; a fall only adds
+            to it.
+        unsure_s: end of the newest silence in which it may have come into the magnet's reach.
         aside_m: from the gear to the target's axis, world axes.
         aside_sigma_m: standard deviation of that; inf where it is unknown.
         sight_s: exposure of the sight that it is carried on from.
@@ -203,6 +211,8 @@ class Reckoning:
     bias_mps2: Vector = ZERO
     estimated_mps: Vector = ZERO
     below_m: float = math.inf
+    nearest_m: float = math.inf
+    unsure_s: float = -math.inf
     aside_m: tuple[float, float] = (0.0, 0.0)
     aside_sigma_m: float = math.inf
     sight_s: float = -math.inf
@@ -227,6 +237,10 @@ def reckoned(
             )
             velocity_mps = (vx, vy, vz)
         unknown = replace(old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated)
+        if old.imu is not None and imu.gap_s > old.imu.t_s:
+            nearest_m = old.nearest_m - MOST_CLIMB_MPS * (imu.t_s - old.imu.t_s)
+            unsure_s = imu.t_s if nearest_m < REACH_M else old.unsure_s
+            unknown = replace(unknown, nearest_m=nearest_m, unsure_s=unsure_s)
         return unknown if old.imu is None else replace(unknown, aside_sigma_m=math.inf)
     dt_s = imu.t_s - old.imu.t_s
     if not dt_s > 0.0:
@@ -256,6 +270,7 @@ def reckoned(
         bias_mps2=(bias[0], bias[1], bias[2]),
         estimated_mps=estimated,
         below_m=math.inf if fell else old.below_m - (vz + CLIMB_SPARE_MPS) * dt_s,
+        nearest_m=old.nearest_m - vz * dt_s,
         aside_m=(ex - vx * dt_s, ey - vy * dt_s),
         aside_sigma_m=old.aside_sigma_m + growth_m,
     )
@@ -266,4 +281,6 @@ def sighted(
 ) -> Reckoning:
     """With a sight of the target: `aside_m` from the gear to its axis, world axes, `below_m`
     from the gear up to it."""
-    return replace(old, sight_s=t_s, aside_m=aside_m, below_m=below_m, aside_sigma_m=sigma_m)
+    return replace(
+        old, sight_s=t_s, aside_m=aside_m, below_m=below_m, nearest_m=below_m, aside_sigma_m=sigma_m
+    )

@@ -28,7 +28,7 @@ from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since
 from perchctl.mission.context import HANGING_S, PUT_RIGHT_S, Context
 from perchctl.mission.guards import has_slipped
 from perchctl.mission.guidance import hold_here, limited, presses, unpressed, walk
-from perchctl.mission.imu import reckoned, sighted
+from perchctl.mission.imu import REACH_M, reckoned, sighted
 from perchctl.mission.release import (
     CATCH_STILL_ABOVE_M,
     STILL_THRUST,
@@ -151,8 +151,6 @@ FALLEN_BELOW_M = 0.4
 _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 
-REACH_M = 0.04
-"""A gear so near below the target may have been caught by its magnet since."""
 HIGH_M, LOW_M, STAYED_M = 0.45, 0.3, 0.15
 SINK_MPS, LOW_SINK_MPS, SLOW_BELOW_M = 0.7, 0.4, 0.6
 """Level it comes down fast from high up: sideways it goes with the third power of the time, by
@@ -227,8 +225,12 @@ def started(
         # that the camera does not see: it has to be seen below before it counts as free.
         contact_z_m = tel.position_m[2]
     hover = _hover_thrust(old, obs)
+    # While the loop was silent the watchdog may have brought it down, or up to the magnet and no
+    # farther: what was felt meanwhile counts from the tick before.
+    within = contact_z_m is not None or new.reckoning.below_m < REACH_M
     new = replace(
-        new, contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
+        new, reach_s=old.t_s if within and old.reach_s is None else old.reach_s,
+        contact_z_m=contact_z_m, level_hover=hover, hover_thrust=hover,
         level_within=HOVER_WITHIN if old.hover_thrust else UNLEARNED_WITHIN,
     )  # fmt: skip
     return blinded(new, obs) if _has_lost_its_position(c) else new
@@ -298,8 +300,6 @@ def finding(c: Context) -> Finding:
     if c.by_sight or not c.placed:
         if c.tracked and c.far_below_target:
             return Finding.STANDS
-        if state.reach_s is None or state.reckoning.imu is None:
-            return Finding.STANDS
         return _by_fall(c, state.reach_s)
     ground_m = state.ground_m[2] if state.ground_m else 0.0
     high = state.entry_m[2] - ground_m > HIGH_M
@@ -309,9 +309,14 @@ def finding(c: Context) -> Finding:
     return Finding.STANDS
 
 
-def _by_fall(c: Context, since_s: float) -> Finding:
-    imu = c.obs.imu
-    if imu.fell_s > since_s:
+def _by_fall(c: Context, since_s: float | None) -> Finding:
+    """`since_s`: within the magnet's reach since."""
+    imu, reckoning = c.obs.imu, c.state.reckoning
+    down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
+    # A sight from after the silence has told where it was.
+    if reckoning.unsure_s > max(down_s, reckoning.sight_s):
+        return Finding.UNKNOWN
+    if since_s is None or down_s > since_s:
         return Finding.STANDS
     return Finding.UNKNOWN if imu.gap_s > since_s else Finding.HANGS
 
@@ -321,7 +326,7 @@ def hangs_where_it_did(c: Context) -> bool:
     time. What telemetry did not show for as long as a fall takes may lie on the floor by now."""
     if not c.by_sight and c.placed and _is_at_contact(c):
         return True
-    return c.state.reach_s is not None and _by_fall(c, c.state.reach_s) is Finding.HANGS
+    return _by_fall(c, c.state.reach_s) is Finding.HANGS
 
 
 def hangs_stopped(c: Context) -> bool:

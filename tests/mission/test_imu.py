@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from perchctl.mission.imu import FROZEN_S, ImuMotion, Reckoning, moved, reckoned
+from perchctl.mission.imu import (
+    FROZEN_S,
+    GAP_S,
+    MOST_CLIMB_MPS,
+    REACH_M,
+    ImuMotion,
+    Reckoning,
+    moved,
+    reckoned,
+    sighted,
+)
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import telemetry
 
@@ -57,3 +70,32 @@ def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     assert reckoned(old, heard, after, believed=False, astray=True).velocity_mps == (
         old.velocity_mps
     )
+
+
+@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 2.0))
+def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silent_s: float) -> None:
+    """However it was last heard to sink. A sight from after it tells again where it is."""
+    before = telemetry(1.0, velocity_mps=(0.0, 0.0, -0.3))
+    after = telemetry(1.0 + silent_s, velocity_mps=(0.0, 0.0, -0.3))
+    imu = flown([before])
+    old = sighted(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
+    new = reckoned(old, moved(imu, before, after), after, believed=False)
+    assert (new.unsure_s == after.t_s) == (below_m - MOST_CLIMB_MPS * silent_s < REACH_M)
+    assert new.below_m == below_m
+    seen = sighted(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
+    assert seen.nearest_m == below_m
+
+
+def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:
+    """It fell by 5 cm, and the setpoint that catches it is a metre above."""
+    falls = [telemetry(1.0 + 0.01 * i, acc_z_g=0.3) for i in range(13)]
+    reckoning = sighted(Reckoning(flown(falls[:1])), 0.9, (0.0, 0.0), 0.0, 0.001)
+    motion = flown(falls[:1])
+    for last, new in pairwise(falls):
+        motion = moved(motion, last, new)
+        reckoning = reckoned(reckoning, motion, new, believed=False)
+    assert motion.fell_s > 1.0
+    assert 0.02 < reckoning.nearest_m < 0.1
+    late = telemetry(falls[-1].t_s + 1.5)
+    reckoning = reckoned(reckoning, moved(motion, falls[-1], late), late, believed=False)
+    assert reckoning.unsure_s == late.t_s
