@@ -228,7 +228,10 @@ def reckoned(
     if old.imu is None or imu.gap_s > old.imu.t_s or frozen:
         velocity_mps = estimated if believed else ZERO
         if astray:
-            velocity_mps = old.velocity_mps
+            vx, vy, vz = old.velocity_mps
+            if old.imu is not None and imu.gap_s <= old.imu.t_s:  # only the attitude stands still
+                vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
+            velocity_mps = (vx, vy, vz)
         elif not believed and old.imu is not None:
             # No position corrects the estimate in a silence: its change is what was felt on board.
             vx, vy, vz = (

@@ -56,6 +56,18 @@ def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> No
     )
 
 
+def test_astray_with_an_attitude_that_stands_still_it_still_feels_a_fall() -> None:
+    """Sideways what was reckoned stays; downwards the accelerometer goes on telling."""
+    samples = [
+        telemetry(0.01 * i, roll_rad=0.01, acc_x_g=0.001 * i, acc_z_g=0.8) for i in range(100)
+    ]
+    before, motion = flown(samples[:50]), flown(samples)
+    old = Reckoning(before, (0.1, 0.2, -0.3))
+    new = reckoned(old, motion, samples[-1], believed=False, astray=True)
+    fell_mps = -0.2 * 9.81 * 0.5
+    assert new.velocity_mps == pytest.approx((0.1, 0.2, -0.3 + fell_mps), abs=0.01)
+
+
 def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     """On board the accelerometer was felt all the time, and no position corrected anything. What
     the estimate was wrong by before it is still wrong by."""
