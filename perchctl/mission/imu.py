@@ -46,16 +46,20 @@ estimate astray within a second."""
 MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5
 """More at a time is a blow, or a correction of the estimate."""
 CLIMB_SPARE_MPS = 0.1
+"""Reckoned, the vehicle may have come nearer to the target by so much each second."""
 MOST_CLIMB_MPS = 1.0
 """What the position mode's own limit lets a vehicle climb while nothing is heard of it."""
 REACH_M = 0.04
 """A gear so near below the target may have been caught by its magnet since."""
-"""Reckoned, the vehicle may have come nearer to the target by so much each second."""
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
 """Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
 the share of the way itself, since the samples of a blow come each 10 ms."""
 
 
+CORRECTED_MPS, CORRECTED_MPS2 = 0.08, 5.0
+"""A sideways speed that the estimate gains at once, and beyond what a tilt gives, is a correction
+by a position; where that is wrong the attitude turned with it is, too."""
+CORRECTED_MEMORY_S = 6.0
 HOVER_MEMORY_S, LEAST_FLYING, SATURATED = 0.5, 0.4, 0.95
 """Of the felt hover thrust; with less of the full thrust nothing flies, with more it tells
 nothing."""
@@ -76,6 +80,8 @@ class ImuMotion:
         frozen_s, attitude_frozen_s: for how long the accelerometer, and the attitude, have read
             the very same, as none that lives does.
         hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
+        misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
+            the motion is reckoned without them.
     """
 
     t_s: float = -math.inf
@@ -93,6 +99,8 @@ class ImuMotion:
     frozen_s: float = 0.0
     attitude_frozen_s: float = 0.0
     hover_thrust: float = 0.0
+    misled_rad: tuple[float, float] = (0.0, 0.0)
+    turning_radps: tuple[float, float] = (0.0, 0.0)
 
 
 def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
@@ -112,7 +120,9 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has(FLYING):
         offset_g = _offset_at_rest(offset_g, new, min(1.0, dt_s / REST_MEMORY_S))
-    before, after = acceleration_mps2(last, offset_g), acceleration_mps2(new, offset_g)
+    misled_rad, turning_radps = _misled(motion, last, new, dt_s)
+    before = acceleration_mps2(_led_right(last, motion.misled_rad), offset_g)
+    after = acceleration_mps2(_led_right(new, misled_rad), offset_g)
     dv = tuple(0.5 * (a + b) * dt_s for a, b in zip(before, after, strict=True))
     x, y, z = (v + d for v, d in zip(motion.velocity_mps, dv, strict=True))
     up_mps2 = dv[2] / dt_s
@@ -144,7 +154,32 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         frozen_s=frozen_s,
         attitude_frozen_s=attitude_frozen_s,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
+        misled_rad=misled_rad,
+        turning_radps=turning_radps,
     )
+
+
+def _misled(
+    motion: ImuMotion, last: Telemetry, new: Telemetry, dt_s: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What corrections have turned roll and pitch by, and the rates that are no correction."""
+    gained_mps = math.dist(new.velocity_mps[:2], last.velocity_mps[:2])
+    turned = (new.roll_rad - last.roll_rad, new.pitch_rad - last.pitch_rad)
+    kept = 1.0 - dt_s / CORRECTED_MEMORY_S
+    (roll, pitch), rates = motion.misled_rad, motion.turning_radps
+    if gained_mps <= CORRECTED_MPS + CORRECTED_MPS2 * dt_s:
+        return (kept * roll, kept * pitch), (turned[0] / dt_s, turned[1] / dt_s)
+    return (
+        kept * roll + turned[0] - rates[0] * dt_s,
+        kept * pitch + turned[1] - rates[1] * dt_s,
+    ), rates
+
+
+def _led_right(sample: Telemetry, misled_rad: tuple[float, float]) -> Telemetry:
+    if misled_rad == (0.0, 0.0):
+        return sample
+    roll, pitch = misled_rad
+    return replace(sample, roll_rad=sample.roll_rad - roll, pitch_rad=sample.pitch_rad - pitch)
 
 
 def _still_s(

@@ -817,7 +817,8 @@ def _braking(c: Context) -> tuple[float, float]:
     bx_mps2, by_mps2, _ = c.state.reckoning.bias_mps2
     x_mps, y_mps = part * x_mps - level_s * bx_mps2, part * y_mps - level_s * by_mps2
     ahead_mps, left_mps = x_mps * cos + y_mps * sin, y_mps * cos - x_mps * sin
-    return _against(-left_mps), _against(ahead_mps)
+    roll_rad, pitch_rad = c.obs.imu.misled_rad
+    return _against(-left_mps) + roll_rad, _against(ahead_mps) + pitch_rad
 
 
 def _against(mps: float) -> float:

@@ -68,6 +68,37 @@ def test_astray_with_an_attitude_that_stands_still_it_still_feels_a_fall() -> No
     assert new.velocity_mps == pytest.approx((0.1, 0.2, -0.3 + fell_mps), abs=0.01)
 
 
+@given(
+    step_rad=st.tuples(st.floats(-0.15, 0.15), st.floats(-0.15, 0.15)),
+    step_mps=st.floats(0.2, 2.0),
+    rate_radps=st.floats(-3.0, 3.0),
+)
+def test_a_correction_by_a_wrong_position_does_not_turn_what_is_felt(
+    step_rad: tuple[float, float], step_mps: float, rate_radps: float
+) -> None:
+    """The estimate's speed steps, and the attitude with it, while the vehicle itself turns on."""
+
+    def flight(jumps: bool) -> list[Telemetry]:
+        samples = []
+        for i in range(60):
+            after = jumps and i >= 30
+            roll, pitch = step_rad if after else (0.0, 0.0)
+            turned_rad = 0.1 * rate_radps * max(0.0, min(0.1, 0.01 * i - 0.25))
+            samples.append(
+                telemetry(
+                    0.01 * i, roll_rad=turned_rad + roll, pitch_rad=pitch,
+                    velocity_mps=(step_mps if after else 0.0, 0.0, 0.0),
+                    acc_x_g=0.0001 * i, acc_z_g=1.0,
+                )
+            )  # fmt: skip
+        return samples
+
+    misled, true = flown(flight(True)), flown(flight(False))
+    assert true.misled_rad == (0.0, 0.0)
+    assert misled.misled_rad == pytest.approx(step_rad, rel=0.06, abs=0.001)
+    assert misled.velocity_mps[:2] == pytest.approx(true.velocity_mps[:2], abs=0.04)
+
+
 def test_after_a_silence_the_estimate_s_own_change_counts() -> None:
     """On board the accelerometer was felt all the time, and no position corrected anything. What
     the estimate was wrong by before it is still wrong by."""
