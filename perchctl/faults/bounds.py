@@ -42,6 +42,8 @@ REACTION_S = 1.0
 """From the profile's limit to the way down, at most: a turn's delay, thrust that goes down."""
 WATCHED_S, SUNK_M = 2.0, 0.15
 """After so much more time it has come down by this, at less than a third of a landing's speed."""
+SINKING_MPS = 0.1
+"""Or it sinks like that: its own landing starts from rest, by a curve that is slow at first."""
 LOW_M = 0.3
 """Where a landing hands over, and slows down."""
 
@@ -144,13 +146,16 @@ class DescentBound:
         self._effects, self._profile = effects, profile
         self._down_by_s = math.inf
         self._from_m: float | None = None
+        self._lowest_m = math.inf
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
         """The fault begins, in a phase of the program."""
         limits_s = [self._limit_s(effect, phase or Phase.APPROACH) for effect in self._effects]
         self._down_by_s = t_s + min(limits_s, default=math.inf) + REACTION_S
 
-    def is_overdue(self, t_s: float, height_m: float, *, touching: bool, uplink: bool) -> bool:
+    def is_overdue(
+        self, t_s: float, height_m: float, vz_mps: float, *, touching: bool, uplink: bool
+    ) -> bool:
         """Whether it should have come down by now and has not. What touches the ceiling before it
         has to come down may hang there, which takes its time to find out; and what hears nothing
         obeys nothing."""
@@ -160,8 +165,10 @@ class DescentBound:
             return False
         if self._from_m is None:
             self._from_m = height_m
+        self._lowest_m = min(self._lowest_m, height_m)
         late = t_s >= self._down_by_s + WATCHED_S
-        return late and height_m > max(LOW_M, self._from_m - SUNK_M)
+        comes_down = vz_mps < -SINKING_MPS or self._lowest_m <= max(LOW_M, self._from_m - SUNK_M)
+        return late and not comes_down
 
     def _limit_s(self, effect: Effect, phase: Phase) -> float:
         """After how long it lands for this; never where it need not."""

@@ -3,13 +3,11 @@ time, and the simulated vehicle prepared as a real one is."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from perchctl.errors import ConnectionFailed
 from perchctl.geometry import yaw_of
 from perchctl.link.mock import MockLink
 from perchctl.link.outside import RESET, parameters_of
-from perchctl.positioning.feed import FeedStatus, PositionFeed
+from perchctl.positioning.feed import PositionFeed
 from perchctl.positioning.judge import label
 from perchctl.positioning.thread import PERIOD_S
 from perchctl.profile import Profile
@@ -26,7 +24,7 @@ def by_mocap(profile: Profile) -> Profile:
     return profile.model_copy(update={"positioning": config})
 
 
-def feed_lockstep(link: MockLink, profile: Profile) -> Callable[[float], FeedStatus] | None:
+def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
     """A feed that turns with the link's time, for the flight loop; None with decks, and where
     the target is the positioning system: the loop feeds then.
 
@@ -50,7 +48,7 @@ def feed_lockstep(link: MockLink, profile: Profile) -> Callable[[float], FeedSta
         link.advance_to(link.now_s + PERIOD_S)
     x, y, z = (float(part) for part in place.position_m)
     _start_at(link, config, x, y, z, yaw_of(place.R))
-    return feed.status
+    return feed
 
 
 def _start_at(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from perchctl.camera.source import FrameSource
 from perchctl.errors import Interrupted, NotFound
@@ -28,6 +29,7 @@ from perchctl.flight.turns import Turns
 from perchctl.flight.watchdog import Watchdog
 from perchctl.link.protocol import Link
 from perchctl.mission import planner
+from perchctl.mission.felt import begun_anew
 from perchctl.mission.lander import Finding
 from perchctl.mission.sent import Sent
 from perchctl.mission.state import (
@@ -58,6 +60,14 @@ HUNG_S = 0.25
 """A turn that takes longer was hung up somewhere: what it knew of the vehicle is old."""
 
 
+class Positions(Protocol):
+    """What the loop needs of a `perchctl.positioning.feed.PositionFeed`."""
+
+    def status(self, now_s: float) -> FeedStatus: ...
+
+    def stop(self) -> None: ...
+
+
 @dataclass(frozen=True, eq=False)
 class FlightParts:
     """The edges. `simulated` says what the scenario of a simulated flight did that explains
@@ -72,12 +82,12 @@ class FlightParts:
     watchers: tuple[Watcher, ...] = ()
     operator: Callable[[], Operator] = lambda: Operator.NONE
     simulated: Callable[[Event], str] = lambda event: ""
-    positions: Callable[[float], FeedStatus] | None = None
+    positions: Positions | None = None
     remarks: Callable[[], Sequence[str]] = tuple
 
     def position_age_s(self, now_s: float) -> float:
         """Of the newest position that a motion capture gave; 0 without one."""
-        return 0.0 if self.positions is None else self.positions(now_s).age_s
+        return 0.0 if self.positions is None else self.positions.status(now_s).age_s
 
 
 def fly(parts: FlightParts) -> FlightReport:
@@ -210,6 +220,9 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         turns.lap()
         watchdog.tick(max(due_s, now_s) + period_s, state, command, obs)
         senses.sends_sights = state.blind_s is None
+        if state.astray and parts.positions is not None and not (before and before.astray):
+            parts.positions.stop()
+            senses.felt = begun_anew(senses.felt)
         events = events_of(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True
@@ -241,7 +254,7 @@ def _outside(parts: FlightParts, senses: Senses, now_s: float) -> FeedStatus | N
     """How it goes with positions from outside, or by the target; None where decks measure."""
     if senses.sights is not None:
         return senses.sights.status(now_s)
-    return None if parts.positions is None else parts.positions(now_s)
+    return None if parts.positions is None else parts.positions.status(now_s)
 
 
 def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:

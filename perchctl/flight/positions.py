@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from importlib.util import find_spec
 
 from perchctl.errors import SafetyAbort, no_motion_capture
@@ -15,7 +14,7 @@ from perchctl.link.claim import vehicle_of
 from perchctl.link.outside import check_parameters
 from perchctl.positioning.capture import check_reachable, open_capture
 from perchctl.positioning.compared import newest, objection
-from perchctl.positioning.feed import FeedStatus, PositionFeed
+from perchctl.positioning.feed import PositionFeed
 from perchctl.positioning.standing import StandingFeed
 from perchctl.positioning.thread import FeedThread
 from perchctl.positioning.types import CaptureSource
@@ -76,7 +75,7 @@ def started_feed(
     config: PositioningConfig,
     clock: Clock,
     profile: Profile,
-) -> Callable[[float], FeedStatus] | None:
+) -> PositionFeed | None:
     """The vehicle's estimate settled on what the capture says, and positions on their way until
     `stack` ends: the link is closed before that, since a vehicle that lands still needs them.
     None with decks, and where the target is the positioning system.
@@ -93,7 +92,7 @@ def started_feed(
     thread.start()
     _refuse_strange(feed, link, clock, profile)
     link.settle(feed)
-    return feed.status
+    return feed
 
 
 def _settle_standing(link: CflibLink, clock: Clock, profile: Profile) -> None:

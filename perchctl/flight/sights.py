@@ -22,6 +22,9 @@ CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06
 0.013."""
 SINKING_MPS = -0.15
 """No such speed comes of a bias while the place is sent."""
+FROZEN_S = 0.06
+"""An attitude that reads the very same for so long is not the one at the picture's exposure, and
+0.1 rad of it places a vehicle 1.2 m under the target 12 cm aside."""
 
 
 class Sights:
@@ -51,7 +54,7 @@ class Sights:
     def see(self, measured: Measured, history: History, now_s: float) -> None:
         """A picture. What is pressed or hangs needs none, and the last ones were of before."""
         pose = surest_of(measured)
-        if pose is None or self._touches:
+        if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
         if then is not None and now is not None:

@@ -26,8 +26,8 @@ BELOW_M = 0.3
 """A target on the ceiling that seems so far below the vehicle is not there."""
 KNOCKED_MPS = 0.5
 """Sideways, under the target: no draught gives a held vehicle so much."""
-FELT_ASTRAY_MPS, FELT_S = 0.4, 0.1
-"""Late positions make less: 0.15 s at 2 m/s2."""
+OTHERWISE_MPS = 0.15
+"""True positions make at most 0.07, also those that are 0.15 s late."""
 SATURATED = 0.98
 """Of the largest thrust: from here on nothing tells how much more it takes."""
 LITTLE_LEFT = 0.93
@@ -67,14 +67,11 @@ def _near_standoff(c: Context) -> bool:
     return c.tracked and c.error_z_m <= ascend.standoff_m + ascend.settle_z_m
 
 
-def beside_felt_mps(c: Context) -> float:
-    """By how much the speed of a motion capture's positions is beside the one that pictures and
-    accelerometer agree on; 0 where they have not just now."""
-    felt = c.obs.felt
-    if c.by_sight or felt is None or c.obs.t_s - felt.t_s > FELT_S:
-        return 0.0
-    (x, y), (ex, ey, _) = felt.velocity_mps, c.obs.telemetry.velocity_mps
-    return math.hypot(x - ex, y - ey)
+def _moves_otherwise(c: Context) -> bool:
+    """The positions of a motion capture lead the estimate elsewhere than the vehicle feels to go:
+    mirrored, turned or swapped axes, which a vehicle at rest cannot tell."""
+    by_capture = c.profile.positioning.by == "mocap"
+    return by_capture and math.hypot(*c.state.reckoning.beside_mps) > OTHERWISE_MPS
 
 
 def _contact(c: Context) -> bool:
@@ -299,7 +296,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
     Condition.TARGET_BELOW: lambda c: c.fresh and c.error_z_m < -BELOW_M,
     Condition.BATTERY_LOW: lambda c: c.battery_is_low,
-    Condition.OTHERWISE: lambda c: beside_felt_mps(c) > FELT_ASTRAY_MPS,
+    Condition.OTHERWISE: _moves_otherwise,
 }
 KEPT_OVER_A_CHANGE = (
     Condition.BATTERY_LOW,

@@ -54,9 +54,10 @@ class Context:
 
     @property
     def telemetry_age_s(self) -> float:
-        """Of the oldest part: position and velocity come by a packet of their own."""
+        """Age of the oldest part: position and velocity come in a packet of their own, and an
+        attitude that reads the very same is as old as its first reading."""
         tel = self.obs.telemetry
-        return self.obs.t_s - tel.t_s + tel.behind_s
+        return self.obs.t_s - tel.t_s + max(tel.behind_s, self.obs.imu.attitude_age_s)
 
     @property
     def attitude_age_s(self) -> float:

@@ -34,6 +34,8 @@ LEAST_LATER_S = 0.1
 """A lesser change swings an alignment by centimetres, and is told after the flight."""
 WANDERS_M, WANDERS_MORE = 0.005, 3.0
 """The sum wanders: by so much, and by so much more than with the right delay or turn."""
+ROUGH_M = 0.03
+"""A sum that wanders by so much within a second tells the speed to 0.05 m/s."""
 ALIKE_S = 3 * STEP_S
 
 
@@ -60,17 +62,24 @@ class FeltMotion:
 class FeltWatch:
     """`sights` of the last `WINDOW_S`, each its time and the way from body to target in body
     axes, m. `found`: the newest judgement, and `agreed`: how many in a row say the same. `motion`:
-    the newest that the sights are sure of."""
+    the newest in which the sum wandered by at most `motion_within_m`."""
 
     sights: tuple[tuple[float, Vector], ...] = ()
     judged_s: float = -math.inf
     found: Mismatch | None = None
     agreed: int = 0
     motion: FeltMotion | None = None
+    motion_within_m: float = WANDERS_M
 
     @property
     def mismatch(self) -> Mismatch | None:
         return self.found if self.agreed >= AGREED else None
+
+
+def begun_anew(old: FeltWatch) -> FeltWatch:
+    """The watch after wrong positions have turned the attitude: the sights from before go, and what
+    they leave turned is better felt roughly than not at all."""
+    return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
 def felt(
@@ -90,7 +99,7 @@ def felt(
         agreed = 0 if found is None else old.agreed + 1 if agrees else 1
         new = replace(new, found=found, agreed=agreed)
     i = _nearest(new.mismatch or Mismatch())
-    if wanders_m[i] <= WANDERS_M:
+    if wanders_m[i] <= new.motion_within_m:
         (vx, vy), (bx, by) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
         new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by)))
     return replace(new, judged_s=t_s)

@@ -51,6 +51,9 @@ MOST_CLIMB_MPS = 1.0
 """What the position mode's own limit lets a vehicle climb while nothing is heard of it."""
 REACH_M = 0.04
 """A gear so near below the target may have been caught by its magnet since."""
+BESIDE_MEMORY_S, PUSHED_G, PUSHED_S = 0.5, 0.25, 0.5
+"""In so long a difference between the speeds gained by estimate and accelerometer is forgotten. A
+push from the side shows in the accelerometer at once, and in the estimate only by and by."""
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
 """Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
 the share of the way itself, since the samples of a blow come each 10 ms."""
@@ -78,8 +81,9 @@ class ImuMotion:
         steady_s: since when the vertical speed has stayed what it is.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
         frozen_s, attitude_frozen_s: for how long the accelerometer, and the attitude, have read
-            the very same, as none that lives does.
+            the very same, as none that lives does; `-inf` before the attitude first changed.
         hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
+        pushed_s: when something last pushed it sideways: in flight only air does, by far less.
         misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
             the motion is reckoned without them.
     """
@@ -97,10 +101,17 @@ class ImuMotion:
     blow_mps: float = 0.0
     blow_s: float = -math.inf
     frozen_s: float = 0.0
-    attitude_frozen_s: float = 0.0
+    attitude_frozen_s: float = -math.inf
     hover_thrust: float = 0.0
+    pushed_s: float = -math.inf
     misled_rad: tuple[float, float] = (0.0, 0.0)
     turning_radps: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def attitude_age_s(self) -> float:
+        """For how long the attitude has read the same while the accelerometer lives: 0 where
+        neither changes, as in a simulated vehicle at rest."""
+        return max(0.0, self.attitude_frozen_s - self.frozen_s)
 
 
 def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
@@ -154,6 +165,7 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         frozen_s=frozen_s,
         attitude_frozen_s=attitude_frozen_s,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
+        pushed_s=new.t_s if math.hypot(new.acc_x_g, new.acc_y_g) > PUSHED_G else motion.pushed_s,
         misled_rad=misled_rad,
         turning_radps=turning_radps,
     )
@@ -186,9 +198,9 @@ def _still_s(
     before_s: float, a: Telemetry | None, b: Telemetry, reading: Callable[[Telemetry], Vector]
 ) -> float:
     """For how long a reading has been the very same."""
-    if a is None or reading(a) != reading(b):
-        return 0.0
-    return before_s + max(0.0, b.t_s - a.t_s)
+    if a is None:
+        return before_s
+    return 0.0 if reading(a) != reading(b) else before_s + max(0.0, b.t_s - a.t_s)
 
 
 def _hover_thrust(old: float, sample: Telemetry, dt_s: float) -> float:
@@ -231,6 +243,8 @@ class Reckoning:
         velocity_mps: world axes.
         bias_mps2: what the accelerometer and the attitude give too much sideways, world axes, as
             learned beside the estimate.
+        beside_mps: the speed that the estimate has gained of late and the accelerometer has not,
+            x and y, world axes.
         below_m: how far the gear is below the target at the least, as far as the telemetry was
             heard; inf before the first sight, and after a fall.
         nearest_m: the same with what it may have climbed while nothing was heard; a fall only adds
@@ -245,6 +259,7 @@ class Reckoning:
     velocity_mps: Vector = ZERO
     bias_mps2: Vector = ZERO
     estimated_mps: Vector = ZERO
+    beside_mps: tuple[float, float] = (0.0, 0.0)
     below_m: float = math.inf
     nearest_m: float = math.inf
     unsure_s: float = -math.inf
@@ -274,7 +289,9 @@ def reckoned(
                 for v, e, o in zip(old.velocity_mps, estimated, old.estimated_mps, strict=True)
             )
             velocity_mps = (vx, vy, vz)
-        unknown = replace(old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated)
+        unknown = replace(
+            old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated, beside_mps=(0.0, 0.0)
+        )
         if old.imu is not None and imu.gap_s > old.imu.t_s:
             nearest_m = old.nearest_m - MOST_CLIMB_MPS * (imu.t_s - old.imu.t_s)
             unsure_s = imu.t_s if nearest_m < REACH_M else old.unsure_s
@@ -283,7 +300,9 @@ def reckoned(
     dt_s = imu.t_s - old.imu.t_s
     if not dt_s > 0.0:
         return old
-    velocity, bias = [], []
+    velocity, bias, beside = [], [], [0.0, 0.0]
+    keeps = math.exp(-dt_s / BESIDE_MEMORY_S)
+    calm = believed and imu.t_s - imu.pushed_s > PUSHED_S
     for i in range(3):
         gained = imu.velocity_mps[i] - old.imu.velocity_mps[i]
         v, b = old.velocity_mps[i] + gained - old.bias_mps2[i] * dt_s, old.bias_mps2[i]
@@ -291,6 +310,9 @@ def reckoned(
             v += (estimated[i] - v) * min(1.0, dt_s / SPEED_MEMORY_S)
             wrong = (gained - (estimated[i] - old.estimated_mps[i])) / dt_s
             wrong = max(-MOST_WRONG_MPS2, min(MOST_WRONG_MPS2, wrong))
+            if calm and i < 2:
+                more = estimated[i] - old.estimated_mps[i] - gained + b * dt_s
+                beside[i] = keeps * old.beside_mps[i] + more
             b += (wrong - b) * min(1.0, dt_s / BIAS_MEMORY_S)
             b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b)) if i < 2 else 0.0
         velocity.append(v)
@@ -307,6 +329,7 @@ def reckoned(
         velocity_mps=(vx, vy, vz),
         bias_mps2=(bias[0], bias[1], bias[2]),
         estimated_mps=estimated,
+        beside_mps=(beside[0], beside[1]),
         below_m=math.inf if fell else old.below_m - (vz + CLIMB_SPARE_MPS) * dt_s,
         nearest_m=old.nearest_m - vz * dt_s,
         aside_m=(ex - vx * dt_s, ey - vy * dt_s),

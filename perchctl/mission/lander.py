@@ -213,7 +213,8 @@ def started(
     """What a way down that `old` leads to starts with, beyond its entry."""
     tel, stopped_s = obs.telemetry, old.stopped_s
     heard = obs.t_s - tel.t_s <= profile.safety.proof_age_s
-    if heard and tel.has(HL_ACTIVE) and profile.positioning.by != "target":
+    ordered = heard and tel.has(HL_ACTIVE) and profile.positioning.by != "target"
+    if ordered and not new.astray:  # else it would follow the wrong positions to its end
         new = replace(new, orders=LEAST_ORDERS, ordered_s=obs.t_s)
     elif heard and tel.thrust < 1 and stopped_s is None:
         # Somebody has stopped the motors, or they never turned: nothing spins them up again.
@@ -427,7 +428,9 @@ def blinded(state: PlannerState, obs: Observation) -> PlannerState:
 def _reckon(c: Context) -> PlannerState:
     state, obs = c.state, c.obs
     believed = c.placed and c.proves and state.blind_s is None and state.jump_s is None
-    new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=state.astray)
+    # By the target no sight is sent on the way down: the estimate's change is what it felt itself.
+    astray = state.astray and not c.by_sight
+    new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
     felt = obs.felt
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         new = replace(

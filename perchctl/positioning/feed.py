@@ -24,6 +24,7 @@ among good ones is none of the pilot's business."""
 HANGS_S = 0.2
 """The turns come every 10 ms, or as often as a simulated flight's loop turns."""
 RATE_OVER_S = 1.0
+STOPPED = "the positions contradict the accelerometer, and are not sent any more"
 BUSY = "the link is busy with something else, and a position does not wait"
 
 Send = Callable[[ExternalPosition], object]
@@ -67,12 +68,17 @@ class PositionFeed:
         self._count = 0
         self._times_s: deque[float] = deque()
         self._problem: str | None = None
+        self._stopped = False
+
+    def stop(self) -> None:
+        """Send nothing from here on: the positions contradict what the vehicle feels."""
+        self._stopped = True
 
     def turn(self, now_s: float) -> None:
         """Poll, judge, send one position at most. Raises nothing: what goes wrong shows as an
         age that grows, with the cause."""
         try:
-            problem = self._one(now_s)
+            problem = STOPPED if self._stopped else self._one(now_s)
         except Exception as error:  # of a source or a link: the flight is ended by the age
             problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
         with self._lock:

@@ -11,6 +11,7 @@ from perchctl.faults.bounds import (
     LASTS_S,
     LOW_M,
     REACTION_S,
+    SINKING_MPS,
     SUNK_M,
     WATCHED_S,
     DescentBound,
@@ -147,7 +148,7 @@ def overdue_s(effect: e.Effect, profile: Profile, phase: Phase, touching: bool =
     made.begin(10.0, phase)
     for k in range(2000):
         t_s = 10.0 + 0.01 * k
-        if made.is_overdue(t_s, 1.5, touching=touching, uplink=True):
+        if made.is_overdue(t_s, 1.5, 0.0, touching=touching, uplink=True):
             return t_s - 10.0
     return math.inf
 
@@ -157,26 +158,40 @@ def test_what_touches_the_ceiling_or_hears_nothing_is_not_overdue() -> None:
     assert overdue_s(gone, SIM, P.ALIGN, touching=True) == math.inf
     made = DescentBound((gone,), SIM)
     made.begin(0.0, P.ALIGN)
-    assert not made.is_overdue(3.0, 1.5, touching=False, uplink=False)
-    assert not made.is_overdue(9.0, 1.5, touching=False, uplink=True)
+    assert not made.is_overdue(3.0, 1.5, 0.0, touching=False, uplink=False)
+    assert not made.is_overdue(9.0, 1.5, 0.0, touching=False, uplink=True)
 
 
 def test_what_rises_to_the_ceiling_instead_is_overdue() -> None:
     made = DescentBound((e.Hung(EVER),), SIM)
     made.begin(0.0, P.ALIGN)
-    assert not made.is_overdue(2.01, 1.5, touching=False, uplink=True)
-    assert not made.is_overdue(3.0, 2.0, touching=True, uplink=True)
-    assert made.is_overdue(4.1, 2.0, touching=True, uplink=True)
+    assert not made.is_overdue(2.01, 1.5, 0.0, touching=False, uplink=True)
+    assert not made.is_overdue(3.0, 2.0, 0.0, touching=True, uplink=True)
+    assert made.is_overdue(4.1, 2.0, 0.0, touching=True, uplink=True)
 
 
 def test_what_is_on_its_way_down_is_not_overdue() -> None:
     for sunk_m, late in ((SUNK_M + 0.01, False), (SUNK_M - 0.01, True)):
         made = DescentBound((e.Hung(EVER),), SIM)
         made.begin(0.0, P.ALIGN)
-        assert not made.is_overdue(2.0 + 1e-6, 1.5, touching=False, uplink=True)
-        found = made.is_overdue(4.1, 1.5 - sunk_m, touching=False, uplink=True)
+        assert not made.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
+        found = made.is_overdue(4.1, 1.5 - sunk_m, 0.0, touching=False, uplink=True)
         assert found is late
     low = DescentBound((e.Hung(EVER),), SIM)
     low.begin(0.0, P.ALIGN)
-    assert not low.is_overdue(4.1, LOW_M, touching=False, uplink=True)
-    assert not low.is_overdue(9.0, LOW_M, touching=False, uplink=True)
+    assert not low.is_overdue(4.1, LOW_M, 0.0, touching=False, uplink=True)
+    assert not low.is_overdue(9.0, LOW_M, 0.0, touching=False, uplink=True)
+
+
+def test_a_landing_of_its_own_that_begins_slowly_is_not_overdue() -> None:
+    """Its curve starts from rest; and what it bounces up by when it begins takes nothing back."""
+    for sinking_mps, late in ((SINKING_MPS + 0.01, False), (SINKING_MPS - 0.01, True)):
+        made = DescentBound((e.Hung(EVER),), SIM)
+        made.begin(0.0, P.ALIGN)
+        assert not made.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
+        assert made.is_overdue(4.1, 1.45, -sinking_mps, touching=False, uplink=True) is late
+    sunk = DescentBound((e.Hung(EVER),), SIM)
+    sunk.begin(0.0, P.ALIGN)
+    assert not sunk.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
+    assert not sunk.is_overdue(3.0, 1.5 - SUNK_M - 0.01, 0.0, touching=False, uplink=True)
+    assert not sunk.is_overdue(4.1, 1.45, 0.1, touching=False, uplink=True)

@@ -142,8 +142,6 @@ def test_something_tells_the_vehicle_where_it_is(
 
 # --- The loop -------------------------------------------------------------------------------
 
-Positions = Callable[[float], FeedStatus]
-
 
 class Outside:
     """The positions of a capture that sees the scripted vehicle, but for `hidden`."""
@@ -157,7 +155,10 @@ class Outside:
         self._link, self._hidden, self._place = link, hidden, place
         self._sent_s, self._newest = -math.inf, None
 
-    def __call__(self, now_s: float) -> FeedStatus:
+    def stop(self) -> None:
+        self._hidden = lambda t_s: True
+
+    def status(self, now_s: float) -> FeedStatus:
         hidden = self._hidden(now_s)
         if not hidden:
             self._sent_s = now_s - 0.01
@@ -167,11 +168,24 @@ class Outside:
         )
 
 
-def rig(positions: Callable[[Vehicle], Positions | None] = Outside, **changes: Any) -> Rig:
+def rig(positions: Callable[[Vehicle], Outside | None] = Outside, **changes: Any) -> Rig:
     it = Rig(Vehicle(lambda sample: replace(sample, **changes)))
     it.profile = MOCAP
     it.positions = positions(it.link)
     return it
+
+
+def test_positions_that_lead_astray_are_sent_no_more() -> None:
+    """It slides by them while it rises: swapped axes, which did not show at rest."""
+    it = Rig(
+        Vehicle(lambda tel: replace(tel, position_m=(tel.position_m[2], 0.0, tel.position_m[2])))
+    )
+    it.profile = MOCAP
+    outside = it.positions = Outside(it.link)
+    stopped_s: list[float] = []
+    outside.stop = lambda: stopped_s.append(it.link.now_s)  # type: ignore[method-assign]
+    assert "swapped axes" in it.fly().reason
+    assert len(stopped_s) == 1
 
 
 def test_positions_that_never_come_keep_it_on_the_ground() -> None:

@@ -105,9 +105,9 @@ def fed(
         link = CflibLink(sim.uri, LinkConfig(), clock.now, positioning=config)
         try:
             link.connect()
-            status = started_feed(stack, capture, link, config, clock, load_profile("sim"))
-            assert status is not None
-            yield link, status
+            feed = started_feed(stack, capture, link, config, clock, load_profile("sim"))
+            assert feed is not None
+            yield link, feed.status
         finally:
             link.close()
 

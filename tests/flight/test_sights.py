@@ -18,6 +18,7 @@ from perchctl.pipeline import make_pipeline
 from perchctl.positioning.place import Place, touching
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry
+from perchctl.vision.types import MarkerPose, Measured
 from tests.helpers.mission import target_at, telemetry
 from tests.helpers.sights import TARGET_ONLY
 
@@ -85,6 +86,23 @@ def test_a_slow_slip_ends_it_within_a_tenth_of_a_second() -> None:
 def test_sinking_at_a_steady_speed_is_no_hanging() -> None:
     samples = at_rest(velocity_mps=(0.0, 0.0, -0.2))
     assert not is_carried(history(samples), samples[-1].t_s)
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_an_attitude_that_stands_still_places_nobody(frozen: bool) -> None:
+    """A sight that is turned by it would lead the vehicle astray."""
+    sights, sent = hung()
+    pose = MarkerPose(
+        source="large", t_s=1.45, rvec_rad=np.zeros(3), tvec_m=np.array([0.0, 0.0, 1.0]),
+        e_m=np.array([0.0, 0.0, 1.0]), e_yaw_rad=0.0, sigma_m=np.full(3, 1e-3), sigma_yaw_rad=1e-3,
+        reprojection_px=0.1,
+    )  # fmt: skip
+    samples = [
+        telemetry(1.0 + SAMPLE_S * i, 1.0, **({"roll_rad": 0.1} if frozen and i else {}))
+        for i in range(50)
+    ]
+    sights.see(Measured(poses={"large": pose}), history(samples), 1.5)
+    assert bool(sent) is not frozen
 
 
 @pytest.mark.parametrize("age_s", [0.15, 2.0])

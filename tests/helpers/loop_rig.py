@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 from perchctl.flight.history import History
-from perchctl.flight.loop import FlightParts, fly
+from perchctl.flight.loop import FlightParts, Positions, fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.mission import lander, planner
 from perchctl.mission.state import Observation, Operator, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
-from perchctl.positioning.feed import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
@@ -220,7 +219,7 @@ class Rig:
     profile: Profile = PROFILE
     setup: Pipeline = SETUP
     operator: Callable[[], Operator] = lambda: Operator.NONE
-    positions: Callable[[float], FeedStatus] | None = None
+    positions: Positions | None = None
 
     def parts(self) -> FlightParts:
         return FlightParts(

@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 
 from perchctl.mission import planner
+from perchctl.mission.conditions import OTHERWISE_MPS
 from perchctl.mission.imu import Reckoning
+from perchctl.mission.lander import LEAST_ORDERS
 from perchctl.mission.state import Phase, PlannerState
-from perchctl.vehicle import RawThrust, StopMotors
+from perchctl.vehicle import HL_ACTIVE, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
     HOVER_THRUST,
@@ -133,6 +135,25 @@ def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
     assert isinstance(command, RawThrust)
     assert state.astray
     assert "swapped axes" in state.reason
+
+
+@pytest.mark.parametrize("beside_mps", [0.9 * OTHERWISE_MPS, 1.1 * OTHERWISE_MPS])
+def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
+    beside_mps: float,
+) -> None:
+    """It would follow them to its end: 15 m aside within six seconds, where they are mirrored."""
+    felt = Felt()
+    begun = felt(observation(BEGIN_S, telemetry=telemetry(BEGIN_S)))
+    state = replace(
+        state_in(Phase.LANDING), orders=LEAST_ORDERS, ordered_s=BEGIN_S, last=begun.telemetry,
+        reckoning=Reckoning(imu=begun.imu),
+    )  # fmt: skip
+    for t_s in times(0.2):
+        state = replace(state, reckoning=replace(state.reckoning, beside_mps=(0.0, -beside_mps)))
+        tel = telemetry(t_s, supervisor=AIRBORNE | HL_ACTIVE)
+        state, command = planner.step(state, felt(observation(t_s, telemetry=tel)), MOCAP)
+    assert state.astray is (beside_mps > OTHERWISE_MPS)
+    assert isinstance(command, RawThrust) is state.astray
 
 
 def come_down(height_m: float, felt: Felt, felt_too_much_g: float) -> tuple[PlannerState, float]:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
-from perchctl.mission.felt import LEAST_LATER_S, STEP_S, FeltWatch, felt
+from perchctl.mission.felt import LEAST_LATER_S, STEP_S, FeltWatch, begun_anew, felt
 from perchctl.vehicle import Telemetry
 
 TARGET_M = np.array([0.3, -0.2, 1.9])
@@ -69,9 +69,12 @@ def watched(
     offset_g: float = 0.0,
     for_s: float = 1.5,
     seed: int = 0,
+    sway_m: float = 0.0,
+    anew: bool = False,
 ) -> FeltWatch:
+    """`sway_m`: what the sights wander by for another reason; `anew`: begun anew before them."""
     rng = np.random.default_rng(seed)
-    watch = FeltWatch()
+    watch = begun_anew(FeltWatch()) if anew else FeltWatch()
     flown = [swing.sample(0.01 * k, offset_g) for k in range(int((for_s + 2.2) * 100) + 1)]
     for i in range(int(for_s * RATE_HZ)):
         t_s = 2.0 + i / RATE_HZ
@@ -79,6 +82,7 @@ def watched(
         samples = tuple(flown[newest - 200 : newest + 1])
         x, y, z = swing.way_m(t_s - later_s, turned_rad)
         x, y = x + float(rng.normal(0.0, 1e-3)), y + float(rng.normal(0.0, 1e-3))
+        x += sway_m * math.sin(25.0 * t_s)
         watch = felt(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0))
     return watch
 
@@ -133,3 +137,12 @@ def test_a_camera_as_the_profile_has_it_fits(
 def test_at_rest_nothing_is_known() -> None:
     assert watched(Swing(0.0), later_s=0.3).mismatch is None
     assert watched(Swing(0.0), turned_rad=math.pi).mismatch is None
+
+
+def test_a_sum_that_wanders_a_little_counts_once_positions_have_turned_the_attitude() -> None:
+    """What they have turned it by goes back slowly, and the speed has to be braked by then."""
+    sure, rough = watched(Swing(), sway_m=0.015), watched(Swing(), sway_m=0.015, anew=True)
+    assert sure.motion is None
+    assert rough.motion is not None
+    true_mps = Swing().velocity_mps(rough.motion.t_s)[:2]
+    assert rough.motion.velocity_mps == pytest.approx(true_mps, abs=0.1)

@@ -13,6 +13,7 @@ from perchctl.mission.imu import (
     FROZEN_S,
     GAP_S,
     MOST_CLIMB_MPS,
+    PUSHED_G,
     REACH_M,
     ImuMotion,
     Reckoning,
@@ -46,7 +47,7 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
 
 def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> None:
     """What it leans by is not known, and whether it falls still is."""
-    samples = [telemetry(0.01 * i, roll_rad=0.2, acc_z_g=1.0) for i in range(100)]
+    samples = [telemetry(0.01 * i, roll_rad=0.2 if i else 0.0, acc_z_g=1.0) for i in range(100)]
     motion = flown(samples)
     assert motion.gap_s < 0.0
     before = Reckoning(flown(samples[:99]), (0.1, 0.2, 0.3), estimated_mps=(0.0, 0.0, 0.0))
@@ -142,3 +143,26 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     late = telemetry(falls[-1].t_s + 1.5)
     reckoning = reckoned(reckoning, moved(motion, falls[-1], late), late, believed=False)
     assert reckoning.unsure_s == late.t_s
+
+
+def beside_mps(turn: int, pushed_g: float = 0.0) -> float:
+    """After 0.4 s of a tilt that speeds it up by 1 m/s2, with an estimate that follows as it is, or
+    mirrored (`turn` -1), or corrected by positions after a push that it did not feel."""
+    lean_rad = 1.0 / 9.81
+    reckoning, motion, last = Reckoning(), ImuMotion(), None
+    for i in range(41):
+        t_s = 1.0 + 0.01 * i
+        new = telemetry(
+            t_s, velocity_mps=(turn * 0.01 * i, 0.0, 0.0), pitch_rad=lean_rad + 1e-6 * (i % 7),
+            acc_x_g=pushed_g if i == 3 else 1e-6 * (i % 7),
+        )  # fmt: skip
+        motion = moved(motion, last, new)
+        reckoning = reckoned(reckoning, motion, new, believed=True)
+        last = new
+    return abs(reckoning.beside_mps[0])
+
+
+def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_was_pushed() -> None:
+    assert beside_mps(1) < 0.05
+    assert beside_mps(-1) > 0.3
+    assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0

@@ -302,3 +302,16 @@ def test_a_level_descent_does_not_change_its_mode_for_a_moment(age_s: float, lev
     state = replace(state_in(Phase.LANDING, z_m=1.5), heading_lost=True)
     _, command = ticked(state, 10.5, telemetry(10.5 - age_s, 1.5))
     assert isinstance(command, RawThrust) is level
+
+
+def test_an_attitude_that_stands_still_is_telemetry_that_grows_old() -> None:
+    """By it a target that is seen is looked for where it is not."""
+    felt, state = Felt(), state_in(Phase.ALIGN)
+    for i in range(70):
+        t_s = 10.0 + 0.02 * i
+        tel = telemetry(t_s, roll_rad=0.1 if i else 0.0)
+        state, _ = planner.step(state, felt(observation(t_s, telemetry=tel)), PROFILE)
+        if state.phase is Phase.LANDING:
+            break
+    assert state.row == "telemetry-stale"
+    assert 0.02 * i == pytest.approx(PROFILE.safety.telemetry_land_s, abs=0.1)

@@ -322,6 +322,17 @@ def test_a_link_that_does_not_take_it_lets_the_age_grow() -> None:
     assert rig.at(1.0).sent == 2
 
 
+def test_what_contradicts_the_vehicle_is_sent_no_more() -> None:
+    rig = Rig()
+    rig.at(1.0)
+    rig.feed.stop()
+    for _ in range(20):
+        status = rig.at(1.0)
+    assert len(rig.places) == status.sent == 1
+    assert status.age_s > 0.15
+    assert "accelerometer" in (status.problem or "")
+
+
 def test_silence_and_a_source_that_is_gone_are_named() -> None:
     rig = Rig()
     assert rig.feed.status(rig.now_s).problem is not None
