@@ -1,10 +1,14 @@
 """Four motors and the cell that feeds them: duty cycles in, newtons out.
 
 - A motor's voltage is its duty cycle times the battery's. Its speed follows that voltage
-  with a first-order lag, and its thrust is the curve at the voltage that belongs to the
-  speed (`perchctl.sim.thrust_curve`): a motor that stands still takes longer to give
-  thrust than one that turns already. The lag of 0.05 s is that of the caught slips in
-  docs/firmware.md, "Catching a slip".
+  with a lag, and its thrust is the curve at the voltage that belongs to the speed
+  (`perchctl.sim.thrust_curve`).
+- The lag is shorter the faster the motor turns. The voltage that keeps a motor at speed w is
+  a w + b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and
+  its square rises linearly with that voltage. A motor that hovers has the lag of 0.05 s of
+  docs/firmware.md, "Catching a slip". One that stands still has `STANDING_LAG_S`: with it the
+  slips of that page cost what was measured there, whether the motors turned, turned slowly or
+  stood. With 0.05 s for all, a vehicle with slow motors falls up to two fifths less.
 - Nothing brakes a brushed motor, so it runs down more slowly than it runs up.
   `MOTOR_COAST_S` is the value with which the fall after a lone notify, the landing, the
   take-offs and the attitude steps of that page come out nearest to what was measured,
@@ -17,7 +21,9 @@
 from __future__ import annotations
 
 import math
+from math import sqrt
 
+from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.cell import RESISTANCE_OHM, Cell, CellKind
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 from perchctl.sim.thrust_curve import (
@@ -28,13 +34,19 @@ from perchctl.sim.thrust_curve import (
     FULL_COMMAND,
     MOTOR_FORCE_N,
     STANDSTILL_V,
+    motor_v,
     thrust_n,
 )
 
 MOTOR_LAG_S = 0.05
+STANDING_LAG_S = 0.18
 MOTOR_COAST_S = 0.12
 MOTOR_CURRENT_A = 1.1
 _AMPERES_PER_N = MOTOR_CURRENT_A / MOTOR_FORCE_N
+_HOVER_V = motor_v(0.042 * GRAVITY_MPS2 / 4.0)
+# The share of the way in one control period is sqrt(_STANDING + _PER_V * v).
+_STANDING = (CONTROL_PERIOD_S / STANDING_LAG_S) ** 2
+_PER_V = ((CONTROL_PERIOD_S / MOTOR_LAG_S) ** 2 - _STANDING) / _HOVER_V
 
 Forces = tuple[float, float, float, float]
 
@@ -48,20 +60,19 @@ class Powertrain:
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
         self.strength: Forces | None = None  # what is left of each motor's thrust; None: all
         self._speeds_v = (0.0, 0.0, 0.0, 0.0)  # each as the voltage that would keep it
-        self._up = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_LAG_S)
         self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
 
     def step(self, pwm: Forces) -> Forces:
         """The forces after one control period under four duty cycles 0..65535."""
         scale = self.battery_v / FULL_COMMAND
-        up, down = self._up, self._down
+        down, a, b = self._down, _STANDING, _PER_V
         v1, v2, v3, v4 = self._speeds_v
         d1, d2, d3, d4 = pwm
         d1, d2, d3, d4 = scale * d1 - v1, scale * d2 - v2, scale * d3 - v3, scale * d4 - v4
-        v1 += up * d1 if d1 > 0.0 else down * d1
-        v2 += up * d2 if d2 > 0.0 else down * d2
-        v3 += up * d3 if d3 > 0.0 else down * d3
-        v4 += up * d4 if d4 > 0.0 else down * d4
+        v1 += (sqrt(a + b * v1) if d1 > 0.0 else down) * d1
+        v2 += (sqrt(a + b * v2) if d2 > 0.0 else down) * d2
+        v3 += (sqrt(a + b * v3) if d3 > 0.0 else down) * d3
+        v4 += (sqrt(a + b * v4) if d4 > 0.0 else down) * d4
         self._speeds_v = (v1, v2, v3, v4)
         # `thrust_n`, four times: 500 calls a second each would cost more than the cubic.
         still = STANDSTILL_V

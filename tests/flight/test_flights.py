@@ -212,6 +212,19 @@ def test_a_magnet_that_never_holds_lands_after_the_attempts() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(("magnet_n", "lost_m"), [(0.10, 0.11), (0.30, 0.46), (0.38, 0.78)])
+def test_a_caught_slip_costs_the_measured_height(magnet_n: float, lost_m: float) -> None:
+    """docs/firmware.md, "Catching a slip": what the program's own catch costs at 42 g.
+
+    A slip falls into a period of the loop anywhere, which is worth 0.1 m: the mean of four."""
+    room = {"mass_kg": 0.042, "ceiling_z_m": 2.0, "battery_rest_v": 4.15}
+    flown = fly_short({"planner.attempts": 4}, magnet_force_n=magnet_n, **room)
+    assert is_landed(flown, Outcome.ATTEMPTS_USED_UP), flown
+    assert len(flown.slips_m) == 4
+    assert sum(flown.slips_m) / 4 == pytest.approx(lost_m, rel=0.15)
+
+
+@pytest.mark.long
 def test_the_papers_method_perches_with_raw_thrust() -> None:
     """profiles/paper.yaml: EPnP's place, weights, level filter and raw thrust."""
     conditions = load_profile(SHORT).simulation.model_dump(mode="json")

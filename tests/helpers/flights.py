@@ -31,11 +31,13 @@ SEED = 3
 
 @dataclass(frozen=True)
 class Flown:
-    """A flight's end, the true height of its last tick, and how far aside it ever was."""
+    """A flight's end, the true height of its last tick, how far aside it ever was, and what each
+    slip from the release cost until it was caught."""
 
     flight: LockstepFlight
     z_m: float
     farthest_m: float = 0.0
+    slips_m: tuple[float, ...] = ()
 
     @property
     def report(self) -> FlightReport:
@@ -77,11 +79,19 @@ class _Heights(NoLog):
     def __init__(self) -> None:
         super().__init__()
         self.z_m = self.farthest_m = 0.0
+        self.slips_m: list[float] = []
+        self._hung_m: float | None = None
 
     def tick(self, tick: Tick) -> None:
         assert self.truth is not None
+        before_m = self.z_m
         (x_m, y_m, self.z_m), _ = self.truth()
         self.farthest_m = max(self.farthest_m, math.hypot(x_m, y_m))
+        if tick.state.phase is Phase.COMPLETE:
+            self._hung_m = max(self._hung_m or 0.0, self.z_m)
+        elif self._hung_m is not None and self.z_m >= before_m:
+            self.slips_m.append(self._hung_m - before_m)
+            self._hung_m = None
 
 
 def short_profile(changes: Mapping[str, Any] | None = None, base: str = SHORT) -> Profile:
@@ -118,4 +128,4 @@ def fly_short(
     flight = fly_lockstep(
         profile, log=heights, scenario=drawn, capture=settings, operator_at=operator_at
     )
-    return Flown(flight, heights.z_m, heights.farthest_m)
+    return Flown(flight, heights.z_m, heights.farthest_m, tuple(heights.slips_m))

@@ -70,9 +70,9 @@ def test_flying_clears_while_the_stream_lives(pilot: Pilot) -> None:
 
 
 RAMP_S = 4.0
-
-
-REACTION_S = 0.04  # telemetry, link and a loop of 50 Hz together
+REACTION_S = 0.02
+"""Telemetry, link and a loop of 50 Hz together: in a real-time flight through cflib and `udp://`
+the newest telemetry was 3 to 7 ms old when the loop looked at it."""
 
 
 def catch_a_slip(pilot: Pilot, share: float, answer: str) -> float:
@@ -107,22 +107,16 @@ def catch_a_slip(pilot: Pilot, share: float, answer: str) -> float:
 
 
 @pytest.mark.parametrize(
-    ("answer", "share", "lost_m", "within_m"),
+    ("answer", "share", "lost_m"),
     [
-        ("below", 0.24, 0.67, 0.06),
-        ("below", 0.73, 0.86, 0.1),
-        ("below", 0.92, 1.03, 0.15),
-        ("above", 0.24, 0.09, 0.05),
-        ("above", 0.73, 0.53, 0.15),
-        ("above", 0.92, 0.80, 0.15),
+        ("below", 0.24, 0.67), ("below", 0.73, 0.86), ("below", 0.92, 1.03),
+        ("above", 0.24, 0.09), ("above", 0.73, 0.53), ("above", 0.92, 0.80),
     ],
-)
-def test_catching_a_slip(
-    pilot: Pilot, answer: str, share: float, lost_m: float, within_m: float
-) -> None:
+)  # fmt: skip
+def test_catching_a_slip(pilot: Pilot, answer: str, share: float, lost_m: float) -> None:
     """Row "Catching a slip during the release": below the contact it costs 0.67, 0.86, 1.03 m,
     above until vz >= 0 and then down 0.09, 0.53, 0.80 m (magnet 0.24, 0.73, 0.92)."""
-    assert catch_a_slip(pilot, share, answer) == pytest.approx(lost_m, abs=within_m)
+    assert catch_a_slip(pilot, share, answer) == pytest.approx(lost_m, rel=0.085)
     assert height(pilot) > 0.5
     assert not pilot.info & LOCKED_BIT
 

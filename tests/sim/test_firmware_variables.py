@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.body import REST_HEIGHT_M
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.firmware.commands import HlGoTo, PositionCommand
@@ -173,6 +174,20 @@ def test_estimate_noise_has_the_scenarios_size() -> None:
     assert np.std(errors) == pytest.approx(0.005, rel=0.35)
 
 
+def test_the_estimated_velocity_is_as_old_as_the_filter_makes_it() -> None:
+    """The accelerometer's filter takes 8 ms, and the estimate is new every 10 ms (source)."""
+    rig = make_rig(**PERFECT, ceiling_z_m=4.0)
+    rig.world.set_pose((0.0, 0.0, 3.5))
+    rig.run(0.1)
+    ages_s = []
+    for _ in range(25):
+        rig.run(0.002)
+        newer_mps = rig.firmware.log_value("stateEstimate.vz") - rig.world.vz_mps
+        ages_s.append(newer_mps / GRAVITY_MPS2)
+    assert 0.007 < min(ages_s) < max(ages_s) < 0.021
+    assert sum(ages_s) / 25 == pytest.approx(0.014, abs=0.002)
+
+
 def test_drift_runs_from_the_first_take_off_and_moves_the_vehicle() -> None:
     rig = make_rig(drift_mps=(0.02, -0.01, 0.0), **PERFECT)
     rig.run(5.0)
@@ -303,7 +318,7 @@ def test_the_propeller_test_tells_good_dead_and_unbalanced_apart() -> None:
 
 def test_a_threshold_sets_the_bits_of_the_motors_within() -> None:
     rig = make_rig(propeller_shake_g=(0.05, 0.05, 0.3, 0.05))
-    rig.firmware.set_parameter("health.propTestThreshold", 1.0)
+    rig.firmware.set_parameter("health.propTestThreshold", 0.5)
     health(rig, "startPropTest")
     assert rig.firmware.log_value("health.motorPass") == 0x80 | 0b1011
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_rpy
 from perchctl.sim.body import GEAR_RADIUS_M, REST_HEIGHT_M
-from perchctl.sim.powertrain import MOTOR_COAST_S, MOTOR_LAG_S
+from perchctl.sim.powertrain import MOTOR_COAST_S, MOTOR_LAG_S, STANDING_LAG_S, Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.thrust_curve import (
     FULL_COMMAND,
@@ -88,7 +88,7 @@ def test_hovers_at_the_weight_over_full_thrust(mass_kg: float) -> None:
     assert world.vz_mps == pytest.approx(0.0, abs=0.005)
 
 
-def test_motors_run_up_with_their_lag_and_down_more_slowly() -> None:
+def test_motors_run_down_more_slowly_than_up() -> None:
     world = make(mass_kg=0.048, ceiling_z_m=9.0)
     world.set_pose((0.0, 0.0, 5.0), hold=True)
     drive(world, 1.0, 40000.0)
@@ -98,12 +98,28 @@ def test_motors_run_up_with_their_lag_and_down_more_slowly() -> None:
     left_n = 4 * thrust_n(motor_v(steady_n) * math.exp(-1.0))
     drag_n = -DRAG_VERTICAL_NSPM * world.vz_mps
     assert lift_n(world, 0.048) == pytest.approx(left_n + drag_n, abs=0.003)
-    world = make(mass_kg=0.048, ceiling_z_m=9.0)
-    world.set_pose((0.0, 0.0, 5.0))
-    drive(world, MOTOR_LAG_S, 40000.0)
-    reached_n = 4 * thrust_n(motor_v(steady_n) * (1.0 - math.exp(-1.0)))
-    assert lift_n(world, 0.048) == pytest.approx(reached_n, abs=0.006)
     assert MOTOR_COAST_S > MOTOR_LAG_S
+
+
+def seconds_to_63_percent(from_v: float, to_v: float) -> float:
+    """How long a motor that turns at one voltage takes for 63 per cent of the way to another."""
+    train = Powertrain(4.2)
+    reached_n = thrust_n(to_v - math.exp(-1.0) * (to_v - from_v))
+    for _ in range(500):
+        train.step((FULL_COMMAND * from_v / train.battery_v,) * 4)
+    for step in range(500):
+        if train.forces_n[0] >= reached_n:
+            return step * CONTROL_PERIOD_S
+        train.step((FULL_COMMAND * to_v / train.battery_v,) * 4)
+    raise AssertionError("it never came so far")
+
+
+def test_a_motor_runs_up_faster_the_faster_it_turns() -> None:
+    hover_v = motor_v(0.042 * GRAVITY_MPS2 / 4)
+    near_s = seconds_to_63_percent(hover_v - 0.1, hover_v + 0.1)
+    assert near_s == pytest.approx(MOTOR_LAG_S, abs=1.5 * CONTROL_PERIOD_S)
+    assert 0.7 * STANDING_LAG_S < seconds_to_63_percent(0.0, 0.75) < STANDING_LAG_S
+    assert 1.5 * MOTOR_LAG_S < seconds_to_63_percent(0.0, hover_v) < 2.0 * MOTOR_LAG_S
 
 
 def test_a_motor_stands_still_below_the_dead_band() -> None:

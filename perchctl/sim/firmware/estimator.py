@@ -5,6 +5,9 @@ above it is in `perchctl.sim.flow_deck`. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
+A deck's velocity is as old as the firmware's: its filter sums up an accelerometer that is
+low-passed at 30 Hz by two poles, and does so 100 times a second (source).
+
 A deck's attitude is what the gyroscope integrates to, drawn to the truth only as slowly as
 the filter's other measurements can: a vehicle that is put on its back by hand, faster
 than any gyroscope measures, is still estimated as level.
@@ -13,6 +16,7 @@ than any gyroscope measures, is still estimated as level.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -32,6 +36,7 @@ _BATCH = 2048
 _NOISE_EVERY = 5  # coloured noise advances at 100 Hz
 _POSITION_MEMORY_S = 0.3
 _VELOCITY_MEMORY_S = 0.1
+_VELOCITY_LATE = 4  # control periods: the group delay of two poles at 30 Hz, 7.5 ms
 _VELOCITY_NOISE_PER_S = 2.5  # m/s of noise a metre of position noise
 _GYRO_NOISE_DPS = 0.08
 _ATTITUDE_MEMORY_S = 2.0
@@ -76,6 +81,8 @@ class Estimator:
         self._drift_s = 0.0
         self._position_noise = (0.0, 0.0, 0.0)
         self._velocity_noise = (0.0, 0.0, 0.0)
+        self._past: deque[Vector] = deque(maxlen=_VELOCITY_LATE + 1)
+        self._velocity_mps: Vector = (0.0, 0.0, 0.0)
         self._position_keep = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / _POSITION_MEMORY_S)
         self._velocity_keep = math.exp(-_NOISE_EVERY * CONTROL_PERIOD_S / _VELOCITY_MEMORY_S)
         self._acc_lag = 1.0 - math.exp(-2 * math.pi * _ACC_CUTOFF_HZ * CONTROL_PERIOD_S)
@@ -232,10 +239,12 @@ class Estimator:
         now = self.now
         nx, ny, nz = self._position_noise
         now.x_m, now.y_m, now.z_m = world.x_m + bx + nx, world.y_m + by + ny, world.z_m + bz + nz
+        self._past.append((world.vx_mps, world.vy_mps, world.vz_mps))
+        if self._steps % _NOISE_EVERY == 1:
+            self._velocity_mps = self._past[0]
         nx, ny, nz = self._velocity_noise
-        now.vx_mps = world.vx_mps + dx + nx
-        now.vy_mps = world.vy_mps + dy + ny
-        now.vz_mps = world.vz_mps + dz + nz
+        vx, vy, vz = self._velocity_mps
+        now.vx_mps, now.vy_mps, now.vz_mps = vx + dx + nx, vy + dy + ny, vz + dz + nz
         if self._flow is not None and flown:
             self._flow.step(world)
             (px, py, pz), (ex, ey) = self._flow.position_error_m, self._flow.velocity_error_mps
