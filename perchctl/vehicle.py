@@ -38,6 +38,7 @@ class Telemetry:
     supervisor: int
     battery_state: int = 0  # pm.state; 3 = low power
     position_variance_m2: float | None = None  # largest of the estimator's three
+    climb_variance_m2ps2: float | None = None  # of the estimated vertical speed
     behind_s: float = 0.0
     acc_x_g: float = 0.0
     acc_y_g: float = 0.0

@@ -71,6 +71,7 @@ def telemetry_from(values: Mapping[str, float], t_s: float, behind_s: float = 0.
         supervisor=int(values["supervisor.info"]),
         battery_state=int(values.get("pm.state", 0)),
         position_variance_m2=max(variances) if variances else None,
+        climb_variance_m2ps2=values.get("kalman.varPZ"),
         behind_s=behind_s,
         acc_x_g=values["acc.x"],
         acc_y_g=values["acc.y"],

@@ -65,6 +65,15 @@ class Context:
         return self.obs.t_s - self.obs.telemetry.t_s
 
     @property
+    def position_age_s(self) -> float:
+        """Of the newest position from outside that was sent to the vehicle; where it has them from
+        elsewhere, as by its decks, of the newest that corrected its estimate."""
+        age_s = self.obs.position_age_s
+        if self.profile.positioning.by == "deck":
+            age_s = max(age_s, self.obs.imu.corrections.age_s(self.obs.t_s))
+        return age_s
+
+    @property
     def proves(self) -> bool:
         """Whether all of the telemetry is new enough to prove anything. What is old is unknown."""
         return self.telemetry_age_s <= self.profile.safety.proof_age_s
@@ -83,12 +92,12 @@ class Context:
 
     @property
     def located(self) -> bool:
-        """Whether the estimated position and speed are believed. With decks always; not where they
-        come from outside and do not, or have only just come again, nor by pictures that do not fit
-        the motion that is felt."""
+        """Whether the estimated position and speed are believed. Not where no
+        position comes, or they have only just come again, nor by pictures that do not fit the
+        motion that is felt."""
         if self.by_sight and self.obs.mismatch is not None:
             return False
-        if self.state.astray or self.obs.position_age_s > self.profile.positioning.hold_s:
+        if self.state.astray or self.position_age_s > self.profile.positioning.hold_s:
             return False
         stale_s = self.state.stale_s
         return stale_s is None or self.obs.t_s - stale_s > PUT_RIGHT_S
@@ -103,7 +112,7 @@ class Context:
         """Whether the accelerometer has felt a blow or a gust that the estimate has not, and no
         sight since corrects it: sideways the firmware's estimator feels nothing."""
         reckoning = self.state.reckoning
-        if not self.by_sight or reckoning.imu is None or self.obs.position_age_s <= CORRECTED_S:
+        if not self.by_sight or reckoning.imu is None or self.position_age_s <= CORRECTED_S:
             return False
         (x, y, _), (ex, ey, _) = reckoning.velocity_mps, self.obs.telemetry.velocity_mps
         return math.hypot(x - ex, y - ey) > BLOWN_MPS

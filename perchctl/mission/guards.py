@@ -163,7 +163,7 @@ def why_beside_magnet(c: Context) -> str:
 def pressed_blindly(c: Context) -> bool:
     """The last centimetres are flown without a sight of the target; where it is the positioning
     system, by dead reckoning, and no longer than that may lead aside by millimetres."""
-    return c.by_sight and c.obs.position_age_s > BLIND_PRESS_S
+    return c.by_sight and c.position_age_s > BLIND_PRESS_S
 
 
 def mounted_wrong(c: Context) -> bool:
@@ -216,7 +216,7 @@ def why_mounted_wrong(c: Context) -> str:
 
 
 def why_pressed_blindly(c: Context) -> str:
-    return f"no contact {c.obs.position_age_s:.1f} s after the last sight of the target"
+    return f"no contact {c.position_age_s:.1f} s after the last sight of the target"
 
 
 def why_unplaced(c: Context) -> str:

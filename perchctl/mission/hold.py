@@ -10,6 +10,7 @@ from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
 NO_PICTURE = "no picture for"
+UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
 BLIND_VARIANCE_M2 = 0.02
 """Passed about 3 s after the last sight (docs/firmware.md, "Target as position")."""
 SINK_MPS, LOWEST_M = 0.2, 0.3
@@ -38,14 +39,14 @@ def hold_reason(c: Context) -> str:
 
 def is_unplaced(c: Context) -> bool:
     """No position from outside is fresh (fault 10)."""
-    return c.obs.position_age_s > c.profile.positioning.hold_s
+    return c.position_age_s > c.profile.positioning.hold_s
 
 
 def is_lost(c: Context) -> bool:
     """No position has come for so long that none is waited for any more: by the age of the last
     one, and of the target's, whose loss leaves nothing but the gyroscope, by the estimate's own
     variance too."""
-    if c.obs.position_age_s > c.profile.positioning.land_s or c.is_blown:
+    if c.position_age_s > c.profile.positioning.land_s or c.is_blown:
         return True
     return c.by_sight and is_unplaced(c) and c.variance_m2 > BLIND_VARIANCE_M2
 
@@ -64,7 +65,9 @@ def unplaced(c: Context) -> str:
     """For how long none was sent, and why."""
     if c.is_blown:
         return "pushed aside while the target was not seen"
-    age_s, why = c.obs.position_age_s, c.obs.position_problem
+    age_s, why = c.position_age_s, c.obs.position_problem
+    if c.profile.positioning.by == "deck":
+        why = why or UNCORRECTED
     text = f"no position for {age_s:.1f} s" if math.isfinite(age_s) else "no position has come"
     return f"{text}: {why}" if why else text
 

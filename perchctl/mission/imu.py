@@ -68,6 +68,42 @@ HOVER_MEMORY_S, LEAST_FLYING, SATURATED = 0.5, 0.4, 0.95
 nothing."""
 
 
+UNCORRECTED_M2PS2_PER_S, UNCORRECTED_S = 5e-4, 0.45
+"""The variance of the estimated vertical speed grows by 1e-3 a second where nothing corrects it
+(docs/firmware.md, "Variances"), by less or not at all where anything does. Growth at half that
+rate over five of the variance's packets is no chance."""
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Whether anything still corrects the estimate's height, by the variance of its vertical speed.
+
+    Attributes:
+        variance_m2ps2: the newest; None before the first.
+        changed_s: when that came.
+        none_since_s: since when it has grown without a break as it does uncorrected.
+    """
+
+    variance_m2ps2: float | None = None
+    changed_s: float = -math.inf
+    none_since_s: float = math.inf
+
+    def age_s(self, now_s: float) -> float:
+        """Of the last correction, where it is certain that none comes any more; else 0."""
+        certain = self.changed_s - self.none_since_s >= UNCORRECTED_S
+        return now_s - self.none_since_s if certain else 0.0
+
+    def watched(self, sample: Telemetry) -> Corrections:
+        """With one more sample. A variance that stands still is one whose packets do not come."""
+        variance, before = sample.climb_variance_m2ps2, self.variance_m2ps2
+        if variance is None or variance == before:
+            return self
+        least = UNCORRECTED_M2PS2_PER_S * (sample.t_s - self.changed_s)
+        grows = before is not None and variance - before >= least
+        none_since_s = min(self.none_since_s, self.changed_s) if grows else math.inf
+        return Corrections(variance, sample.t_s, none_since_s)
+
+
 @dataclass(frozen=True)
 class ImuMotion:
     """The vehicle's motion by its accelerometer and attitude alone.
@@ -86,6 +122,7 @@ class ImuMotion:
         pushed_s: when something last pushed it sideways: in flight only air does, by far less.
         misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
             the motion is reckoned without them.
+        corrections: whether anything corrects the estimate that stands beside this motion.
     """
 
     t_s: float = -math.inf
@@ -106,6 +143,7 @@ class ImuMotion:
     pushed_s: float = -math.inf
     misled_rad: tuple[float, float] = (0.0, 0.0)
     turning_radps: tuple[float, float] = (0.0, 0.0)
+    corrections: Corrections = Corrections()
 
     @property
     def attitude_age_s(self) -> float:
@@ -121,12 +159,13 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
     attitude_frozen_s = _still_s(
         motion.attitude_frozen_s, last, new, lambda s: (s.roll_rad, s.pitch_rad, s.yaw_rad)
     )
+    corrections = motion.corrections.watched(new)
     if last is None or not 0.0 < dt_s <= GAP_S or frozen_s > FROZEN_S:
         gap_s = motion.gap_s if last is None else new.t_s
         return replace(
             motion, t_s=new.t_s, gap_s=gap_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
             steady_mps=motion.velocity_mps[2], light_since_s=math.inf, frozen_s=frozen_s,
-            attitude_frozen_s=attitude_frozen_s,
+            attitude_frozen_s=attitude_frozen_s, corrections=corrections,
         )  # fmt: skip
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has(FLYING):
@@ -168,6 +207,7 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         pushed_s=new.t_s if math.hypot(new.acc_x_g, new.acc_y_g) > PUSHED_G else motion.pushed_s,
         misled_rad=misled_rad,
         turning_radps=turning_radps,
+        corrections=corrections,
     )
 
 

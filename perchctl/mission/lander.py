@@ -275,7 +275,7 @@ def _has_lost_its_position(c: Context) -> bool:
     """Whether accelerometer and attitude are what is left: nothing from outside places it."""
     if c.by_sight:
         return not _is_sighted(c)
-    return c.profile.positioning.by == "mocap" and not (c.located or c.state.astray)
+    return not (c.located or c.state.astray)
 
 
 def reach_of(c: Context) -> Reach:
@@ -378,7 +378,7 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
         kept = {name: s for name, s in state.since.items() if name in KEPT_OVER_A_CHANGE}
         stale_s = obs.t_s if profile.positioning.by == "target" else state.stale_s
         state = replace(state, since=kept, stale_s=stale_s, caught=True)
-    if obs.position_age_s > profile.positioning.hold_s:
+    if Context(state, obs, profile).position_age_s > profile.positioning.hold_s:
         state = replace(state, stale_s=obs.t_s)
     if obs.jumped:
         state = _jumped(state, obs)

@@ -45,7 +45,14 @@ def test_pitch_and_degrees_turn_at_the_edge() -> None:
     assert sample.supervisor == 0x021E
     assert sample.t_s == 1.5
     assert sample.position_variance_m2 is None
+    assert sample.climb_variance_m2ps2 is None
     assert sample.battery_v == 0.0  # unknown, which to the planner is not empty
+
+
+def test_the_vertical_speed_s_variance_stands_by_itself() -> None:
+    variances = {"kalman.varPX": 3e-4, "kalman.varPY": 2e-4, "kalman.varPZ": 1e-4}
+    sample = telemetry_from(dict.fromkeys(NEEDED, 0.0) | variances, 1.5)
+    assert (sample.position_variance_m2, sample.climb_variance_m2ps2) == (3e-4, 1e-4)
 
 
 @given(

@@ -106,10 +106,15 @@ EVENTS: dict[str, tuple[Event, float, frozenset[Phase] | set[Phase], str, Outcom
 
 BY_ITSELF = ("link-lost", "telemetry-stale", "estimator-jump", "loop-late")
 """Where height, link or loop are doubtful the vehicle lands by its own; else by setpoints."""
+LEVEL = "position-lost"
+"""Where nothing measures the position it comes down level, by thrust."""
 
 
-def down(command: object, z_m: float, *, by_itself: bool) -> None:
-    if by_itself:
+def down(command: object, z_m: float, *, by_itself: bool = False, level: bool = False) -> None:
+    if level:
+        assert isinstance(command, RawThrust)
+        assert command.thrust < HOVER_THRUST
+    elif by_itself:
         assert isinstance(command, Land)
         assert command.height_m <= 0.0
     else:
@@ -154,7 +159,7 @@ def test_every_phase_meets_every_abort(phase: Phase, name: str) -> None:
         assert state.phase is Phase.LANDING
         at_ceiling = phase in (Phase.PERCH, Phase.COMPLETE)  # peeled off first, also blindly
         by_itself = name in BY_ITSELF and not at_ceiling
-        down(commands[-1], state.entry_m[2], by_itself=by_itself)
+        down(commands[-1], state.entry_m[2], by_itself=by_itself, level=name == LEVEL)
     assert state.reason
 
 
@@ -168,7 +173,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
         obs = observation(20.0 + 0.02 * i, 0.8)
         state, command = planner.step(state, obs, PROFILE)
         assert state.phase is Phase.LANDING
-        assert isinstance(command, Land | Idle | PositionSetpoint)
+        assert isinstance(command, RawThrust if name == LEVEL else Land | Idle | PositionSetpoint)
         if isinstance(command, PositionSetpoint):
             assert command.z_m < 0.8
         orders += isinstance(command, Land)
@@ -180,7 +185,7 @@ def test_ctrl_c_once_lands_and_twice_stops(phase: Phase) -> None:
     state = _begin(phase, "")
     obs = observation(10.02, state.entry_m[2], operator=Operator.LAND)
     state, command = planner.step(state, obs, PROFILE)
-    down(command, state.entry_m[2], by_itself=False)
+    down(command, state.entry_m[2])
     state, command = planner.step(
         state, observation(10.04, state.entry_m[2], operator=Operator.STOP), PROFILE
     )

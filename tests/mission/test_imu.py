@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,6 +16,7 @@ from perchctl.mission.imu import (
     MOST_CLIMB_MPS,
     PUSHED_G,
     REACH_M,
+    UNCORRECTED_S,
     ImuMotion,
     Reckoning,
     moved,
@@ -58,7 +60,8 @@ def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> No
 
 
 def test_astray_with_an_attitude_that_stands_still_it_still_feels_a_fall() -> None:
-    """Sideways what was reckoned stays; downwards the accelerometer goes on telling."""
+        telemetry(0.01 * i, roll_rad=0.01 if i else 0.0, acc_x_g=0.001 * i, acc_z_g=0.8)
+        for i in range(100)
     samples = [
         telemetry(0.01 * i, roll_rad=0.01, acc_x_g=0.001 * i, acc_z_g=0.8) for i in range(100)
     ]
@@ -166,3 +169,46 @@ def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_wa
     assert beside_mps(1) < 0.05
     assert beside_mps(-1) > 0.3
     assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0
+
+
+# --- Whether the estimate is corrected -----------------------------------------------------------
+
+
+def uncorrected_s(*growths: tuple[float, float]) -> float:
+    """The age of the last correction, after each a second by how much the variance of the vertical
+    speed grows in it and how long it lasts; its packets come each 0.1 s."""
+    variance, motion, last = 1e-4, ImuMotion(), None
+    t_s = 0.0
+    for per_s, lasts_s in growths:
+        for _ in range(round(lasts_s / 0.01)):
+            t_s += 0.01
+            if round(100 * t_s) % 10 == 0:
+                variance += 0.1 * per_s
+            new = telemetry(t_s, climb_variance_m2ps2=variance)
+            motion, last = moved(motion, last, new), new
+    return motion.corrections.age_s(t_s)
+
+
+def test_a_variance_that_grows_on_and_on_is_corrected_no_more() -> None:
+    """After 0.5 s it is certain, and then the age counts from the last correction."""
+    assert uncorrected_s((0.0, 1.0), (1e-3, UNCORRECTED_S)) == 0.0
+    assert uncorrected_s((0.0, 1.0), (1e-3, 0.6)) == pytest.approx(0.6, abs=0.11)
+    assert uncorrected_s((0.0, 1.0), (1e-3, 5.0)) == pytest.approx(5.0, abs=0.11)
+
+
+@pytest.mark.parametrize("growths", [
+    ((2e-4, 5.0),),  # a laser's reading that is worse with each centimetre of height
+    ((1e-3, 0.4), (-1e-3, 0.1)) * 8,  # positions with holes
+    ((1e-3, 3.0), (-1e-2, 0.2)),  # they come again
+    ((1e-3, 0.4), (0.0, 3.0)),  # the variance's packets come no more
+    ((math.nan, 3.0),),
+])  # fmt: skip
+def test_what_is_corrected_or_not_known_is_not_called_uncorrected(
+    growths: tuple[tuple[float, float], ...],
+) -> None:
+    assert uncorrected_s((0.0, 1.0), *growths) == 0.0
+
+
+def test_no_silence_and_no_frozen_accelerometer_hides_that_nothing_corrects_it() -> None:
+    silent = [telemetry(0.3 * i, climb_variance_m2ps2=1e-4 + 3e-4 * i) for i in range(10)]
+    assert flown(silent).corrections.age_s(2.7) == pytest.approx(2.7)

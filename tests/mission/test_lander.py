@@ -17,7 +17,7 @@ import perchctl
 from perchctl.mission import actions, lander, planner
 from perchctl.mission.context import Context
 from perchctl.mission.felt import FeltMotion, Mismatch
-from perchctl.mission.imu import ImuMotion, Reckoning
+from perchctl.mission.imu import Corrections, ImuMotion, Reckoning
 from perchctl.mission.lander import (
     MANOEUVRES,
     PEEL_S,
@@ -199,7 +199,7 @@ def judged(profile: Profile, state: dict[str, Any], **observed: Any) -> Evidence
     ("observed", "with_decks", "by_target"),
     [
         ({}, Evidence.POSITION, Evidence.SIGHT),
-        ({"position_age_s": 0.6}, Evidence.POSITION, Evidence.IMU),
+        ({"position_age_s": 0.6}, Evidence.IMU, Evidence.IMU),
         ({"mismatch": Mismatch(later_s=0.2)}, Evidence.POSITION, Evidence.IMU),
         ({"jumped": True}, Evidence.ONBOARD, Evidence.IMU),
         ({"loop_late_s": 0.5}, Evidence.ONBOARD, Evidence.IMU),
@@ -228,6 +228,13 @@ def test_a_capture_that_gives_no_positions_leaves_what_is_felt() -> None:
     assert judged(MOCAP, {}) is Evidence.POSITION
     assert judged(MOCAP, {}, position_age_s=0.6) is Evidence.IMU
     assert judged(MOCAP, {"blind_s": NOW_S - 1.0}) is Evidence.IMU
+
+
+def test_a_deck_that_gives_no_positions_leaves_what_is_felt() -> None:
+    lost = ImuMotion(t_s=NOW_S, corrections=Corrections(1e-3, NOW_S, NOW_S - 0.6))
+    assert judged(DECKS, {}, imu=lost) is Evidence.IMU
+    doubtful = replace(lost, corrections=Corrections(1e-3, NOW_S, NOW_S - 0.3))
+    assert judged(DECKS, {}, imu=doubtful) is Evidence.POSITION
 
 
 def test_what_went_astray_is_believed_no_more() -> None:

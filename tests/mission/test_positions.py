@@ -96,6 +96,34 @@ def test_a_lasting_occlusion_lands_and_says_why(phase: Phase) -> None:
     assert len(sent) * TURN_S == pytest.approx(LAND_S, abs=0.03)
 
 
+@pytest.mark.parametrize("lost_s", [0.0, 0.06])
+@pytest.mark.parametrize("phase", [*HELD_PHASES, Phase.RECOVER, Phase.PERCH])
+def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, lost_s: float) -> None:
+    """Level, by thrust alone, within a second: long before the estimate itself doubts. Until
+    then the setpoint is nowhere above the one that was flown."""
+    see, state, sent = Felt(), state_in(phase), []
+    state = replace(state, entered_s=BEGIN_S, attempts=1)
+    for i in range(125):
+        t_s = BEGIN_S + 0.01 * (i - 24)
+        variance = 2e-4 + 1e-4 * max(0, math.ceil(10 * (t_s - BEGIN_S - lost_s) - 1e-6))
+        tel = telemetry(
+            t_s, 1.0, climb_variance_m2ps2=variance, position_variance_m2=variance,
+            acc_x_g=1e-4 * (i % 2),
+        )  # fmt: skip
+        obs = see(observation(t_s, telemetry=tel, new_frame=False))
+        if i % 2 == 0 and t_s > BEGIN_S:
+            state, command = planner.step(state, obs, PROFILE)
+            sent.append(command)
+        if state.phase is Phase.LANDING:
+            break
+    assert (state.phase, state.row, state.outcome) == (
+        Phase.LANDING, "position-lost", Outcome.SAFETY,
+    )  # fmt: skip
+    assert "variance only grows" in state.reason
+    assert LAND_S <= len(sent) * TURN_S <= 1.0
+    assert isinstance(sent[-1], RawThrust)
+
+
 def test_what_was_never_measured_lands_at_once() -> None:
     state, _ = planner.step(state_in(Phase.ALIGN), observation(10.02, **hidden(math.inf)), MOCAP)
     assert state.phase is Phase.LANDING

@@ -129,13 +129,15 @@ class Estimator:
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
         """Of a state as `perchctl.sim.firmware.covariance` counts them. A deck's is the position's
-        for all of them: it falls after a reset."""
+        for all of them: it falls after a reset. Flow says nothing of the height, which a laser
+        measures."""
         if self.outside is not None:
             return self.outside.variance(state)
         deck_m2 = _VARIANCE_FLOOR + _VARIANCE_START * math.exp(
             -(t_s - self._reset_s) / _VARIANCE_FALL_S
         )
-        return deck_m2 if self._flow is None else deck_m2 + self._flow.variance
+        is_height = state % 3 == 2
+        return deck_m2 if self._flow is None or is_height else deck_m2 + self._flow.variance
 
     def update(
         self,
