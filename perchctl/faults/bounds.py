@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 from perchctl.faults.effects import (
     BlockDead,
     CameraFault,
+    DeckSilent,
     Effect,
     EstimateError,
     ExternalPositions,
@@ -186,6 +187,8 @@ class DescentBound:
                     limits_s.append(safety.camera_land_s)
                 if kind in NO_SIGHT and positioning.by == "target":
                     limits_s.append(positioning.land_s)
+            case DeckSilent(lasts_s):
+                limits_s.append(positioning.land_s)
             case ExternalPositions(how, lasts_s) if how in NO_POSITION:
                 limits_s.append(positioning.land_s)
         limit_s = min(limits_s)

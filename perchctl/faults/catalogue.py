@@ -208,6 +208,8 @@ FAULTS: tuple[Fault, ...] = (
           draws.camera_sooner),
     Fault("brown-out", (6, 13), "the voltage breaks down, and the vehicle starts again", AIR,
           draws.reboots, (BROWN_OUT,)),
+    Fault("deck-silent", (10,), "the positions of the vehicle's own deck end for 0.3 s to ever",
+          AIR, draws.deck_silent),
 )  # fmt: skip
 
 BY_NAME = {fault.name: fault for fault in FAULTS}

@@ -142,6 +142,11 @@ def external_late(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.ExternalPositions("late", lasting_s(rng, 1.0), late_s),)
 
 
+def deck_silent(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
+    """The height then runs away by 0.1 to 0.4 m/s within 5 s."""
+    return (e.DeckSilent(lasting_s(rng, 0.3), sign(rng) * between(rng, 0.03, 0.08)),)
+
+
 def sags(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
     return (e.BatterySags(log_between(rng, 0.01, 0.1), between(rng, 0.2, 0.7)),)
 

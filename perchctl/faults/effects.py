@@ -79,6 +79,15 @@ class ExternalPositions:
 
 
 @dataclass(frozen=True)
+class DeckSilent:
+    """The vehicle has an IMU and a deck that measures absolute positions; the positions end. What
+    they corrected until then is an accelerometer that reads `acc_z_mps2` too much along z."""
+
+    for_s: float
+    acc_z_mps2: float
+
+
+@dataclass(frozen=True)
 class LogReads:
     """A log variable reads this value (None: the one of the moment) whatever is true."""
 
@@ -201,7 +210,7 @@ class DiskFull:
 
 Effect = (
     Silence | PacketLost | PacketTwice | BlockDead | TelemetryDelayed | CameraFault
-    | EstimateError | ExternalPositions | LogReads | BatterySags | Reboots | MotorWeak
-    | ThrustChanged | Push | MagnetHolds | MagnetLetsGo | Room | TargetMoves | Operator | Killed
-    | Suspended | Hung | Slow | Raises | DiskFull
+    | EstimateError | ExternalPositions | DeckSilent | LogReads | BatterySags | Reboots
+    | MotorWeak | ThrustChanged | Push | MagnetHolds | MagnetLetsGo | Room | TargetMoves | Operator
+    | Killed | Suspended | Hung | Slow | Raises | DiskFull
 )  # fmt: skip

@@ -16,7 +16,7 @@ from perchctl.faults.bounds import DescentBound, PlaceBound, drifted_m
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
 from perchctl.faults.claims import claims_of, claims_of_rescue, last_row
-from perchctl.faults.effects import CameraFault, Effect, ExternalPositions, Suspended
+from perchctl.faults.effects import CameraFault, DeckSilent, Effect, ExternalPositions, Suspended
 from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.expected_outcomes import unexpected
 from perchctl.faults.facts import FactsRecorder
@@ -27,7 +27,7 @@ from perchctl.faults.radio import FaultyRadio
 from perchctl.faults.result import End, FaultResult
 from perchctl.faults.truth import WatchedVehicle, sample_of
 from perchctl.flight.lockstep import lockstep_source
-from perchctl.flight.lockstep_positions import by_mocap, feed_lockstep
+from perchctl.flight.lockstep_positions import feed_lockstep, measured_by
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.operator import OperatorSwitch
@@ -295,7 +295,9 @@ def _sooner_s(effects: Sequence[Effect]) -> float:
 def _flown_by(profile: Profile, case: Case) -> Profile:
     """The profile as the case needs it."""
     if any(isinstance(effect, ExternalPositions) for effect in case.effects):
-        profile = by_mocap(profile)
+        profile = measured_by("mocap", profile)
+    if any(isinstance(effect, DeckSilent) for effect in case.effects):
+        profile = measured_by("deck", profile)
     more_s = _sooner_s(case.effects)
     if more_s == 0.0:
         return profile

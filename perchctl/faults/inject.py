@@ -7,6 +7,7 @@ simulated time; `Injector.tick` with every turn of the loop.
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from perchctl.faults.effects import (
     BatterySags,
     BlockDead,
     CameraFault,
+    DeckSilent,
     DiskFull,
     Effect,
     EstimateError,
@@ -49,6 +51,7 @@ from perchctl.sim.capture.settings import MILLIMETRES, CaptureFault
 from perchctl.sim.firmware.controller import Estimate
 from perchctl.sim.scenario import Neighbour, Scenario
 
+LIGHTHOUSE = "deck.bcLighthouse4"
 CAPTURE_FAULTS = {
     "frozen": CaptureFault(frozen=True),
     "silent": CaptureFault(gone=True),
@@ -70,9 +73,12 @@ def changed_scenario(scenario: Scenario, effects: tuple[Effect, ...]) -> Scenari
                 scenario = replace(scenario, magnet_force_n=hold_n, first_contact_force_n=None)
             case Room():
                 scenario = _other_room(scenario, effect)
-            case ExternalPositions():
+            case ExternalPositions() | DeckSilent():
                 extra = {**scenario.extra, "external_position": 1.0}
-                scenario = replace(scenario, extra=extra)
+                parameters = scenario.parameters
+                if isinstance(effect, DeckSilent):
+                    parameters = {**parameters, LIGHTHOUSE: 1.0}
+                scenario = replace(scenario, extra=extra, parameters=parameters)
     return scenario
 
 
@@ -138,6 +144,9 @@ class Injector:
         self._estimate: tuple[EstimateError, float] | None = None
         self._sag: tuple[BatterySags, float] | None = None
         self._outside = False
+        self._deck: random.Random | None = None  # the noise of a deck whose positions come
+        if any(isinstance(effect, DeckSilent) for effect in effects):
+            self._deck = random.Random(edges.vehicle.firmware.scenario.seed)
         self._lets_go: float | None = None
         self.begin_s: float | None = None
         self.flown: Phase | None = None  # the phase of the newest turn
@@ -176,6 +185,8 @@ class Injector:
         while self._later and self._later[0][0] <= t_s:
             self._later.pop(0)[1]()
         world = self._edges.vehicle.world
+        if self._deck is not None:
+            self._measure(self._deck)
         if self._sag is not None:
             sag, left_v = self._sag
             step_v = min(sag.rate_vps * SAMPLE_S, left_v)
@@ -225,6 +236,10 @@ class Injector:
                 self._outside = True
                 fault = replace(CAPTURE_FAULTS[effect.how], late_s=effect.late_s)
                 vehicle.capture.lay(fault, effect.for_s)
+            case DeckSilent(for_s, acc_z_mps2):
+                noise, self._deck = self._deck, None
+                vehicle.firmware.estimator.shift_accelerometer(acc_z_mps2)
+                self._at(t_s + for_s, lambda: setattr(self, "_deck", noise))
             case LogReads():
                 self._read_wrongly(effect, t_s)
             case BatterySags():
@@ -251,6 +266,13 @@ class Injector:
                 self._at(t_s + effect.for_s, self._make_room)
             case MagnetHolds() | Room():
                 pass  # from the start: `changed_scenario`
+
+    def _measure(self, noise: random.Random) -> None:
+        """A position by the vehicle's own deck, of which the program knows nothing."""
+        world, firmware = self._edges.vehicle.world, self._edges.vehicle.firmware
+        sigma_m = firmware.scenario.estimate_noise_m
+        x_m, y_m, z_m = (p + noise.gauss(0.0, sigma_m) for p in (world.x_m, world.y_m, world.z_m))
+        firmware.estimator.external_position((x_m, y_m, z_m))
 
     def _spoil(self, now: Estimate) -> None:
         assert self._estimate is not None

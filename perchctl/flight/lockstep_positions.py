@@ -3,6 +3,8 @@ time, and the simulated vehicle prepared as a real one is."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 from perchctl.errors import ConnectionFailed
 from perchctl.geometry import yaw_of
 from perchctl.link.mock import MockLink
@@ -18,9 +20,9 @@ from perchctl.sim.capture.system import LockstepCapture
 FIRST_FRAME_S = 1.0
 
 
-def by_mocap(profile: Profile) -> Profile:
-    """The same with its position from outside instead of by decks."""
-    config = profile.positioning.model_copy(update={"by": "mocap"})
+def measured_by(by: Literal["deck", "mocap"], profile: Profile) -> Profile:
+    """The same with its position by decks, or from outside."""
+    config = profile.positioning.model_copy(update={"by": by})
     return profile.model_copy(update={"positioning": config})
 
 

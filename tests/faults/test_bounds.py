@@ -131,6 +131,8 @@ NEVER = math.inf
         (e.CameraFault("covered", EVER), TARGET_ONLY, P.ALIGN, TARGET_ONLY.positioning.land_s),
         (e.CameraFault("lossy", EVER), TARGET_ONLY, P.ALIGN, NEVER),
         (e.ExternalPositions("silent", EVER), SIM, P.APPROACH, SIM.positioning.land_s),
+        (e.DeckSilent(EVER, 0.05), SIM, P.ALIGN, SIM.positioning.land_s),
+        (e.DeckSilent(SIM.positioning.land_s + 0.1, 0.05), SIM, P.ALIGN, NEVER),
         (e.ExternalPositions("late", EVER, 0.1), SIM, P.ALIGN, NEVER),
         (e.Operator((0.0,)), SIM, P.ALIGN, NEVER),
     ],

@@ -4,7 +4,9 @@ by motion capture and by the target alone."""
 from __future__ import annotations
 
 import json
+import math
 import re
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from perchctl.commands.positioning import POSITIONINGS, positioned
 from perchctl.faults import flight as faulty
 from perchctl.faults.catalogue import BY_NAME, FAULTS, case_of
 from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
+from perchctl.faults.effects import FOR_EVER, DeckSilent
 from perchctl.faults.flight import fly_fault_seed, fly_with_fault
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.plot import plot_heat_map
@@ -101,6 +104,56 @@ def test_a_broken_promise_is_seen() -> None:
         made(1, "camera-turned", Phase.ALIGN, reason="turn camera.mount by 90 deg")
     )
     assert not turned.is_kept(made(1, "camera-turned", Phase.ALIGN, reason="target not found"))
+
+
+class HeightWatched(faulty.FaultyFlight):
+    """Notes how far the vehicle rises from the fault's beginning on, and when it is landed."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.begin_m: float | None = None
+        self.rise_m, self.landed_for_s = 0.0, math.inf
+
+    def _each(self, t_s: float) -> None:
+        super()._each(t_s)
+        begin_s, z_m = self._injector.begin_s, self._vehicle.world.z_m
+        if begin_s is None:
+            return
+        self.begin_m = z_m if self.begin_m is None else self.begin_m
+        self.rise_m = max(self.rise_m, z_m - self.begin_m)
+        if self._injector.flown is Phase.LANDING:
+            self.landed_for_s = min(self.landed_for_s, t_s - begin_s)
+
+
+def deck_lost(phase: Phase, for_s: float, acc_z_mps2: float) -> tuple[HeightWatched, FaultResult]:
+    cv2.setNumThreads(1)
+    scenario = draw_scenario(profile(), SEED)
+    case = case_of(BY_NAME["deck-silent"], phase, np.random.default_rng(1), scenario)
+    case = replace(case, effects=(DeckSilent(for_s, acc_z_mps2),), moment_s=0.2)
+    flight = HeightWatched(profile(), case, scenario)
+    return flight, flight.fly()
+
+
+@pytest.mark.parametrize("acc_z_mps2", [-0.08, 0.08])
+@pytest.mark.parametrize("phase", [
+    pytest.param(Phase.SEARCH, marks=pytest.mark.long), Phase.ALIGN,
+    pytest.param(Phase.RECOVER, marks=pytest.mark.long),
+])  # fmt: skip
+def test_it_does_not_climb_with_an_estimate_that_nothing_corrects(
+    phase: Phase, acc_z_mps2: float
+) -> None:
+    """Where a deck's positions end it was landed 5.6 s later, from a metre higher up."""
+    flight, result = deck_lost(phase, FOR_EVER, acc_z_mps2)
+    assert (result.end, result.counted) == ("landed", ()), result
+    assert flight.landed_for_s < 1.0
+    assert flight.rise_m < 0.15
+
+
+@pytest.mark.long
+def test_a_deck_that_is_blind_for_a_moment_is_waited_for() -> None:
+    flight, result = deck_lost(Phase.ALIGN, 0.3, -0.08)
+    assert (result.end, result.counted) == ("perched", ()), result
+    assert math.isinf(flight.landed_for_s)
 
 
 @pytest.fixture(scope="module")

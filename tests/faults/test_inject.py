@@ -15,6 +15,7 @@ from perchctl.calibration.files import load_calibration
 from perchctl.faults import effects as e
 from perchctl.faults.inject import (
     CAPTURE_FAULTS,
+    LIGHTHOUSE,
     Disk,
     Edges,
     Injector,
@@ -177,6 +178,24 @@ def test_positions_come_mirrored() -> None:
         x_m, found_y_m, _ = capture.take()[-1].bodies["crazyflie"].position_m
         assert (x_m, found_y_m) == pytest.approx((0.1, y_m), abs=0.01)
         rig.injector.begin_now()
+
+
+def test_a_deck_s_positions_end_for_their_time() -> None:
+    """The estimate runs away, its variance grows as docs/firmware.md has it, and both come back."""
+    effect = e.DeckSilent(4.0, -0.06)
+    rig = Rig((effect,), changed_scenario(SCENARIO, (effect,)))
+    firmware, world = rig.vehicle.firmware, rig.vehicle.world
+    assert firmware.get_parameter(LIGHTHOUSE) == 1.0
+    rig.wait(1.0)
+    steady = firmware.log_value("kalman.varPZ")
+    assert steady == pytest.approx(2.5e-4, rel=0.3)
+    rig.injector.begin_now()
+    rig.wait(3.9)
+    assert firmware.estimator.now.z_m - world.z_m == pytest.approx(-0.5 * 0.06 * 3.9**2, abs=0.1)
+    assert firmware.log_value("kalman.varPZ") == pytest.approx(steady + 3.9e-3, rel=0.3)
+    rig.wait(0.6)
+    assert firmware.estimator.now.z_m == pytest.approx(world.z_m, abs=0.05)
+    assert firmware.log_value("kalman.varPZ") == pytest.approx(steady, rel=0.3)
 
 
 def test_a_log_variable_reads_wrongly() -> None:

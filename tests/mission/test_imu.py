@@ -60,10 +60,10 @@ def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> No
 
 
 def test_astray_with_an_attitude_that_stands_still_it_still_feels_a_fall() -> None:
+    """Sideways what was reckoned stays; downwards the accelerometer goes on telling."""
+    samples = [
         telemetry(0.01 * i, roll_rad=0.01 if i else 0.0, acc_x_g=0.001 * i, acc_z_g=0.8)
         for i in range(100)
-    samples = [
-        telemetry(0.01 * i, roll_rad=0.01, acc_x_g=0.001 * i, acc_z_g=0.8) for i in range(100)
     ]
     before, motion = flown(samples[:50]), flown(samples)
     old = Reckoning(before, (0.1, 0.2, -0.3))

@@ -127,6 +127,13 @@ class Estimator:
         if self.outside is not None:
             setattr(self.outside, SETTINGS[name], value)
 
+    def shift_accelerometer(self, z_mps2: float) -> None:
+        """From now on it reads so much more along z; only without a deck that is simulated by its
+        errors."""
+        if self._imu is not None:
+            x, y, z = self._imu.acc_bias_mps2
+            self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
+
     def variance(self, t_s: float, state: int = POSITION) -> float:
         """Of a state as `perchctl.sim.firmware.covariance` counts them. A deck's is the position's
         for all of them: it falls after a reset. Flow says nothing of the height, which a laser
