@@ -130,7 +130,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("external-late", (10,), "positions come 50 to 150 ms later than they say", AIR,
           draws.external_late),
     # --- power and motors -----------------------------------------------------------
-    Fault("battery-sags", (6,), "loses 0.2 to 0.7 V at 10 to 100 mV/s", AIR, draws.sags,
+    Fault("battery-sags", (6,), "loses 0.2 to 0.65 V at 10 to 100 mV/s", AIR, draws.sags,
           (SAGS_TOO_FAST,)),
     Fault("battery-reading-frozen", (7,), "its reading stands still", AIR,
           draws.reading_frozen),

@@ -148,7 +148,7 @@ def deck_silent(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 
 def sags(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
-    return (e.BatterySags(log_between(rng, 0.01, 0.1), between(rng, 0.2, 0.7)),)
+    return (e.BatterySags(log_between(rng, 0.01, 0.1), between(rng, 0.2, 0.65)),)
 
 
 def reboots(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
