@@ -143,7 +143,6 @@ class Injector:
         self._later: list[tuple[float, Callable[[], None]]] = []
         self._estimate: tuple[EstimateError, float] | None = None
         self._sag: tuple[BatterySags, float] | None = None
-        self._outside = False
         self._deck: random.Random | None = None  # the noise of a deck whose positions come
         if any(isinstance(effect, DeckSilent) for effect in effects):
             self._deck = random.Random(edges.vehicle.firmware.scenario.seed)
@@ -164,19 +163,6 @@ class Injector:
                 self._due_s = tick.t_s + self._moment_s
         elif self._due_s is not None:  # left before its time
             self._begin(self._edges.vehicle.t_s)
-
-    @property
-    def drifted_m(self) -> float:
-        """How far a slow drift, or positions from outside that come no more or are late, have led
-        the estimate astray by now."""
-        if self._outside:
-            now, world = self._edges.vehicle.firmware.estimator.now, self._edges.vehicle.world
-            return math.hypot(now.x_m - world.x_m, now.y_m - world.y_m)
-        if self._estimate is None:
-            return 0.0
-        error, begin_s = self._estimate
-        drift_s = min(self._edges.vehicle.t_s - begin_s, error.for_s)
-        return math.hypot(*error.drift_mps) * drift_s
 
     def each(self, t_s: float) -> None:
         """What goes on with simulated time."""
@@ -233,7 +219,6 @@ class Injector:
                 self._at(t_s + effect.for_s, self._heal)
             case ExternalPositions():
                 assert vehicle.capture is not None
-                self._outside = True
                 fault = replace(CAPTURE_FAULTS[effect.how], late_s=effect.late_s)
                 vehicle.capture.lay(fault, effect.for_s)
             case DeckSilent(for_s, acc_z_mps2):
