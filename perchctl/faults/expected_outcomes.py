@@ -22,8 +22,8 @@ NOTICED_S, DOWN_MPS = 1.5, 0.4
 @dataclass(frozen=True)
 class ExpectedOutcome:
     """`flags` are no fault of the program between the time that `cause` gives (None: it never
-    came) and `within_s` later. `chosen`: the user, the firmware or who kills a program decides it,
-    so that no program could make it rare."""
+    came) and `within_s` later. `chosen`: the user, the firmware, the battery or who kills a program
+    decides it, so that no program could make it rare."""
 
     name: str
     cause: Callable[[Facts], float | None]
@@ -54,10 +54,6 @@ def _flags(*flags: Flag) -> frozenset[Flag]:
     return frozenset(flags)
 
 
-def _cut(facts: Facts) -> float | None:
-    return None if facts.own_landing else facts.muted_s
-
-
 def _killed_in_landing(facts: Facts) -> float | None:
     killed = any(isinstance(effect, Killed) for effect in facts.effects)
     return facts.killed_s if killed and facts.own_landing else None
@@ -80,7 +76,8 @@ def _sagged_too_fast(facts: Facts) -> float | None:
 
 
 CUT = ExpectedOutcome(
-    "cut by the firmware", _cut, 4.0, _flags("fell", "slid", "strayed", "locked_needlessly"),
+    "cut by the firmware", lambda facts: facts.cut_s, 4.0,
+    _flags("fell", "slid", "strayed", "locked_needlessly"),
     "2 s after the last setpoint the firmware cuts the motors and locks; nothing that the "
     "program sends arrives any more", chosen=True,
 )  # fmt: skip

@@ -27,10 +27,10 @@ class Facts:
     Attributes:
         effects: what the fault did.
         begin_s: when it began.
-        muted_s: when nothing of the program had reached the vehicle for so long that the firmware
-            cuts; `own_landing`: the vehicle's own landing ran as that silence began.
+        cut_s: when the firmware locked the vehicle since nothing of the program had reached it.
+        own_landing: the vehicle's own landing ran as a silence of that length began.
         killed_s: when the program was killed.
-        rebooted_s: when the vehicle started again.
+        rebooted_s: when the vehicle started again on turning motors, off the floor.
         stop_s: second Ctrl-C.
         let_go_s: when the magnet let go for good; `watched`: by then the whole weight had hung on
             it, motors off, for as long as the program is to watch it.
@@ -41,7 +41,7 @@ class Facts:
 
     effects: tuple[Effect, ...] = ()
     begin_s: float | None = None
-    muted_s: float | None = None
+    cut_s: float | None = None
     own_landing: bool = False
     killed_s: float | None = None
     rebooted_s: float | None = None
@@ -64,11 +64,12 @@ class FactsRecorder:
         self._min_load_v = profile.safety.min_load_v
         self._vehicle = vehicle
         self._silent_s: float | None = None  # since when nothing has arrived
-        self._landed_alone = False
+        self._landed_alone = self._locked_before = False
         self._hangs_s: float | None = None  # since when the whole weight has hung
         self._before: Sample | None = None
-        self.muted_s: float | None = None
+        self.cut_s: float | None = None
         self.own_landing = False
+        self._flew: bool | None = None  # as the fault began
         self.let_go_s: float | None = None
         self.watched = False
         self.slipped_s: float | None = None
@@ -82,18 +83,24 @@ class FactsRecorder:
         self._note_silence(s)
         self._note_hanging(s)
         if begun:
+            if self._flew is None:
+                before = self._before
+                self._flew = before is not None and before.motors_on and not before.floor
             self._note_power(s)
         self._before = s
 
     def _note_silence(self, s: Sample) -> None:
+        long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
+        if long and self._landed_alone:
+            self.own_landing = True
+        if long and s.locked and self.cut_s is None and not self._locked_before:
+            self.cut_s = s.t_s
+        self._locked_before = s.locked
         if s.uplink:
             self._silent_s = None
-            return
-        if self._silent_s is None:
+        elif self._silent_s is None:
             self._silent_s = s.t_s
             self._landed_alone = self._vehicle.firmware.planner.active
-        if self.muted_s is None and s.t_s - self._silent_s >= CUT_S:
-            self.muted_s, self.own_landing = s.t_s, self._landed_alone
 
     def _note_hanging(self, s: Sample) -> None:
         still = s.hanging and not s.motors_on
@@ -132,10 +139,10 @@ class FactsRecorder:
         return Facts(
             effects=effects,
             begin_s=begin_s,
-            muted_s=self.muted_s,
+            cut_s=self.cut_s,
             own_landing=self.own_landing,
             killed_s=killed_s,
-            rebooted_s=begin_s if any(isinstance(e, Reboots) for e in effects) else None,
+            rebooted_s=begin_s if self._flew and _reboots(effects) else None,
             stop_s=stop_s,
             let_go_s=self.let_go_s,
             watched=self.watched,
@@ -145,3 +152,7 @@ class FactsRecorder:
             low_s=self.low_s,
             low_m=self.low_m,
         )
+
+
+def _reboots(effects: tuple[Effect, ...]) -> bool:
+    return any(isinstance(effect, Reboots) for effect in effects)

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration.files import load_calibration
+from perchctl.faults.effects import Reboots
 from perchctl.faults.facts import CUT_S, FactsRecorder
 from perchctl.faults.oracle import Sample
 from perchctl.faults.truth import WatchedVehicle, sample_of
@@ -83,9 +84,9 @@ class Recorded:
         self.recorder = FactsRecorder(vehicle, PROFILE)
         self.t_s = 0.0
 
-    def show(self, sample: Sample, for_s: float, **changes: Any) -> Recorded:
+    def show(self, sample: Sample, for_s: float, *, begun: bool = True, **changes: Any) -> Recorded:
         for _ in range(round(for_s / DT_S)):
-            self.recorder.see(sample._replace(t_s=self.t_s, **changes), begun=True)
+            self.recorder.see(sample._replace(t_s=self.t_s, **changes), begun=begun)
             self.t_s += DT_S
         return self
 
@@ -104,14 +105,38 @@ def test_the_magnet_is_watched_by_the_world_not_by_the_report(
     assert it.recorder.watched is watched
 
 
-@pytest.mark.parametrize("own_landing", [False, True])
-def test_silence_that_ends_in_a_cut(own_landing: bool) -> None:
-    it = Recorded().show(HOVER, 1.0).show(HOVER, CUT_S - 0.1, uplink=False).show(HOVER, 1.0)
-    assert it.recorder.muted_s is None
-    it.planner.active = own_landing
-    it.show(HOVER, CUT_S + 1.0, uplink=False)
-    assert it.recorder.muted_s == pytest.approx(2.0 + 2.0 * CUT_S - 0.1, abs=0.02)
-    assert it.recorder.own_landing is own_landing
+def test_silence_that_ends_in_a_cut() -> None:
+    """By the vehicle's lock, not by how long nothing came."""
+    it = Recorded().show(HOVER, 1.0).show(HOVER, CUT_S + 0.05, uplink=False).show(HOVER, 1.0)
+    assert it.recorder.cut_s is None
+    it.show(HOVER, 2.0, uplink=False).show(HOVER, 1.0, uplink=False, locked=True)
+    assert it.recorder.cut_s == pytest.approx(4.0 + CUT_S + 0.05)
+    assert not it.recorder.own_landing
+
+
+@pytest.mark.parametrize(
+    "before", [{"silent_s": 0.5, "locked": False}, {"silent_s": 3.0, "locked": True}]
+)
+def test_a_lock_that_no_silence_brought_is_no_cut(before: dict[str, Any]) -> None:
+    it = Recorded().show(HOVER, 1.0, locked=before["locked"])
+    it.show(HOVER, before["silent_s"], uplink=False, locked=before["locked"])
+    assert it.show(HOVER, 1.0, uplink=False, locked=True).recorder.cut_s is None
+
+
+def test_a_landing_of_the_vehicle_s_own_is_kept_that_began_before_the_silence() -> None:
+    it = Recorded().show(HOVER, 1.0)
+    it.planner.active = True
+    it.show(HOVER, CUT_S - 0.1, uplink=False)
+    assert not it.recorder.own_landing
+    assert it.show(HOVER, 0.2, uplink=False).recorder.own_landing
+
+
+@pytest.mark.parametrize(("before", "flew"), [(HOVER, True), (HANGING, False)])
+def test_what_hangs_or_stands_loses_nothing_by_starting_again(before: Sample, flew: bool) -> None:
+    it = Recorded()
+    it.show(before, 1.0, begun=False).show(HANGING, 1.0)
+    facts = it.recorder.facts((Reboots(1.0),), begin_s=1.0, killed_s=None, stop_s=None)
+    assert facts.rebooted_s == (1.0 if flew else None)
 
 
 def test_a_slip_from_still_motors_is_kept_with_its_height() -> None:
