@@ -13,12 +13,13 @@ claimed, and raises flags, the gravest first:
   with still motors has fallen), or not on its way down in time after a loss for which the
   profile lands (`perchctl.faults.bounds.DescentBound`);
 - *endless*: the flight did not end by itself;
-- *stop_not_obeyed*: the motors turn 0.5 s after the second Ctrl-C, though all that time packets
-  passed from the program to the vehicle;
+- *stop_not_obeyed*: the motors turn 0.5 s after the second Ctrl-C or later, though all that time
+  packets passed from the program to the vehicle;
 - *pressed*: the motors press against ceiling or floor for more than 4 s;
 - *strayed*: in the air more than 1 m from where it should be (`perchctl.faults.bounds.PlaceBound`),
   or truly above the height limit by more than 0.3 m;
-- *lied*: one of the program's claims contradicts what is true of the vehicle;
+- *lied*: one of the program's claims contradicts what is true of the vehicle, or motors that it
+  said are off turn again;
 - *locked_needlessly*: locked in the end, although it was never crashed, tumbled or tilted.
 """
 
@@ -57,6 +58,7 @@ TILT_WITHIN_DEG = 10.0
 tilt by an estimate."""
 CLAIM_S = 0.5
 """A claim has to become true within this time (motors are cut 25 ms after the order)."""
+SAY_OFF: frozenset[Claim] = frozenset({"hangs", "stands", "hangs or stands", "motors off"})
 STOP_S = 0.5
 """So long after the second Ctrl-C the motors are off."""
 SECOND_AFTER_S, SILENCE_S, HAMMERED_S = 0.5, 0.3, 2.0
@@ -155,8 +157,8 @@ class Oracle:
         self._ended_by_vehicle = False
         self._may_lock = False
         self._claims: dict[Claim, float] = {}  # those that are not found true yet
+        self._said_off = False  # a claim that the motors are off has been found true
         self._presses_s: list[float] = []
-        self._obeyed = False
         self._muted_s = -math.inf  # when last nothing arrived
         self._end_s = math.inf
 
@@ -289,9 +291,13 @@ class Oracle:
             self._raise("flies_on", s.t_s)
 
     def _watch_claims(self, s: Sample) -> None:
+        """Motors that were off as was said must not turn again: somebody reaches for them."""
+        if self._said_off and s.motors_on:
+            self._raise("lied", s.t_s)
         for claim, claimed_s in list(self._claims.items()):
             if self._is_true(claim, s):
                 del self._claims[claim]
+                self._said_off = self._said_off or claim in SAY_OFF
             elif s.t_s >= claimed_s + CLAIM_S:
                 del self._claims[claim]
                 self._raise("lied", s.t_s)
@@ -301,9 +307,9 @@ class Oracle:
             case "hangs":
                 return s.hanging and not s.motors_on
             case "stands":
-                return not s.motors_on and not _airborne(s)
+                return not s.motors_on and self._is_upright_below(s)
             case "hangs or stands":
-                return not s.motors_on and (s.hanging or not _airborne(s))
+                return not s.motors_on and (s.hanging or self._is_upright_below(s))
             case "motors off":
                 return not s.motors_on
             case "locked":
@@ -314,15 +320,20 @@ class Oracle:
                 limit_deg = self._limits.max_tilt_deg - TILT_WITHIN_DEG
                 return self._least_up_z < math.cos(math.radians(limit_deg))
 
+    def _is_upright_below(self, s: Sample) -> bool:
+        """What lies on its side or its back does not stand."""
+        tilted_up_z = math.cos(math.radians(self._limits.max_tilt_deg))
+        return not _airborne(s) and s.up_z > tilted_up_z
+
     def _watch_stop(self, s: Sample) -> None:
-        """Only while packets pass: what cannot be heard is not disobeyed."""
+        """Only while packets pass: what cannot be heard is not disobeyed. Motors that are off by
+        then stay off."""
         if not s.uplink:
             self._muted_s = s.t_s
         stop_s = self.stop_s
-        if stop_s is None or self._obeyed or stop_s > self._end_s:
+        if stop_s is None or stop_s > self._end_s:
             return
-        self._obeyed = not s.motors_on
-        if not self._obeyed and s.t_s > max(stop_s, self._muted_s) + STOP_S:
+        if s.motors_on and s.t_s > max(stop_s, self._muted_s) + STOP_S:
             self._raise("stop_not_obeyed", s.t_s)
 
     def _watch_lock(self, s: Sample) -> None:

@@ -234,10 +234,14 @@ LOCKED = ON_THE_FLOOR._replace(locked=True, ended_by_vehicle=True)
         ("stands", ON_THE_FLOOR, set()),
         ("stands", ON_THE_FLOOR._replace(motors_on=True), {"lied"}),
         ("stands", HANGING, {"lied"}),
+        ("stands", ON_THE_FLOOR._replace(up_z=-1.0), {"lied"}),
+        ("stands", ON_THE_FLOOR._replace(up_z=0.5), {"lied"}),
+        ("stands", ON_THE_FLOOR._replace(up_z=0.6), set()),
         ("hangs or stands", HANGING, set()),
         ("hangs or stands", ON_THE_FLOOR, set()),
         ("hangs or stands", HANGING._replace(motors_on=True), {"lied"}),
         ("hangs or stands", HOVER, {"lied"}),
+        ("hangs or stands", ON_THE_FLOOR._replace(up_z=-1.0), {"lied"}),
         ("motors off", ON_THE_FLOOR, set()),
         ("motors off", ON_THE_FLOOR._replace(motors_on=True), {"lied"}),
         ("locked", LOCKED, set()),
@@ -270,6 +274,21 @@ def test_a_claim_has_half_a_second_to_become_true() -> None:
     script = Script().show(ON_THE_FLOOR, 1.0, motors_on=True)
     script.oracle.claims(frozenset({"motors off"}), script.t_s)
     assert script.show(ON_THE_FLOOR, 0.3, motors_on=True).show(ON_THE_FLOOR, 2.0).flags == set()
+
+
+@pytest.mark.parametrize("claim", ["hangs", "stands", "hangs or stands", "motors off"])
+def test_motors_that_were_said_to_be_off_turn_no_more(claim: Claim) -> None:
+    truth = HANGING if claim == "hangs" else ON_THE_FLOOR
+    script = Script().show(truth, 1.0)
+    script.oracle.claims(frozenset({claim}), script.t_s)
+    assert script.show(truth, 3.0).flags == set()
+    assert script.show(truth, 0.05, motors_on=True).flags == {"lied"}
+
+
+def test_what_is_said_of_a_lock_says_nothing_of_later_motors() -> None:
+    script = Script().show(LOCKED, 1.0)
+    script.oracle.claims(frozenset({"locked"}), script.t_s)
+    assert script.show(LOCKED, 1.0).show(LOCKED, 0.1, motors_on=True).flags == set()
 
 
 @pytest.mark.parametrize(
@@ -351,6 +370,16 @@ def test_the_second_ctrl_c_stops_the_motors_within_half_a_second() -> None:
 def test_what_is_not_heard_is_not_disobeyed() -> None:
     assert stopped(1.4, silent_s=1.0) == set()
     assert stopped(1.6, silent_s=1.0) == {"stop_not_obeyed"}
+
+
+def test_motors_that_the_second_ctrl_c_stopped_stay_off() -> None:
+    low = HOVER._replace(height_m=0.05)
+    script = Script().show(low, 1.0)
+    for _ in range(2):
+        script.oracle.pressed(script.t_s)
+        script.show(low, 0.6, motors_on=script.oracle.stop_s is None)
+    assert script.show(low, 1.0, motors_on=False).flags == set()
+    assert script.show(low, 0.1).flags == {"stop_not_obeyed"}
 
 
 def test_one_ctrl_c_asks_for_no_stop() -> None:
