@@ -7,7 +7,7 @@ Neither goes by the program's estimate: that may be what is wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from perchctl.faults.effects import (
     BlockDead,
@@ -17,8 +17,11 @@ from perchctl.faults.effects import (
     EstimateError,
     ExternalPositions,
     Hung,
+    Operator,
     Push,
+    Raises,
     Silence,
+    Suspended,
     TelemetryDelayed,
 )
 from perchctl.geometry import rot_z
@@ -30,6 +33,7 @@ Place = tuple[float, float]
 """On the floor, world axes, m."""
 
 UNDER_TARGET = frozenset({Phase.ASCEND, Phase.PERCH, Phase.COMPLETE})
+STEERED_BY_TARGET = UNDER_TARGET | {Phase.ESTIMATE, Phase.ALIGN}
 TERMINALS = frozenset({Phase.LANDING, Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 BY_CAMERA = frozenset({Phase.SEARCH, Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER})
 IN_THE_OPEN = BY_CAMERA | {Phase.APPROACH}
@@ -122,53 +126,65 @@ def targets_of(scenario: Scenario) -> list[Place]:
     return found
 
 
-def drifted_m(effects: Iterable[Effect], scenario: Scenario, fault_s: float) -> float:
-    """How far the vehicle may have been led or pushed aside `fault_s` after the fault's beginning
-    without anything on board that could know: by a slide of the estimate, and by a force as long
-    as it acts. A step of the estimate is none of these: it can be seen."""
-    aside_m = 0.0
-    for effect in effects:
-        match effect:
-            case EstimateError():
-                x_mps, y_mps, _ = effect.drift_mps
-                aside_m += math.hypot(x_mps, y_mps) * min(fault_s, effect.for_s)
-            case Push():
-                x_n, y_n, _ = effect.force_n
-                acts_s = min(fault_s, effect.for_s)
-                aside_m += 0.5 * math.hypot(x_n, y_n) / scenario.mass_kg * acts_s**2
-    return aside_m
+class UnfeltDrift:
+    """How far the vehicle may have been led or pushed aside without anything on board that could
+    know: by a slide of the estimate while it does not steer by a target that it sees, and, where
+    the target is the positioning system and out of view, by a force as long as it acts. A step of
+    the estimate is none of these: it can be seen."""
+
+    def __init__(self, effects: Sequence[Effect], scenario: Scenario, *, by_target: bool) -> None:
+        slides = [effect for effect in effects if isinstance(effect, EstimateError)]
+        self._slides = [(math.hypot(*slide.drift_mps[:2]), slide.for_s) for slide in slides]
+        pushes = [effect for effect in effects if isinstance(effect, Push) and by_target]
+        self._pushes = [
+            (math.hypot(*push.force_n[:2]) / scenario.mass_kg, push.for_s) for push in pushes
+        ]
+        self._slid_m = self._fault_s = 0.0
+
+    def after_m(self, fault_s: float, phase: Phase | None) -> float:
+        """By now, `fault_s` after the fault's beginning: asked again and again as time passes."""
+        before_s, self._fault_s = self._fault_s, fault_s
+        if phase in UNDER_TARGET:
+            self._slid_m = 0.0
+        elif phase not in STEERED_BY_TARGET:
+            for speed_mps, for_s in self._slides:
+                self._slid_m += speed_mps * (min(fault_s, for_s) - min(before_s, for_s))
+        return self._slid_m + sum(
+            0.5 * acc_mps2 * min(fault_s, for_s) ** 2 for acc_mps2, for_s in self._pushes
+        )
 
 
 class DescentBound:
-    """By when the vehicle should be on its way down: where what the fault takes away is lost for
-    longer than the profile waits for it."""
+    """By when the vehicle should be on its way down: at once where the operator asks for it or the
+    loop ends by an exception, else where what the fault takes away is lost for longer than the
+    profile waits for it."""
 
     def __init__(self, effects: Sequence[Effect], profile: Profile) -> None:
         self._effects, self._profile = effects, profile
-        self._down_by_s = math.inf
-        self._from_m: float | None = None
-        self._lowest_m = math.inf
+        self._due_s = math.inf
+        self._from_m: float | None = None  # its height when the way down was due
 
     def begin(self, t_s: float, phase: Phase | None) -> None:
         """The fault begins, in a phase of the program."""
         limits_s = [self._limit_s(effect, phase or Phase.APPROACH) for effect in self._effects]
-        self._down_by_s = t_s + min(limits_s, default=math.inf) + REACTION_S
+        self._due_s = t_s + min(limits_s, default=math.inf)
 
     def is_overdue(
         self, t_s: float, height_m: float, vz_mps: float, *, touching: bool, uplink: bool
     ) -> bool:
         """Whether it should have come down by now and has not. What touches the ceiling before it
         has to come down may hang there, which takes its time to find out; and what hears nothing
-        obeys nothing."""
-        if not uplink or (touching and self._from_m is None):
-            self._down_by_s = math.inf
-        if t_s < self._down_by_s:
+        obeys nothing until it hears again."""
+        if touching and t_s < self._due_s + REACTION_S:
+            self._due_s = math.inf
+        if not uplink:
+            self._due_s, self._from_m = max(self._due_s, t_s), None
+        if t_s < self._due_s:
             return False
         if self._from_m is None:
             self._from_m = height_m
-        self._lowest_m = min(self._lowest_m, height_m)
-        late = t_s >= self._down_by_s + WATCHED_S
-        comes_down = vz_mps < -SINKING_MPS or self._lowest_m <= max(LOW_M, self._from_m - SUNK_M)
+        late = t_s >= self._due_s + REACTION_S + WATCHED_S
+        comes_down = vz_mps < -SINKING_MPS or height_m <= max(LOW_M, self._from_m - SUNK_M)
         return late and not comes_down
 
     def _limit_s(self, effect: Effect, phase: Phase) -> float:
@@ -176,8 +192,14 @@ class DescentBound:
         safety, positioning = self._profile.safety, self._profile.positioning
         lasts_s, limits_s = 0.0, [math.inf]
         match effect:
-            case Silence(lasts_s, up=False, down=True) | BlockDead("state" | "attitude", lasts_s):
+            case Operator(presses_s):
+                return min(presses_s) if phase in IN_THE_OPEN else math.inf
+            case Raises():
+                return 0.0 if phase in IN_THE_OPEN else math.inf
+            case Silence(lasts_s, down=True) | BlockDead("state" | "attitude", lasts_s):
                 limits_s.append(safety.telemetry_land_s)
+            case Suspended(lasts_s):
+                limits_s.append(safety.loop_late_land_s)
             case TelemetryDelayed(delay_s, lasts_s) if delay_s > safety.telemetry_land_s:
                 limits_s.append(safety.telemetry_land_s)
             case Hung(lasts_s):

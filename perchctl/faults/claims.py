@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from perchctl.flight.loop import RESCUED
+from perchctl.mission.lander import Finding
 from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
 
@@ -50,8 +52,15 @@ OUTCOME_CLAIMS: dict[Outcome, frozenset[Claim]] = {
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
 """The rows of a flight whose end the program does not know: whether the vehicle hangs or stands,
 and whether it came down at all."""
-RESCUE_UNCONFIRMED = "could not be confirmed"
-"""Says so in the note of a rescue."""
+RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
+    Finding.STANDS: _claims("stands"),
+    Finding.HANGS: _claims("hangs"),
+    Finding.UNKNOWN: _claims("hangs or stands"),
+    None: _claims(),
+}
+"""What the note of a rescue says, by what the rescue found."""
+REFUSAL_CLAIMS = _claims("stands")
+"""A refusal says that nothing was started."""
 
 
 def last_row(report: FlightReport) -> str:
@@ -73,5 +82,5 @@ def claims_of_rescue(event: Event) -> frozenset[Claim]:
     """What the note of a rescue says; nothing where the event is none."""
     if event.kind is not EventKind.NOTE or RESCUE not in event.reason:
         return _claims()
-    unconfirmed = RESCUE_UNCONFIRMED in event.reason
-    return _claims() if unconfirmed else _claims("hangs or stands")
+    found = next(found for found, text in RESCUED.items() if event.reason.endswith(text))
+    return RESCUE_CLAIMS[found]

@@ -12,10 +12,10 @@ import cv2
 
 from perchctl.calibration.files import camera_of
 from perchctl.errors import PerchError
-from perchctl.faults.bounds import DescentBound, PlaceBound, drifted_m
+from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
-from perchctl.faults.claims import claims_of, claims_of_rescue, last_row
+from perchctl.faults.claims import REFUSAL_CLAIMS, claims_of, claims_of_rescue, last_row
 from perchctl.faults.effects import CameraFault, DeckSilent, Effect, ExternalPositions, Suspended
 from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.expected_outcomes import unexpected
@@ -109,6 +109,9 @@ class FaultyFlight:
         safety = profile.safety
         self._oracle = Oracle(Limits(safety.max_height_m, safety.max_tilt_deg))
         self._place_bound = PlaceBound(scenario, profile)
+        self._drift = UnfeltDrift(
+            case.effects, scenario, by_target=profile.positioning.by == "target"
+        )
         self._descent_bound = DescentBound(case.effects, profile)
         self._recorder = FactsRecorder(vehicle, profile)
         self._touched = False  # the ceiling, since the fault began
@@ -151,6 +154,7 @@ class FaultyFlight:
             return _Ended("failed", error=str(error))
         except Exception as error:
             if isinstance(error, PerchError) and self._injector.flown is None:
+                self._oracle.claims(REFUSAL_CLAIMS, self._link.now_s)
                 return _Ended("refused", error=str(error))
             return _Ended("failed", error=f"{type(error).__name__}: {error}", crashed=True)
         self._vehicle.camera = None  # nobody looks any more
@@ -176,11 +180,12 @@ class FaultyFlight:
         sample, world = sample_of(self._vehicle), self._vehicle.world
         begin_s, phase = self._injector.begin_s, self._injector.flown
         place = (sample.x_m, sample.y_m)
-        self._place_bound.target_at(world.magnet.target_xy_m)
+        if not self._scenario.no_target:
+            self._place_bound.target_at(world.magnet.target_xy_m)
         self._place_bound.enter(phase, place)
         astray_m = self._place_bound.astray_m(place)
         if begin_s is not None:
-            astray_m -= drifted_m(self._case.effects, self._scenario, t_s - begin_s)
+            astray_m -= self._drift.after_m(t_s - begin_s, phase)
             self._touched = self._touched or sample.hanging or world.contacts()[0] > 0.0
         uplink = not self._is_suspended(t_s) and self._radio.up(PROBE, t_s)
         overdue = self._descent_bound.is_overdue(

@@ -16,7 +16,7 @@ from perchctl.faults.bounds import (
     WATCHED_S,
     DescentBound,
     PlaceBound,
-    drifted_m,
+    UnfeltDrift,
     targets_of,
 )
 from perchctl.mission.state import Phase
@@ -94,15 +94,45 @@ def test_a_target_that_moved_is_followed() -> None:
     assert made.astray_m((2.0, 0.0)) == 0.0
 
 
+def drifted(
+    *effects: e.Effect, after_s: float, by_target: bool = True, phase: Phase = P.SEARCH
+) -> float:
+    drift = UnfeltDrift(effects, SCENARIO, by_target=by_target)
+    for k in range(1, round(after_s / 0.1)):
+        drift.after_m(0.1 * k, phase)
+    return drift.after_m(after_s, phase)
+
+
+SLIDE = e.EstimateError(step_m=(2.0, 0.0, 0.0), drift_mps=(0.3, 0.4, 9.0), for_s=4.0)
+
+
 def test_what_nothing_on_board_can_know_is_allowed_on_top() -> None:
-    slide = e.EstimateError(step_m=(2.0, 0.0, 0.0), drift_mps=(0.3, 0.4, 9.0), for_s=4.0)
-    assert drifted_m((slide,), SCENARIO, 2.0) == pytest.approx(1.0)
-    assert drifted_m((slide,), SCENARIO, 60.0) == pytest.approx(2.0)
+    assert drifted(SLIDE, after_s=2.0) == pytest.approx(1.0)
+    assert drifted(SLIDE, after_s=60.0) == pytest.approx(2.0)
     push = e.Push((0.042, 0.0, 1.0), 2.0)  # 1 m/s^2 at 42 g
-    assert drifted_m((push,), SCENARIO, 1.0) == pytest.approx(0.5)
-    assert drifted_m((push, slide), SCENARIO, 60.0) == pytest.approx(4.0)
+    assert drifted(push, after_s=1.0) == pytest.approx(0.5)
+    assert drifted(push, SLIDE, after_s=60.0) == pytest.approx(4.0)
     lost = e.ExternalPositions("silent", e.FOR_EVER)
-    assert drifted_m((lost, e.CameraFault("covered", 9.0)), SCENARIO, 60.0) == 0.0
+    assert drifted(lost, e.CameraFault("covered", 9.0), after_s=60.0) == 0.0
+
+
+@pytest.mark.parametrize("phase", [P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.COMPLETE])
+def test_a_slide_is_seen_while_it_steers_by_the_target(phase: Phase) -> None:
+    assert drifted(SLIDE, after_s=4.0, phase=phase) == 0.0
+
+
+def test_a_slide_of_before_is_forgotten_once_it_is_under_the_target() -> None:
+    """And counts anew on the way down, where no picture steers."""
+    drift = UnfeltDrift((SLIDE,), SCENARIO, by_target=False)
+    assert drift.after_m(1.0, P.SEARCH) == pytest.approx(0.5)
+    assert drift.after_m(2.0, P.ALIGN) == pytest.approx(0.5)
+    assert drift.after_m(3.0, P.ASCEND) == 0.0
+    assert drift.after_m(4.0, P.LANDING) == pytest.approx(0.5)
+
+
+def test_a_push_is_felt_where_something_else_than_the_target_tells_the_position() -> None:
+    push = e.Push((0.042, 0.0, 1.0), 2.0)
+    assert drifted(push, after_s=1.0, by_target=False) == 0.0
 
 
 # --- the way down -----------------------------------------------------------------------
@@ -117,7 +147,8 @@ NEVER = math.inf
         (e.Silence(EVER, False, True), SIM, P.APPROACH, SAFETY.telemetry_land_s),
         (e.Silence(EVER, False, True), SIM, P.ALIGN, SAFETY.telemetry_land_s),
         (e.Silence(EVER, False, True), SIM, P.COMPLETE, NEVER),
-        (e.Silence(EVER, True, True), SIM, P.ALIGN, NEVER),
+        (e.Silence(EVER, True, True), SIM, P.ALIGN, SAFETY.telemetry_land_s),
+        (e.Silence(EVER, True, False), SIM, P.ALIGN, NEVER),
         (e.Silence(1.0 + LASTS_S, False, True), SIM, P.ALIGN, NEVER),
         (e.BlockDead("state", EVER), SIM, P.SEARCH, SAFETY.telemetry_land_s),
         (e.BlockDead("battery", EVER), SIM, P.SEARCH, NEVER),
@@ -134,7 +165,14 @@ NEVER = math.inf
         (e.DeckSilent(EVER, 0.05), SIM, P.ALIGN, SIM.positioning.land_s),
         (e.DeckSilent(SIM.positioning.land_s + 0.1, 0.05), SIM, P.ALIGN, NEVER),
         (e.ExternalPositions("late", EVER, 0.1), SIM, P.ALIGN, NEVER),
-        (e.Operator((0.0,)), SIM, P.ALIGN, NEVER),
+        (e.Suspended(1.9), SIM, P.ALIGN, SAFETY.loop_late_land_s),
+        (e.Suspended(1.4), SIM, P.ALIGN, NEVER),
+        (e.Raises(), SIM, P.ALIGN, 0.0),
+        (e.Raises(), SIM, P.PERCH, NEVER),
+        (e.Operator((0.0, 4.0)), SIM, P.ALIGN, 0.0),
+        (e.Operator((0.0,), hang_up=True), SIM, P.APPROACH, 0.0),
+        (e.Operator((0.0,)), SIM, P.COMPLETE, NEVER),
+        (e.Slow(0.4, EVER), SIM, P.ALIGN, NEVER),
     ],
 )
 def test_after_what_loss_it_comes_down_and_when(
@@ -155,13 +193,29 @@ def overdue_s(effect: e.Effect, profile: Profile, phase: Phase, touching: bool =
     return math.inf
 
 
-def test_what_touches_the_ceiling_or_hears_nothing_is_not_overdue() -> None:
-    gone = e.Silence(EVER, False, True)
-    assert overdue_s(gone, SIM, P.ALIGN, touching=True) == math.inf
-    made = DescentBound((gone,), SIM)
+def test_what_touches_the_ceiling_is_not_overdue() -> None:
+    assert overdue_s(e.Silence(EVER, False, True), SIM, P.ALIGN, touching=True) == math.inf
+
+
+def test_what_hears_nothing_is_overdue_once_it_hears_again() -> None:
+    """As a program that was suspended for 1.9 s is, or a link that was silent for so long."""
+    for effect in (e.Suspended(1.9), e.Silence(1.9, True, True)):
+        made = DescentBound((effect,), SIM)
+        made.begin(0.0, P.ALIGN)
+        assert not made.is_overdue(1.9, 1.5, 0.0, touching=False, uplink=False)
+        assert not made.is_overdue(1.9 + REACTION_S + 0.01, 1.5, touching=False, uplink=True)
+        late_s = 1.9 + REACTION_S + WATCHED_S + 0.02
+        assert not made.is_overdue(late_s - 0.1, 1.5, touching=False, uplink=True)
+        assert made.is_overdue(late_s, 1.5, 0.0, touching=False, uplink=True)
+
+
+def test_a_silence_on_the_way_down_begins_it_anew() -> None:
+    made = DescentBound((e.Hung(EVER),), SIM)
     made.begin(0.0, P.ALIGN)
+    assert not made.is_overdue(2.1, 1.5, 0.0, touching=False, uplink=True)
     assert not made.is_overdue(3.0, 1.5, 0.0, touching=False, uplink=False)
-    assert not made.is_overdue(9.0, 1.5, 0.0, touching=False, uplink=True)
+    assert not made.is_overdue(4.2, 1.5, 0.0, touching=False, uplink=True)
+    assert made.is_overdue(6.3, 1.5, 0.0, touching=False, uplink=True)
 
 
 def test_what_rises_to_the_ceiling_instead_is_overdue() -> None:
@@ -186,14 +240,9 @@ def test_what_is_on_its_way_down_is_not_overdue() -> None:
 
 
 def test_a_landing_of_its_own_that_begins_slowly_is_not_overdue() -> None:
-    """Its curve starts from rest; and what it bounces up by when it begins takes nothing back."""
+    """Its curve starts from rest."""
     for sinking_mps, late in ((SINKING_MPS + 0.01, False), (SINKING_MPS - 0.01, True)):
         made = DescentBound((e.Hung(EVER),), SIM)
         made.begin(0.0, P.ALIGN)
         assert not made.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
         assert made.is_overdue(4.1, 1.45, -sinking_mps, touching=False, uplink=True) is late
-    sunk = DescentBound((e.Hung(EVER),), SIM)
-    sunk.begin(0.0, P.ALIGN)
-    assert not sunk.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
-    assert not sunk.is_overdue(3.0, 1.5 - SUNK_M - 0.01, 0.0, touching=False, uplink=True)
-    assert not sunk.is_overdue(4.1, 1.45, 0.1, touching=False, uplink=True)

@@ -12,12 +12,14 @@ from perchctl.faults.claims import (
     NOT_KNOWN,
     OUTCOME_CLAIMS,
     PHASE_CLAIMS,
-    RESCUE_UNCONFIRMED,
+    RESCUE_CLAIMS,
     ROW_CLAIMS,
     UNCONFIRMED,
     claims_of,
     claims_of_rescue,
 )
+from perchctl.flight.loop import RESCUED
+from perchctl.mission.lander import Finding
 from perchctl.mission.state import TERMINALS, MotorStop, Outcome, Phase
 from perchctl.mission.table import TABLE
 from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
@@ -81,12 +83,23 @@ def test_a_report_claims_all_that_it_says() -> None:
     assert claims_of(report(Phase.ABORTED, Outcome.SAFETY, UNCONFIRMED)) == set()
 
 
-def test_what_a_rescue_says_counts_too() -> None:
-    def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
-        return Event(9.0, kind, text)
+def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
+    return Event(9.0, kind, text)
 
-    down = note(f"ValueError{RESCUE}it is down, or hangs: the motors are off")
-    assert claims_of_rescue(down) == {"hangs or stands"}
-    assert claims_of_rescue(note(f"ValueError{RESCUE}{RESCUE_UNCONFIRMED}")) == set()
+
+@pytest.mark.parametrize("found", RESCUED)
+def test_what_a_rescue_says_counts_too(found: Finding | None) -> None:
+    """By what it found: that it hangs is another claim than that it stands."""
+    claims = claims_of_rescue(note(f"ValueError{RESCUE}{RESCUED[found]}"))
+    words = {
+        "stands on the floor": "stands", "hangs on the magnet": "hangs",
+        "whether the vehicle hangs or stands": "hangs or stands",
+    }  # fmt: skip
+    assert claims == {claim for word, claim in words.items() if word in RESCUED[found]}
+    assert set(RESCUE_CLAIMS) == set(RESCUED)
+
+
+def test_what_is_no_rescue_s_note_claims_nothing() -> None:
     assert claims_of_rescue(note("no battery reading")) == set()
-    assert claims_of_rescue(note(f"E{RESCUE}down", EventKind.PHASE)) == set()
+    phase = note(f"E{RESCUE}{RESCUED[None]}", EventKind.PHASE)
+    assert claims_of_rescue(phase) == set()

@@ -188,6 +188,17 @@ def test_the_operator_s_word_is_excused() -> None:
     assert result.counted == ()
 
 
+@pytest.mark.parametrize(("name", "astray_m"), [("bare-ceiling", 2.0), ("kick", 0.0)])
+def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: float) -> None:
+    """By the true room: a bare ceiling has none where one was drawn."""
+    scenario = replace(draw_scenario(profile(), SEED), target_xy_m=(2.0, 0.0))
+    case = case_of(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
+    flight = faulty.FaultyFlight(profile(), case, scenario)
+    flight._sample(0.0)
+    flight._place_bound.enter(Phase.SEARCH, (0.0, 0.0))
+    assert flight._place_bound.astray_m((2.0, 0.0)) == pytest.approx(astray_m, abs=0.1)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "counted"), [(ValueError("a figure"), ("crashed",)), (PlantedError("of a fault"), ())]
