@@ -297,6 +297,21 @@ def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(flown:
     flown.heard_after_s(LAND, began_s)
 
 
+@pytest.mark.parametrize("driver", [radiodriver.RadioDriver, OpaqueRadio])
+def test_the_end_of_the_first_driver_is_one_of_many(driver: type[Any], cache: Any) -> None:
+    """The one that cflib opened, with cflib's own word for its end: what cflib then forgets, nobody
+    asks for again, and a second word of it would end the next driver."""
+    with connection_by(driver, cache, OTHER_URI) as flown:
+        flown.await_telemetry()
+        first = flown.error_callback()
+        first("unplugged")
+        assert flown.problem() == "unplugged"
+        flown.until(lambda: flown.problem() is None)
+        first("once more")
+        assert flown.problem() is None
+        flown.await_telemetry()
+
+
 def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flown) -> None:
     told: list[Sent] = []
     flown.link.guard(Nobody(), told.append)
