@@ -16,9 +16,10 @@ from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
 
 Claim = Literal[
     "hangs", "stands", "hangs or stands", "motors off", "locked", "ended by the supervisor",
-    "tilted",
+    "tilted", "not seen down",
 ]  # fmt: skip
-"""`hangs`, `stands` and `hangs or stands` say that the motors are off, too."""
+"""`hangs`, `stands` and `hangs or stands` say that the motors are off, too; `not seen down` that
+nothing the program has heard shows the vehicle at rest with its motors off."""
 
 
 def _claims(*claims: Claim) -> frozenset[Claim]:
@@ -36,7 +37,7 @@ ROW_CLAIMS: dict[str, frozenset[Claim]] = {
     "hung": _claims("hangs"),
     "landed": _claims("stands"),
     "hangs-or-stands": _claims("hangs or stands"),
-    "landing-timeout": _claims(),
+    "landing-timeout": _claims("not seen down"),
 }
 """What the sentence of each row that ends a flight says of the vehicle."""
 PHASE_CLAIMS = {Phase.PERCHED: _claims("hangs"), Phase.LANDED: _claims("stands")}
@@ -56,7 +57,7 @@ RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
     Finding.STANDS: _claims("stands"),
     Finding.HANGS: _claims("hangs"),
     Finding.UNKNOWN: _claims("hangs or stands"),
-    None: _claims(),
+    None: _claims("not seen down"),
 }
 """What the note of a rescue says, by what the rescue found."""
 REFUSAL_CLAIMS = _claims("stands")

@@ -16,7 +16,14 @@ from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.catalogue import FROM_THE_START, Case, draw_case
 from perchctl.faults.claims import REFUSAL_CLAIMS, claims_of, claims_of_rescue, last_row
-from perchctl.faults.effects import CameraFault, DeckSilent, Effect, ExternalPositions, Suspended
+from perchctl.faults.effects import (
+    CameraFault,
+    DeckSilent,
+    Effect,
+    ExternalPositions,
+    LogReads,
+    Suspended,
+)
 from perchctl.faults.effects import Operator as Presses
 from perchctl.faults.expected_outcomes import unexpected
 from perchctl.faults.facts import FactsRecorder
@@ -32,6 +39,7 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.geometry import GRAVITY_MPS2
+from perchctl.link.assemble import FAST_BLOCKS
 from perchctl.link.bursty import radio_of
 from perchctl.link.mock import MockLink
 from perchctl.log.exact import to_exact
@@ -191,7 +199,16 @@ class FaultyFlight:
         overdue = self._descent_bound.is_overdue(
             t_s, sample.height_m, sample.vz_mps, touching=self._touched, uplink=uplink
         )
-        return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink)
+        heard = all(self._is_heard(block, t_s) for block in FAST_BLOCKS)
+        return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
+
+    def _is_heard(self, block: str, t_s: float) -> bool:
+        if self._injector.begin_s is not None and any(
+            isinstance(effect, LogReads) for effect in self._case.effects
+        ):
+            return False
+        delay_s = self._radio.down(block, t_s)
+        return delay_s is not None and delay_s <= self._profile.safety.proof_age_s
 
     def _is_suspended(self, t_s: float) -> bool:
         begin_s = self._injector.begin_s

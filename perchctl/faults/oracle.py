@@ -59,6 +59,9 @@ tilt by an estimate."""
 CLAIM_S = 0.5
 """A claim has to become true within this time (motors are cut 25 ms after the order)."""
 SAY_OFF: frozenset[Claim] = frozenset({"hangs", "stands", "hangs or stands", "motors off"})
+SEEN_S = 6.0
+"""What has been at rest and heard for so long has been seen: a supervisor's word that does not
+agree is taken for old after 5 s."""
 STOP_S = 0.5
 """So long after the second Ctrl-C the motors are off."""
 SECOND_AFTER_S, SILENCE_S, HAMMERED_S = 0.5, 0.3, 2.0
@@ -87,6 +90,7 @@ class Sample(NamedTuple):
     uplink: bool = True  # what the program sends would arrive
     astray_m: float = 0.0  # from where it should be, less what the fault has made it drift by
     overdue: bool = False  # it should have been on its way down for some time
+    heard: bool = True  # its telemetry arrives in time, and tells what is true
 
 
 @dataclass(frozen=True)
@@ -157,6 +161,7 @@ class Oracle:
         self._ended_by_vehicle = False
         self._may_lock = False
         self._claims: dict[Claim, float] = {}  # those that are not found true yet
+        self._seen_down_s: float | None = None  # at rest with still motors, and heard, since
         self._said_off = False  # a claim that the motors are off has been found true
         self._presses_s: list[float] = []
         self._muted_s = -math.inf  # when last nothing arrived
@@ -294,6 +299,8 @@ class Oracle:
         """Motors that were off as was said must not turn again: somebody reaches for them."""
         if self._said_off and s.motors_on:
             self._raise("lied", s.t_s)
+        at_rest = not s.motors_on and (s.hanging or not _airborne(s))
+        self._seen_down_s = _since(self._seen_down_s, at_rest and s.heard, s.t_s)
         for claim, claimed_s in list(self._claims.items()):
             if self._is_true(claim, s):
                 del self._claims[claim]
@@ -319,6 +326,8 @@ class Oracle:
             case "tilted":
                 limit_deg = self._limits.max_tilt_deg - TILT_WITHIN_DEG
                 return self._least_up_z < math.cos(math.radians(limit_deg))
+            case "not seen down":
+                return not _lasts(self._seen_down_s, SEEN_S, s.t_s)
 
     def _is_upright_below(self, s: Sample) -> bool:
         """What lies on its side or its back does not stand."""

@@ -203,9 +203,9 @@ def test_what_hears_nothing_is_overdue_once_it_hears_again() -> None:
         made = DescentBound((effect,), SIM)
         made.begin(0.0, P.ALIGN)
         assert not made.is_overdue(1.9, 1.5, 0.0, touching=False, uplink=False)
-        assert not made.is_overdue(1.9 + REACTION_S + 0.01, 1.5, touching=False, uplink=True)
+        assert not made.is_overdue(1.9 + REACTION_S + 0.01, 1.5, 0.0, touching=False, uplink=True)
         late_s = 1.9 + REACTION_S + WATCHED_S + 0.02
-        assert not made.is_overdue(late_s - 0.1, 1.5, touching=False, uplink=True)
+        assert not made.is_overdue(late_s - 0.1, 1.5, 0.0, touching=False, uplink=True)
         assert made.is_overdue(late_s, 1.5, 0.0, touching=False, uplink=True)
 
 

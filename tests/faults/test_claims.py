@@ -80,7 +80,7 @@ def test_a_report_claims_all_that_it_says() -> None:
     assert claims_of(cut) == {"motors off", "locked"}
     not_known = report(Phase.ABORTED, Outcome.SAFETY, NOT_KNOWN)
     assert claims_of(not_known) == {"hangs or stands"}
-    assert claims_of(report(Phase.ABORTED, Outcome.SAFETY, UNCONFIRMED)) == set()
+    assert claims_of(report(Phase.ABORTED, Outcome.SAFETY, UNCONFIRMED)) == {"not seen down"}
 
 
 def note(text: str, kind: EventKind = EventKind.NOTE) -> Event:
@@ -94,6 +94,7 @@ def test_what_a_rescue_says_counts_too(found: Finding | None) -> None:
     words = {
         "stands on the floor": "stands", "hangs on the magnet": "hangs",
         "whether the vehicle hangs or stands": "hangs or stands",
+        "could not be confirmed": "not seen down",
     }  # fmt: skip
     assert claims == {claim for word, claim in words.items() if word in RESCUED[found]}
     assert set(RESCUE_CLAIMS) == set(RESCUED)

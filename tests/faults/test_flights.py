@@ -199,6 +199,26 @@ def test_only_a_target_that_hangs_there_is_one_to_fly_to(name: str, astray_m: fl
     assert flight._place_bound.astray_m((2.0, 0.0)) == pytest.approx(astray_m, abs=0.1)
 
 
+@pytest.mark.parametrize(
+    ("name", "heard"),
+    [
+        ("kick", True),
+        ("battery-block-dead", True),
+        ("downlink-silent", False),
+        ("state-block-dead", False),
+        ("attitude-block-dead", False),
+        ("thrust-frozen", False),
+    ],
+)
+def test_what_telemetry_does_not_tell_is_not_heard(name: str, heard: bool) -> None:
+    scenario = draw_scenario(profile(), SEED)
+    case = case_of(BY_NAME[name], Phase.APPROACH, np.random.default_rng(0), scenario)
+    flight = faulty.FaultyFlight(profile(), case, scenario)
+    assert flight._sample(0.0).heard
+    flight._injector.begin_now()
+    assert flight._sample(0.02).heard is heard
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "counted"), [(ValueError("a figure"), ("crashed",)), (PlantedError("of a fault"), ())]

@@ -285,6 +285,24 @@ def test_motors_that_were_said_to_be_off_turn_no_more(claim: Claim) -> None:
     assert script.show(truth, 0.05, motors_on=True).flags == {"lied"}
 
 
+@pytest.mark.parametrize("truth", [HANGING, ON_THE_FLOOR])
+@pytest.mark.parametrize(
+    ("at_rest_s", "changes", "flags"),
+    [
+        (5.0, {}, set()),
+        (6.5, {}, {"lied"}),
+        (6.5, {"heard": False}, set()),
+        (6.5, {"motors_on": True}, set()),
+    ],
+)
+def test_a_landing_that_was_to_be_seen_is_not_unconfirmed(
+    truth: Sample, at_rest_s: float, changes: dict[str, Any], flags: set[str]
+) -> None:
+    script = Script().show(truth, at_rest_s, **changes)
+    script.oracle.claims(frozenset({"not seen down"}), script.t_s)
+    assert script.show(truth, 0.6, **changes).flags == flags
+
+
 def test_what_is_said_of_a_lock_says_nothing_of_later_motors() -> None:
     script = Script().show(LOCKED, 1.0)
     script.oracle.claims(frozenset({"locked"}), script.t_s)
