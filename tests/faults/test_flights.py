@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from perchctl.cli import app
 from perchctl.commands.positioning import POSITIONINGS, positioned
+from perchctl.errors import SafetyAbort
 from perchctl.faults import flight as faulty
 from perchctl.faults.catalogue import BY_NAME, FAULTS, case_of
 from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
@@ -217,6 +218,21 @@ def test_what_telemetry_does_not_tell_is_not_heard(name: str, heard: bool) -> No
     assert flight._sample(0.0).heard
     flight._injector.begin_now()
     assert flight._sample(0.02).heard is heard
+
+
+def test_a_refusal_says_that_nothing_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refusing(parts: Any) -> Any:
+        raise SafetyAbort("the battery rests at 3.7 V")
+
+    monkeypatch.setattr(faulty, "fly", refusing)
+    scenario = draw_scenario(profile(), SEED)
+    case = case_of(BY_NAME["kick"], Phase.APPROACH, np.random.default_rng(0), scenario)
+    flight = faulty.FaultyFlight(profile(), case, scenario)
+    standing = flight._sample(0.0)
+    assert flight._mission().end == "refused"
+    for k in range(100):
+        flight._oracle.see(standing._replace(t_s=0.01 * k, motors_on=True))
+    assert flight._oracle.flags == {"lied": pytest.approx(0.5)}
 
 
 @pytest.mark.long
