@@ -1,0 +1,175 @@
+"""Six defects, planted into the program one at a time: the campaign notices each within 20 flights
+of the faults that concern it: by a flight that raises nothing of the kind without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import pytest
+
+pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+
+from perchctl.commands.positioning import POSITIONINGS, positioned
+from perchctl.faults import flight as faulty
+from perchctl.faults.flight import fly_fault_seed
+from perchctl.faults.oracle import Flag
+from perchctl.flight.operator import OperatorSwitch
+from perchctl.mission import actions, lander, planner
+from perchctl.mission.context import Context
+from perchctl.mission.lander import Manoeuvre
+from perchctl.mission.release import Acted, stop_motors
+from perchctl.mission.state import Observation, Operator, Phase, PlannerState
+from perchctl.profile import Profile, load_profile
+from perchctl.vehicle import Command, Land
+from tests.helpers.flights import SHORT
+
+FLIGHTS = 20
+Patch = pytest.MonkeyPatch
+
+
+def stops_after_contact(patch: Patch) -> None:
+    """The motors stop 0.3 s after the contact, whatever the magnet carries."""
+    complete = actions.ACTIONS[Phase.COMPLETE]
+
+    def stopping(c: Context) -> Acted:
+        return stop_motors(c) if c.in_phase_s >= 0.3 else complete(c)
+
+    patch.setitem(actions.ACTIONS, Phase.COMPLETE, stopping)
+
+
+def ignores_the_second_press(patch: Patch) -> None:
+    read = OperatorSwitch.read
+    patch.setattr(OperatorSwitch, "read", lambda self: min(read(self), Operator.LAND))
+
+
+def lands_fast(patch: Patch) -> None:
+    """At 1.5 m/s, by itself and by thrust."""
+    order = lander.own_landing
+
+    def fast(*known: Any) -> Land:
+        land = order(*known)
+        newest = known[-1]
+        way_m = 1.0 if newest is None else newest.position_m[2] - land.height_m
+        return Land(land.height_m, max(0.1, way_m / 1.5))
+
+    patch.setattr(lander, "own_landing", fast)
+    patch.setitem(lander.ACTIONS, Manoeuvre.SETPOINTS, lander._own_landing)
+    for name in ("SINK_MPS", "LOW_SINK_MPS"):
+        patch.setattr(lander, name, 1.5)
+
+
+def says_landed(patch: Patch) -> None:
+    """Whatever the end of the flight is."""
+    step = planner.step
+
+    def landed(*given: Any) -> tuple[PlannerState, Command]:
+        state, command = step(*given)
+        if planner.is_over(state):
+            state = replace(state, phase=Phase.LANDED, row="landed")
+        return state, command
+
+    patch.setattr(planner, "step", landed)
+
+
+def deceived(change: Callable[[Profile], Profile]) -> Callable[[Patch], None]:
+    """The program flies by other limits than those it is held to."""
+
+    def plant(patch: Patch) -> None:
+        fly = faulty.fly
+        patch.setattr(
+            faulty, "fly", lambda parts: fly(replace(parts, profile=change(parts.profile)))
+        )
+
+    return plant
+
+
+def lands_late(profile: Profile) -> Profile:
+    """By 5 s, after each loss."""
+    safety, positioning = profile.safety, profile.positioning
+    later = {
+        name: getattr(safety, name) + 5.0
+        for name in ("telemetry_land_s", "camera_land_s", "loop_late_land_s")
+    }
+    return profile.model_copy(
+        update={
+            "safety": safety.model_copy(update=later),
+            "positioning": positioning.model_copy(update={"land_s": positioning.land_s + 5.0}),
+        }
+    )
+
+
+def believes_old_telemetry(patch: Patch) -> None:
+    """Whatever is proven or waited for, the newest sample counts as one of this moment."""
+    step = planner.step
+
+    def believing(
+        state: PlannerState, obs: Observation, *rest: Any
+    ) -> tuple[PlannerState, Command]:
+        telemetry = replace(obs.telemetry, t_s=obs.t_s, behind_s=0.0)
+        return step(state, replace(obs, telemetry=telemetry), *rest)
+
+    patch.setattr(planner, "step", believing)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """One of the `flags` is what the oracle has to raise; `faults` are those that concern the
+    defect."""
+
+    name: str
+    into: Callable[[Patch], None]
+    flags: tuple[Flag, ...]
+    faults: tuple[str, ...]
+
+
+PLANTS = (
+    Plant("stops-after-contact", stops_after_contact, ("fell",), ("no-magnet", "weak-magnet")),
+    Plant(
+        "ignores-the-second-press", ignores_the_second_press, ("stop_not_obeyed",),
+        ("operator-twice", "operator-hammers", "emergency-stop-lost"),
+    ),
+    Plant("lands-fast", lands_fast, ("fell",), ("operator-once", "hang-up", "landing-lost")),
+    Plant("says-landed", says_landed, ("lied",), ("disk-full", "kick", "operator-twice")),
+    Plant(
+        "lands-late", deceived(lands_late), ("flies_on",),
+        ("downlink-silent", "state-block-dead", "hung"),
+    ),
+    Plant(
+        "believes-old-telemetry", believes_old_telemetry, ("flies_on", "pressed", "fell"),
+        ("downlink-silent", "attitude-block-dead"),
+    ),
+)  # fmt: skip
+GUARD = {(plant.name, POSITIONINGS[i % len(POSITIONINGS)]) for i, plant in enumerate(PLANTS)}
+"""Each once, the positionings by turns."""
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize(
+    ("plant", "by"),
+    [
+        pytest.param(
+            plant, by, id=f"{plant.name}-{by}",
+            marks=[pytest.mark.guard] * ((plant.name, by) in GUARD),
+        )
+        for by in POSITIONINGS
+        for plant in PLANTS
+    ],
+)  # fmt: skip
+def test_the_campaign_notices(plant: Plant, by: str) -> None:
+    cv2.setNumThreads(1)
+    profile = positioned(load_profile(SHORT), by)
+
+    def is_flagged(seed: int, *, planted: bool) -> bool:
+        with Patch.context() as patch:
+            if planted:
+                plant.into(patch)
+            result = fly_fault_seed(profile, seed, plant.faults)
+        return bool(set(plant.flags) & set(result.counted))
+
+    assert any(
+        is_flagged(seed, planted=True) and not is_flagged(seed, planted=False)
+        for seed in range(FLIGHTS)
+    )
