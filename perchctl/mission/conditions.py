@@ -108,6 +108,22 @@ def contact_aside_m(c: Context) -> tuple[float, float]:
     return math.hypot(*reckoning.aside_m), reckoning.aside_sigma_m
 
 
+def contact_within_m(c: Context) -> float:
+    """How far from the target's height a gear may seem to be that touches it: the contact's
+    tolerance, and what the estimate may have drifted by since the last sight, bounded."""
+    planner = c.profile.planner
+    drift_mps = CARRIED_ON_MPS if c.by_sight else planner.landing.drift_mps
+    return planner.perch.contact_z_m + min(planner.perch.contact_z_m, drift_mps * unseen_s(c))
+
+
+def is_at_target(c: Context) -> bool:
+    """Whether the gear is where the target's magnet can hold it: at its height, and within the
+    magnet's radius of its axis. What is not known is not there."""
+    aside_m, sigma_m = contact_aside_m(c)
+    near = aside_m + sigma_m <= c.profile.planner.perch.contact_xy_m
+    return near and abs(c.error_z_m) <= contact_within_m(c)
+
+
 def press_thrust(profile: Profile) -> float:
     """The most that a press can have."""
     perch = profile.planner.perch
@@ -182,26 +198,25 @@ def _weight_hangs(c: Context) -> bool:
 
 
 def _hanging(c: Context) -> bool:
-    """Held up by the magnet, wherever the mission is: still, at the target's height, on
-    a thrust that could not carry the vehicle.
+    """Held up by something, wherever the mission is: still, off the floor, on a thrust that could
+    not carry the vehicle. Whether that is the target's magnet, `is_at_target` tells.
 
     Where no position comes from outside nothing tells a magnet from the floor. Either carries
     it, and what follows, a slow release under watch, suits both."""
     tel, complete = c.obs.telemetry, c.profile.planner.complete
     if not c.placed:
         return _is_carried(c) and _still(c)
+    held = _is_carried(c) and c.height_m > 0.3 and _still(c)
+    if c.state.phase is not Phase.LANDING:
+        return held
     at_contact = (
         c.state.contact_z_m is not None
         and abs(tel.position_m[2] - c.state.contact_z_m) <= complete.slip_m
     )
     at_target = c.obs.target is not None and abs(c.error_z_m) <= 0.15
     # A landing that does not come down is held, wherever the target was thought to be.
-    stayed = (
-        c.state.phase is Phase.LANDING
-        and c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M
-        and not c.far_below_target
-    )
-    return _is_carried(c) and c.height_m > 0.3 and (at_contact or at_target or stayed) and _still(c)
+    stayed = c.state.entry_m[2] - tel.position_m[2] < HELD_WITHIN_M and not c.far_below_target
+    return held and (at_contact or at_target or stayed)
 
 
 def _steady(c: Context) -> bool:

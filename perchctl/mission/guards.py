@@ -8,9 +8,10 @@ from perchctl.mission import budget
 from perchctl.mission.conditions import (
     SATURATED,
     contact_aside_m,
+    is_at_target,
     press_thrust,
 )
-from perchctl.mission.context import Context
+from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.hold import unplaced
 from perchctl.mission.mounting import explained
 from perchctl.mission.state import Condition, Phase
@@ -30,6 +31,8 @@ ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
 BELOW_S = 0.3
 WEAK_S = 2.0
 BLIND_PRESS_S = 1.25
+HELD_S = 2.0
+"""By then a hold at the magnet has been told from any other."""
 
 
 def left_jump_hold(c: Context) -> bool:
@@ -151,6 +154,24 @@ def is_beside_magnet(c: Context) -> bool:
         return False
     aside_m, sigma_m = contact_aside_m(c)
     return not aside_m + sigma_m <= c.profile.planner.perch.contact_xy_m
+
+
+def is_caught(c: Context) -> bool:
+    """The target's magnet holds it already."""
+    return c.held(Condition.HANGING) >= HANGING_S and is_at_target(c)
+
+
+def is_held(c: Context) -> bool:
+    """Something else than the target's magnet holds it: a hand, a net, another ceiling."""
+    return c.held(Condition.HANGING) >= HELD_S
+
+
+def why_held(c: Context) -> str:
+    aside_m, sigma_m = contact_aside_m(c)
+    if c.obs.target is None or not math.isfinite(sigma_m):
+        return "something holds it, and where the target is is not known"
+    below = f"{abs(c.error_z_m):.2f} m {'below' if c.error_z_m >= 0.0 else 'above'}"
+    return f"something holds it {below} and {aside_m:.2f} m aside of the target"
 
 
 def why_beside_magnet(c: Context) -> str:

@@ -24,8 +24,8 @@ import math
 from enum import Enum
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since
-from perchctl.mission.context import HANGING_S, PUT_RIGHT_S, Context
+from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, contact_within_m
+from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
 from perchctl.mission.guards import has_slipped
 from perchctl.mission.guidance import hold_here, limited, presses, unpressed, walk
 from perchctl.mission.imu import REACH_M, reckoned, sighted
@@ -152,6 +152,8 @@ _PEAK_OF_MEAN = 1.875
 """Of a quintic from rest to rest: its largest speed over its mean."""
 
 HIGH_M, LOW_M, STAYED_M = 0.45, 0.3, 0.15
+HELD = "held"
+"""The row of a landing that began since something held it."""
 SINK_MPS, LOW_SINK_MPS, SLOW_BELOW_M = 0.7, 0.4, 0.6
 """Level it comes down fast from high up: sideways it goes with the third power of the time, by
 the gyroscope's offset, 2 m in 4 s."""
@@ -298,6 +300,8 @@ def finding(c: Context) -> Finding:
     the telemetry could hide a fall. Else a position tells, or the picture of a target far above.
     """
     tel, state = c.obs.telemetry, c.state
+    if _is_held_elsewhere(c):
+        return Finding.UNKNOWN
     if c.by_sight or not c.placed:
         if c.tracked and c.far_below_target:
             return Finding.STANDS
@@ -308,6 +312,21 @@ def finding(c: Context) -> Finding:
     if stayed or (c.height_m > LOW_M and not c.far_below_target and state.contact_z_m is not None):
         return Finding.HANGS
     return Finding.STANDS
+
+
+def _is_held_elsewhere(c: Context) -> bool:
+    """Up, and not on the target's magnet: in a hand, or caught by something. It was felt to be held
+    as the landing began and has not fallen since, or it is below the target by a position."""
+    state = c.state
+    if state.phase is not Phase.LANDING:
+        return False
+    if c.placed and state.entry_m[2] - c.obs.telemetry.position_m[2] >= STAYED_M:
+        return False
+    if state.row == HELD:
+        return c.obs.imu.fell_s <= state.entered_s
+    below = contact_within_m(c) < c.error_z_m <= FAR_BELOW_M and state.contact_aside_m is None
+    by_position = c.placed and not c.by_sight and state.jump_s is None and c.height_m > HIGH_M
+    return below and (c.fresh or by_position)
 
 
 def _by_fall(c: Context, since_s: float | None) -> Finding:
@@ -355,6 +374,8 @@ def why_landed(c: Context) -> str:
 
 
 def why_unknown(c: Context) -> str:
+    if _is_held_elsewhere(c):
+        return "motors off; something else than the target's magnet holds it: take hold of it"
     return (
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
         "whether it hangs or stands: look before you touch it"

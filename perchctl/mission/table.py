@@ -6,7 +6,7 @@ The diagram and the table of docs/architecture.md are drawn from `TABLE`.
 from __future__ import annotations
 
 from perchctl.mission.budget import why_short
-from perchctl.mission.context import HANGING_S, Context
+from perchctl.mission.context import Context
 from perchctl.mission.guards import (
     attempts_used,
     has_recovered,
@@ -14,6 +14,8 @@ from perchctl.mission.guards import (
     is_aligned,
     is_beside_magnet,
     is_blocked,
+    is_caught,
+    is_held,
     is_watched,
     pressed_blindly,
     searched_out,
@@ -22,10 +24,12 @@ from perchctl.mission.guards import (
     too_weak,
     why_beside_magnet,
     why_contact,
+    why_held,
     why_not_found,
     why_pressed_blindly,
 )
 from perchctl.mission.lander import (
+    HELD,
     LOOKED_S,
     Finding,
     finding,
@@ -54,8 +58,11 @@ TABLE: tuple[Row, ...] = (
     # --- the magnet may catch early ---------------------------------------------
     Row(
         "caught", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
-        lambda c: c.held(C.HANGING) >= HANGING_S, P.COMPLETE,
-        "hanging on the magnet already",
+        is_caught, P.COMPLETE, "hanging on the magnet already",
+    ),
+    Row(
+        HELD, only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER), is_held,
+        P.LANDING, why_held, S.LAND, O.SAFETY,
     ),
     # --- something is in the way -----------------------------------------------
     Row(

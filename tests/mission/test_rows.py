@@ -212,7 +212,13 @@ CASES: dict[str, Case] = {
     "time-over": Case(
         P.ALIGN, P.LANDING, seen(), 0.1, O.ATTEMPTS_USED_UP, state={"started_s": -1000.0}
     ),
-    "caught": Case(P.PERCH, P.COMPLETE, flown(2.1, thrust=QUIET), 1.2, z_m=2.1),
+    "caught": Case(
+        P.PERCH, P.COMPLETE, flown(CONTACT_Z_M - 0.03, thrust=QUIET), 1.2, z_m=CONTACT_Z_M - 0.03
+    ),
+    "held": Case(
+        P.RECOVER, P.LANDING, flown(CONTACT_Z_M - 0.2, thrust=QUIET), 2.2, O.SAFETY,
+        state={"entered_s": START_S, "contact_z_m": CONTACT_Z_M - 0.2}, z_m=CONTACT_Z_M - 0.2,
+    ),
     "cannot-rise": Case(
         P.APPROACH, P.LANDING, flown(0.3, thrust=FULL), 0.9, O.SAFETY,
         state={"setpoint": PositionSetpoint(0.0, 0.0, 0.5, 0.0)}, z_m=0.3,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,12 +16,16 @@ from perchctl.mission.release import UNREAD_S
 from perchctl.mission.state import (
     Observation,
     Operator,
+    Outcome,
     Phase,
+    PlannerState,
 )
+from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
     LOCKED,
     TUMBLED,
+    Command,
     EmergencyStop,
     PositionSetpoint,
     RawThrust,
@@ -32,8 +38,10 @@ from tests.helpers.mission import (
     HOVER_THRUST,
     PROFILE,
     READY,
+    Felt,
     observation,
     state_in,
+    target_at,
     telemetry,
 )
 
@@ -211,15 +219,100 @@ def test_what_hangs_teaches_no_hover_thrust() -> None:
         assert state.hover_thrust > 0.8 * HOVER_THRUST
 
 
-@pytest.mark.parametrize("begin", [Phase.ESTIMATE, Phase.RECOVER])
-def test_what_has_not_come_down_is_not_landed(begin: Phase) -> None:
-    """Its own landing ended up there, motors off: it hangs, and is said to."""
-    state = replace(state_in(Phase.LANDING, z_m=1.8), orders=3, ordered_s=9.9)
-    for i in range(1, 40):
-        tel = telemetry(10.0 + 0.02 * i, 1.8, thrust=0.0, supervisor=READY)
-        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
-    assert state.phase is Phase.PERCHED
-    assert "hanging" in state.reason
+@pytest.mark.parametrize(
+    ("below_m", "ends", "words"),
+    [
+        (0.0, Phase.PERCHED, "hanging"),
+        (0.08, Phase.PERCHED, "hanging"),  # as far as an old estimate may have drifted
+        (0.2, Phase.ABORTED, "something else"),
+        (0.6, Phase.LANDED, "motors off"),  # a height that stood still above the floor
+    ],
+)
+def test_what_has_not_come_down_hangs_where_the_target_is(
+    below_m: float, ends: Phase, words: str
+) -> None:
+    """Its own landing ended up there, motors off."""
+    z_m = HANG_Z_M - below_m
+    state = replace(state_in(Phase.LANDING, z_m=z_m), orders=3, ordered_s=9.9)
+    for i in range(1, 120):
+        tel = telemetry(10.0 + 0.02 * i, z_m, thrust=0.0, supervisor=READY)
+        target = target_at(tel.t_s, body_m=(0.0, 0.0, z_m), measured=False, measured_s=-20.0)
+        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel, target=target), PROFILE)
+    assert state.phase is ends
+    assert words in state.reason
+
+
+def in_a_hand(
+    begin: PlannerState, below_m: float, aside_m: float = 0.0, sigma_m: float = 1e-3,
+    profile: Profile = PROFILE, lasts_s: float = 20.0, seen_until_s: float = math.inf,
+) -> tuple[PlannerState, list[tuple[float, Command]]]:  # fmt: skip
+    """A hand holds it so far below the target, whatever its motors do; they do as ordered, and a
+    setpoint makes them turn at a third."""
+    felt, state, thrust = Felt(), begin, 0.34 * HOVER_THRUST
+    z_m, sent = HANG_Z_M - below_m, []
+    for i in range(1, round(lasts_s / 0.02)):
+        t_s = 10.0 + 0.02 * i
+        tel = replace(telemetry(t_s, z_m, thrust=thrust), position_m=(aside_m, 0.0, z_m))
+        target = target_at(
+            t_s, body_m=(aside_m, 0.0, z_m), sigma_m=np.full(3, sigma_m), tracked=below_m > 0.1
+        )
+        unseen_s = max(0.0, t_s - seen_until_s)
+        if unseen_s:
+            target = replace(target, measured=False, tracked=False, measured_s=seen_until_s)
+        obs = observation(t_s, telemetry=tel, target=target, position_age_s=unseen_s)
+        state, command = planner.step(state, felt(obs), profile)
+        sent.append((t_s, command))
+        if planner.is_over(state):
+            break
+        match command:
+            case RawThrust(order):
+                thrust = 0.0 if order < 5000 else float(order)
+            case StopMotors():
+                thrust = 0.0
+            case PositionSetpoint():
+                thrust = 0.34 * HOVER_THRUST
+    return state, sent
+
+
+@pytest.mark.parametrize(
+    ("positioning", "seen_until_s"), [("deck", math.inf), ("target", math.inf), ("target", 13.0)]
+)
+@pytest.mark.parametrize("phase", [Phase.SEARCH, Phase.ALIGN, Phase.ASCEND, Phase.RECOVER])
+def test_what_a_hand_holds_below_the_target_has_not_perched(
+    phase: Phase, positioning: str, seen_until_s: float
+) -> None:
+    """Not even where it was pressed before, and a contact seemed to be there; nor once the target
+    that tells it is out of sight."""
+    begin = replace(state_in(phase, z_m=HANG_Z_M - 0.2), contact_z_m=HANG_Z_M - 0.2)
+    profile = Profile.model_validate({"positioning": positioning})
+    state, sent = in_a_hand(begin, 0.2, profile=profile, seen_until_s=seen_until_s)
+    assert (state.phase, state.outcome) == (Phase.ABORTED, Outcome.SAFETY)
+    assert "something else than the target's magnet holds it" in state.reason
+    # It neither fights on in the hand, nor stops without its weight having hung in it.
+    first_s = next(t_s for t_s, command in sent if isinstance(command, StopMotors))
+    assert first_s < 10.0 + 8.0
+    still = [t_s for t_s, c in sent if isinstance(c, RawThrust) and c.thrust <= 5000]
+    assert first_s - still[0] >= PROFILE.planner.complete.hang_s - 0.05
+
+
+@pytest.mark.parametrize(
+    ("below_m", "aside_m", "sigma_m", "to"),
+    [
+        (0.0, 0.0, 0.001, Phase.COMPLETE),
+        (0.04, 0.02, 0.001, Phase.COMPLETE),
+        (0.06, 0.0, 0.001, Phase.LANDING),  # in sight, so that nothing has drifted
+        (0.0, 0.03, 0.001, Phase.LANDING),  # beside the magnet
+        (0.0, 0.0, 0.03, Phase.LANDING),  # perhaps beside
+        (0.0, 0.0, math.inf, Phase.LANDING),  # nobody knows
+    ],
+)
+def test_only_what_hangs_at_the_target_is_caught(
+    below_m: float, aside_m: float, sigma_m: float, to: Phase
+) -> None:
+    begin = state_in(Phase.RECOVER, z_m=HANG_Z_M - below_m)
+    begin = replace(begin, contact_z_m=HANG_Z_M - below_m)
+    state, _ = in_a_hand(begin, below_m, aside_m, sigma_m, lasts_s=2.2)
+    assert state.phase is to
 
 
 @pytest.mark.parametrize("step_m", [-0.6, 0.7])
