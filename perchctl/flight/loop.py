@@ -22,7 +22,7 @@ from perchctl.flight.preflight import (
     refuse_unmeasured,
     still_waiting_for,
 )
-from perchctl.flight.rescue import rescue
+from perchctl.flight.rescue import Rescued, rescue
 from perchctl.flight.senses import Senses
 from perchctl.flight.told import events_of, report_of
 from perchctl.flight.turns import Turns
@@ -148,8 +148,10 @@ RESCUED = {
 }
 
 
-def _tell_rescue(parts: FlightParts, error: BaseException, found: Finding | None) -> None:
-    text = f"{type(error).__name__}{RESCUE}{RESCUED[found]}"
+def _tell_rescue(parts: FlightParts, error: BaseException, found: Rescued) -> None:
+    text = f"{type(error).__name__}{RESCUE}{RESCUED[found.finding]}"
+    if found.touchdown is not None and found.touchdown.is_hard:
+        text += f"; it {found.touchdown.text}"
     for watcher in parts.watchers:
         with contextlib.suppress(Exception):  # it may be the one that failed
             watcher.event(Event(parts.clock.now(), EventKind.NOTE, text))

@@ -5,18 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from typing import NamedTuple
 
 from perchctl.flight.clock import Clock
 from perchctl.flight.history import History, extended
 from perchctl.link.protocol import Link, ToldSent, tell_nobody
 from perchctl.mission import lander
 from perchctl.mission.context import Context
+from perchctl.mission.ending import Touchdown, touchdown_of
 from perchctl.mission.felt import FeltMotion
 from perchctl.mission.lander import Finding
 from perchctl.mission.sent import Sent
 from perchctl.mission.state import Condition, Observation, Operator, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, EmergencyStop, Idle
+
+
+class Rescued(NamedTuple):
+    """Where the vehicle is, and how it met the floor; None for what is not known."""
+
+    finding: Finding | None = None
+    touchdown: Touchdown | None = None
+
 
 LOOK_S = 0.5
 """For so long a vehicle must be seen with its motors off before a rescue leaves it."""
@@ -32,9 +42,9 @@ def rescue(
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
     told: ToldSent = tell_nobody,
     felt: FeltMotion | None = None,
-) -> Finding | None:
+) -> Rescued:
     """Fly the way down without the planner, the camera and the log, bounded by the landing's
-    time. Returns where the vehicle is, once its motors have been seen off; else None.
+    time. Returns where the vehicle is, once its motors have been seen off.
 
     `state` is the planner's last, None before its first tick; `history` the telemetry so far;
     `position_age_s` how old the newest position from outside is at a time. By the target none is
@@ -50,7 +60,7 @@ def rescue(
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
         if operator() is Operator.STOP:
             send(EmergencyStop())  # the link's guard repeats it
-            return None
+            return Rescued()
         with suppress(Exception):
             history = extended(history, link.telemetry(), profile.safety)
         newest = history.newest
@@ -72,9 +82,11 @@ def rescue(
                 send(command)
             c = Context(state, obs, profile)
             if c.held(Condition.DOWN) >= LOOK_S:
-                return lander.finding(c)
+                found = lander.finding(c)
+                hangs = found is Finding.HANGS
+                return Rescued(found, None if hangs else touchdown_of(c))
         clock.wait_until(now_s + period_s)
-    return None
+    return Rescued()
 
 
 def _before_take_off(obs: Observation) -> PlannerState:

@@ -6,6 +6,7 @@ from perchctl.flight.senses import Senses
 from perchctl.link.evidence import FRESH_S
 from perchctl.mission import planner
 from perchctl.mission.context import Context
+from perchctl.mission.ending import contact_error_of, touchdown_of
 from perchctl.mission.findings import findings_of
 from perchctl.mission.hold import unplaced
 from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
@@ -47,6 +48,7 @@ def report_of(
     state: PlannerState, obs: Observation, passed: tuple[Event, ...], senses: Senses
 ) -> FlightReport:
     seen, camera = senses.noticed_at_last(), senses.profile.camera
+    c = Context(state, obs, senses.profile)
     return FlightReport(
         phase=state.phase,
         outcome=state.outcome or Outcome.SAFETY,
@@ -57,6 +59,8 @@ def report_of(
         locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
         history=passed,
         findings=None if seen is None else findings_of(seen, camera),
+        contact=contact_error_of(c),
+        touchdown=touchdown_of(c),
     )
 
 

@@ -75,7 +75,8 @@ def _end_record(log: FlightLog) -> dict[str, Any]:
     record = end.as_record()
     return {
         key: record.get(key)
-        for key in ("outcome", "cause", "reason", "locked", "fell", "mount_turn_deg",
+        for key in ("outcome", "cause", "reason", "locked", "fell", "contact_aside_m",
+                    "contact_sigma_m", "touchdown_mps", "touchdown_g", "mount_turn_deg",
                     "mount_turn_sigma_deg")
     } | {
         "advice": record.get("advice") or [],

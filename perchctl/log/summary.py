@@ -11,6 +11,7 @@ import numpy as np
 
 from perchctl.log.read import FlightLog, PhaseSpan
 from perchctl.log.recording.end import RecordingEnd
+from perchctl.mission.ending import ContactError, Touchdown
 from perchctl.mission.findings import Findings, latency_text, turn_text
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -24,6 +25,8 @@ class FlightSummary:
             that ends without its summary.
         cause: what decided it, such as ``target not found``.
         miss_m: None where no truth is known.
+        contact: the program's own error, of what hangs.
+        touchdown: how the floor was met, as far as that was felt.
         lost_records, log_problem: what the log lacks, and why; 0 and None for a whole one.
         recording: what became of it, None of a flight without one.
     """
@@ -39,6 +42,8 @@ class FlightSummary:
     fell: bool = False
     phases: tuple[PhaseSpan, ...] = ()
     findings: Findings | None = None
+    contact: ContactError | None = None
+    touchdown: Touchdown | None = None
     lost_records: int = 0
     log_problem: str | None = None
     recording: RecordingEnd | None = None
@@ -53,6 +58,7 @@ class FlightSummary:
             "duration_s": self.duration_s,
             "attempts": self.attempts,
             "miss_m": self.miss_m,
+            **_ending(self.contact, self.touchdown),
             "battery_min_v": self.battery_min_v,
             "locked": self.locked,
             "fell": self.fell,
@@ -81,6 +87,27 @@ def _recording_in(end: Mapping[str, Any], beside: Path) -> RecordingEnd | None:
         int(end.get("pictures_missing") or 0),
         end.get("recording_problem"),
     )
+
+
+def _ending(contact: ContactError | None, touchdown: Touchdown | None) -> dict[str, Any]:
+    return {
+        "contact_aside_m": None if contact is None else contact.aside_m,
+        "contact_sigma_m": None if contact is None else contact.sigma_m,
+        "touchdown_mps": None if touchdown is None else touchdown.speed_mps,
+        "touchdown_g": None if touchdown is None else touchdown.peak_g,
+    }
+
+
+def _contact_in(end: Mapping[str, Any]) -> ContactError | None:
+    if end.get("contact_aside_m") is None:
+        return None
+    return ContactError(float(end["contact_aside_m"]), float(end["contact_sigma_m"]))
+
+
+def _touchdown_in(end: Mapping[str, Any]) -> Touchdown | None:
+    if end.get("touchdown_mps") is None:
+        return None
+    return Touchdown(float(end["touchdown_mps"]), float(end["touchdown_g"]))
 
 
 def _found(findings: Findings | None) -> dict[str, Any]:
@@ -140,6 +167,8 @@ def summary_of(log: FlightLog) -> FlightSummary:
         fell=bool(end.get("fell", False)),
         phases=phases,
         findings=_findings_in(end),
+        contact=_contact_in(end),
+        touchdown=_touchdown_in(end),
         lost_records=int(end.get("lost_records") or 0),
         log_problem=end.get("problem"),
         recording=_recording_in(end, log.path),
@@ -169,6 +198,8 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
         lines[0] += f" [{flight.cause}]"
     if flight.miss_m is not None:
         lines.append(f"miss:      {flight.miss_m * 1e3:.1f} mm")
+    if flight.contact is not None:
+        lines.append(f"contact:   {flight.contact.text}")
     lines.append(f"flight:    {flight.duration_s:.1f} s, {_attempts(flight.attempts)}")
     if flight.phases:
         lines.append(f"phases:    {phases_text(flight.phases)}")
@@ -178,6 +209,8 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
         lines += findings_lines(flight.findings)
     if flight.locked:
         lines.append("vehicle:   locked by its supervisor: inspect and restart it")
+    if flight.touchdown is not None and flight.touchdown.is_hard:
+        lines.append(f"vehicle:   {flight.touchdown.text}")
     if flight.fell:
         lines.append("vehicle:   fell")
     lines += faults

@@ -159,6 +159,8 @@ class LogWatcher:
             fell=fell,
             phases=spans_of(report),
             findings=report.findings,
+            contact=report.contact,
+            touchdown=report.touchdown,
         )
         self.writer.conclude(summary.as_record())
         recording = self._ended_recording()

@@ -17,6 +17,11 @@ from perchctl.vehicle import FULL_THRUST
 DESCENDED_M, HELD_WITHIN_M = 0.1, 0.1
 CARRIED_ON_MPS = 0.1
 """By so much the height of a pressed vehicle may run away from the last sight's."""
+TOUCHES_M = 0.001
+"""By so much the touch itself moves the gear, whatever was known of it before."""
+SHAKEN_M, SLIDES_MPS = 0.002, 0.01
+"""An estimate by decks is off by so much after the blow on the ceiling, and by so much more for
+each second without a sight."""
 DRIFTED_M = 0.02
 """So far the estimate may have drifted up from the contact, and a slip counts all the same."""
 PRESSED_M = 0.08
@@ -103,9 +108,15 @@ def unseen_s(c: Context) -> float:
 
 
 def contact_aside_m(c: Context) -> tuple[float, float]:
-    """How far the gear is from the target's axis, and the standard deviation of that."""
+    """How far the gear is from the target's axis, and the standard deviation of that.
+
+    By decks the place of the last sight is carried on by an estimate that slides, and that the blow
+    on the ceiling shakes; where no position comes, `reckoned` has counted that already."""
     reckoning = c.state.reckoning
-    return math.hypot(*reckoning.aside_m), reckoning.aside_sigma_m
+    sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M)
+    if c.profile.positioning.by == "deck" and c.placed:
+        sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * unseen_s(c))
+    return math.hypot(*reckoning.aside_m), sigma_m
 
 
 def contact_within_m(c: Context) -> float:

@@ -35,6 +35,8 @@ IMPACT_G = -0.3
 """What brakes a climb harder is an impact on the ceiling, and no way down."""
 BLOW_MPS, BLOW_S = 0.22, 0.1
 """A speed upwards gained within that time: more than any thrust gives, so the floor was met."""
+BEFORE_BLOW_S, BOUNCES_S = 0.05, 0.5
+"""A blow is noticed so long after it began, and what follows within so long is the same one."""
 STEADY_MPS = 0.06
 """Vertical speeds so near to each other are one speed."""
 REST_MEMORY_S = 0.5
@@ -105,6 +107,25 @@ class Corrections:
 
 
 @dataclass(frozen=True)
+class Blow:
+    """A blow from below: as from the floor.
+
+    Attributes:
+        t_s: when it was felt; `-inf` where none was.
+        estimated_mps, felt_mps: the vertical speed just before it, by the state estimate, and as
+            `ImuMotion.velocity_mps` has it.
+        peak_g: the largest specific force that was read in it, along the body's z axis.
+        z_m: where the state estimate had the vehicle.
+    """
+
+    t_s: float = -math.inf
+    estimated_mps: float = 0.0
+    felt_mps: float = 0.0
+    peak_g: float = 0.0
+    z_m: float = 0.0
+
+
+@dataclass(frozen=True)
 class ImuMotion:
     """The vehicle's motion by its accelerometer and attitude alone.
 
@@ -123,6 +144,8 @@ class ImuMotion:
         misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
             the motion is reckoned without them.
         corrections: whether anything corrects the estimate that stands beside this motion.
+        blow: the newest one from below.
+        off_s: since when the motors have been off; `inf` while they turn.
     """
 
     t_s: float = -math.inf
@@ -144,6 +167,9 @@ class ImuMotion:
     misled_rad: tuple[float, float] = (0.0, 0.0)
     turning_radps: tuple[float, float] = (0.0, 0.0)
     corrections: Corrections = Corrections()
+    before_blow: Blow = Blow()
+    blow: Blow = Blow()
+    off_s: float = math.inf
 
     @property
     def attitude_age_s(self) -> float:
@@ -155,6 +181,7 @@ class ImuMotion:
 def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """The motion with one more sample; `last` is the one before, None at the first."""
     dt_s = math.inf if last is None else new.t_s - last.t_s
+    off_s = min(motion.off_s, new.t_s) if new.thrust < 1 else math.inf
     frozen_s = _still_s(motion.frozen_s, last, new, lambda s: (s.acc_x_g, s.acc_y_g, s.acc_z_g))
     attitude_frozen_s = _still_s(
         motion.attitude_frozen_s, last, new, lambda s: (s.roll_rad, s.pitch_rad, s.yaw_rad)
@@ -165,7 +192,7 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         return replace(
             motion, t_s=new.t_s, gap_s=gap_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
             steady_mps=motion.velocity_mps[2], light_since_s=math.inf, frozen_s=frozen_s,
-            attitude_frozen_s=attitude_frozen_s, corrections=corrections,
+            attitude_frozen_s=attitude_frozen_s, corrections=corrections, off_s=off_s,
         )  # fmt: skip
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has(FLYING):
@@ -208,7 +235,34 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         misled_rad=misled_rad,
         turning_radps=turning_radps,
         corrections=corrections,
+        before_blow=_falling(motion.before_blow, new, z),
+        blow=_struck(motion, new, blow),
+        off_s=off_s,
     )
+
+
+def _falling(old: Blow, new: Telemetry, felt_mps: float) -> Blow:
+    """The fastest way down of the last moment, which a blow would end, and the largest force."""
+    estimated_mps = new.velocity_mps[2]
+    if new.t_s - old.t_s <= BEFORE_BLOW_S and old.felt_mps < felt_mps:
+        return replace(old, peak_g=max(old.peak_g, new.acc_z_g))
+    return Blow(new.t_s, estimated_mps, felt_mps, new.acc_z_g, new.position_m[2])
+
+
+def _struck(motion: ImuMotion, new: Telemetry, gained_mps: float) -> Blow:
+    """The newest blow; of its bounces the hardest counts."""
+    old, begun = motion.blow, motion.before_blow
+    follows = new.t_s - old.t_s <= BOUNCES_S
+    if gained_mps > BLOW_MPS:
+        peak_g = max(begun.peak_g, new.acc_z_g)
+        if not follows:
+            return replace(begun, t_s=new.t_s, peak_g=peak_g)
+        return replace(
+            old, peak_g=max(old.peak_g, peak_g),
+            estimated_mps=min(old.estimated_mps, begun.estimated_mps),
+            felt_mps=min(old.felt_mps, begun.felt_mps),
+        )  # fmt: skip
+    return replace(old, peak_g=max(old.peak_g, new.acc_z_g)) if follows else old
 
 
 def _misled(

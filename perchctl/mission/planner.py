@@ -161,7 +161,10 @@ def _enter(state: PlannerState, row: Row, context: Context) -> PlannerState:
 
 
 def _outcome(state: PlannerState, row: Row) -> Outcome | None:
-    """What hangs after all has found its target, by whatever it was brought there."""
+    """What hangs after all has found its target, by whatever it was brought there. What was found
+    hanging on its way down is told as what led to that: nobody has seen whether it hangs there."""
+    if state.phase is Phase.LANDING and row.outcome is Outcome.PERCHED and state.outcome:
+        return state.outcome
     if row.name == "hung" and state.outcome is Outcome.TARGET_NOT_FOUND:
         return Outcome.ATTEMPTS_USED_UP
     return row.outcome or state.outcome
@@ -187,6 +190,7 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
             return replace(
                 new,
                 stopped_s=None,
+                contact_aside_m=None,
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,

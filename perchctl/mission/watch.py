@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, runtime_checkable
 
+from perchctl.mission.ending import ContactError, Touchdown
 from perchctl.mission.findings import Findings
 from perchctl.mission.sent import Sent
 from perchctl.mission.state import Outcome, Phase, PlannerState, Severity
@@ -117,7 +118,8 @@ class EventKeeper:
 @dataclass(frozen=True)
 class FlightReport:
     """How the flight ended; `history` are its phases' events, the first at the start.
-    `findings`: what it showed of latency and mounting, where it was long enough."""
+    `findings`: what it showed of latency and mounting, where it was long enough. `contact`: of what
+    hangs. `touchdown`: of what met the floor, as far as that was felt."""
 
     phase: Phase
     outcome: Outcome
@@ -127,3 +129,5 @@ class FlightReport:
     locked: bool
     history: tuple[Event, ...] = ()
     findings: Findings | None = None
+    contact: ContactError | None = None
+    touchdown: Touchdown | None = None

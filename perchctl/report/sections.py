@@ -41,6 +41,8 @@ def headline(told: Told, back: str = "") -> Markup:
     ]  # fmt: skip
     if flight.miss_m is not None:
         facts.insert(1, ("miss", f"{flight.miss_m * 1e3:.1f} mm, true (simulated)"))
+    if flight.contact is not None:
+        facts.insert(1, ("contact", flight.contact.text))
     if told.log.header.get("seed") is not None:
         facts.append(("seed", str(told.log.header["seed"])))
     return tag(

@@ -302,6 +302,8 @@ def _end(track: Track) -> Iterator[Sentence]:
         if flight.locked:
             text = "The supervisor locked the vehicle: inspect and restart it"
             yield Sentence(track.end_s, text, "bad")
+        if flight.touchdown is not None and flight.touchdown.is_hard:
+            yield Sentence(track.end_s, f"It {flight.touchdown.text}", "bad")
         if flight.fell:
             yield Sentence(track.end_s, "The vehicle fell", "bad")
         return

@@ -133,7 +133,7 @@ def test_a_rescue_at_the_ceiling_peels_off_first() -> None:
     pressed = Vehicle()
     pressed.z_m, pressed.motors = 2.0, True
     rig = Rig(pressed)
-    assert rig.rescue(telemetry(0.0, 2.0), **AT_CEILING) is Finding.STANDS
+    assert rig.rescue(telemetry(0.0, 2.0), **AT_CEILING).finding is Finding.STANDS
     first = rig.link.sent[0][1]
     assert isinstance(first, PositionSetpoint)
     assert first.z_m <= 2.0

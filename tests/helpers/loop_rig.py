@@ -12,9 +12,9 @@ import pytest
 
 from perchctl.flight.history import History
 from perchctl.flight.loop import FlightParts, Positions, fly
-from perchctl.flight.rescue import rescue
+from perchctl.flight.rescue import Rescued, rescue
 from perchctl.link.mock import ScriptedLink
-from perchctl.mission import lander, planner
+from perchctl.mission import planner
 from perchctl.mission.state import Observation, Operator, Phase
 from perchctl.mission.watch import Event, FlightReport, Tick
 from perchctl.pipeline import Pipeline, make_pipeline
@@ -236,7 +236,7 @@ class Rig:
     def fly(self) -> FlightReport:
         return fly(self.parts())
 
-    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> lander.Finding | None:
+    def rescue(self, known: Telemetry, age_s: float = 0.0, **state: Any) -> Rescued:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state

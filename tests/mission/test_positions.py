@@ -7,10 +7,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from perchctl.mission import planner
+from perchctl.mission.conditions import contact_aside_m
+from perchctl.mission.context import Context
 from perchctl.mission.state import Observation, Outcome, Phase, PlannerState
+from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, Command, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
@@ -21,6 +25,7 @@ from tests.helpers.mission import (
     Felt,
     observation,
     state_in,
+    target_at,
     telemetry,
 )
 
@@ -373,3 +378,27 @@ def test_a_release_that_is_held_goes_by_where_the_estimate_is_now() -> None:
     _, command = planner.step(state, observation(BEGIN_S, telemetry=late, **hidden(4.0)), MOCAP)
     assert isinstance(command, PositionSetpoint)
     assert command.z_m > late.position_m[2]
+
+
+# --- Where it touched ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("by", "unseen_s", "least_m", "most_m"),
+    [("deck", 0.1, 0.002, 0.003), ("deck", 1.0, 0.01, 0.012), ("mocap", 1.0, 0.001, 0.002)],
+)
+def test_the_spread_of_a_contact_grows_with_what_the_estimate_may_slide(
+    by: str, unseen_s: float, least_m: float, most_m: float
+) -> None:
+    """A target that is only remembered keeps the spread of its last sight."""
+    profile = Profile.model_validate({"positioning": by})
+    state = state_in(Phase.PERCH, z_m=HANG_Z_M)
+    for t_s in times(0.1):
+        remembered = target_at(
+            t_s, body_m=(0.0, 0.0, HANG_Z_M), measured_s=t_s - unseen_s, measured=False,
+            tracked=False, sigma_m=np.full(3, 1e-4),
+        )  # fmt: skip
+        obs = observation(t_s, HANG_Z_M, target=remembered)
+        state, _ = planner.step(state, obs, profile)
+    _, sigma_m = contact_aside_m(Context(state, obs, profile))
+    assert least_m <= sigma_m <= most_m

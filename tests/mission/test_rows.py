@@ -330,6 +330,18 @@ def test_without_the_row_a_case_fails(name: str) -> None:
     assert not CASES[name].holds(without)
 
 
+def test_what_was_locked_while_it_landed_has_not_perched() -> None:
+    """It hangs, but nobody has seen whether it hangs on the target: its outcome is that of what led
+    to the landing."""
+    state = replace(
+        state_in(P.LANDING, START_S, CONTACT_Z_M), stopped_s=START_S - 1.0,
+        contact_z_m=CONTACT_Z_M, outcome=O.OPERATOR,
+    )  # fmt: skip
+    locked = flown(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(START_S + PERIOD_S)
+    state, _ = planner.step(state, locked, PROFILE)
+    assert (state.phase, state.row, state.outcome) == (P.PERCHED, "hung-but-locked", O.OPERATOR)
+
+
 # --- severity ------------------------------------------------------------------------------
 
 ROGUE = Row("rogue", FLYING_PHASES | {P.LANDING}, lambda c: True, P.SEARCH, "take off again")

@@ -44,6 +44,10 @@ def card_of(summary: FlightSummary, log: Path) -> Card:
     rows = [["cause", summary.cause]] if summary.cause not in ("", summary.outcome) else []
     if summary.miss_m is not None:
         rows.append(["miss", f"{summary.miss_m * 1e3:.1f} mm"])
+    if summary.contact is not None:
+        rows.append(["contact", summary.contact.text])
+    if summary.touchdown is not None and summary.touchdown.is_hard:
+        rows.append(["vehicle", summary.touchdown.text])
     rows.append(["flight", f"{summary.duration_s:.1f} s, attempts {summary.attempts}"])
     if summary.battery_min_v is not None:
         rows.append(["battery", f"{summary.battery_min_v:.2f} V at its lowest"])

@@ -1,0 +1,247 @@
+"""How a flight met the floor: felt, true of the vehicle, and told whoever flew the way down."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+from perchctl.display.page.told import card_of
+from perchctl.log.read import read_log
+from perchctl.log.shown import show_record, show_text
+from perchctl.log.summary import FlightSummary, summary_of, summary_text
+from perchctl.mission import planner
+from perchctl.mission.context import Context
+from perchctl.mission.ending import HARD_MPS, ContactError, Touchdown, touchdown_of
+from perchctl.mission.imu import BLOW_MPS, Blow, ImuMotion, Reckoning, moved, reckoned
+from perchctl.mission.state import Observation, Operator, Phase
+from perchctl.mission.watch import EventKind
+from perchctl.profile import load_profile
+from perchctl.report.sections import headline
+from perchctl.report.told import tell
+from perchctl.vehicle import PositionSetpoint, RawThrust, Telemetry
+from tests.flight.test_silent_loop import Guarded, hanging_camera
+from tests.helpers import log
+from tests.helpers.loop_rig import PROFILE, Broken, Rig, Vehicle
+from tests.helpers.mission import HANG_Z_M, observation, state_in, telemetry
+
+HARD = Touchdown(0.9, 3.1)
+SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
+
+
+# --- True of the vehicle ---------------------------------------------------------------------
+
+
+def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdown | None]:
+    """The vehicle comes down on a share of the thrust that it hovers on. Returns its true speed
+    at the floor, its largest true specific force, g, and what was felt."""
+    from perchctl.link.bursty import radio_of
+    from perchctl.link.mock import MockLink
+    from perchctl.sim.draw import draw_scenario
+    from perchctl.sim.vehicle import SimulatedVehicle
+
+    profile = load_profile("sim")
+    scenario = draw_scenario(profile, seed)
+    vehicle = SimulatedVehicle(scenario)
+    link = MockLink(vehicle, profile.link.telemetry_period_s, radio_of(scenario))
+    link.connect()
+    motion, carried, last = ImuMotion(), Reckoning(), None
+    t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0
+    place = (0.0, 0.0, 0.0)
+    while t_s < min(9.0, hit_s + 0.6):
+        if t_s < 5.0:
+            link.send(PositionSetpoint(place[0], place[1], place[2] + min(0.5, 0.3 * t_s), 0.0))
+        else:
+            dropped_s = min(dropped_s, t_s)
+            link.send(RawThrust(int(share * motion.hover_thrust)))
+        for _ in range(10):
+            t_s += 0.002
+            link.advance_to(t_s)
+            if dropped_s < t_s < hit_s and vehicle.world.on_floor():
+                hit_s, speed_mps = t_s, sink_mps
+            sink_mps = -vehicle.world.vz_mps
+        for sample in link.telemetry():
+            if last is None:
+                place = sample.position_m
+            motion = moved(motion, last, sample)
+            believed = not blind or t_s < dropped_s
+            carried, last = reckoned(carried, motion, sample, believed=believed), sample
+    assert last is not None
+    obs = Observation(last.t_s, last, imu=motion)
+    blind_s = dropped_s if blind else None
+    state = replace(state_in(Phase.LANDED, z_m=0.0), reckoning=carried, blind_s=blind_s)
+    return speed_mps, motion.blow.peak_g, touchdown_of(Context(state, obs, profile))
+
+
+@pytest.mark.parametrize("blind", [False, True])
+@pytest.mark.parametrize("share", [0.96, 0.85, 0.5])
+def test_the_felt_speed_is_the_true_one(share: float, blind: bool) -> None:
+    pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+    truth_mps, _, felt = dropped(3, share, blind)
+    assert truth_mps > 0.4
+    assert felt is not None
+    assert felt.speed_mps == pytest.approx(truth_mps, abs=0.15 if blind else 0.08)
+    assert felt.is_hard is (truth_mps > HARD_MPS)
+    assert felt.peak_g > 2.0
+
+
+# --- A blow, sample by sample ------------------------------------------------------------------
+
+
+def blown(*hits: tuple[float, float, float]) -> ImuMotion:
+    """Each hit: when, with what speed down, and the specific force of two samples."""
+    motion, last = ImuMotion(), None
+    for i in range(300):
+        t_s = 0.01 * i
+        vz_mps, acc_g = 0.0, 1.0
+        for hit_s, down_mps, force_g in hits:
+            if hit_s - 0.2 <= t_s < hit_s:
+                vz_mps = -down_mps
+            if hit_s <= t_s < hit_s + 0.015:
+                acc_g = force_g
+        sample = telemetry(t_s, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
+        motion = moved(motion, last, sample)
+        last = sample
+    return motion
+
+
+def test_of_bounces_the_hardest_counts_and_a_blow_of_long_ago_none() -> None:
+    blow = blown((1.0, 1.2, 3.0), (2.0, 0.9, 4.1), (2.3, 0.4, 2.9)).blow
+    assert (blow.estimated_mps, blow.peak_g) == (-0.9, 4.1)
+    assert blow.t_s == pytest.approx(2.0, abs=0.03)
+    assert blown((1.0, 0.2, 1.0 + BLOW_MPS)).blow.t_s == -math.inf  # a soft one
+
+
+@pytest.mark.parametrize(
+    ("state", "blow", "told"),
+    [
+        ({}, Blow(9.0, -0.9, 0.0, 3.1), True),
+        ({}, Blow(4.0, -0.9, 0.0, 3.1), False),  # long before
+        ({}, Blow(9.0, -0.9, 0.0, 3.1, 0.8), False),  # in the air
+        ({"phase": Phase.PERCHED}, Blow(9.0, -0.9, 0.0, 3.1), False),
+        ({}, Blow(), False),
+    ],
+)
+def test_only_the_floor_is_a_touchdown(state: dict[str, object], blow: Blow, told: bool) -> None:
+    ended = replace(state_in(Phase.LANDED, z_m=0.0), **state)  # type: ignore[arg-type]
+    obs = observation(10.0, 0.0, imu=ImuMotion(t_s=10.0, blow=blow))
+    assert touchdown_of(Context(ended, obs, PROFILE)) == (HARD if told else None)
+
+
+# --- Whoever flew the way down -------------------------------------------------------------------
+
+
+def striking() -> Callable[[Telemetry], Telemetry]:
+    """Samples of a vehicle that comes down at 0.9 m/s and meets the floor."""
+    before: list[Telemetry] = []
+    struck: list[float] = []
+
+    def changed(sample: Telemetry) -> Telemetry:
+        z_m = sample.position_m[2]
+        last_m = before[-1].position_m[2] if before else 0.0
+        before.append(sample)
+        if z_m < last_m - 1e-6 and z_m > 0.0:
+            return replace(sample, velocity_mps=(0.0, 0.0, -0.9))
+        if z_m == 0.0 and last_m > 0.0:
+            struck.append(sample.t_s)
+        if struck and sample.t_s < struck[0] + 0.025:
+            return replace(sample, acc_z_g=3.1)
+        return sample
+
+    return changed
+
+
+def land_at(clock: Callable[[], float], t_s: float) -> Callable[[], Operator]:
+    return lambda: Operator.LAND if clock() > t_s else Operator.NONE
+
+
+def test_the_planner_s_report_has_it() -> None:
+    link = Vehicle(striking())
+    report = Rig(link, operator=land_at(lambda: link.now_s, 4.0)).fly()
+    assert report.phase is Phase.LANDED
+    assert report.touchdown == HARD
+
+
+def test_what_the_watchdog_brought_down_is_in_the_report() -> None:
+    link = Guarded(striking())
+    rig = Rig(link, hanging_camera(link, 12.0))
+    report = rig.fly()
+    assert link.own
+    assert report.touchdown == HARD
+
+
+def test_the_rescue_says_so() -> None:
+    rig = Rig(Vehicle(striking()))
+
+    def leave(tick: object) -> None:
+        if rig.link.now_s > 4.0:
+            raise Broken
+
+    rig.watcher.on_tick = leave
+    with pytest.raises(Broken):
+        rig.fly()
+    note = next(e for e in rig.watcher.events if e.kind is EventKind.NOTE and "Broken" in e.reason)
+    assert note.reason.endswith(f"; it {SENTENCE}")
+
+
+# --- What is told ---------------------------------------------------------------------------------
+
+
+def test_the_summary_tells_a_hard_touchdown_in_one_sentence() -> None:
+    landed = FlightSummary("landed", "the operator asked to land", touchdown=HARD)
+    assert f"\nvehicle:   {SENTENCE}" in summary_text(landed)
+    soft = FlightSummary("landed", "the operator asked to land", touchdown=Touchdown(0.3, 1.9))
+    assert "touched down" not in summary_text(soft)
+    assert soft.as_record()["touchdown_mps"] == 0.3
+
+
+def test_the_summary_tells_the_error_at_the_contact() -> None:
+    hangs = FlightSummary("perched", "hanging", contact=ContactError(1.8e-3, 0.6e-3))
+    assert "\ncontact:   1.8 +- 0.6 mm off centre" in summary_text(hangs)
+    assert hangs.as_record()["contact_sigma_m"] == 0.6e-3
+
+
+def test_an_attempt_that_failed_leaves_no_contact() -> None:
+    state = replace(
+        state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact_aside_m=0.002, contact_sigma_m=0.001
+    )
+    falls = telemetry(10.02, HANG_Z_M - 0.1, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
+    for t_s in (10.02, 10.04, 10.06, 10.08):
+        state, _ = planner.step(state, observation(t_s, telemetry=replace(falls, t_s=t_s)), PROFILE)
+    assert state.phase is Phase.RECOVER
+    assert state.contact_aside_m is None
+
+
+def test_blind_it_is_the_reckoned_speed_that_counts() -> None:
+    """The estimate has drifted; by what has been felt since, it came down at 0.9 m/s and rests."""
+    imu = ImuMotion(t_s=10.0, velocity_mps=(0.0, 0.0, -0.6), blow=Blow(9.0, -0.2, -1.5, 3.1))
+    state = replace(state_in(Phase.LANDED, z_m=0.0), blind_s=5.0, reckoning=Reckoning(imu))
+    told = touchdown_of(Context(state, observation(10.0, 0.4, imu=imu), PROFILE))
+    assert told is not None
+    assert (told.speed_mps, told.peak_g) == (pytest.approx(0.9), 3.1)
+    silent = replace(imu, gap_s=9.5)  # what was reckoned ended there
+    told = touchdown_of(Context(state, observation(10.0, 0.4, imu=silent), PROFILE))
+    assert told is not None
+    assert told.speed_mps == pytest.approx(0.2)
+
+
+def test_log_show_and_log_report_tell_both(tmp_path: Path) -> None:
+    end = log.SUMMARY | FlightSummary(
+        "perched", "r", contact=ContactError(1.8e-3, 0.6e-3), touchdown=HARD
+    ).as_record() | {"outcome": "landed", "attempts": 1}  # fmt: skip
+    flown = read_log(log.write(tmp_path / "f.jsonl", summary=end))
+    record, text, whole = show_record(flown), show_text(flown), tell(flown)
+    assert "contact:   1.8 +- 0.6 mm off centre" in text
+    assert f"vehicle:   {SENTENCE}" in text
+    assert (record["contact_aside_m"], record["contact_sigma_m"]) == (1.8e-3, 0.6e-3)
+    assert (record["touchdown_mps"], record["touchdown_g"]) == (0.9, 3.1)
+    page = unescape(str(headline(whole))).replace("\xa0", " ")
+    assert "1.8 +- 0.6 mm off centre" in page, page
+    assert f"It {SENTENCE}" in [sentence.text for sentence in whole.story]
+    card = card_of(summary_of(flown), flown.path)
+    assert ["contact", "1.8 +- 0.6 mm off centre"] in card["rows"]
+    assert ["vehicle", SENTENCE] in card["rows"]
