@@ -15,10 +15,10 @@ from perchctl.mission.state import Outcome, Phase
 from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
 
 Claim = Literal[
-    "hangs", "stands", "hangs or stands", "motors off", "locked", "ended by the supervisor",
-    "tilted", "not seen down",
+    "hangs on the target", "hangs", "stands", "hangs or stands", "motors off", "locked",
+    "ended by the supervisor", "tilted", "not seen down",
 ]  # fmt: skip
-"""`hangs`, `stands` and `hangs or stands` say that the motors are off, too; `not seen down` that
+"""All that say hanging or standing say that the motors are off, too; `not seen down` says that
 nothing the program has heard shows the vehicle at rest with its motors off."""
 
 
@@ -33,7 +33,7 @@ ROW_CLAIMS: dict[str, frozenset[Claim]] = {
     "tumbled": _claims("ended by the supervisor", "motors off"),
     "crashed": _claims("ended by the supervisor", "motors off"),
     "tilted": _claims("tilted", "motors off"),
-    "perched": _claims("hangs"),
+    "perched": _claims("hangs on the target"),
     "hung": _claims("hangs"),
     "landed": _claims("stands"),
     "hangs-or-stands": _claims("hangs or stands"),
@@ -42,7 +42,7 @@ ROW_CLAIMS: dict[str, frozenset[Claim]] = {
 """What the sentence of each row that ends a flight says of the vehicle."""
 PHASE_CLAIMS = {Phase.PERCHED: _claims("hangs"), Phase.LANDED: _claims("stands")}
 OUTCOME_CLAIMS: dict[Outcome, frozenset[Claim]] = {
-    Outcome.PERCHED: _claims("hangs"),
+    Outcome.PERCHED: _claims("hangs on the target"),
     Outcome.TARGET_NOT_FOUND: _claims("stands"),
     Outcome.ATTEMPTS_USED_UP: _claims("hangs or stands"),
     Outcome.SAFETY: _claims(),

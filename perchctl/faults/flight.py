@@ -114,8 +114,8 @@ class FaultyFlight:
             positions=feed_lockstep(self._link, profile),
             remarks=tuple if log is None else log.remarks,
         )  # fmt: skip
-        safety = profile.safety
-        self._oracle = Oracle(Limits(safety.max_height_m, safety.max_tilt_deg))
+        safety, radius_m = profile.safety, profile.planner.perch.contact_xy_m
+        self._oracle = Oracle(Limits(safety.max_height_m, safety.max_tilt_deg, radius_m))
         self._place_bound = PlaceBound(scenario, profile)
         self._drift = UnfeltDrift(
             case.effects, scenario, by_target=profile.positioning.by == "target"

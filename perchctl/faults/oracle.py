@@ -89,16 +89,18 @@ class Sample(NamedTuple):
     aside_mps: float = 0.0  # horizontal speed
     uplink: bool = True  # what the program sends would arrive
     astray_m: float = 0.0  # from where it should be, less what the fault has made it drift by
+    miss_m: float = 0.0  # of the gear from the target's centre, horizontally
     overdue: bool = False  # it should have been on its way down for some time
     heard: bool = True  # its telemetry arrives in time, and tells what is true
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of the profile that is flown: `safety`."""
+    """Of the profile that is flown: `safety`, and how far from its axis the target is met."""
 
     max_height_m: float
     max_tilt_deg: float = 55.0
+    magnet_radius_m: float = 0.025
 
 
 @dataclass(frozen=True)
@@ -311,6 +313,8 @@ class Oracle:
 
     def _is_true(self, claim: Claim, s: Sample) -> bool:
         match claim:
+            case "hangs on the target":
+                return s.hanging and not s.motors_on and s.miss_m <= self._limits.magnet_radius_m
             case "hangs":
                 return s.hanging and not s.motors_on
             case "stands":

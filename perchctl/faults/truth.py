@@ -74,4 +74,5 @@ def sample_of(vehicle: SimulatedVehicle) -> Sample:
         bool(firmware.supervisor_info & LOCKED),
         supervisor.crashed or supervisor.tumbled,
         math.hypot(world.vx_mps, world.vy_mps),
+        miss_m=world.gear_miss_m(),
     )

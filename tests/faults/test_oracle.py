@@ -228,6 +228,12 @@ LOCKED = ON_THE_FLOOR._replace(locked=True, ended_by_vehicle=True)
 @pytest.mark.parametrize(
     ("claim", "truth", "flags"),
     [
+        ("hangs on the target", HANGING, set()),
+        ("hangs on the target", HANGING._replace(miss_m=0.024), set()),
+        ("hangs on the target", HANGING._replace(miss_m=0.026), {"lied"}),
+        ("hangs on the target", HANGING._replace(motors_on=True), {"lied"}),
+        ("hangs on the target", ON_THE_FLOOR, {"lied"}),
+        ("hangs", HANGING._replace(miss_m=0.026), set()),
         ("hangs", HANGING, set()),
         ("hangs", HANGING._replace(motors_on=True), {"lied"}),
         ("hangs", ON_THE_FLOOR, {"lied"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -154,3 +155,11 @@ def test_when_nothing_lifts_it_any_more() -> None:
     it.show(HOVER, 0.5, height_m=1.2)
     assert it.recorder.weak_s == pytest.approx(0.5)
     assert (it.recorder.low_s, it.recorder.low_m) == (pytest.approx(0.5), 1.2)
+
+
+def test_a_sample_tells_how_far_the_gear_is_from_the_target() -> None:
+    vehicle = WatchedVehicle(SCENARIO, CAMERA, TargetConfig())
+    x_m, y_m = vehicle.world.magnet.target_xy_m
+    vehicle.world.set_pose((x_m + 0.04, y_m, 1.0))
+    gear_m = SCENARIO.gear_body_m
+    assert sample_of(vehicle).miss_m == pytest.approx(math.hypot(0.04 + gear_m[0], gear_m[1]))
