@@ -31,6 +31,7 @@ ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
 BELOW_S = 0.3
 WEAK_S = 2.0
 BLIND_PRESS_S = 1.25
+UNSTOPPED_S = 10.0
 HELD_S = 2.0
 """By then a hold at the magnet has been told from any other."""
 
@@ -126,6 +127,12 @@ def is_watched(c: Context) -> bool:
     """The motors have been off for as long as a perched vehicle is watched."""
     watched = stopped_for_s(c) >= c.profile.planner.complete.watch_s
     return watched and c.held(Condition.DOWN) >= 0.1
+
+
+def still_turns(c: Context) -> bool:
+    """The motors were stopped, and are not seen to have, for longer than a supervisor's word that
+    stands still is waited for."""
+    return stopped_for_s(c) > c.profile.planner.complete.watch_s + UNSTOPPED_S
 
 
 def settling_too_long(c: Context) -> bool:

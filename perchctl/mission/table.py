@@ -20,6 +20,7 @@ from perchctl.mission.guards import (
     pressed_blindly,
     searched_out,
     settling_too_long,
+    still_turns,
     too_little_left,
     too_weak,
     why_beside_magnet,
@@ -192,6 +193,11 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(
         "fell-unseen", only(P.COMPLETE), is_watched, P.LANDING, why_fell_unseen, S.LAND, O.SAFETY,
+    ),
+    Row(
+        "not-stopped", only(P.COMPLETE), still_turns, P.LANDING,
+        lambda c: f"motors stopped, but their thrust still reads {c.obs.telemetry.thrust:.0f}",
+        S.LAND, O.SAFETY,
     ),
     # --- the failed attempt --------------------------------------------------
     Row(

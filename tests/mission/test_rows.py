@@ -281,6 +281,11 @@ CASES: dict[str, Case] = {
         P.COMPLETE, P.LANDING, flown(0.02, **OFF), 0.3, O.SAFETY,
         state={"stopped_s": START_S - 3.0, "contact_z_m": CONTACT_Z_M}, z_m=CONTACT_Z_M,
     ),
+    "not-stopped": Case(
+        P.COMPLETE, P.LANDING, flown(CONTACT_Z_M, thrust=1000.0, supervisor=READY), 0.1, O.SAFETY,
+        state={"stopped_s": START_S - 12.0, "orders": 5, "contact_z_m": CONTACT_Z_M},
+        z_m=CONTACT_Z_M,
+    ),
     "attempts-used": Case(
         P.RECOVER, P.LANDING, seen(), 0.7, O.ATTEMPTS_USED_UP,
         state={"attempts": PROFILE.planner.attempts},

@@ -27,6 +27,7 @@ from perchctl.vehicle import (
     TUMBLED,
     Command,
     EmergencyStop,
+    Idle,
     PositionSetpoint,
     RawThrust,
     StopMotors,
@@ -419,3 +420,31 @@ def test_without_a_heading_a_slip_is_not_caught_by_position() -> None:
     state, command = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
     assert isinstance(command, RawThrust)
     assert state.caught
+
+
+@pytest.mark.parametrize("positioning", ["deck", "target"])
+@pytest.mark.parametrize(
+    ("frozen", "ends"),
+    [
+        ({"thrust": 0.0, "supervisor": AIRBORNE}, Phase.PERCHED),
+        ({"thrust": 1000.0, "supervisor": READY}, Phase.ABORTED),
+        ({"thrust": 20000.0, "supervisor": AIRBORNE}, Phase.ABORTED),
+    ],
+)
+def test_a_completion_whose_telemetry_stands_still_ends(
+    frozen: dict[str, float], ends: Phase, positioning: str
+) -> None:
+    """The supervisor's word, or the thrust, reads as before the stop. Nothing spins up again."""
+    profile = Profile.model_validate({"positioning": positioning})
+    felt, state = Felt(), replace(
+        state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact_z_m=HANG_Z_M, reach_s=9.0, released_s=9.0,
+        stopped_s=10.0, ordered_s=10.0, orders=1,
+    )  # fmt: skip
+    for i in range(1, 50 * 50):
+        t_s = 10.0 + 0.02 * i
+        tel = telemetry(t_s, HANG_Z_M, **frozen)
+        state, command = planner.step(state, felt(observation(t_s, telemetry=tel)), profile)
+        assert isinstance(command, (StopMotors, Idle))
+        if planner.is_over(state):
+            break
+    assert state.phase is ends
