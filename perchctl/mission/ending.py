@@ -69,8 +69,6 @@ def touchdown_of(c: Context) -> Touchdown | None:
         return None
     if c.placed and c.state.blind_s is None and blow.z_m - tel.position_m[2] > SAME_HEIGHT_M:
         return None
-    speed_mps = -blow.estimated_mps
-    reckons = reckoning.imu is not None and imu.gap_s < blow.t_s
-    if (c.state.blind_s is not None or c.state.astray) and reckons:
-        speed_mps = imu.velocity_mps[2] - blow.felt_mps - reckoning.velocity_mps[2]
+    by_feel = c.state.blind_s is not None or c.state.astray
+    speed_mps = -(reckoning.struck_mps if by_feel else blow.estimated_mps)
     return Touchdown(max(0.0, speed_mps), blow.peak_g)

@@ -144,7 +144,7 @@ class ImuMotion:
         misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
             the motion is reckoned without them.
         corrections: whether anything corrects the estimate that stands beside this motion.
-        blow: the newest one from below.
+        blow: the newest one from below; `last_moment`: what one that begins now has ended.
         off_s: since when the motors have been off; `inf` while they turn.
     """
 
@@ -167,7 +167,7 @@ class ImuMotion:
     misled_rad: tuple[float, float] = (0.0, 0.0)
     turning_radps: tuple[float, float] = (0.0, 0.0)
     corrections: Corrections = Corrections()
-    before_blow: Blow = Blow()
+    last_moment: tuple[Blow, ...] = ()
     blow: Blow = Blow()
     off_s: float = math.inf
 
@@ -215,6 +215,8 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
     steady_s, steady_mps = motion.steady_s, motion.steady_mps
     if abs(z - steady_mps) > STEADY_MPS:
         steady_s, steady_mps = new.t_s, z
+    now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
+    last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
     return ImuMotion(
         t_s=new.t_s,
         velocity_mps=(x, y, z),
@@ -235,30 +237,29 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         misled_rad=misled_rad,
         turning_radps=turning_radps,
         corrections=corrections,
-        before_blow=_falling(motion.before_blow, new, z),
-        blow=_struck(motion, new, blow),
+        last_moment=last_moment,
+        blow=_struck(motion, new, last_moment, blow),
         off_s=off_s,
     )
 
 
-def _falling(old: Blow, new: Telemetry, felt_mps: float) -> Blow:
-    """The fastest way down of the last moment, which a blow would end, and the largest force."""
-    estimated_mps = new.velocity_mps[2]
-    if new.t_s - old.t_s <= BEFORE_BLOW_S and old.felt_mps < felt_mps:
-        return replace(old, peak_g=max(old.peak_g, new.acc_z_g))
-    return Blow(new.t_s, estimated_mps, felt_mps, new.acc_z_g, new.position_m[2])
-
-
-def _struck(motion: ImuMotion, new: Telemetry, gained_mps: float) -> Blow:
-    """The newest blow; of its bounces the hardest counts."""
-    old, begun = motion.blow, motion.before_blow
+def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mps: float) -> Blow:
+    """The newest blow, which has gained `mps` by now; of its bounces the hardest counts. On board
+    the estimate has the whole of a blow before its second sample is here."""
+    old = motion.blow
     follows = new.t_s - old.t_s <= BOUNCES_S
-    if gained_mps > BLOW_MPS:
-        peak_g = max(begun.peak_g, new.acc_z_g)
+    if mps > BLOW_MPS:
+        begun = Blow(
+            new.t_s,
+            min(moment.estimated_mps for moment in last_moment),
+            min(moment.felt_mps for moment in last_moment),
+            max(moment.peak_g for moment in last_moment),
+            new.position_m[2],
+        )
         if not follows:
-            return replace(begun, t_s=new.t_s, peak_g=peak_g)
+            return begun
         return replace(
-            old, peak_g=max(old.peak_g, peak_g),
+            old, peak_g=max(old.peak_g, begun.peak_g),
             estimated_mps=min(old.estimated_mps, begun.estimated_mps),
             felt_mps=min(old.felt_mps, begun.felt_mps),
         )  # fmt: skip
@@ -347,6 +348,7 @@ class Reckoning:
         aside_m: from the gear to the target's axis, world axes.
         aside_sigma_m: standard deviation of that; inf where it is unknown.
         sight_s: exposure of the sight that it is carried on from.
+        struck_mps: vertical speed just before `ImuMotion.blow`.
     """
 
     imu: ImuMotion | None = None
@@ -360,6 +362,7 @@ class Reckoning:
     aside_m: tuple[float, float] = (0.0, 0.0)
     aside_sigma_m: float = math.inf
     sight_s: float = -math.inf
+    struck_mps: float = 0.0
 
 
 def reckoned(
@@ -367,7 +370,11 @@ def reckoned(
 ) -> Reckoning:
     """One tick on. `believed`: the sample's estimated velocity is true; `astray`: it may be
     another axis', and after a silence, too, the reckoned one is better."""
-    estimated = sample.velocity_mps
+    estimated, blow = sample.velocity_mps, imu.blow
+    if old.imu is not None and blow.t_s > old.imu.blow.t_s:
+        carried = not old.imu.t_s < imu.gap_s <= blow.t_s
+        carried_mps = old.velocity_mps[2] + blow.felt_mps - old.imu.velocity_mps[2]
+        old = replace(old, struck_mps=carried_mps if carried else blow.estimated_mps)
     frozen = imu.attitude_frozen_s > FROZEN_S
     if old.imu is None or imu.gap_s > old.imu.t_s or frozen:
         velocity_mps = estimated if believed else ZERO
