@@ -6,10 +6,12 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import planner
 from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
@@ -20,11 +22,14 @@ from perchctl.profile import Profile
 from perchctl.vehicle import Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
+    CEILING_M,
+    HANG_Z_M,
     HOVER_THRUST,
     READY,
     Felt,
     observation,
     state_in,
+    target_at,
     telemetry,
 )
 
@@ -351,3 +356,45 @@ def test_by_other_means_a_press_has_the_time_that_it_always_had() -> None:
     state = state_in(Phase.PERCH, z_m=2.1)
     after, _ = planner.step(state, unseen(BEGIN_S + TURN_S, 2.1, 1.3), Profile())
     assert after.row != "pressed-blindly"
+
+
+def pressed_past_the_sight(
+    aside_m: float = 0.0, sigma_m: float = 1e-3, climb_mps: float = 0.0
+) -> PlannerState:
+    """The last sight was 4.5 cm below the target. From there on the estimate sinks at 0.1 m/s, as
+    after an impact, and the accelerometer feels `climb_mps` more each second; it holds."""
+    felt, state = Felt(), state_in(Phase.PERCH, z_m=HANG_Z_M - 0.045)
+    for i in range(round(0.9 / TURN_S)):
+        t_s = BEGIN_S + TURN_S * (i + 1)
+        z_m = HANG_Z_M - 0.045 - 0.1 * TURN_S * i
+        tel = telemetry(
+            t_s, z_m, velocity_mps=(0.0, 0.0, -0.1 if i else 0.0), thrust=1.1 * HOVER_THRUST,
+            acc_z_g=1.0 + climb_mps / GRAVITY_MPS2,
+        )  # fmt: skip
+        target = target_at(
+            t_s, (aside_m, 0.0, CEILING_M), tel.position_m, measured=not i,
+            measured_s=BEGIN_S + TURN_S, sigma_m=np.full(3, sigma_m),
+        )  # fmt: skip
+        obs = observation(
+            t_s, telemetry=tel, target=target, new_frame=not i, position_age_s=TURN_S * i
+        )
+        state, _ = planner.step(state, felt(obs), PROFILE)
+        if state.phase is not Phase.PERCH:
+            break
+    return state
+
+
+def test_a_contact_that_holds_is_proven_past_the_last_sight_by_what_is_felt() -> None:
+    """Though the estimate sinks, and half a second later places nothing any more."""
+    state = pressed_past_the_sight()
+    assert (state.phase, state.row) == (Phase.COMPLETE, "contact")
+    assert state.entered_s - BEGIN_S > HOLD_S
+    assert pressed_past_the_sight(climb_mps=0.5).phase is Phase.PERCH  # it rises still
+
+
+@pytest.mark.parametrize(("aside_m", "sigma_m"), [(0.03, 1e-3), (0.02, 0.01), (0.0, math.inf)])
+def test_a_contact_beside_the_magnet_or_nobody_knows_where_is_none(
+    aside_m: float, sigma_m: float
+) -> None:
+    state = pressed_past_the_sight(aside_m, sigma_m)
+    assert (state.phase, state.row, state.attempts) == (Phase.RECOVER, "beside-the-magnet", 1)

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from perchctl.mission import planner
-from perchctl.mission.conditions import contact_thrust
+from perchctl.mission import lander, planner
+from perchctl.mission.conditions import CONDITIONS, contact_thrust
 from perchctl.mission.context import Context
-from perchctl.mission.state import Outcome, Phase, PlannerState
+from perchctl.mission.state import Condition, Outcome, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, PositionSetpoint
 from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry
@@ -150,3 +150,30 @@ def test_a_change_of_phase_does_not_hide_a_weak_vehicle() -> None:
         rows.append(state.row)
     assert "aligned" in rows
     assert rows[-1] == "too-weak"
+
+
+@pytest.mark.parametrize(
+    ("raw_order", "reads", "known"),
+    [
+        (1000, 20000.0, False),  # stands still where it was before the order
+        (1000, 0.0, True),
+        (20000, 20000.0, True),
+        (None, 20000.0, True),  # position mode: nothing tells what it should be
+    ],
+)
+def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
+    raw_order: int | None, reads: float, known: bool
+) -> None:
+    """It proves no hold: a magnet that carries nothing would pass for one that carries it all."""
+    state = replace(
+        state_in(Phase.COMPLETE, z_m=CONTACT_Z_M), raw_order=raw_order, released_s=9.5,
+        setpoint=None if raw_order else PositionSetpoint(0.0, 0.0, CONTACT_Z_M, 0.0),
+    )  # fmt: skip
+    for i in range(1, 20):
+        t_s = 10.0 + 0.02 * i
+        obs = observation(t_s, telemetry=telemetry(t_s, CONTACT_Z_M, thrust=reads))
+        state = replace(lander.observed(state, obs, PROFILE), t_s=t_s, last=obs.telemetry)
+    c = Context(state, obs, PROFILE)
+    assert c.thrust_is_known is known
+    held = CONDITIONS[Condition.MAGNET_HOLDS](c)
+    assert held is known
