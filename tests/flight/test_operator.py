@@ -8,14 +8,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.errors import Interrupted
+from perchctl.errors import Interrupted, UsageError
+from perchctl.flight import session
 from perchctl.flight.operator import AGAIN_S, DELAY_S, HELD_S, INSIST_S, OperatorSwitch
 from perchctl.mission.state import Operator
+from perchctl.profile import load_profile
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -261,3 +264,33 @@ def test_a_terminal_that_is_gone_is_no_failure() -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stderr=write)
     os.close(write)
     assert done.returncode == 7
+
+
+def test_it_is_asked_once_the_vehicle_has_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a no ends has armed nothing, and is closed."""
+    order: list[str] = []
+
+    class Link:
+        def __init__(self, *args: object, **options: object) -> None:
+            pass
+
+        def connect(self) -> None:
+            order.append("connected")
+
+        def close(self) -> None:
+            order.append("closed")
+
+    def ask() -> None:
+        order.append("asked")
+        raise UsageError("not confirmed: nothing was started")
+
+    camera = SimpleNamespace(close=lambda: order.append("camera closed"))
+    monkeypatch.setattr(session, "CflibLink", Link)
+    monkeypatch.setattr(session, "open_source", lambda *args, **options: camera)
+    monkeypatch.setattr(session, "fly", lambda parts: order.append("flew"))
+    options = session.FlyOptions(
+        load_profile("crazyflie"), Path("crazyflie.yaml"), "radio://0/80/2M", "http://cam/"
+    )
+    with pytest.raises(UsageError, match="not confirmed"):
+        session.fly_session(options, before_arming=ask)
+    assert order == ["connected", "asked", "closed", "camera closed"]
