@@ -375,7 +375,7 @@ def why_landed(c: Context) -> str:
 
 def why_unknown(c: Context) -> str:
     if _is_held_elsewhere(c):
-        return "motors off; something else than the target's magnet holds it: take hold of it"
+        return "motors off; something holds it, but not at the target: look before you touch it"
     return (
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
         "whether it hangs or stands: look before you touch it"

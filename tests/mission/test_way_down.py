@@ -225,7 +225,7 @@ def test_what_hangs_teaches_no_hover_thrust() -> None:
     [
         (0.0, Phase.PERCHED, "hanging"),
         (0.08, Phase.PERCHED, "hanging"),  # as far as an old estimate may have drifted
-        (0.2, Phase.ABORTED, "something else"),
+        (0.2, Phase.ABORTED, "something holds it"),
         (0.6, Phase.LANDED, "motors off"),  # a height that stood still above the floor
     ],
 )
@@ -288,7 +288,7 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
     profile = Profile.model_validate({"positioning": positioning})
     state, sent = in_a_hand(begin, 0.2, profile=profile, seen_until_s=seen_until_s)
     assert (state.phase, state.outcome) == (Phase.ABORTED, Outcome.SAFETY)
-    assert "something else than the target's magnet holds it" in state.reason
+    assert "something holds it, but not at the target" in state.reason
     # It neither fights on in the hand, nor stops without its weight having hung in it.
     first_s = next(t_s for t_s, command in sent if isinstance(command, StopMotors))
     assert first_s < 10.0 + 8.0
