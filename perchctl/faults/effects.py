@@ -81,7 +81,8 @@ class ExternalPositions:
 @dataclass(frozen=True)
 class DeckSilent:
     """The vehicle has an IMU and a deck that measures absolute positions; the positions end. What
-    they corrected until then is an accelerometer that reads `acc_z_mps2` too much along z."""
+    they corrected until then is an accelerometer that reads `acc_z_mps2` too much along z, since
+    turning motors shake it."""
 
     for_s: float
     acc_z_mps2: float

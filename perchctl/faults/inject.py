@@ -144,8 +144,11 @@ class Injector:
         self._estimate: tuple[EstimateError, float] | None = None
         self._sag: tuple[BatterySags, float] | None = None
         self._deck: random.Random | None = None  # the noise of a deck whose positions come
-        if any(isinstance(effect, DeckSilent) for effect in effects):
-            self._deck = random.Random(edges.vehicle.firmware.scenario.seed)
+        self._shakes_mps2 = 0.0
+        for effect in effects:
+            if isinstance(effect, DeckSilent):
+                self._deck = random.Random(edges.vehicle.firmware.scenario.seed)
+                self._shakes_mps2 = effect.acc_z_mps2
         self._lets_go: float | None = None
         self.begin_s: float | None = None
         self.flown: Phase | None = None  # the phase of the newest turn
@@ -155,6 +158,8 @@ class Injector:
         return None
 
     def tick(self, tick: Tick) -> None:
+        if self.flown is None and self._shakes_mps2:
+            self._edges.vehicle.firmware.estimator.shift_accelerometer(self._shakes_mps2)
         self.flown = tick.state.phase
         if self.begin_s is not None:
             return
@@ -221,9 +226,8 @@ class Injector:
                 assert vehicle.capture is not None
                 fault = replace(CAPTURE_FAULTS[effect.how], late_s=effect.late_s)
                 vehicle.capture.lay(fault, effect.for_s)
-            case DeckSilent(for_s, acc_z_mps2):
+            case DeckSilent(for_s):
                 noise, self._deck = self._deck, None
-                vehicle.firmware.estimator.shift_accelerometer(acc_z_mps2)
                 self._at(t_s + for_s, lambda: setattr(self, "_deck", noise))
             case LogReads():
                 self._read_wrongly(effect, t_s)

@@ -43,7 +43,7 @@ REST_MEMORY_S = 0.5
 """At rest on the ground the accelerometer's offsets are learned in so long."""
 SPEED_MEMORY_S, BIAS_MEMORY_S = 3.0, 4.0
 """In so long the reckoned speed is drawn to the estimate's while that is believed, and what is
-left of the offsets sideways is learned, a wrong attitude's too. Wrong or late pictures lead the
+left of the offsets is learned, a wrong attitude's too. Wrong or late pictures lead the
 estimate astray within a second."""
 MOST_BIAS_MPS2, MOST_WRONG_MPS2 = 0.3, 0.5
 """More at a time is a blow, or a correction of the estimate."""
@@ -336,8 +336,8 @@ class Reckoning:
     Attributes:
         imu: the motion up to which it is reckoned; None before the first tick.
         velocity_mps: world axes.
-        bias_mps2: what the accelerometer and the attitude give too much sideways, world axes, as
-            learned beside the estimate.
+        bias_mps2: what the accelerometer and the attitude give too much, world axes, as learned
+            beside the estimate.
         beside_mps: the speed that the estimate has gained of late and the accelerometer has not,
             x and y, world axes.
         below_m: how far the gear is below the target at the least, as far as the telemetry was
@@ -415,7 +415,7 @@ def reckoned(
                 more = estimated[i] - old.estimated_mps[i] - gained + b * dt_s
                 beside[i] = keeps * old.beside_mps[i] + more
             b += (wrong - b) * min(1.0, dt_s / BIAS_MEMORY_S)
-            b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b)) if i < 2 else 0.0
+            b = max(-MOST_BIAS_MPS2, min(MOST_BIAS_MPS2, b))
         velocity.append(v)
         bias.append(b)
     vx, vy, vz = velocity

@@ -457,7 +457,7 @@ def _reckon(c: Context) -> PlannerState:
         new = replace(
             new,
             velocity_mps=(*felt.velocity_mps, new.velocity_mps[2]),
-            bias_mps2=(*felt.bias_mps2, 0.0),
+            bias_mps2=(*felt.bias_mps2, new.bias_mps2[2]),
         )
     target = obs.target
     if target is not None:

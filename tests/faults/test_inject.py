@@ -185,6 +185,7 @@ def test_a_deck_s_positions_end_for_their_time() -> None:
     rig = Rig((effect,), changed_scenario(SCENARIO, (effect,)))
     firmware, world = rig.vehicle.firmware, rig.vehicle.world
     assert firmware.get_parameter(LIGHTHOUSE) == 1.0
+    rig.turn(Phase.APPROACH)
     rig.wait(1.0)
     steady = firmware.log_value("kalman.varPZ")
     assert steady == pytest.approx(2.5e-4, rel=0.3)

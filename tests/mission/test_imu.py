@@ -212,3 +212,16 @@ def test_what_is_corrected_or_not_known_is_not_called_uncorrected(
 def test_no_silence_and_no_frozen_accelerometer_hides_that_nothing_corrects_it() -> None:
     silent = [telemetry(0.3 * i, climb_variance_m2ps2=1e-4 + 3e-4 * i) for i in range(10)]
     assert flown(silent).corrections.age_s(2.7) == pytest.approx(2.7)
+
+
+@pytest.mark.parametrize("too_much_g", [-0.008, 0.008])
+def test_an_offset_that_turning_motors_make_is_learned_while_the_estimate_is_believed(
+    too_much_g: float,
+) -> None:
+    """Blind, it would be 0.4 m/s within 5 s: a way down ends in a hover, or above it."""
+    reckoning, motion, last = Reckoning(), ImuMotion(), None
+    for i in range(1500):
+        new = telemetry(0.01 * i, acc_z_g=1.0 + too_much_g + 1e-6 * (i % 7))
+        motion = moved(motion, last, new)
+        reckoning, last = reckoned(reckoning, motion, new, believed=i < 1000), new
+    assert abs(reckoning.velocity_mps[2]) < 0.1
