@@ -17,6 +17,7 @@ from perchctl.faults.effects import Effect
 from perchctl.faults.expected_outcomes import (
     BROWN_OUT,
     CUT,
+    KNOCKED_OFF,
     LEFT_LANDING,
     LETS_GO_LATER,
     NO_LIFT,
@@ -130,20 +131,21 @@ FAULTS: tuple[Fault, ...] = (
     Fault("external-late", (10,), "positions come 50 to 150 ms later than they say", AIR,
           draws.external_late),
     # --- power and motors -----------------------------------------------------------
-    Fault("battery-sags", (6,), "loses 0.2 to 0.65 V at 10 to 100 mV/s", AIR, draws.sags,
+    Fault("battery-sags", (6,), "loses 0.2 to 0.6 V at 10 to 100 mV/s", AIR, draws.sags,
           (SAGS_TOO_FAST,)),
     Fault("battery-reading-frozen", (7,), "its reading stands still", AIR,
           draws.reading_frozen),
     Fault("battery-low", (6,), "its reading is low", AIR, draws.reading_low),
     Fault("motor-weak", (37,), "one motor gives 15 % less", AIR, draws.weak_motor, (NO_LIFT,)),
     # --- what pushes ------------------------------------------------------------------
-    Fault("kick", (37,), "a blow that changes the speed by 0.2 to 1 m/s", AIR, draws.kick),
+    Fault("kick", (37,), "a blow that changes the speed by 0.2 to 1 m/s", AIR, draws.kick,
+          (KNOCKED_OFF,)),
     Fault("gust", (37,), "5 to 20 % of the weight, for 0.5 to 1 s", AIR, draws.gust),
     # --- the magnet -------------------------------------------------------------------
     Fault("no-magnet", (38,), "nothing holds", AT_CONTACT, draws.no_magnet),
     Fault("weak-magnet", (39,), "carries 0.2 to 1.1 of the weight", AT_CONTACT,
           draws.weak_magnet, (TOO_LOW,)),
-    Fault("magnet-lets-go", (39, 40), "lets go 1 to 20 s after the contact", AT_CONTACT,
+    Fault("magnet-lets-go", (39, 40), "lets go 1 to 25 s after the contact", AT_CONTACT,
           draws.lets_go, (LETS_GO_LATER, TOO_LOW)),
     # --- the room and the target ------------------------------------------------------
     Fault("ceiling-beside-its-plane", (38, 40), "the target lies 2 to 20 cm above or below what "

@@ -148,7 +148,7 @@ def deck_silent(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 
 def sags(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
-    return (e.BatterySags(log_between(rng, 0.01, 0.1), between(rng, 0.2, 0.65)),)
+    return (e.BatterySags(log_between(rng, 0.01, 0.1), between(rng, 0.2, 0.6)),)
 
 
 def reboots(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
@@ -200,7 +200,7 @@ def weak_magnet(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
 
 
 def lets_go(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:
-    return (e.MagnetLetsGo(log_between(rng, 1.0, 20.0)),)
+    return (e.MagnetLetsGo(log_between(rng, 1.0, 25.0)),)
 
 
 def beside_its_plane(rng: Rng, scenario: Scenario) -> tuple[e.Effect, ...]:

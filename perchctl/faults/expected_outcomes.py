@@ -10,13 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from perchctl.faults.effects import Killed
+from perchctl.faults.effects import Killed, Push
 from perchctl.faults.facts import Facts
 from perchctl.faults.oracle import Flag
 from perchctl.mission.guards import CATCHABLE_M
 
 NOTICED_S, DOWN_MPS = 1.5, 0.4
 """How long a low battery takes to be believed, and how fast a landing goes at best."""
+PUSHED_OFF_S = 0.2
+"""A blow of 0.04 s has torn it off by then, or not at all."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,13 @@ def _slipped_low(facts: Facts) -> float | None:
     return facts.slipped_s if facts.slipped_m < CATCHABLE_M else None
 
 
+def _knocked_off(facts: Facts) -> float | None:
+    pushed = any(isinstance(effect, Push) for effect in facts.effects)
+    if not pushed or facts.begin_s is None or facts.slipped_s is None or not facts.toppled:
+        return None
+    return facts.slipped_s if 0.0 <= facts.slipped_s - facts.begin_s <= PUSHED_OFF_S else None
+
+
 def _sagged_too_fast(facts: Facts) -> float | None:
     if facts.weak_s is None:
         return None
@@ -100,6 +109,10 @@ TOO_LOW = ExpectedOutcome(
     "too low to catch", _slipped_low, 4.0, _flags("fell", "slid"),
     "a fall from standing motors takes up to 0.8 m to catch; it hung lower than 1 m",
 )  # fmt: skip
+KNOCKED_OFF = ExpectedOutcome(
+    "knocked off the magnet", _knocked_off, 4.0, _flags("fell", "slid"),
+    "a blow has torn it off while its motors stood still, and turned it over before they turned",
+)  # fmt: skip
 NO_LIFT = ExpectedOutcome(
     "too weak to hover", lambda facts: facts.weak_s, 15.0, _flags("fell", "slid"),
     "what battery and motors can lift is less than the weight: four times what the weak motor "
@@ -119,5 +132,6 @@ BROWN_OUT = ExpectedOutcome(
 )  # fmt: skip
 
 EXPECTED_OUTCOMES = (
-    BROWN_OUT, CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, NO_LIFT, SAGS_TOO_FAST,
+    BROWN_OUT, CUT, LEFT_LANDING, OPERATOR_STOPS, LETS_GO_LATER, TOO_LOW, KNOCKED_OFF, NO_LIFT,
+    SAGS_TOO_FAST,
 )  # fmt: skip

@@ -16,6 +16,8 @@ LEAST_LIFT = 1.02
 """Over the weight: with less nothing is held in the air."""
 CUT_S = 1.9
 """Silence for longer ends in the firmware's cut (2.0 s after the last setpoint)."""
+TOPPLES_S, TOPPLED_UP_Z = 0.3, 0.5
+"""Motors that stand still take longer than that to turn fast enough for any control."""
 WATCH_WITHIN_S = 0.1
 """The weight hangs before the program's telemetry shows it."""
 
@@ -34,7 +36,8 @@ class Facts:
         stop_s: second Ctrl-C.
         let_go_s: when the magnet let go for good; `watched`: by then the whole weight had hung on
             it, motors off, for as long as the program is to watch it.
-        slipped_s: when it first came off the magnet with its motors still; `slipped_m`: how high.
+        slipped_s: when it first came off the magnet with its motors still; `slipped_m`: how high;
+            `toppled`: within `TOPPLES_S` from there it had turned over.
         weak_s: when battery and motors could first not lift the weight any more.
         low_s, low_m: when the battery was first low under load, and how high the vehicle was.
     """
@@ -50,6 +53,7 @@ class Facts:
     watched: bool = False
     slipped_s: float | None = None
     slipped_m: float = 0.0
+    toppled: bool = False
     weak_s: float | None = None
     low_s: float | None = None
     low_m: float = 0.0
@@ -74,6 +78,7 @@ class FactsRecorder:
         self.watched = False
         self.slipped_s: float | None = None
         self.slipped_m = 0.0
+        self.toppled = False
         self.weak_s: float | None = None
         self.low_s: float | None = None
         self.low_m = 0.0
@@ -111,6 +116,8 @@ class FactsRecorder:
         came_off = before is not None and before.hanging and not s.hanging and not s.motors_on
         if came_off and self.slipped_s is None:
             self.slipped_s, self.slipped_m = s.t_s, s.height_m
+        if self.slipped_s is not None and s.t_s - self.slipped_s <= TOPPLES_S:
+            self.toppled = self.toppled or s.up_z < TOPPLED_UP_Z
         if not still:
             self._hangs_s = None
         elif self._hangs_s is None:
@@ -148,6 +155,7 @@ class FactsRecorder:
             watched=self.watched,
             slipped_s=self.slipped_s,
             slipped_m=self.slipped_m,
+            toppled=self.toppled,
             weak_s=self.weak_s,
             low_s=self.low_s,
             low_m=self.low_m,

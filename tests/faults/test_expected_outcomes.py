@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from perchctl.faults.expected_outcomes import (
     BROWN_OUT,
     CUT,
     EXPECTED_OUTCOMES,
+    KNOCKED_OFF,
     LEFT_LANDING,
     LETS_GO_LATER,
     NO_LIFT,
@@ -24,11 +26,14 @@ from perchctl.faults.expected_outcomes import (
 from perchctl.faults.facts import LEAST_LIFT, Facts
 from perchctl.faults.oracle import FLAGS
 from perchctl.geometry import GRAVITY_MPS2
+from perchctl.mission.state import Phase
 from perchctl.profile import Profile, load_profile
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.powertrain import most_thrust_n
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.thrust_curve import MOTOR_FORCE_N
+
+BLOW = e.Push((0.7, 0.0, 0.0), 0.04)
 
 
 def test_they_name_flags_and_reasons() -> None:
@@ -56,6 +61,10 @@ def test_they_name_flags_and_reasons() -> None:
         (LETS_GO_LATER, Facts(let_go_s=21.0, watched=True), 21.0),
         (LETS_GO_LATER, Facts(let_go_s=21.0), None),
         (TOO_LOW, Facts(slipped_s=8.0, slipped_m=0.8), 8.0),
+        (KNOCKED_OFF, Facts((BLOW,), 7.9, slipped_s=8.0, toppled=True), 8.0),
+        (KNOCKED_OFF, Facts((BLOW,), 7.9, slipped_s=8.0), None),
+        (KNOCKED_OFF, Facts((BLOW,), 7.0, slipped_s=8.0, toppled=True), None),
+        (KNOCKED_OFF, Facts((), 7.9, slipped_s=8.0, toppled=True), None),
         (TOO_LOW, Facts(slipped_s=8.0, slipped_m=1.2), None),
         (NO_LIFT, Facts(weak_s=6.0), 6.0),
         (NO_LIFT, Facts(), None),
@@ -76,6 +85,7 @@ CAUSED: dict[str, Facts] = {
     LEFT_LANDING.name: Facts(effects=(e.Killed(),), killed_s=10.0, own_landing=True),
     OPERATOR_STOPS.name: Facts(stop_s=10.0),
     LETS_GO_LATER.name: Facts(let_go_s=10.0, watched=True),
+    KNOCKED_OFF.name: Facts(effects=(BLOW,), begin_s=9.95, slipped_s=10.0, toppled=True),
     TOO_LOW.name: Facts(slipped_s=10.0, slipped_m=0.8),
     NO_LIFT.name: Facts(weak_s=10.0),
     SAGS_TOO_FAST.name: Facts(weak_s=10.0),
@@ -107,6 +117,9 @@ def test_other_flags_count_whatever_was_expected() -> None:
 
 # --- how many drawn cases may have one ------------------------------------------------
 
+RELEASED_S, TEARS_OFF_N = 1.0, 0.42
+"""The motors stand still no sooner after the contact, and what a hanging vehicle needs at the least
+to be torn off."""
 WATCHED_S, LOOKED_S = 5.2, 6.0
 """From contact to the end of the watch, with the shipped profiles' times, and for how long the
 oracle looks on from there."""
@@ -122,6 +135,10 @@ def may_come(outcome: ExpectedOutcome, case: Case, scenario: Scenario) -> bool:
                 return WATCHED_S < after_s < WATCHED_S + LOOKED_S
             case ExpectedOutcome(name=TOO_LOW.name), e.MagnetHolds() | e.MagnetLetsGo():
                 return scenario.ceiling_z_m < 1.0
+            case ExpectedOutcome(name=KNOCKED_OFF.name), e.Push(force_n, 0.04):
+                hangs = case.phase is Phase.COMPLETE and case.moment_s > RELEASED_S
+                hangs = hangs or case.landed_from in (Phase.PERCH, Phase.COMPLETE)
+                return hangs and math.hypot(*force_n) > TEARS_OFF_N
             case ExpectedOutcome(name=NO_LIFT.name), e.MotorWeak(_, strength):
                 lift_n = strength * most_thrust_n(scenario.battery_rest_v - 0.1)
                 return min(4.0 * MOTOR_FORCE_N, lift_n) < LEAST_LIFT * weight_n
