@@ -98,7 +98,7 @@ def felt(
         agrees = found is not None and old.found is not None and _alike(found, old.found)
         agreed = 0 if found is None else old.agreed + 1 if agrees else 1
         new = replace(new, found=found, agreed=agreed)
-    i = _nearest(new.mismatch or Mismatch())
+    i = _best_about(new.mismatch or Mismatch(), wanders_m)
     if wanders_m[i] <= new.motion_within_m:
         (vx, vy), (bx, by) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
         new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by)))
@@ -113,6 +113,14 @@ def _nearest(mismatch: Mismatch) -> int:
     """Which of those that are tried."""
     later_s, turn_rad = mismatch.later_s, mismatch.turn_rad
     return int(np.argmin(np.abs(LATER_S - later_s) + np.abs(TURNS_RAD - turn_rad)))
+
+
+def _best_about(mismatch: Mismatch, wanders_m: Array) -> int:
+    """Of those that are no other mismatch: a delay that is some hundredths of a second beside makes
+    0.1 m/s of speed that is none, and leans by as much."""
+    about = np.abs(LATER_S - mismatch.later_s) < LEAST_LATER_S
+    about &= mismatch.turn_rad == TURNS_RAD
+    return int(np.argmin(np.where(about, wanders_m, np.inf)))
 
 
 def _found(wanders_m: Array) -> Mismatch | None:

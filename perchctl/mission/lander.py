@@ -164,6 +164,8 @@ HOVER_MEMORY_S, HOVER_WITHIN, UNLEARNED_WITHIN = 0.3, 0.12, 0.35
 LATEST_S, UNHEARD_PART, OWN_ESTIMATE_S = 1.0, 0.98, 1.5
 """Telemetry so late still tells how fast it sank, and what was ordered since adds to that. Where
 nothing is heard, a little less than what should be right: it has to come down."""
+HELD_S = 0.6
+"""So long by setpoints at one place, and no speed of before is left."""
 RAMP_PER_S, STILL_MPS = 0.25, 0.05
 """What does not sink gets less and less thrust."""
 LEAST_PART, MOST_RAW = 0.4, 60000.0
@@ -452,6 +454,10 @@ def _reckon(c: Context) -> PlannerState:
     # By the target no sight is sent on the way down: the estimate's change is what it felt itself.
     astray = state.astray and not c.by_sight
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
+    rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
+    if state.contact_z_m is not None and rests:
+        # What the impact left of a speed is none: pressed or hanging it stands still.
+        new = replace(new, velocity_mps=(0.0, 0.0, 0.0))
     felt = obs.felt
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         new = replace(
@@ -485,7 +491,7 @@ def _reckon(c: Context) -> PlannerState:
     )
 
 
-UNSEEN_S = 0.15
+UNSEEN_S, AT_REST_S = 0.15, 0.3
 Place = tuple[float, float, float]
 
 
@@ -727,7 +733,9 @@ def _level(c: Context) -> Acted:
     unlearned = state.level_thrust == 0.0 and state.level_within == UNLEARNED_WITHIN
     if unheard and unlearned and c.in_phase_s < OWN_ESTIMATE_S:
         return _by_setpoints(c)  # the vehicle's own estimate is nearer than an unknown thrust
-    climb_mps = c.climb_mps + state.under_way_mps
+    # Unheard since before it came down, it was held by setpoints until then: it hardly moves.
+    held = tel.t_s < state.entered_s - HELD_S
+    climb_mps = (0.0 if held else c.climb_mps) + state.under_way_mps
     hover = _learned_hover(c, dt_s)
     height_m = c.height_m if state.blind_s is None else state.blind_height_m
     height_m += min(0.0, climb_mps) * age_s
@@ -820,6 +828,8 @@ def _is_overdue(c: Context) -> bool:
     began_s = max(c.state.blind_s or 0.0, c.state.entered_s)
     heard = c.attitude_age_s <= LATEST_S
     spare_s = LEVEL_SPARE_S if heard else UNHEARD_SPARE_S
+    if not heard and c.state.level_within == UNLEARNED_WITHIN:
+        spare_s += OWN_ESTIMATE_S  # by then its own estimate has flown it, on the spot
     return c.obs.t_s - began_s > spare_s + way_m / LEVEL_MEAN_MPS
 
 

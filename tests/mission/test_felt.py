@@ -146,3 +146,15 @@ def test_a_sum_that_wanders_a_little_counts_once_positions_have_turned_the_attit
     assert rough.motion is not None
     true_mps = Swing().velocity_mps(rough.motion.t_s)[:2]
     assert rough.motion.velocity_mps == pytest.approx(true_mps, abs=0.1)
+
+
+@given(later_s=st.floats(-0.07, 0.07), heading_rad=st.floats(-3.0, 3.0))
+def test_a_delay_too_small_to_be_named_does_not_make_a_speed(
+    later_s: float, heading_rad: float
+) -> None:
+    swing = Swing(0.06, heading_rad=heading_rad)
+    watch = watched(swing, later_s=later_s)
+    assert watch.mismatch is None
+    assert watch.motion is not None
+    true_mps = swing.velocity_mps(watch.motion.t_s)[:2]
+    assert watch.motion.velocity_mps == pytest.approx(true_mps, abs=0.05)

@@ -16,7 +16,13 @@ from perchctl.mission import planner
 from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
 from perchctl.mission.imu import GAP_S, ImuMotion, Reckoning
-from perchctl.mission.lander import BRAKE_RAD_PER_MPS, MOST_BRAKE_RAD, SINK_MPS
+from perchctl.mission.lander import (
+    BRAKE_RAD_PER_MPS,
+    HOVER_WITHIN,
+    MOST_BRAKE_RAD,
+    SINK_MPS,
+    UNLEARNED_WITHIN,
+)
 from perchctl.mission.state import Observation, Operator, Phase, PlannerState, Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
@@ -273,6 +279,51 @@ def test_how_long_it_may_take_counts_from_the_loss_and_not_from_the_landing() ->
     _, command = planner.step(state, unseen(BEGIN_S + TURN_S, 0.8, 2.5), PROFILE)
     assert isinstance(command, RawThrust)
     assert command.thrust > 0.97 * HOVER_THRUST
+
+
+@pytest.mark.parametrize(("entered_s", "falls"), [(BEGIN_S, False), (BEGIN_S - 2.0, True)])
+def test_a_speed_from_before_it_was_held_unheard_is_none_any_more(
+    entered_s: float, falls: bool
+) -> None:
+    """Silent in a climb of 0.7 m/s, it is held for a second, and then let down as what hovers. In a
+    way down that was heard so far the last speed is the present one."""
+    state = blind(1.0, (0.0, 0.0, 0.7), entered_s=entered_s, level_thrust=HOVER_THRUST)
+    tel = telemetry(BEGIN_S - 1.1, 1.0, velocity_mps=(0.0, 0.0, 0.7))
+    _, command = planner.step(state, unseen(BEGIN_S + TURN_S, 1.0, 2.0, telemetry=tel), PROFILE)
+    assert isinstance(command, RawThrust)
+    assert (command.thrust < 0.75 * HOVER_THRUST) is falls
+
+
+@pytest.mark.parametrize(("within", "overdue"), [(UNLEARNED_WITHIN, False), (HOVER_WITHIN, True)])
+def test_unheard_its_time_begins_after_its_own_estimate_has_flown_it(
+    within: float, overdue: bool
+) -> None:
+    """Else it would have less and less thrust as soon as thrust flies it, and fall."""
+    heard_s = BEGIN_S - 3.0
+    state = blind(
+        0.3, (0.0, 0.0, -0.4), blind_s=BEGIN_S - 2.0, entered_s=BEGIN_S - 2.0, level_within=within,
+        level_thrust=0.9 * HOVER_THRUST, entry_m=(0.0, 0.0, 0.3), under_way_mps=-0.4,
+    )  # fmt: skip
+    tel = telemetry(heard_s, 0.3)
+    state, command = planner.step(state, unseen(BEGIN_S + TURN_S, 0.3, 3.0, telemetry=tel), PROFILE)
+    assert isinstance(command, RawThrust)
+    assert (command.thrust < 0.9 * HOVER_THRUST) is overdue
+
+
+@pytest.mark.parametrize("fell_ago_s", [math.inf, 0.5])
+def test_what_an_impact_left_of_a_speed_goes_while_it_rests_at_its_contact(
+    fell_ago_s: float,
+) -> None:
+    """Reckoned on, it would be 0.1 m/s for all of a way down, and half a metre of its height."""
+    felt, state = Felt(), blind(1.0, (0.0, 0.0, -0.12), contact_z_m=1.0)
+    begun = felt(unseen(BEGIN_S, 1.0, 2.0))
+    state = replace(state, reckoning=replace(state.reckoning, imu=begun.imu))
+    for i in range(1, 30):
+        obs = felt(unseen(BEGIN_S + TURN_S * i, 1.0, 2.0))
+        obs = replace(obs, imu=replace(obs.imu, fell_s=obs.t_s - fell_ago_s))
+        state, _ = planner.step(state, obs, PROFILE)
+    rests = state.reckoning.velocity_mps == (0.0, 0.0, 0.0)
+    assert rests is (fell_ago_s == math.inf)
 
 
 @pytest.mark.parametrize("hover", [0.0, HOVER_THRUST])
