@@ -50,12 +50,13 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class FeltMotion:
-    """The vehicle's motion sideways, world axes, by pictures and accelerometer: its speed at `t_s`,
-    and by how much the accelerometer and the attitude give too much."""
+    """The vehicle's motion by pictures and accelerometer, world axes: its speed sideways at `t_s`,
+    by how much the accelerometer and the attitude give too much there, and its vertical speed."""
 
     t_s: float
     velocity_mps: tuple[float, float]
     bias_mps2: tuple[float, float]
+    climb_mps: float
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,8 @@ def felt(
         new = replace(new, found=found, agreed=agreed)
     i = _best_about(new.mismatch or Mismatch(), wanders_m)
     if wanders_m[i] <= new.motion_within_m:
-        (vx, vy), (bx, by) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
-        new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by)))
+        (vx, vy, vz), (bx, by, _) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
+        new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by), vz))
     return replace(new, judged_s=t_s)
 
 
@@ -136,12 +137,12 @@ def _found(wanders_m: Array) -> Mismatch | None:
 def explained(
     sights: tuple[tuple[float, Vector], ...], samples: tuple[Telemetry, ...], offset_g: Vector
 ) -> tuple[Array, Array, Array]:
-    """For each pair of `LATER_S` and `TURNS_RAD`, (n,): by how much the target moves, rms in m;
-    and with that the vehicle's speed at the newest sample and the offset, x and y, (2, n)."""
+    """For each pair of `LATER_S` and `TURNS_RAD`, (n,): by how much the target moves sideways, rms
+    in m; and with that the vehicle's speed at the newest sample and the offset, (3, n)."""
     stamps_s = np.array([s.t_s for s in samples])
     attitudes = np.array([(s.roll_rad, s.pitch_rad, s.yaw_rad) for s in samples])
     attitudes[:, 2] = np.unwrap(attitudes[:, 2])
-    forces = np.array([acceleration_mps2(s, offset_g)[:2] for s in samples])
+    forces = np.array([acceleration_mps2(s, offset_g) for s in samples])
     speeds = _integral(stamps_s, forces)
     moved = _integral(stamps_s, speeds)
 
@@ -153,16 +154,15 @@ def explained(
     y, z = _turned(y, z, roll)
     z, x = _turned(z, x, pitch)
     x, y = _turned(x, y, yaw)
-    x = x + np.interp(then_s, stamps_s, moved[:, 0])
-    y = y + np.interp(then_s, stamps_s, moved[:, 1])
+    x, y, z = (a + np.interp(then_s, stamps_s, b) for a, b in zip((x, y, z), moved.T, strict=True))
 
     # What is left of both beyond a place, a speed and an offset.
     u = seen_s - seen_s.mean()
     unknown = np.stack([np.ones_like(u), u, 0.5 * u * u], axis=1)
     known = np.diag([0.0, 0.0, (SIGMA_M / OFFSET_MPS2) ** 2])
-    sums = np.stack([x, y])  # (2, n, sights)
+    sums = np.stack([x, y, z])  # (3, n, sights)
     found = sums @ np.linalg.solve(unknown.T @ unknown + known, unknown.T).T
-    left = ((sums - found @ unknown.T) * sums).sum(axis=(0, 2))
+    left = ((sums - found @ unknown.T) * sums)[:2].sum(axis=(0, 2))
     newest_u = stamps_s[-1] + LATER_S - seen_s.mean()
     velocity = speeds[-1][:, None] - found[..., 1] - found[..., 2] * newest_u
     return np.sqrt(np.maximum(left, 0.0) / len(u)), velocity, found[..., 2]

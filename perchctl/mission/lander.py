@@ -26,7 +26,7 @@ from enum import Enum
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, contact_within_m
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
-from perchctl.mission.guards import has_slipped
+from perchctl.mission.guards import has_slipped, latency_changed
 from perchctl.mission.guidance import hold_here, limited, presses, unpressed, walk
 from perchctl.mission.imu import REACH_M, reckoned, sighted
 from perchctl.mission.release import (
@@ -458,11 +458,12 @@ def _reckon(c: Context) -> PlannerState:
     if state.contact_z_m is not None and rests:
         # What the impact left of a speed is none: pressed or hanging it stands still.
         new = replace(new, velocity_mps=(0.0, 0.0, 0.0))
-    felt = obs.felt
+    felt, late = obs.felt, latency_changed(c)
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
         new = replace(
             new,
-            velocity_mps=(*felt.velocity_mps, new.velocity_mps[2]),
+            # Pictures that are late have led the estimate's height astray, too.
+            velocity_mps=(*felt.velocity_mps, felt.climb_mps if late else new.velocity_mps[2]),
             bias_mps2=(*felt.bias_mps2, new.bias_mps2[2]),
         )
     target = obs.target
@@ -739,7 +740,9 @@ def _level(c: Context) -> Acted:
     hover = _learned_hover(c, dt_s)
     height_m = c.height_m if state.blind_s is None else state.blind_height_m
     height_m += min(0.0, climb_mps) * age_s
-    sink_mps = SINK_MPS if height_m > SLOW_BELOW_M else LOW_SINK_MPS
+    # By late pictures the floor may be half a metre nearer than it seems.
+    low = height_m <= SLOW_BELOW_M or latency_changed(c)
+    sink_mps = LOW_SINK_MPS if low else SINK_MPS
     gain = GAIN_AGE_S2_PER_M / max(1e-3, c.attitude_age_s)
     gain = max(LEAST_GAIN_S_PER_M, min(MOST_GAIN_S_PER_M, gain))
     thrust = hover * (1.0 - gain * (climb_mps + sink_mps)) / max(0.8, math.cos(c.tilt_rad))

@@ -356,7 +356,7 @@ def test_a_press_that_was_ordered_is_unwound_whatever_thrust_is_read() -> None:
 def felt_at(c: Context, age_s: float, bias_mps2: tuple[float, float]) -> Context:
     """With a motion that was felt so long ago: at rest, by an attitude that is wrong."""
     reckoning = replace(c.state.reckoning, bias_mps2=(*bias_mps2, 0.0))
-    felt = FeltMotion(NOW_S - age_s, (0.0, 0.0), bias_mps2)
+    felt = FeltMotion(NOW_S - age_s, (0.0, 0.0), bias_mps2, 0.0)
     return Context(replace(c.state, reckoning=reckoning), replace(c.obs, felt=felt), c.profile)
 
 
@@ -376,7 +376,7 @@ def test_level_is_what_pictures_show_to_be_level() -> None:
 
 def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
     c = context((Evidence.IMU, Reach.FREE, Stage.DOWN))
-    motion = FeltMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0))
+    motion = FeltMotion(NOW_S - 0.01, (0.3, 0.0), (0.0, 0.0), 0.0)
     obs = replace(c.obs, felt=motion, imu=replace(c.obs.imu, t_s=NOW_S - 0.01))
     before = replace(c.state, reckoning=Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03)))
     state = lander.observed(before, obs, c.profile)
@@ -384,6 +384,22 @@ def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
     later = replace(obs, imu=replace(obs.imu, t_s=NOW_S + 0.01))  # the same motion again
     moved = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.1, 0.0, 0.0)))
     assert lander.observed(moved, later, c.profile).reckoning.velocity_mps[0] < 0.2
+
+
+@pytest.mark.parametrize("later_s", [0.0, 0.5])
+def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
+    """Its vertical speed is what they tell with the right delay, and the floor may be near."""
+    c = context((Evidence.IMU, Reach.FREE, Stage.DOWN))
+    motion = FeltMotion(NOW_S - 0.01, (0.0, 0.0), (0.0, 0.0), -0.4)
+    obs = replace(c.obs, felt=motion, mismatch=Mismatch(later_s) if later_s else None)
+    reckoning = Reckoning(imu=ImuMotion(t_s=NOW_S - 0.03), velocity_mps=(0.0, 0.0, -0.7))
+    before = replace(c.state, reckoning=reckoning, blind_height_m=2.0)
+    state = lander.observed(before, replace(obs, imu=replace(obs.imu, t_s=NOW_S)), c.profile)
+    assert state.reckoning.velocity_mps[2] == pytest.approx(-0.4 if later_s else -0.7, abs=0.05)
+    state = replace(state, reckoning=replace(state.reckoning, velocity_mps=(0.0, 0.0, -0.4)))
+    _, command = lander.act(Context(state, obs, c.profile))
+    assert isinstance(command, RawThrust)
+    assert (command.thrust > 0.97 * HOVER_THRUST) is (later_s > 0.0)
 
 
 def test_a_hover_thrust_that_was_not_learned_is_felt() -> None:
