@@ -44,7 +44,8 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
     """The history with new samples; `jumped` and `turned_rad`, the largest step of the
     heading, are about these samples only.
 
-    Samples with NaN or out of order are left out (fault 35).
+    Samples with NaN or out of order are left out (fault 35). Where position and velocity alone
+    are no numbers, they are those of the sample before, and older by that.
     """
     jumped, turned_rad = False, 0.0
     if not new:
@@ -52,6 +53,8 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
     samples, imu = list(history.samples), history.imu
     changed_s, battery_v = history.battery_changed_s, history.battery_v
     for sample in new:
+        if samples and not _is_placed(sample):
+            sample = _carried_on(samples[-1], sample)
         if not is_finite(sample) or (samples and sample.t_s <= samples[-1].t_s):
             continue
         if samples:
@@ -171,6 +174,18 @@ def _is_moved(a: Telemetry, b: Telemetry, safety: SafetyConfig) -> bool:
 def _between_s(a: Telemetry, b: Telemetry) -> float:
     """Between the two positions, which are as old as their own packets."""
     return max(b.t_s - a.t_s, b.t_s - b.behind_s - (a.t_s - a.behind_s))
+
+
+def _is_placed(s: Telemetry) -> bool:
+    return all(map(math.isfinite, (*s.position_m, *s.velocity_mps)))
+
+
+def _carried_on(last: Telemetry, new: Telemetry) -> Telemetry:
+    """Attitude, acceleration and thrust are fresh all the same: by them it comes down."""
+    behind_s = last.behind_s + max(0.0, new.t_s - last.t_s)
+    return replace(
+        new, position_m=last.position_m, velocity_mps=last.velocity_mps, behind_s=behind_s
+    )
 
 
 def is_finite(s: Telemetry) -> bool:

@@ -287,7 +287,7 @@ def _tick(
         command,
         obs.loop_late_s,
         obs.camera_age_s,
-        obs.t_s - obs.telemetry.t_s,
+        obs.t_s - obs.telemetry.t_s + obs.telemetry.behind_s,
         None if newest is told else newest,
         obs.delay_s,
         turn.outside,

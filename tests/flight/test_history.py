@@ -180,3 +180,20 @@ def test_an_estimate_that_is_no_number_for_long_is_stale() -> None:
     report = rig.fly()
     assert report.outcome is Outcome.SAFETY
     assert "no telemetry" in report.reason
+
+
+@pytest.mark.parametrize("name", ["position_m", "velocity_mps"])
+def test_a_position_that_is_no_number_takes_no_attitude_with_it(name: str) -> None:
+    """It is as old as the last that was one; by acceleration and thrust the way down goes on."""
+    history = extended(History(), [telemetry(1.0, 0.7)], SAFETY)
+    for i in range(1, 6):
+        nowhere = {name: (0.0, math.nan, 0.0)}
+        history = extended(history, [telemetry(1.0 + 0.01 * i, acc_z_g=0.9, **nowhere)], SAFETY)
+    newest = history.newest
+    assert newest is not None
+    assert (newest.t_s, newest.acc_z_g) == (pytest.approx(1.05), 0.9)
+    assert newest.position_m == (0.0, 0.0, 0.7)
+    assert newest.behind_s == pytest.approx(0.05)
+    assert not history.jumped
+    tilted = extended(history, [telemetry(1.06, roll_rad=math.nan)], SAFETY)
+    assert tilted.newest is newest
