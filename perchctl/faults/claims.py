@@ -36,6 +36,7 @@ ROW_CLAIMS: dict[str, frozenset[Claim]] = {
     "perched": _claims("hangs on the target"),
     "hung": _claims("hangs"),
     "landed": _claims("stands"),
+    "held-elsewhere": _claims("hangs"),
     "hangs-or-stands": _claims("hangs or stands"),
     "landing-timeout": _claims("not seen down"),
 }
@@ -51,11 +52,13 @@ OUTCOME_CLAIMS: dict[Outcome, frozenset[Claim]] = {
 }
 """What the meaning of each outcome's exit code says (`perchctl.errors.EXIT_CODES`)."""
 NOT_KNOWN, UNCONFIRMED = "hangs-or-stands", "landing-timeout"
+HELD_ELSEWHERE = "held-elsewhere"
 """The rows of a flight whose end the program does not know: whether the vehicle hangs or stands,
 and whether it came down at all."""
 RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
     Finding.STANDS: _claims("stands"),
     Finding.HANGS: _claims("hangs"),
+    Finding.HELD: _claims("hangs"),
     Finding.UNKNOWN: _claims("hangs or stands"),
     None: _claims("not seen down"),
 }

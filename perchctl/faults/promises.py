@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from perchctl.faults.claims import UNCONFIRMED
+from perchctl.faults.claims import HELD_ELSEWHERE, UNCONFIRMED
 from perchctl.faults.result import End, FaultResult
 
 DOWN: frozenset[End] = frozenset({"perched", "landed"})
@@ -17,7 +17,8 @@ CUT: frozenset[End] = frozenset({"perched", "landed", "aborted"})
 @dataclass(frozen=True)
 class Promise:
     """`ends`: how a flight with one of the `faults` may end; `unseen`: also aborted, where the
-    landing was ordered and nobody saw it; `names`: its last sentence says so,
+    landing was ordered and nobody saw it, or it is held where its estimate, which may have moved,
+    has no target; `names`: its last sentence says so,
     unless it perched."""
 
     what: str
@@ -33,7 +34,7 @@ class Promise:
             return False
         if result.end == "refused":  # nothing took off
             return True
-        if self.unseen and result.row == UNCONFIRMED:
+        if self.unseen and result.row in (UNCONFIRMED, HELD_ELSEWHERE):
             return True
         if result.end != "perched" and self.names not in result.reason:
             return False
@@ -119,7 +120,13 @@ PROMISES = (
     Promise(
         "pressed against something for 0.7 s, ceiling bare or elsewhere",
         "backs off down, or lands when it was the take-off; lands when nothing is found",
-        ("low-bare-ceiling", "bare-ceiling", "ceiling-unusual", "ceiling-beside-its-plane"),
+        ("low-bare-ceiling", "bare-ceiling", "ceiling-unusual"),
+    ),
+    Promise(
+        "magnet 2 to 20 cm above or below the printed target",
+        "perched within the contact's tolerance; what holds it farther away is left holding it "
+        "with the motors off, and said so",
+        ("ceiling-beside-its-plane",), CUT,
     ),
     Promise(
         "target moved, a second one",

@@ -143,6 +143,7 @@ def _teller(parts: FlightParts) -> Callable[[Sent], None]:
 RESCUED = {
     Finding.STANDS: "the vehicle stands on the floor, its motors are off",
     Finding.HANGS: "the vehicle hangs on the magnet, its motors are off",
+    Finding.HELD: "something holds the vehicle away from the target; the motors are off",
     Finding.UNKNOWN: "the motors are off; it is not known whether the vehicle hangs or stands",
     None: "a landing was flown, but could not be confirmed: keep away from the vehicle",
 }

@@ -83,7 +83,7 @@ def rescue(
             c = Context(state, obs, profile)
             if c.held(Condition.DOWN) >= LOOK_S:
                 found = lander.finding(c)
-                hangs = found is Finding.HANGS
+                hangs = found in (Finding.HANGS, Finding.HELD)
                 return Rescued(found, None if hangs else touchdown_of(c))
         clock.wait_until(now_s + period_s)
     return Rescued()

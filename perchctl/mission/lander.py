@@ -120,6 +120,7 @@ class Finding(Enum):
     """Where a vehicle with its motors off is."""
 
     HANGS = "hangs"
+    HELD = "is held away from the target"
     STANDS = "stands"
     UNKNOWN = "not known"
 
@@ -303,7 +304,7 @@ def finding(c: Context) -> Finding:
     """
     tel, state = c.obs.telemetry, c.state
     if _is_held_elsewhere(c):
-        return Finding.UNKNOWN
+        return Finding.HELD
     if c.by_sight or not c.placed:
         if c.tracked and c.far_below_target:
             return Finding.STANDS
@@ -376,8 +377,6 @@ def why_landed(c: Context) -> str:
 
 
 def why_unknown(c: Context) -> str:
-    if _is_held_elsewhere(c):
-        return "motors off; something holds it, but not at the target: look before you touch it"
     return (
         "motors off; the telemetry was silent for as long as a fall takes, and it is not known "
         "whether it hangs or stands: look before you touch it"

@@ -225,6 +225,12 @@ TABLE: tuple[Row, ...] = (
         lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.STANDS, P.LANDED, why_landed,
     ),
     Row(
+        "held-elsewhere", only(P.LANDING),
+        lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.HELD, P.ABORTED,
+        "motors off; something holds it where its estimate has no target: look before you touch it",
+        S.LAND, O.SAFETY,
+    ),
+    Row(
         "hangs-or-stands", only(P.LANDING), lambda c: c.held(C.DOWN) >= LOOKED_S, P.ABORTED,
         why_unknown, S.LAND, O.SAFETY,
     ),

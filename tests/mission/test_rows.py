@@ -304,6 +304,11 @@ CASES: dict[str, Case] = {
         P.LANDING, P.LANDED, flown(0.02, **OFF), 0.3, O.OPERATOR,
         state={"outcome": O.OPERATOR, "orders": 1}, z_m=0.02,
     ),
+    "held-elsewhere": Case(
+        P.LANDING, P.ABORTED, flown(CONTACT_Z_M - 0.2, **OFF), 0.3, O.SAFETY,
+        state={"outcome": O.SAFETY, "stopped_s": START_S, "row": "held", "entered_s": START_S},
+        z_m=CONTACT_Z_M - 0.2,
+    ),
     "hangs-or-stands": Case(
         P.LANDING, P.ABORTED, unknown, 2.3, O.SAFETY,
         state={

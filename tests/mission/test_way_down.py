@@ -288,7 +288,7 @@ def test_what_a_hand_holds_below_the_target_has_not_perched(
     profile = Profile.model_validate({"positioning": positioning})
     state, sent = in_a_hand(begin, 0.2, profile=profile, seen_until_s=seen_until_s)
     assert (state.phase, state.outcome) == (Phase.ABORTED, Outcome.SAFETY)
-    assert "something holds it, but not at the target" in state.reason
+    assert state.row == "held-elsewhere"
     # It neither fights on in the hand, nor stops without its weight having hung in it.
     first_s = next(t_s for t_s, command in sent if isinstance(command, StopMotors))
     assert first_s < 10.0 + 8.0
