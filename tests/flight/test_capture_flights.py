@@ -64,7 +64,7 @@ def test_what_lasts_is_landed_and_named(what: dict[str, Any], words: str) -> Non
 def test_what_the_profile_s_limit_promises_is_flown_and_what_is_later_ends_softly(
     late_s: float, perches: bool
 ) -> None:
-    """From the start: 50 ms as the profile says them, and 100 that nobody knows of."""
+    """From the start: 40 ms as the profile says them, and 100 that nobody knows of."""
     told = {"positioning.latency_s": MOST_LATENCY_S, "positioning.hold_s": 0.19}
     it = fly_short(MOCAP | told, capture=ASIDE | {"delay_s": late_s})
     assert it.report.phase is (Phase.PERCHED if perches else Phase.LANDED), it.report.reason
