@@ -131,7 +131,17 @@ def test_one_seed_is_told_with_its_phases_log_and_plot(repeated: tuple[Said, Pat
     assert re.fullmatch(r"\[ +\d+\.\d\d s\] COMPLETE: contact proven by .*", lines[6])
     assert lines[8] == "PERCHED: hanging still with the motors off"
     words = dict(line.split(":", 1) for line in lines[9:])
-    always = {"miss", "contact", "flight", "phases", "battery", "latency", "mounting", "log", "plot"}
+    always = {
+        "miss",
+        "contact",
+        "flight",
+        "phases",
+        "battery",
+        "latency",
+        "mounting",
+        "log",
+        "plot",
+    }
     assert set(words) - {"advice"} == always
     assert "ALIGN 0.4 s > ASCEND" in words["phases"]
     assert Path(words["log"].strip()) == folder / f"flight_seed{SEED}.jsonl"

@@ -8,6 +8,7 @@ from perchctl.mission import budget
 from perchctl.mission.conditions import (
     SATURATED,
     contact_aside_m,
+    contact_within_m,
     is_at_target,
     press_thrust,
 )
@@ -75,6 +76,12 @@ def too_little_left(c: Context) -> bool:
 
 def is_blocked(c: Context) -> bool:
     return c.held(Condition.BLOCKED) >= c.profile.safety.blocked_s
+
+
+def is_blocked_off_target(c: Context) -> bool:
+    """Pressed, and in the press so far from the target's height that no contact can be proven."""
+    pressing = c.state.phase is Phase.PERCH
+    return is_blocked(c) and not (pressing and abs(c.error_z_m) <= contact_within_m(c))
 
 
 def too_weak(c: Context) -> bool:

@@ -14,6 +14,7 @@ from perchctl.mission.guards import (
     is_aligned,
     is_beside_magnet,
     is_blocked,
+    is_blocked_off_target,
     is_caught,
     is_held,
     is_watched,
@@ -72,8 +73,8 @@ TABLE: tuple[Row, ...] = (
         S.LAND, O.SAFETY,
     ),
     Row(
-        "blocked", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER), is_blocked,
-        P.RECOVER,
+        "blocked", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
+        is_blocked_off_target, P.RECOVER,
         lambda c: f"pressed against something at {c.height_m:.2f} m"
         + ("" if c.state.hover_thrust else ", or the thrust is weak"), S.BACK_OFF,
         counts_attempt=True,
