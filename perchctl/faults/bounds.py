@@ -48,7 +48,7 @@ REACTION_S = 1.0
 WATCHED_S, SUNK_M = 2.0, 0.15
 """After so much more time it has come down by this, at less than a third of a landing's speed."""
 SINKING_MPS = 0.1
-"""Or it sinks like that: its own landing starts from rest, by a curve that is slow at first."""
+"""Or it sinks like that."""
 LOW_M = 0.3
 """Where a landing hands over, and slows down."""
 
@@ -170,11 +170,19 @@ class DescentBound:
         self._due_s = t_s + min(limits_s, default=math.inf)
 
     def is_overdue(
-        self, t_s: float, height_m: float, vz_mps: float, *, touching: bool, uplink: bool
+        self,
+        t_s: float,
+        height_m: float,
+        vz_mps: float,
+        *,
+        touching: bool,
+        uplink: bool,
+        lands: bool = False,
     ) -> bool:
         """Whether it should have come down by now and has not. What touches the ceiling before it
         has to come down may hang there, which takes its time to find out; and what hears nothing
-        obeys nothing until it hears again."""
+        obeys nothing until it hears again. `lands`: it flies its own landing, whose curve starts
+        from rest, and anew with each of the three orders."""
         if touching and t_s < self._due_s + REACTION_S:
             self._due_s = math.inf
         if not uplink:
@@ -184,7 +192,7 @@ class DescentBound:
         if self._from_m is None:
             self._from_m = height_m
         late = t_s >= self._due_s + REACTION_S + WATCHED_S
-        comes_down = vz_mps < -SINKING_MPS or height_m <= max(LOW_M, self._from_m - SUNK_M)
+        comes_down = lands or vz_mps < -SINKING_MPS or height_m <= max(LOW_M, self._from_m - SUNK_M)
         return late and not comes_down
 
     def _limit_s(self, effect: Effect, phase: Phase) -> float:

@@ -197,7 +197,12 @@ class FaultyFlight:
             self._touched = self._touched or sample.hanging or world.contacts()[0] > 0.0
         uplink = not self._is_suspended(t_s) and self._radio.up(PROBE, t_s)
         overdue = self._descent_bound.is_overdue(
-            t_s, sample.height_m, sample.vz_mps, touching=self._touched, uplink=uplink
+            t_s,
+            sample.height_m,
+            sample.vz_mps,
+            touching=self._touched,
+            uplink=uplink,
+            lands=self._vehicle.firmware.planner.active,
         )
         heard = all(self._is_heard(block, t_s) for block in FAST_BLOCKS)
         return sample._replace(astray_m=astray_m, overdue=overdue, uplink=uplink, heard=heard)
