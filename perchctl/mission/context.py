@@ -54,10 +54,10 @@ class Context:
 
     @property
     def telemetry_age_s(self) -> float:
-        """Age of the oldest part: position and velocity come in a packet of their own, and an
-        attitude that reads the very same is as old as its first reading."""
-        tel = self.obs.telemetry
-        return self.obs.t_s - tel.t_s + max(tel.behind_s, self.obs.imu.attitude_age_s)
+        """Age of the oldest part: position and velocity come in a packet of their own, and what
+        reads the very same is as old as its first reading."""
+        tel, imu = self.obs.telemetry, self.obs.imu
+        return self.obs.t_s - tel.t_s + max(tel.behind_s, imu.attitude_age_s, imu.place_age_s)
 
     @property
     def attitude_age_s(self) -> float:

@@ -137,8 +137,9 @@ class ImuMotion:
         gap_s: end of the newest silence that a fall could hide in.
         steady_s: since when the vertical speed has stayed what it is.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
-        frozen_s, attitude_frozen_s: for how long the accelerometer, and the attitude, have read
-            the very same, as none that lives does; `-inf` before the attitude first changed.
+        frozen_s, attitude_frozen_s, place_frozen_s: for how long the accelerometer, the attitude,
+            and position with velocity have read the very same, as none that lives does; `-inf`
+            before they first changed.
         hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
         pushed_s: when something last pushed it sideways: in flight only air does, by far less.
         misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
@@ -162,6 +163,7 @@ class ImuMotion:
     blow_s: float = -math.inf
     frozen_s: float = 0.0
     attitude_frozen_s: float = -math.inf
+    place_frozen_s: float = -math.inf
     hover_thrust: float = 0.0
     pushed_s: float = -math.inf
     misled_rad: tuple[float, float] = (0.0, 0.0)
@@ -177,6 +179,11 @@ class ImuMotion:
         neither changes, as in a simulated vehicle at rest."""
         return max(0.0, self.attitude_frozen_s - self.frozen_s)
 
+    @property
+    def place_age_s(self) -> float:
+        """The same of the position and the velocity."""
+        return max(0.0, self.place_frozen_s - self.frozen_s)
+
 
 def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """The motion with one more sample; `last` is the one before, None at the first."""
@@ -186,13 +193,17 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
     attitude_frozen_s = _still_s(
         motion.attitude_frozen_s, last, new, lambda s: (s.roll_rad, s.pitch_rad, s.yaw_rad)
     )
+    place_frozen_s = _still_s(
+        motion.place_frozen_s, last, new, lambda s: (*s.position_m, *s.velocity_mps)
+    )
     corrections = motion.corrections.watched(new)
     if last is None or not 0.0 < dt_s <= GAP_S or frozen_s > FROZEN_S:
         gap_s = motion.gap_s if last is None else new.t_s
         return replace(
             motion, t_s=new.t_s, gap_s=gap_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
             steady_mps=motion.velocity_mps[2], light_since_s=math.inf, frozen_s=frozen_s,
-            attitude_frozen_s=attitude_frozen_s, corrections=corrections, off_s=off_s,
+            attitude_frozen_s=attitude_frozen_s, place_frozen_s=place_frozen_s,
+            corrections=corrections, off_s=off_s,
         )  # fmt: skip
     offset_g = motion.offset_g
     if new.thrust < 1 and not new.has(FLYING):
@@ -232,6 +243,7 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         blow_s=new.t_s if blow > BLOW_MPS else motion.blow_s,
         frozen_s=frozen_s,
         attitude_frozen_s=attitude_frozen_s,
+        place_frozen_s=place_frozen_s,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
         pushed_s=new.t_s if math.hypot(new.acc_x_g, new.acc_y_g) > PUSHED_G else motion.pushed_s,
         misled_rad=misled_rad,
@@ -290,7 +302,10 @@ def _led_right(sample: Telemetry, misled_rad: tuple[float, float]) -> Telemetry:
 
 
 def _still_s(
-    before_s: float, a: Telemetry | None, b: Telemetry, reading: Callable[[Telemetry], Vector]
+    before_s: float,
+    a: Telemetry | None,
+    b: Telemetry,
+    reading: Callable[[Telemetry], tuple[float, ...]],
 ) -> float:
     """For how long a reading has been the very same."""
     if a is None:

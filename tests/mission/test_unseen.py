@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -304,12 +305,18 @@ def test_a_level_descent_does_not_change_its_mode_for_a_moment(age_s: float, lev
     assert isinstance(command, RawThrust) is level
 
 
-def test_an_attitude_that_stands_still_is_telemetry_that_grows_old() -> None:
-    """By it a target that is seen is looked for where it is not."""
+@pytest.mark.parametrize(
+    "frozen",
+    [{"roll_rad": 0.1}, {"position_m": (0.0, 0.0, 1.01), "velocity_mps": (0.0, 0.0, 0.01)}],
+    ids=["attitude", "position and velocity"],
+)
+def test_what_stands_still_is_telemetry_that_grows_old(frozen: dict[str, Any]) -> None:
+    """By such an attitude a target that is seen is looked for where it is not; by such a speed an
+    offset of the accelerometer seems to be there that is none."""
     felt, state = Felt(), state_in(Phase.ALIGN)
     for i in range(70):
         t_s = 10.0 + 0.02 * i
-        tel = telemetry(t_s, roll_rad=0.1 if i else 0.0)
+        tel = telemetry(t_s, **(frozen if i else {}))
         state, _ = planner.step(state, felt(observation(t_s, telemetry=tel)), PROFILE)
         if state.phase is Phase.LANDING:
             break
