@@ -165,7 +165,7 @@ HOVER_MEMORY_S, HOVER_WITHIN, UNLEARNED_WITHIN = 0.3, 0.12, 0.35
 LATEST_S, UNHEARD_PART, OWN_ESTIMATE_S = 1.0, 0.98, 1.5
 """Telemetry so late still tells how fast it sank, and what was ordered since adds to that. Where
 nothing is heard, a little less than what should be right: it has to come down."""
-HELD_S = 0.6
+ON_THE_SPOT_S = 0.6
 """So long by setpoints at one place, and no speed of before is left."""
 RAMP_PER_S, STILL_MPS = 0.25, 0.05
 """What does not sink gets less and less thrust."""
@@ -734,7 +734,7 @@ def _level(c: Context) -> Acted:
     if unheard and unlearned and c.in_phase_s < OWN_ESTIMATE_S:
         return _by_setpoints(c)  # the vehicle's own estimate is nearer than an unknown thrust
     # Unheard since before it came down, it was held by setpoints until then: it hardly moves.
-    held = tel.t_s < state.entered_s - HELD_S
+    held = tel.t_s < state.entered_s - ON_THE_SPOT_S
     climb_mps = (0.0 if held else c.climb_mps) + state.under_way_mps
     hover = _learned_hover(c, dt_s)
     height_m = c.height_m if state.blind_s is None else state.blind_height_m
