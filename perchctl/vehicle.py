@@ -23,7 +23,7 @@ class Telemetry:
     `t_s` is on the loop's clock; `thrust` is the commanded 0..65535; `acc_x_g`, `acc_y_g` and
     `acc_z_g` are the specific force along the body's axes (0, 0, +1 at rest on the ground).
     `behind_s`: by how much position and velocity, which come by a packet of their own, are older
-    than `t_s`.
+    than `t_s`. `start`: how often the vehicle has started anew since it was first heard.
     """
 
     t_s: float
@@ -42,6 +42,7 @@ class Telemetry:
     behind_s: float = 0.0
     acc_x_g: float = 0.0
     acc_y_g: float = 0.0
+    start: int = 0
 
     def has(self, bit: int) -> bool:
         return bool(self.supervisor & bit)

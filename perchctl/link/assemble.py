@@ -38,16 +38,22 @@ class Assembler:
     def __init__(self) -> None:
         self._values: dict[str, float] = {}
         self._state_s: float | None = None
+        self._start = 0
 
-    def accept(self, block: str, values: Mapping[str, float], t_s: float) -> Telemetry | None:
-        """One packet of a block, its stamp on the loop's clock; the sample that it completes."""
+    def accept(
+        self, block: str, values: Mapping[str, float], t_s: float, start: int = 0
+    ) -> Telemetry | None:
+        """One packet of a block, its stamp on the loop's clock and the vehicle's start that it is
+        from; the sample that it completes. What a vehicle told before it started anew is over."""
+        if start > self._start:
+            self._start, self._state_s = start, None
         self._values.update(values)
         if block == "state":
             self._state_s = t_s
         if block != "attitude" or self._state_s is None or self.missing():
             return None
         behind_s = t_s - self._state_s
-        return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s))
+        return telemetry_from(_carried(self._values, behind_s), t_s, max(0.0, behind_s), start)
 
     def missing(self) -> list[str]:
         """The needed variables of which nothing has come yet."""

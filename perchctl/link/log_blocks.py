@@ -107,7 +107,8 @@ class LogBlocks:
         name = block.name.removeprefix(_PREFIX)
         self._awaited.discard(name)
         self._arrived_s[name] = now_s
-        sample = self._assembler.accept(name, data, self._timebase.to_loop_s(stamp, now_s))
+        sent_s = self._timebase.to_loop_s(stamp, now_s)
+        sample = self._assembler.accept(name, data, sent_s, self._timebase.start)
         if sample is None or (self._awaited and now_s < self._started_s + AWAIT_SLOW_S):
             return  # the first sample is to contain the battery too
         self.newest = sample

@@ -72,7 +72,8 @@ class MockLink:
             name: telemetry_period_s if name in FAST_BLOCKS else SLOW_PERIOD_S for name in BLOCKS
         }
         self._due_s = dict.fromkeys(BLOCKS, 0.0)
-        self._under_way: list[tuple[float, int, str, float, dict[str, float]]] = []
+        self._under_way: list[tuple[float, int, str, float, dict[str, float], int]] = []
+        self._start, self._stamp_s = 0, 0.0
         self._count = itertools.count()
         self._arrived: list[Telemetry] = []
         self._newest: Telemetry | None = None
@@ -140,8 +141,8 @@ class MockLink:
 
     def _collect(self) -> None:
         while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
-            _, _, block, stamp_s, values = heapq.heappop(self._under_way)
-            sample = self._assembler.accept(block, values, stamp_s)
+            _, _, block, stamp_s, values, start = heapq.heappop(self._under_way)
+            sample = self._assembler.accept(block, values, stamp_s, start)
             if sample is not None:
                 self._newest = sample
                 self._arrived.append(sample)
@@ -169,10 +170,14 @@ class MockLink:
 
     def _send_down(self, block: str) -> None:
         firmware = self.vehicle.firmware
+        if firmware.t_s < self._stamp_s:
+            self._start += 1
+        self._stamp_s = firmware.t_s
         delay_s = self.radio.down(block, self.now_s)
         if delay_s is not None:
             values = firmware.log_values(BLOCKS[block])
-            packet = (self.now_s + delay_s, next(self._count), block, self.now_s, values)
+            arrives_s, number = self.now_s + delay_s, next(self._count)
+            packet = (arrives_s, number, block, self.now_s, values, self._start)
             heapq.heappush(self._under_way, packet)
 
 

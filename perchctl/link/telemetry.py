@@ -46,9 +46,11 @@ VARIANCE_BLOCK: dict[str, str] = {
 NEEDED = (*STATE_BLOCK, *ATTITUDE_BLOCK)
 
 
-def telemetry_from(values: Mapping[str, float], t_s: float, behind_s: float = 0.0) -> Telemetry:
-    """Telemetry from log values by name; `behind_s` as `Telemetry` has it. KeyError when a needed
-    one is missing."""
+def telemetry_from(
+    values: Mapping[str, float], t_s: float, behind_s: float = 0.0, start: int = 0
+) -> Telemetry:
+    """Telemetry from log values by name; `behind_s` and `start` as `Telemetry` has them. KeyError
+    when a needed one is missing."""
     variances = [values[name] for name in VARIANCE_BLOCK if name in values]
     return Telemetry(
         t_s=t_s,
@@ -75,4 +77,5 @@ def telemetry_from(values: Mapping[str, float], t_s: float, behind_s: float = 0.
         behind_s=behind_s,
         acc_x_g=values["acc.x"],
         acc_y_g=values["acc.y"],
+        start=start,
     )

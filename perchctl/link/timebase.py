@@ -15,10 +15,11 @@ class Timebase:
 
     The smallest difference between arrival and stamp belongs to the packet that
     waited least; it may grow slowly, so that a drifting clock is followed. A vehicle that has
-    started again is followed from its first stamp on.
+    started again is followed from its first stamp on; `start` counts how often it has.
     """
 
     def __init__(self) -> None:
+        self.start = 0
         self._last_ms: int | None = None
         self._unwrapped_ms = 0
         self._offset_s: float | None = None
@@ -33,6 +34,7 @@ class Timebase:
             self._unwrapped_ms += step
             if step < -REBOOTED_MS:
                 self._offset_s = None
+                self.start += 1
         self._last_ms = stamp_ms
         offset_s = arrival_s - self._unwrapped_ms / 1000.0
         if self._offset_s is None:

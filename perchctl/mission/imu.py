@@ -24,6 +24,11 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 
 GAP_S = 0.2
 """A silence in which a vehicle falls by 20 cm, or more than it may and still hang."""
+STEADY_GAIN_MPS, STEADY_WAY_M = 0.25, 0.25
+"""What hangs gains no more by its estimate while nothing is heard of it, beyond the speed that this
+had before. A fall of half a metre gains 3 m/s, or where the floor has taken that again, the way."""
+SINKS_MPS = -0.3
+"""By the estimate of each moment what hangs is no faster: 5 cm of a fall are."""
 FROZEN_S = 0.2
 """An accelerometer that reads the very same for so long is a silence, too."""
 FALL_G, FALL_S = 0.6, 0.1
@@ -134,7 +139,11 @@ class ImuMotion:
         velocity_mps: integral of the acceleration since the first sample, world axes. It drifts:
             only differences over some seconds mean anything.
         fell_s: when it last fell, or came down and met the floor; `-inf` if it never did.
-        gap_s: end of the newest silence that a fall could hide in.
+        silent_s: end of the newest silence, that of an accelerometer that stood still among them.
+        gap_s: end of the newest one that a fall could hide in: where the estimate, which goes on
+            feeling on board, shows none, it hides none.
+        started_s: when the vehicle was first heard again after it had started anew.
+        sunk_m: by how much the estimate has sunk while the accelerometer has stood still.
         steady_s: since when the vertical speed has stayed what it is.
         offset_g: what the accelerometer read too much at rest on the ground, body axes.
         frozen_s, attitude_frozen_s, place_frozen_s: for how long the accelerometer, the attitude,
@@ -153,7 +162,10 @@ class ImuMotion:
     velocity_mps: Vector = ZERO
     offset_g: Vector = ZERO
     fell_s: float = -math.inf
+    silent_s: float = -math.inf
     gap_s: float = -math.inf
+    started_s: float = -math.inf
+    sunk_m: float = 0.0
     steady_s: float = math.inf
     steady_mps: float = 0.0
     light_since_s: float = math.inf
@@ -197,10 +209,18 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         motion.place_frozen_s, last, new, lambda s: (*s.position_m, *s.velocity_mps)
     )
     corrections = motion.corrections.watched(new)
+    started_s = motion.started_s if last is None or new.start == last.start else new.t_s
     if last is None or not 0.0 < dt_s <= GAP_S or frozen_s > FROZEN_S:
-        gap_s = motion.gap_s if last is None else new.t_s
+        silent_s, gap_s, sunk_m = motion.silent_s, motion.gap_s, 0.0
+        if last is not None:
+            silent_s = new.t_s
+            sunk_m = min(0.0, motion.sunk_m + new.position_m[2] - last.position_m[2])
+            alive = 0.0 <= place_frozen_s <= FROZEN_S and new.start == last.start
+            if not (alive and _shows_no_fall(last, new, sunk_m)):
+                gap_s, sunk_m = new.t_s, 0.0
         return replace(
-            motion, t_s=new.t_s, gap_s=gap_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
+            motion, t_s=new.t_s, silent_s=silent_s, gap_s=gap_s, sunk_m=sunk_m,
+            started_s=started_s, steady_s=new.t_s, sink_mps=0.0, blow_mps=0.0,
             steady_mps=motion.velocity_mps[2], light_since_s=math.inf, frozen_s=frozen_s,
             attitude_frozen_s=attitude_frozen_s, place_frozen_s=place_frozen_s,
             corrections=corrections, off_s=off_s,
@@ -233,7 +253,9 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         velocity_mps=(x, y, z),
         offset_g=offset_g,
         fell_s=new.t_s if fell else motion.fell_s,
+        silent_s=motion.silent_s,
         gap_s=motion.gap_s,
+        started_s=started_s,
         steady_s=steady_s,
         steady_mps=steady_mps,
         light_since_s=light,
@@ -253,6 +275,19 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         blow=_struck(motion, new, last_moment, blow),
         off_s=off_s,
     )
+
+
+def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
+    """What the estimate tells of a silence between two samples, or of a moment in which only the
+    accelerometer stood still. It is drawn astray, but by nothing as a fall and a blow draw it."""
+    dt_s = new.t_s - last.t_s
+    gained_mps = new.velocity_mps[2] - last.velocity_mps[2]
+    way_m = new.position_m[2] - last.position_m[2] - last.velocity_mps[2] * dt_s
+    if max(last.behind_s, new.behind_s) > GAP_S:
+        return False
+    if 0.0 < dt_s <= GAP_S:
+        return new.velocity_mps[2] > SINKS_MPS and sunk_m > -STEADY_WAY_M
+    return abs(gained_mps) <= STEADY_GAIN_MPS and abs(way_m) <= STEADY_WAY_M
 
 
 def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mps: float) -> Blow:
@@ -387,15 +422,17 @@ def reckoned(
     another axis', and after a silence, too, the reckoned one is better."""
     estimated, blow = sample.velocity_mps, imu.blow
     if old.imu is not None and blow.t_s > old.imu.blow.t_s:
-        carried = not old.imu.t_s < imu.gap_s <= blow.t_s
+        carried = not old.imu.t_s < imu.silent_s <= blow.t_s
         carried_mps = old.velocity_mps[2] + blow.felt_mps - old.imu.velocity_mps[2]
         old = replace(old, struck_mps=carried_mps if carried else blow.estimated_mps)
     frozen = imu.attitude_frozen_s > FROZEN_S
-    if old.imu is None or imu.gap_s > old.imu.t_s or frozen:
+    if old.imu is None or imu.silent_s > old.imu.t_s or frozen:
         velocity_mps = estimated if believed else ZERO
         if astray:
             vx, vy, vz = old.velocity_mps
-            if old.imu is not None and imu.gap_s <= old.imu.t_s:  # only the attitude stands still
+            if (
+                old.imu is not None and imu.silent_s <= old.imu.t_s
+            ):  # only the attitude stands still
                 vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
             velocity_mps = (vx, vy, vz)
         elif not believed and old.imu is not None:
@@ -408,10 +445,14 @@ def reckoned(
         unknown = replace(
             old, imu=imu, velocity_mps=velocity_mps, estimated_mps=estimated, beside_mps=(0.0, 0.0)
         )
-        if old.imu is not None and imu.gap_s > old.imu.t_s:
-            nearest_m = old.nearest_m - MOST_CLIMB_MPS * (imu.t_s - old.imu.t_s)
-            unsure_s = imu.t_s if nearest_m < REACH_M else old.unsure_s
-            unknown = replace(unknown, nearest_m=nearest_m, unsure_s=unsure_s)
+        if old.imu is not None and imu.silent_s > old.imu.t_s:
+            flew = _may_have_flown(old.imu, imu)
+            nearest_m = old.nearest_m - _most_climb_m(old, imu.t_s, flew=flew)
+            near = nearest_m < REACH_M
+            unknown = replace(
+                unknown, nearest_m=nearest_m, unsure_s=imu.t_s if near else old.unsure_s,
+                below_m=old.below_m if near or flew else math.inf,
+            )  # fmt: skip
         return unknown if old.imu is None else replace(unknown, aside_sigma_m=math.inf)
     dt_s = imu.t_s - old.imu.t_s
     if not dt_s > 0.0:
@@ -451,6 +492,20 @@ def reckoned(
         aside_m=(ex - vx * dt_s, ey - vy * dt_s),
         aside_sigma_m=old.aside_sigma_m + growth_m,
     )
+
+
+def _may_have_flown(before: ImuMotion, after: ImuMotion) -> bool:
+    """All through a silence: not with motors that were off, or by a vehicle that started anew."""
+    off = before.off_s <= before.t_s and after.off_s <= after.t_s
+    return not (off or after.started_s > before.t_s)
+
+
+def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
+    """In a silence; without thrust it goes on by the speed that it had."""
+    if flew:
+        return MOST_CLIMB_MPS * (now_s - (old.imu.t_s if old.imu else now_s))
+    climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
+    return climb_mps**2 / (2.0 * GRAVITY_MPS2)
 
 
 def sighted(

@@ -336,12 +336,11 @@ def _by_fall(c: Context, since_s: float | None) -> Finding:
     """`since_s`: within the magnet's reach since."""
     imu, reckoning = c.obs.imu, c.state.reckoning
     down_s = max(imu.fell_s, -math.inf if c.state.touch_s is None else c.state.touch_s)
-    # A sight from after the silence has told where it was.
-    if reckoning.unsure_s > max(down_s, reckoning.sight_s):
-        return Finding.UNKNOWN
+    unsure = reckoning.unsure_s > max(down_s, reckoning.sight_s)  # a sight tells where it was
     if since_s is None or down_s > since_s:
-        return Finding.STANDS
-    return Finding.UNKNOWN if imu.gap_s > since_s else Finding.HANGS
+        return Finding.UNKNOWN if unsure else Finding.STANDS
+    came_unheard = unsure and reckoning.unsure_s <= since_s
+    return Finding.UNKNOWN if came_unheard or imu.gap_s > since_s else Finding.HANGS
 
 
 def hangs_where_it_did(c: Context) -> bool:

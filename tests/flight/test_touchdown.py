@@ -234,13 +234,13 @@ def test_blind_it_is_the_reckoned_speed_that_counts() -> None:
     carried = reckoned(
         Reckoning(before, velocity_mps=(0.0, 0.0, -0.7)), after, telemetry(9.1, 0.4), believed=False
     )
-    still = replace(after, t_s=10.0, gap_s=10.0)
+    still = replace(after, t_s=10.0, silent_s=10.0)
     carried = reckoned(carried, still, telemetry(10.0, 0.4), believed=False)
     state = replace(state_in(Phase.LANDED, z_m=0.0), blind_s=5.0, reckoning=carried)
     told = touchdown_of(Context(state, observation(10.0, 0.4, imu=still), PROFILE))
     assert told is not None
     assert (told.speed_mps, told.peak_g) == (pytest.approx(0.9), 3.1)
-    silent = replace(after, gap_s=8.95)  # what was reckoned ended there
+    silent = replace(after, silent_s=8.95)  # what was reckoned ended there
     carried = reckoned(Reckoning(before), silent, telemetry(9.1, 0.4), believed=False)
     assert carried.struck_mps == -0.2
 

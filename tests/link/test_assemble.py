@@ -37,6 +37,16 @@ def test_a_dead_block_shows_in_the_sample(silent_ms: int, speed_mps: float) -> N
     assert sample.position_m[2] == pytest.approx(carried_m)
 
 
+def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
+    assembler = Assembler()
+    assembler.accept("state", STILL["state"], 1.0)
+    assert assembler.accept("attitude", STILL["attitude"], 2.0, 1) is None
+    assembler.accept("state", STILL["state"], 2.01, 1)
+    sample = assembler.accept("attitude", STILL["attitude"], 2.02, 1)
+    assert sample is not None
+    assert (sample.start, sample.behind_s) == (1, pytest.approx(0.01))
+
+
 HANGS = Telemetry(
     1.0, (0.0, 0.0, 2.0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 1.0, 0.0, 3.9, supervisor=0x020E
 )  # fmt: skip

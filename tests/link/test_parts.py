@@ -77,8 +77,10 @@ def test_a_vehicle_that_has_started_again_is_followed_from_its_first_stamp_on() 
     base = Timebase()
     assert base.to_loop_s(60_000, 100.0) == pytest.approx(100.0)
     assert base.to_loop_s(59_990, 100.0) == pytest.approx(99.99)
+    assert base.start == 0
     assert base.to_loop_s(300, 103.0) == pytest.approx(103.0)
     assert base.to_loop_s(310, 103.02) == pytest.approx(103.01)
+    assert base.start == 1
 
 
 @pytest.mark.parametrize(

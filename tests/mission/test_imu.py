@@ -24,7 +24,7 @@ from perchctl.mission.imu import (
     sighted,
 )
 from perchctl.vehicle import Telemetry
-from tests.helpers.mission import telemetry
+from tests.helpers.mission import HOVER_THRUST, telemetry
 
 
 def flown(samples: list[Telemetry], motion: ImuMotion | None = None) -> ImuMotion:
@@ -39,12 +39,59 @@ def test_an_accelerometer_that_stands_still_is_a_silence() -> None:
     frozen = [telemetry(0.01 * i, acc_x_g=0.0, acc_z_g=0.9) for i in range(300)]
     motion = flown(frozen)
     assert motion.frozen_s == pytest.approx(2.99)
-    assert motion.gap_s == pytest.approx(2.99)
+    assert motion.silent_s == pytest.approx(2.99)
     assert motion.fell_s < 0.0
     assert abs(motion.velocity_mps[2]) < 1.1 * 0.1 * 9.81 * FROZEN_S
     alive = flown([telemetry(0.01 * i, acc_z_g=0.9) for i in range(300)])
     assert alive.frozen_s == 0.0
     assert alive.fell_s > 0.0
+
+
+def since_heard(after: Telemetry, before: Telemetry | None = None) -> ImuMotion:
+    """What a silence leaves, of a vehicle that hung at 1.9 m before it."""
+    hung = [telemetry(0.01 * i, 1.9) for i in range(100)]
+    return moved(flown(hung), before or hung[-1], after)
+
+
+@given(silent_s=st.floats(GAP_S + 0.01, 4.0), drift_mps=st.floats(-0.1, 0.1))
+def test_a_silence_over_which_the_estimate_shows_no_fall_hides_none(
+    silent_s: float, drift_mps: float
+) -> None:
+    """On board the accelerometer is felt all the time: what fell has gained speed, or where the
+    floor took that, has gone down."""
+    t_s = 0.99 + silent_s
+    hangs = since_heard(telemetry(t_s, 1.9 + 0.05, velocity_mps=(0.0, 0.0, drift_mps)))
+    assert (hangs.silent_s, hangs.gap_s) == (t_s, -math.inf)
+    for z_m, climb_mps, changes in (
+        (1.9, drift_mps - 1.0, {}),  # the floor's blow was more than the accelerometer reads
+        (0.0, drift_mps, {}),
+        (1.9, drift_mps, {"behind_s": silent_s}),  # the position is from before
+        (1.9, drift_mps, {"start": 1}),  # and this estimate is another one
+    ):
+        after = telemetry(t_s, z_m, velocity_mps=(0.0, 0.0, climb_mps), **changes)
+        assert since_heard(after).gap_s == t_s
+    still = telemetry(0.99, 1.9)
+    assert since_heard(replace(still, t_s=t_s), still).gap_s == t_s
+
+
+@pytest.mark.parametrize(
+    ("way_m", "climb_mps", "hidden"),
+    [(0.0, -0.1, False), (-0.2, -0.1, False), (-0.4, -0.2, True), (0.0, -0.4, True)],
+)
+def test_where_only_the_accelerometer_stands_still_the_estimate_tells_of_a_fall(
+    way_m: float, climb_mps: float, hidden: bool
+) -> None:
+    samples = [telemetry(0.01 * i, 1.9, acc_x_g=0.01) for i in range(50)]
+    samples += [
+        telemetry(
+            0.5 + 0.01 * i, 1.9 + way_m * i / 50, acc_x_g=0.01,
+            velocity_mps=(1e-9 * i, 0.0, climb_mps if i == 25 else 0.0),
+        )
+        for i in range(50)
+    ]  # fmt: skip
+    motion = flown(samples)
+    assert motion.silent_s > 0.9
+    assert (motion.gap_s > 0.5) is hidden
 
 
 def test_with_an_attitude_that_stands_still_the_estimate_s_change_counts() -> None:
@@ -131,6 +178,22 @@ def test_in_a_silence_it_may_climb_into_the_magnet_s_reach(below_m: float, silen
     assert new.below_m == below_m
     seen = sighted(new, after.t_s + 0.1, (0.0, 0.0), below_m, 0.001)
     assert seen.nearest_m == below_m
+
+
+@given(below_m=st.floats(0.05, 2.0), silent_s=st.floats(GAP_S + 0.01, 3.0))
+def test_what_had_no_thrust_in_a_silence_did_not_climb(below_m: float, silent_s: float) -> None:
+    """With motors that were off, or started anew: it lies, or hangs where it hung."""
+    for thrust, start in ((0.0, 0), (HOVER_THRUST, 1)):
+        before = telemetry(1.0, thrust=thrust)
+        after = telemetry(1.0 + silent_s, thrust=0.0, start=start)
+        imu = flown([before])
+        old = sighted(Reckoning(imu), 0.9, (0.0, 0.0), below_m, 0.001)
+        new = reckoned(old, moved(imu, before, after), after, believed=False)
+        assert new.unsure_s == -math.inf
+        assert new.below_m == math.inf
+        near = replace(old, below_m=0.02, nearest_m=0.02)
+        new = reckoned(near, moved(imu, before, after), after, believed=False)
+        assert (new.unsure_s, new.below_m) == (after.t_s, 0.02)
 
 
 def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring() -> None:

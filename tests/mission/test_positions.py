@@ -279,20 +279,29 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
 STOPPED: dict[str, Any] = {"stopped_s": BEGIN_S - 1.0, "released_s": BEGIN_S - 3.0, "orders": 5}
 
 
-def off(t_s: float, supervisor: int = READY) -> Observation:
+def off(t_s: float, supervisor: int = READY, gained_mps: float = 0.0) -> Observation:
     """Motors off, no position."""
     tel = telemetry(t_s, HANG_Z_M, thrust=0.0, supervisor=supervisor)
+    x_mps, y_mps, z_mps = tel.velocity_mps
+    tel = replace(tel, velocity_mps=(x_mps, y_mps, z_mps + gained_mps))
     return observation(t_s, telemetry=tel, target=None, **hidden(5.0))
 
 
-@pytest.mark.parametrize(("silence_s", "ends"), [(0.1, Phase.PERCHED), (0.5, Phase.ABORTED)])
-def test_what_nobody_saw_hang_has_not_perched(silence_s: float, ends: Phase) -> None:
-    """Motors off, no position, and a gap in the telemetry: it may lie on the floor."""
+@pytest.mark.parametrize(
+    ("silence_s", "gained_mps", "ends"),
+    [(0.1, 0.0, Phase.PERCHED), (0.5, 0.0, Phase.PERCHED), (0.5, -2.5, Phase.ABORTED)],
+)
+def test_what_nobody_saw_hang_has_not_perched(
+    silence_s: float, gained_mps: float, ends: Phase
+) -> None:
+    """Motors off, no position, and a gap in the telemetry: it may lie on the floor, unless what
+    was felt on board meanwhile is no fall."""
     state, felt = replace(at_the_magnet(), **STOPPED), Felt()
     felt(off(BEGIN_S))
     reasons = []
     for t_s in times(4.0):
-        obs = felt(off(t_s if t_s > BEGIN_S + silence_s else BEGIN_S))
+        heard = t_s > BEGIN_S + silence_s
+        obs = felt(off(t_s, gained_mps=gained_mps) if heard else off(BEGIN_S))
         state, command = planner.step(state, replace(obs, t_s=t_s), MOCAP)
         assert not isinstance(command, Land | PositionSetpoint)
         reasons.append(state.reason)
@@ -304,13 +313,15 @@ def test_what_nobody_saw_hang_has_not_perched(silence_s: float, ends: Phase) -> 
         assert "not known" in state.reason
 
 
-@pytest.mark.parametrize("silence_s", [0.02, 0.5])
-def test_a_locked_vehicle_hangs_where_it_has_not_fallen_from(silence_s: float) -> None:
+@pytest.mark.parametrize(("silence_s", "gained_mps"), [(0.02, 0.0), (0.5, 0.0), (0.5, -2.5)])
+def test_a_locked_vehicle_hangs_where_it_has_not_fallen_from(
+    silence_s: float, gained_mps: float
+) -> None:
     state, felt = replace(at_the_magnet(), **STOPPED), Felt()
     felt(off(BEGIN_S - 0.02))
-    locked = felt(off(BEGIN_S + silence_s, READY | LOCKED))
+    locked = felt(off(BEGIN_S + silence_s, READY | LOCKED, gained_mps))
     state, _ = planner.step(state, locked, MOCAP)
-    assert state.phase is (Phase.ABORTED if silence_s > 0.2 else Phase.PERCHED)
+    assert state.phase is (Phase.ABORTED if gained_mps else Phase.PERCHED)
 
 
 # --- On the way down ---------------------------------------------------------------------
