@@ -51,24 +51,27 @@ class Mismatch:
 @dataclass(frozen=True)
 class FeltMotion:
     """The vehicle's motion by pictures and accelerometer, world axes: its speed sideways at `t_s`,
-    by how much the accelerometer and the attitude give too much there, and its vertical speed."""
+    by how much the accelerometer and the attitude give too much there, and its vertical speed; None
+    where the delay that it rests on may be over, which a place that hardly changes does not tell.
+    """
 
     t_s: float
     velocity_mps: tuple[float, float]
     bias_mps2: tuple[float, float]
-    climb_mps: float
+    climb_mps: float | None
 
 
 @dataclass(frozen=True)
 class FeltWatch:
     """`sights` of the last `WINDOW_S`, each its time and the way from body to target in body
-    axes, m. `found`: the newest judgement, and `agreed`: how many in a row say the same. `motion`:
-    the newest in which the sum wandered by at most `motion_within_m`."""
+    axes, m. `found`: the newest judgement, and `agreed`: how many in a row say the same, `agreed_s`
+    since when. `motion`: the newest in which the sum wandered by at most `motion_within_m`."""
 
     sights: tuple[tuple[float, Vector], ...] = ()
     judged_s: float = -math.inf
     found: Mismatch | None = None
     agreed: int = 0
+    agreed_s: float = -math.inf
     motion: FeltMotion | None = None
     motion_within_m: float = WANDERS_M
 
@@ -98,11 +101,12 @@ def felt(
         found = _found(wanders_m)
         agrees = found is not None and old.found is not None and _alike(found, old.found)
         agreed = 0 if found is None else old.agreed + 1 if agrees else 1
-        new = replace(new, found=found, agreed=agreed)
+        new = replace(new, found=found, agreed=agreed, agreed_s=t_s)
     i = _best_about(new.mismatch or Mismatch(), wanders_m)
     if wanders_m[i] <= new.motion_within_m:
         (vx, vy, vz), (bx, by, _) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
-        new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by), vz))
+        climb_mps = vz if t_s - new.agreed_s <= WINDOW_S else None
+        new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by), climb_mps))
     return replace(new, judged_s=t_s)
 
 

@@ -458,10 +458,12 @@ def _reckon(c: Context) -> PlannerState:
         new = replace(new, velocity_mps=(0.0, 0.0, 0.0))
     felt, late = obs.felt, latency_changed(c)
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
+        # Pictures that are late have led the estimate's height astray, too.
+        climb_mps = felt.climb_mps if late else None
+        climb_mps = new.velocity_mps[2] if climb_mps is None else climb_mps
         new = replace(
             new,
-            # Pictures that are late have led the estimate's height astray, too.
-            velocity_mps=(*felt.velocity_mps, felt.climb_mps if late else new.velocity_mps[2]),
+            velocity_mps=(*felt.velocity_mps, climb_mps),
             bias_mps2=(*felt.bias_mps2, new.bias_mps2[2]),
         )
     target = obs.target
@@ -473,6 +475,14 @@ def _reckon(c: Context) -> PlannerState:
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
+    held_s = c.held(Condition.PRESSED)
+    flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
+    if c.by_sight and flies and held_s >= c.profile.planner.perch.contact_dwell_s:
+        # It is at something above it, as the target may be: late pictures have that higher up.
+        new = replace(
+            new, below_m=min(0.0, new.below_m), nearest_m=min(0.0, new.nearest_m),
+            velocity_mps=(*new.velocity_mps[:2], 0.0),
+        )  # fmt: skip
     reach_s = state.reach_s
     if stage_of(c) in (Stage.DOWN, Stage.ORDERED):  # what is released or stopped moves no more
         # What has felt the floor climbs no more, whatever may have been reckoned since.

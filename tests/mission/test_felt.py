@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
-from perchctl.mission.felt import LEAST_LATER_S, STEP_S, FeltWatch, begun_anew, felt
+from perchctl.mission.felt import LEAST_LATER_S, STEP_S, WINDOW_S, FeltWatch, begun_anew, felt
 from perchctl.vehicle import Telemetry
 
 TARGET_M = np.array([0.3, -0.2, 1.9])
@@ -109,6 +109,18 @@ def test_a_delay_is_found_and_the_speed_with_it(
     *true_mps, true_climb_mps = swing.velocity_mps(motion.t_s)
     assert motion.velocity_mps == pytest.approx(true_mps, abs=0.05)
     assert motion.climb_mps == pytest.approx(true_climb_mps, abs=0.05)
+
+
+def test_the_vertical_speed_is_told_only_while_the_delay_has_just_been_found() -> None:
+    """A mismatch stays, and its delay may end: where nothing swings no wandering shows that."""
+    swing = Swing(0.05, heave_m=0.05)
+    found = watched(swing, later_s=0.2)
+    assert found.motion is not None
+    assert found.motion.climb_mps is not None
+    long_ago = watched(swing, later_s=0.2, for_s=1.5 + WINDOW_S)
+    assert long_ago.mismatch is not None
+    assert long_ago.motion is not None
+    assert long_ago.motion.climb_mps is None
 
 
 @pytest.mark.parametrize("quarters", [1, 2, -1])
