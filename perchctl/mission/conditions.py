@@ -289,6 +289,20 @@ def _blocked(c: Context) -> bool:
     return pressing and c.height_m > 0.15 and _still(c)
 
 
+def _pressed(c: Context) -> bool:
+    """By what is felt alone: much more than hovering takes, and one g, over a steady speed. In the
+    air it would rise, whatever an estimate by late pictures says of its place."""
+    tel, perch, hover = c.obs.telemetry, c.profile.planner.perch, c.state.hover_thrust
+    much = min(c.profile.safety.blocked_thrust_ratio * hover, SATURATED * FULL_THRUST)
+    return (
+        0 < hover < LITTLE_LEFT * FULL_THRUST
+        and c.thrust_is_known
+        and tel.thrust >= much
+        and abs(tel.acc_z_g - 1.0) <= perch.contact_acc_g
+        and c.obs.t_s - c.obs.imu.steady_s >= perch.contact_dwell_s
+    )
+
+
 def _knocked(c: Context) -> bool:
     vx, vy, _ = c.obs.telemetry.velocity_mps
     return c.proves and c.placed and math.hypot(vx, vy) > KNOCKED_MPS
@@ -317,6 +331,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
+    Condition.PRESSED: _pressed,
     Condition.KNOCKED: _knocked,
     Condition.SATURATED: _saturated,
     Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
@@ -343,6 +358,7 @@ PROOFS = frozenset(
         Condition.WEIGHT_HANGS,
         Condition.DOWN,
         Condition.ON_FLOOR,
+        Condition.PRESSED,
         Condition.SATURATED,
     }
 )

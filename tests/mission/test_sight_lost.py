@@ -12,8 +12,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import planner
-from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
+from perchctl.mission import lander, planner
+from perchctl.mission.context import BLOWN_MPS, CORRECTED_S, Context
 from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.lander import (
@@ -446,6 +446,24 @@ def test_a_contact_that_holds_is_proven_past_the_last_sight_by_what_is_felt() ->
     assert (state.phase, state.row) == (Phase.COMPLETE, "contact")
     assert state.entered_s - BEGIN_S > HOLD_S
     assert pressed_past_the_sight(climb_mps=0.5).phase is Phase.PERCH  # it rises still
+
+
+@pytest.mark.parametrize(("of_hover", "within"), [(1.25, True), (1.0, False)])
+def test_what_is_felt_to_press_is_within_reach_whatever_late_pictures_say(
+    of_hover: float, within: bool
+) -> None:
+    """They have the target 0.2 m above. In the air so much thrust would lift it, and from there no
+    way down is told that nobody felt."""
+    felt, state = Felt(), state_in(Phase.RECOVER, z_m=HANG_Z_M - 0.2)
+    for i in range(round(0.9 / TURN_S)):
+        t_s = BEGIN_S + TURN_S * (i + 1)
+        tel = telemetry(t_s, HANG_Z_M - 0.2, thrust=of_hover * HOVER_THRUST)
+        target = target_at(t_s, body_m=tel.position_m)
+        obs = observation(t_s, telemetry=tel, target=target, new_frame=TURN_S * i < 0.3)
+        state, _ = planner.step(state, felt(obs), PROFILE)
+    assert (state.reach_s is not None) is within
+    landing = lander.begun(state, obs, PROFILE)
+    assert (lander.reach_of(Context(landing, obs, PROFILE)) is lander.Reach.MAGNET) is within
 
 
 @pytest.mark.parametrize(("aside_m", "sigma_m"), [(0.03, 1e-3), (0.02, 0.01), (0.0, math.inf)])
