@@ -289,15 +289,16 @@ def _blocked(c: Context) -> bool:
     return pressing and c.height_m > 0.15 and _still(c)
 
 
-def _pressed(c: Context) -> bool:
-    """By what is felt alone: much more than hovering takes, and one g, over a steady speed. In the
-    air it would rise, whatever an estimate by late pictures says of its place."""
+def _carried(c: Context) -> bool:
+    """By what is felt alone: much more or much less than hovering takes, and one g over a steady
+    speed. In the air it would rise or sink, whatever late pictures say of its place."""
     tel, perch, hover = c.obs.telemetry, c.profile.planner.perch, c.state.hover_thrust
-    much = min(c.profile.safety.blocked_thrust_ratio * hover, SATURATED * FULL_THRUST)
+    apart = (c.profile.safety.blocked_thrust_ratio - 1.0) * hover
+    pressed = tel.thrust >= min(hover + apart, SATURATED * FULL_THRUST)
     return (
         0 < hover < LITTLE_LEFT * FULL_THRUST
         and c.thrust_is_known
-        and tel.thrust >= much
+        and (pressed or tel.thrust <= hover - apart)
         and abs(tel.acc_z_g - 1.0) <= perch.contact_acc_g
         and c.obs.t_s - c.obs.imu.steady_s >= perch.contact_dwell_s
     )
@@ -331,7 +332,7 @@ CONDITIONS: dict[Condition, Callable[[Context], bool]] = {
     Condition.ON_FLOOR: _on_floor,
     Condition.WEIGHT_HANGS: _weight_hangs,
     Condition.BLOCKED: _blocked,
-    Condition.PRESSED: _pressed,
+    Condition.CARRIED: _carried,
     Condition.KNOCKED: _knocked,
     Condition.SATURATED: _saturated,
     Condition.UNSURE: lambda c: c.variance_m2 > c.profile.safety.flight_variance_m2,
@@ -344,6 +345,7 @@ KEPT_OVER_A_CHANGE = (
     Condition.TILTED,
     Condition.UNSURE,
     Condition.SATURATED,
+    Condition.CARRIED,
     Condition.OTHERWISE,
 )
 """The vehicle's own, whatever the phase, and however it is held."""
@@ -358,7 +360,7 @@ PROOFS = frozenset(
         Condition.WEIGHT_HANGS,
         Condition.DOWN,
         Condition.ON_FLOOR,
-        Condition.PRESSED,
+        Condition.CARRIED,
         Condition.SATURATED,
     }
 )

@@ -128,6 +128,8 @@ class Finding(Enum):
 LOOKED_S = 2.0
 """For so long it is looked whether a target that is seen far above tells where it is."""
 HUNG_WITHIN_M = 0.3
+MAGNET_M = 0.3
+"""What carries or presses a vehicle in flight, so near below the target, is the target."""
 REPEAT_ORDER_S = 0.3
 LEAST_ORDERS, MAX_ORDERS = 3, 6
 """An order without its notify shows *HL active* and is not flown, and 2 s later the vehicle
@@ -453,8 +455,9 @@ def _reckon(c: Context) -> PlannerState:
     astray = state.astray and not c.by_sight
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
-    if state.contact_z_m is not None and rests:
-        # What the impact left of a speed is none: pressed or hanging it stands still.
+    if state.contact_z_m is not None and new.below_m < REACH_M and rests:
+        # What the impact left of a speed is none: pressed or hanging it stands still. On its way
+        # to the target a gust moves it.
         new = replace(new, velocity_mps=(0.0, 0.0, 0.0))
     felt, late = obs.felt, latency_changed(c)
     if felt is not None and (state.reckoning.imu is None or felt.t_s > state.reckoning.imu.t_s):
@@ -475,10 +478,11 @@ def _reckon(c: Context) -> PlannerState:
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
-    held_s = c.held(Condition.PRESSED)
+    held_s = c.held(Condition.CARRIED)
     flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
-    if c.by_sight and flies and held_s >= c.profile.planner.perch.contact_dwell_s:
-        # It is at something above it, as the target may be: late pictures have that higher up.
+    near = c.by_sight and flies and new.below_m < MAGNET_M
+    if near and held_s >= c.profile.planner.perch.contact_dwell_s:
+        # It is at the target: by late pictures it is lower.
         new = replace(
             new, below_m=min(0.0, new.below_m), nearest_m=min(0.0, new.nearest_m),
             velocity_mps=(*new.velocity_mps[:2], 0.0),

@@ -89,7 +89,7 @@ class Condition(Enum):
     ON_FLOOR = "on the floor"
     WEIGHT_HANGS = "the whole weight hangs"
     BLOCKED = "blocked"
-    PRESSED = "pressed from below, by feel"
+    CARRIED = "carried or pressed, by feel"
     KNOCKED = "knocked aside"
     SATURATED = "saturated"
     UNSURE = "unsure"
