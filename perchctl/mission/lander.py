@@ -499,6 +499,11 @@ def _reckon(c: Context) -> PlannerState:
     if state.blind_s is not None and state.reckoning.imu is not None:
         dt_s = max(0.0, min(0.5, obs.imu.t_s - state.reckoning.imu.t_s))
         down_m = new.velocity_mps[2] * dt_s
+        last, tel = state.last, obs.telemetry
+        heard_again = obs.imu.silent_s > state.reckoning.imu.t_s and c.proves and not obs.jumped
+        if heard_again and last is not None and tel.start == last.start:
+            # No position corrected the estimate in the silence: its change is what was felt.
+            down_m = tel.position_m[2] - last.position_m[2]
     return replace(
         state, reckoning=new, reach_s=reach_s, blind_height_m=state.blind_height_m + down_m
     )

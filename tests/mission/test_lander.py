@@ -386,6 +386,19 @@ def test_the_felt_speed_is_braked_whatever_the_estimate_says() -> None:
     assert lander.observed(moved, later, c.profile).reckoning.velocity_mps[0] < 0.2
 
 
+@pytest.mark.parametrize("starts", [0, 1])
+def test_a_silence_on_the_way_down_has_the_height_that_the_estimate_felt(starts: int) -> None:
+    """The way down began while the program had heard nothing for long. A vehicle that started anew
+    has another world."""
+    c = context((Evidence.IMU, Reach.FREE, Stage.DOWN), 0.5)
+    last = replace(c.obs.telemetry, t_s=NOW_S - 1.7)
+    before = replace(c.state, last=last, reckoning=Reckoning(imu=ImuMotion(t_s=last.t_s)))
+    tel = telemetry(NOW_S, 0.2, start=starts)
+    imu = ImuMotion(t_s=NOW_S, silent_s=NOW_S)
+    state = lander.observed(before, replace(c.obs, telemetry=tel, imu=imu), c.profile)
+    assert state.blind_height_m == pytest.approx(0.5 if starts else 0.2)
+
+
 @pytest.mark.parametrize("later_s", [0.0, 0.5])
 def test_late_pictures_have_led_the_height_astray_too(later_s: float) -> None:
     """Its vertical speed is what they tell with the right delay, and the floor may be near."""
