@@ -53,8 +53,9 @@ WARY_MPS, WARY_M = 0.25, 0.2
 
 def act(c: Context) -> Acted:
     """The phase's command for this tick."""
-    falls = c.state.phase is Phase.RECOVER and not c.state.caught
-    if c.state.hold and c.state.setpoint is not None and not falls:
+    # A fall is caught, and a press ended, whatever else is to be held: its setpoint is above.
+    leaves = c.state.phase is Phase.RECOVER and (c.state.pressed or not c.state.caught)
+    if c.state.hold and c.state.setpoint is not None and not leaves:
         lift = c.state.phase is not Phase.APPROACH or c.height_m > LIFTED_M
         return _fly_to(c, sinking(c, c.state.setpoint), lift=lift)
     return ACTIONS[c.state.phase](c)

@@ -74,6 +74,11 @@ def too_little_left(c: Context) -> bool:
     return begins and not attempts_used(c) and budget.short_of_charge(c)
 
 
+def presses_too_long(c: Context) -> bool:
+    """No contact is proven in time, or would be by the next turn of a loop as late as this one."""
+    return c.in_phase_s + c.obs.loop_late_s > c.profile.planner.perch.timeout_s
+
+
 def is_blocked(c: Context) -> bool:
     return c.held(Condition.BLOCKED) >= c.profile.safety.blocked_s
 
@@ -85,7 +90,10 @@ def is_blocked_off_target(c: Context) -> bool:
 
 
 def too_weak(c: Context) -> bool:
-    """No thrust is left to press with: seen at full thrust, or known before the press."""
+    """No thrust is left to press with: seen at full thrust, or known before the press. What is
+    backing off from a press has it from that."""
+    if c.state.pressed:
+        return False
     if c.held(Condition.SATURATED) >= WEAK_S:
         return True
     near = c.state.phase is Phase.ASCEND and c.held(Condition.NEAR_STANDOFF) >= 0.0

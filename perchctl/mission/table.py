@@ -19,6 +19,7 @@ from perchctl.mission.guards import (
     is_held,
     is_watched,
     pressed_blindly,
+    presses_too_long,
     searched_out,
     settling_too_long,
     still_turns,
@@ -172,9 +173,8 @@ TABLE: tuple[Row, ...] = (
         "pushed aside under the target", S.BACK_OFF, counts_attempt=True,
     ),
     Row(
-        "no-contact", only(P.PERCH),
-        lambda c: c.in_phase_s > c.profile.planner.perch.timeout_s, P.RECOVER,
-        "no proof of contact", S.BACK_OFF, counts_attempt=True,
+        "no-contact", only(P.PERCH), presses_too_long, P.RECOVER, "no proof of contact",
+        S.BACK_OFF, counts_attempt=True,
     ),
     # --- phase 7: completion -------------------------------------------------
     Row(

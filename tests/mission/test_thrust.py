@@ -10,7 +10,7 @@ import pytest
 from perchctl.mission import lander, planner
 from perchctl.mission.conditions import CONDITIONS, contact_thrust
 from perchctl.mission.context import Context
-from perchctl.mission.state import Condition, Outcome, Phase, PlannerState
+from perchctl.mission.state import Condition, Observation, Outcome, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, PositionSetpoint
 from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry
@@ -177,3 +177,32 @@ def test_a_reading_that_stands_still_under_a_changed_order_is_stale(
     assert c.thrust_is_known is known
     held = CONDITIONS[Condition.MAGNET_HOLDS](c)
     assert held is known
+
+
+def pressed_late(t_s: float, late_s: float) -> Observation:
+    """A vehicle that touches something with all its thrust, seen by a late turn."""
+    sample = telemetry(t_s, CONTACT_Z_M, thrust=float(FULL_THRUST))
+    return observation(t_s, telemetry=sample, target=None, new_frame=False, loop_late_s=late_s)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.3])
+def test_a_press_ends_before_the_turn_that_would_be_too_late(late_s: float) -> None:
+    timeout_s = PROFILE.planner.perch.timeout_s
+    state = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.02)
+    state, _ = planner.step(state, pressed_late(10.0 + timeout_s - 0.2, late_s), PROFILE)
+    assert state.phase is (Phase.RECOVER if late_s else Phase.PERCH)
+
+
+def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
+    """Late turns hold a vehicle in place: by the press's own setpoint they would press on."""
+    t_s = 10.1 + PROFILE.planner.perch.timeout_s
+    saturated = {Condition.SATURATED: 10.5}
+    above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
+    state = replace(above, since=saturated, caught=True)
+    for _ in range(2):
+        state, command = planner.step(state, pressed_late(t_s, 0.3), PROFILE)
+        assert state.phase is Phase.RECOVER  # and full thrust is no sign of a heavy vehicle
+        assert state.hold
+        assert isinstance(command, PositionSetpoint)
+        assert command.z_m < CONTACT_Z_M - 0.5
+        t_s += 0.3
