@@ -29,6 +29,9 @@ half a metre. A landing goes straight down."""
 ABOVE_START_M = 0.1
 OTHERWISE_S = 0.1
 ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
+WALKED = frozenset({Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND})
+SWINGS_MPS = 0.9
+"""Nothing sinks so fast where it hovers or walks up by itself: position control swings it."""
 BELOW_S = 0.3
 WEAK_S = 2.0
 BLIND_PRESS_S = 1.25
@@ -100,6 +103,12 @@ def too_weak(c: Context) -> bool:
     return near and c.state.hover_thrust > SATURATED * press_thrust(c.profile)
 
 
+def _swings(c: Context) -> bool:
+    """Up and down, by a motion capture that is late: soon sideways, too, with a wrong attitude."""
+    by_capture = c.profile.positioning.by == "mocap"
+    return by_capture and c.state.phase in WALKED and c.climb_mps < -SWINGS_MPS
+
+
 def is_astray(c: Context) -> bool:
     """Position control leads away from its setpoint: at take-off sideways, where only a climb was
     ordered, and later farther off than any draught carries it. On a way down that began for another
@@ -110,7 +119,7 @@ def is_astray(c: Context) -> bool:
     setpoint = c.state.setpoint
     if c.profile.positioning.by == "deck" or not c.placed:
         return False
-    if c.held(Condition.OTHERWISE) >= OTHERWISE_S:
+    if c.held(Condition.OTHERWISE) >= OTHERWISE_S or _swings(c):
         return True
     if setpoint is None:
         return False
@@ -274,6 +283,11 @@ def why_astray(c: Context) -> str:
         return (
             f"the position goes {away_m:.2f} m aside at a height of {c.height_m:.2f} m: does "
             f"camera.mount have the camera turned as it is?"
+        )
+    if _swings(c):
+        return (
+            f"it swings up and down, now at {-c.climb_mps:.1f} m/s: are the positions of the "
+            f"motion capture late?"
         )
     what = f"the position goes {away_m:.2f} m aside"
     if c.held(Condition.OTHERWISE) >= 0.0:

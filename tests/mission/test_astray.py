@@ -120,6 +120,26 @@ def test_a_draught_is_not_another_world(
     assert (state.row == "position-astray") is lands
 
 
+@pytest.mark.parametrize(
+    ("phase", "climb_mps", "lands"),
+    [
+        (Phase.ASCEND, -1.0, True), (Phase.ALIGN, -1.0, True), (Phase.ASCEND, -0.7, False),
+        (Phase.ASCEND, 1.0, False), (Phase.RECOVER, -1.0, False), (Phase.APPROACH, -1.0, False),
+    ],
+)  # fmt: skip
+def test_positions_that_are_late_swing_it_up_and_down(
+    phase: Phase, climb_mps: float, lands: bool
+) -> None:
+    """A catch falls as fast, and a take-off may be set down by hand."""
+    tel = telemetry(10.02, 1.0, velocity_mps=(0.0, 0.0, climb_mps))
+    for profile in (MOCAP, PROFILE):
+        begin = state_in(phase, z_m=1.0)
+        state, _ = planner.step(begin, observation(10.02, telemetry=tel), profile)
+        assert (state.row == "position-astray") is (lands and profile is MOCAP)
+        if state.row == "position-astray":
+            assert "late" in state.reason
+
+
 def test_what_has_touched_the_ceiling_is_left_to_its_landing() -> None:
     """The magnet may hold it aside of its setpoint: that is no other world."""
     begin = replace(state_in(Phase.LANDING, z_m=1.0), contact_z_m=1.0)
