@@ -61,6 +61,9 @@ REACH_M = 0.04
 BESIDE_MEMORY_S, PUSHED_G, PUSHED_S = 0.5, 0.1, 1.5
 """In so long a difference between the speeds gained by estimate and accelerometer is forgotten. A
 push from the side shows in the accelerometer at once, and in the estimate a second or two later."""
+PUSH_MEMORY_S = 0.05
+"""The sideways force is a mean of so long: turning motors shake single samples by as much as a push
+gives, and each of these would end the comparison for `PUSHED_S`."""
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
 """Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
 the share of the way itself, since the samples of a blow come each 10 ms."""
@@ -150,6 +153,7 @@ class ImuMotion:
             and position with velocity have read the very same, as none that lives does; `-inf`
             before they first changed.
         hover_thrust: what the thrust is for each g that is felt in flight, 0..65535; 0 before it.
+        aside_g: mean sideways specific force of the last moment, body axes, without the offsets.
         pushed_s: when something last pushed it sideways: in flight only air does, by far less.
         misled_rad: roll and pitch by which corrections of the estimate turned the attitude at once;
             the motion is reckoned without them.
@@ -177,6 +181,7 @@ class ImuMotion:
     attitude_frozen_s: float = -math.inf
     place_frozen_s: float = -math.inf
     hover_thrust: float = 0.0
+    aside_g: tuple[float, float] = (0.0, 0.0)
     pushed_s: float = -math.inf
     misled_rad: tuple[float, float] = (0.0, 0.0)
     turning_radps: tuple[float, float] = (0.0, 0.0)
@@ -247,6 +252,7 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
     if abs(z - steady_mps) > STEADY_MPS:
         steady_s, steady_mps = new.t_s, z
     now = Blow(new.t_s, new.velocity_mps[2], z, new.acc_z_g)
+    aside_g = _aside_g(motion.aside_g, new, offset_g, dt_s)
     last_moment = (*(m for m in motion.last_moment if new.t_s - m.t_s <= BEFORE_BLOW_S), now)
     return ImuMotion(
         t_s=new.t_s,
@@ -267,7 +273,8 @@ def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotio
         attitude_frozen_s=attitude_frozen_s,
         place_frozen_s=place_frozen_s,
         hover_thrust=_hover_thrust(motion.hover_thrust, new, dt_s),
-        pushed_s=new.t_s if math.hypot(new.acc_x_g, new.acc_y_g) > PUSHED_G else motion.pushed_s,
+        aside_g=aside_g,
+        pushed_s=new.t_s if math.hypot(*aside_g) > PUSHED_G else motion.pushed_s,
         misled_rad=misled_rad,
         turning_radps=turning_radps,
         corrections=corrections,
@@ -311,6 +318,17 @@ def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mp
             felt_mps=min(old.felt_mps, begun.felt_mps),
         )  # fmt: skip
     return replace(old, peak_g=max(old.peak_g, new.acc_z_g)) if follows else old
+
+
+def _aside_g(
+    old_g: tuple[float, float], new: Telemetry, offset_g: Vector, dt_s: float
+) -> tuple[float, float]:
+    """The mean sideways force with one more sample."""
+    keeps, (x_g, y_g) = math.exp(-dt_s / PUSH_MEMORY_S), old_g
+    return (
+        new.acc_x_g - offset_g[0] + keeps * (x_g - new.acc_x_g + offset_g[0]),
+        new.acc_y_g - offset_g[1] + keeps * (y_g - new.acc_y_g + offset_g[1]),
+    )
 
 
 def _misled(

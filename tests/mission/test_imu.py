@@ -211,16 +211,17 @@ def test_a_fall_that_was_caught_does_not_take_it_out_of_what_a_silence_may_bring
     assert reckoning.unsure_s == late.t_s
 
 
-def beside_mps(turn: int, pushed_g: float = 0.0) -> float:
+def beside_mps(turn: int, pushed_g: float = 0.0, samples: int = 4, offset_g: float = 0.0) -> float:
     """After 0.4 s of a tilt that speeds it up by 1 m/s2, with an estimate that follows as it is, or
-    mirrored (`turn` -1), or corrected by positions after a push that it did not feel."""
+    mirrored (`turn` -1), or corrected by positions after a push that it did not feel and that so
+    many samples show. `offset_g`: what the accelerometer reads too much."""
     lean_rad = 1.0 / 9.81
-    reckoning, motion, last = Reckoning(), ImuMotion(), None
+    reckoning, motion, last = Reckoning(), ImuMotion(offset_g=(offset_g, 0.0, 0.0)), None
     for i in range(41):
         t_s = 1.0 + 0.01 * i
         new = telemetry(
             t_s, velocity_mps=(turn * 0.01 * i, 0.0, 0.0), pitch_rad=lean_rad + 1e-6 * (i % 7),
-            acc_x_g=pushed_g if i == 3 else 1e-6 * (i % 7),
+            acc_x_g=offset_g + (pushed_g if 3 <= i < 3 + samples else 1e-6 * (i % 7)),
         )  # fmt: skip
         motion = moved(motion, last, new)
         reckoning = reckoned(reckoning, motion, new, believed=True)
@@ -232,6 +233,13 @@ def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_wa
     assert beside_mps(1) < 0.05
     assert beside_mps(-1) > 0.3
     assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0
+    assert beside_mps(-1, offset_g=1.2 * PUSHED_G) > 0.3
+
+
+@pytest.mark.parametrize("pushed_g", [2.0 * PUSHED_G, -2.0 * PUSHED_G])
+def test_a_sample_that_the_motors_shook_is_no_push(pushed_g: float) -> None:
+    """It would end the comparison for as long as mirrored positions take to tumble the vehicle."""
+    assert beside_mps(-1, pushed_g=pushed_g, samples=1) > 0.25
 
 
 # --- Whether the estimate is corrected -----------------------------------------------------------
