@@ -78,6 +78,11 @@ HOVER_MEMORY_S, LEAST_FLYING, SATURATED = 0.5, 0.4, 0.95
 nothing."""
 
 
+LED_PER_S = 1.5
+"""The acceleration that wrong positions feign for each m/s by which they have led the speed astray:
+the filter on board corrects the attitude with it (docs/firmware.md, "Estimator in flight")."""
+
+
 UNCORRECTED_M2PS2_PER_S, UNCORRECTED_S = 5e-4, 0.45
 """The variance of the estimated vertical speed grows by 1e-3 a second where nothing corrects it
 (docs/firmware.md, "Variances"), by less or not at all where anything does. Growth at half that
@@ -510,6 +515,13 @@ def reckoned(
         aside_m=(ex - vx * dt_s, ey - vy * dt_s),
         aside_sigma_m=old.aside_sigma_m + growth_m,
     )
+
+
+def led_astray(old: Reckoning) -> Reckoning:
+    """The reckoning once the positions are found to be wrong: they have turned the attitude, too,
+    and nothing turns it back. In so short a time hardly any of that was learned."""
+    (bx, by, bz), (x_mps, y_mps) = old.bias_mps2, old.beside_mps
+    return replace(old, bias_mps2=(bx + LED_PER_S * x_mps, by + LED_PER_S * y_mps, bz))
 
 
 def _may_have_flown(before: ImuMotion, after: ImuMotion) -> bool:

@@ -20,6 +20,7 @@ from perchctl.mission.conditions import (
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
 from perchctl.mission.hold import hold_reason
+from perchctl.mission.imu import led_astray
 from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import catch_above_m, is_carried
 from perchctl.mission.row import Row, risen
@@ -203,7 +204,8 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
             # and by such positions the landing would speed up until it tilts over.
             capture = c.profile.positioning.by == "mocap" and old.mount.wrong
             if new.row == "position-astray" or (new.row == "mounting" and capture):
-                new = replace(new, astray=True)
+                reckoning = old.reckoning if old.astray else led_astray(old.reckoning)
+                new = replace(new, astray=True, reckoning=reckoning)
             if new.row == "mounting":
                 # The setpoint is ahead, and every centimetre there is one in a wrong direction.
                 new = replace(new, setpoint=None)

@@ -176,6 +176,22 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     assert isinstance(command, RawThrust) is state.astray
 
 
+def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motion() -> None:
+    """They have added 0.3 m/s to the left: so the attitude leans by 0.05 rad that the vehicle does
+    not, and what is reckoned by it would brake a speed that is none."""
+    felt = Felt()
+    begun = felt(observation(BEGIN_S, telemetry=telemetry(BEGIN_S)))
+    state = replace(state_in(Phase.ALIGN), last=begun.telemetry, reckoning=Reckoning(begun.imu))
+    for t_s in times(1.5):
+        if not state.astray:
+            beside = replace(state.reckoning, beside_mps=(0.0, 0.3))
+            state = replace(state, reckoning=beside)
+        tel = telemetry(t_s, roll_rad=-0.05 + 1e-6 * (round(100 * t_s) % 7))  # alive
+        state, _ = planner.step(state, felt(observation(t_s, telemetry=tel)), MOCAP)
+    assert state.row == "position-astray"
+    assert abs(state.reckoning.velocity_mps[1]) < 0.15
+
+
 def come_down(height_m: float, felt: Felt, felt_too_much_g: float) -> tuple[PlannerState, float]:
     """A vehicle in a world whose axes are swapped in the plane alone, until it meets the floor:
     with what speed, 0 if it does not."""
