@@ -182,7 +182,7 @@ class DescentBound:
         """Whether it should have come down by now and has not. What touches the ceiling before it
         has to come down may hang there, which takes its time to find out; and what hears nothing
         obeys nothing until it hears again. `lands`: it flies its own landing, whose curve starts
-        from rest, and anew with each of the three orders."""
+        from rest, and anew with each of the three orders; a landing that climbs is none."""
         if touching and t_s < self._due_s + REACTION_S:
             self._due_s = math.inf
         if not uplink:
@@ -192,8 +192,9 @@ class DescentBound:
         if self._from_m is None:
             self._from_m = height_m
         late = t_s >= self._due_s + REACTION_S + WATCHED_S
-        comes_down = lands or vz_mps < -SINKING_MPS or height_m <= max(LOW_M, self._from_m - SUNK_M)
-        return late and not comes_down
+        comes_down = vz_mps < -SINKING_MPS or height_m <= max(LOW_M, self._from_m - SUNK_M)
+        begins = lands and height_m <= self._from_m + SUNK_M
+        return late and not (comes_down or begins)
 
     def _limit_s(self, effect: Effect, phase: Phase) -> float:
         """After how long it lands for this; never where it need not."""

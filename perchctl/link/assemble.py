@@ -45,6 +45,8 @@ class Assembler:
     ) -> Telemetry | None:
         """One packet of a block, its stamp on the loop's clock and the vehicle's start that it is
         from; the sample that it completes. What a vehicle told before it started anew is over."""
+        if start < self._start:
+            return None
         if start > self._start:
             self._start, self._state_s = start, None
         self._values.update(values)

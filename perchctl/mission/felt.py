@@ -64,14 +64,15 @@ class FeltMotion:
 @dataclass(frozen=True)
 class FeltWatch:
     """`sights` of the last `WINDOW_S`, each its time and the way from body to target in body
-    axes, m. `found`: the newest judgement, and `agreed`: how many in a row say the same, `agreed_s`
-    since when. `motion`: the newest in which the sum wandered by at most `motion_within_m`."""
+    axes, m. `found`: the newest judgement, made at `found_s`, and `agreed`: how many in a row say
+    the same. Once enough agree, it stays. `motion`: the newest in which the sum wandered by at most
+    `motion_within_m`."""
 
     sights: tuple[tuple[float, Vector], ...] = ()
     judged_s: float = -math.inf
     found: Mismatch | None = None
+    found_s: float = -math.inf
     agreed: int = 0
-    agreed_s: float = -math.inf
     motion: FeltMotion | None = None
     motion_within_m: float = WANDERS_M
 
@@ -101,11 +102,11 @@ def felt(
         found = _found(wanders_m)
         agrees = found is not None and old.found is not None and _alike(found, old.found)
         agreed = 0 if found is None else old.agreed + 1 if agrees else 1
-        new = replace(new, found=found, agreed=agreed, agreed_s=t_s)
+        new = replace(new, found=found, found_s=t_s, agreed=agreed)
     i = _best_about(new.mismatch or Mismatch(), wanders_m)
     if wanders_m[i] <= new.motion_within_m:
         (vx, vy, vz), (bx, by, _) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
-        climb_mps = vz if t_s - new.agreed_s <= WINDOW_S else None
+        climb_mps = vz if t_s - new.found_s <= WINDOW_S else None
         new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by), climb_mps))
     return replace(new, judged_s=t_s)
 

@@ -24,7 +24,7 @@ ZERO: Vector = (0.0, 0.0, 0.0)
 
 GAP_S = 0.2
 """A silence in which a vehicle falls by 20 cm, or more than it may and still hang."""
-STEADY_GAIN_MPS, STEADY_WAY_M = 0.25, 0.25
+NO_FALL_MPS, NO_FALL_M = 0.25, 0.25
 """What hangs gains no more by its estimate while nothing is heard of it, beyond the speed that this
 had before. A fall of half a metre gains 3 m/s, or where the floor has taken that again, the way."""
 SINKS_MPS = -0.3
@@ -298,8 +298,8 @@ def _shows_no_fall(last: Telemetry, new: Telemetry, sunk_m: float) -> bool:
     if max(last.behind_s, new.behind_s) > GAP_S:
         return False
     if 0.0 < dt_s <= GAP_S:
-        return new.velocity_mps[2] > SINKS_MPS and sunk_m > -STEADY_WAY_M
-    return abs(gained_mps) <= STEADY_GAIN_MPS and abs(way_m) <= STEADY_WAY_M
+        return new.velocity_mps[2] > SINKS_MPS and sunk_m > -NO_FALL_M
+    return abs(gained_mps) <= NO_FALL_MPS and abs(way_m) <= NO_FALL_M
 
 
 def _struck(motion: ImuMotion, new: Telemetry, last_moment: tuple[Blow, ...], mps: float) -> Blow:
@@ -453,9 +453,8 @@ def reckoned(
         velocity_mps = estimated if believed else ZERO
         if astray:
             vx, vy, vz = old.velocity_mps
-            if (
-                old.imu is not None and imu.silent_s <= old.imu.t_s
-            ):  # only the attitude stands still
+            if old.imu is not None and imu.silent_s <= old.imu.t_s:
+                # Only the attitude stands still.
                 vz += imu.velocity_mps[2] - old.imu.velocity_mps[2]
             velocity_mps = (vx, vy, vz)
         elif not believed and old.imu is not None:

@@ -128,7 +128,7 @@ class Finding(Enum):
 LOOKED_S = 2.0
 """For so long it is looked whether a target that is seen far above tells where it is."""
 HUNG_WITHIN_M = 0.3
-MAGNET_M = 0.3
+CARRIED_WITHIN_M = 0.3
 """What carries or presses a vehicle in flight, so near below the target, is the target."""
 REPEAT_ORDER_S = 0.3
 LEAST_ORDERS, MAX_ORDERS = 3, 6
@@ -480,7 +480,7 @@ def _reckon(c: Context) -> PlannerState:
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
     held_s = c.held(Condition.CARRIED)
     flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
-    near = c.by_sight and flies and new.below_m < MAGNET_M
+    near = c.by_sight and flies and new.below_m < CARRIED_WITHIN_M
     if near and held_s >= c.profile.planner.perch.contact_dwell_s:
         # It is at the target: by late pictures it is lower.
         new = replace(

@@ -247,6 +247,7 @@ def test_a_landing_of_its_own_that_begins_slowly_is_not_overdue() -> None:
         assert not made.is_overdue(2.0 + 1e-6, 1.5, 0.0, touching=False, uplink=True)
         late = made.is_overdue(4.1, 1.5, 0.0, touching=False, uplink=True, lands=lands)
         assert late is not lands
+        assert made.is_overdue(4.1, 1.8, 0.2, touching=False, uplink=True, lands=lands)  # it climbs
     for sinking_mps, late in ((SINKING_MPS + 0.01, False), (SINKING_MPS - 0.01, True)):
         made = DescentBound((e.Hung(EVER),), SIM)
         made.begin(0.0, P.ALIGN)

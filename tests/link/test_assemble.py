@@ -42,6 +42,7 @@ def test_what_a_vehicle_told_before_it_started_anew_is_over() -> None:
     assembler.accept("state", STILL["state"], 1.0)
     assert assembler.accept("attitude", STILL["attitude"], 2.0, 1) is None
     assembler.accept("state", STILL["state"], 2.01, 1)
+    assert assembler.accept("attitude", STILL["attitude"], 1.01, 0) is None  # it came late
     sample = assembler.accept("attitude", STILL["attitude"], 2.02, 1)
     assert sample is not None
     assert (sample.start, sample.behind_s) == (1, pytest.approx(0.01))
