@@ -15,7 +15,9 @@ from perchctl.link import evidence
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.connection import Connection
 from perchctl.link.estimate import EstimateLink
+from perchctl.link.mock import MockLink
 from perchctl.sim.process.handle import SimProcess
+from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vehicle import FLYING, HL_ACTIVE, LOCKED, EmergencyStop, Land
 from tests.helpers.mission import AIRBORNE, READY, telemetry
 from tests.link.test_cflib_link import (
@@ -93,6 +95,25 @@ def test_a_failed_look_at_the_estimate_commands_nothing(sim: SimProcess) -> None
     with pytest.raises(ConnectionFailed, match="by the test"):
         link.connect()
     assert sent == [[]]
+
+
+# --- started anew ----------------------------------------------------------------------------
+
+
+def test_a_vehicle_that_has_started_anew_is_known_by_its_samples(sim: SimProcess) -> None:
+    """By its stamps over the radio; simulated in lockstep, by the firmware's own clock."""
+    with linked(sim) as link:
+        let_pass(sim, 2.0)
+        assert newest(link).start == 0
+        sim.reboot()
+        until(lambda: any(sample.start == 1 for sample in link.telemetry()))
+    vehicle = SimulatedVehicle(LOW_CEILING)
+    mock = MockLink(vehicle)
+    mock.advance_to(0.5)
+    assert mock.telemetry()[-1].start == 0
+    vehicle.firmware.reboot()
+    mock.advance_to(1.0)
+    assert mock.telemetry()[-1].start == 1
 
 
 # --- lost in flight --------------------------------------------------------------------------

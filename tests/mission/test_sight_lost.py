@@ -452,22 +452,35 @@ def test_a_contact_that_holds_is_proven_past_the_last_sight_by_what_is_felt() ->
     assert pressed_past_the_sight(climb_mps=0.5).phase is Phase.PERCH  # it rises still
 
 
-@pytest.mark.parametrize(("of_hover", "within"), [(1.25, True), (1.0, False), (0.8, True)])
+@pytest.mark.parametrize(
+    ("of_hover", "below_m", "age_s", "phase", "within"),
+    [
+        (1.25, 0.2, 0.0, Phase.RECOVER, True),
+        (0.8, 0.2, 0.0, Phase.RECOVER, True),
+        (1.0, 0.2, 0.0, Phase.RECOVER, False),
+        (1.25, 0.2, 0.6, Phase.RECOVER, True),  # and it is held in place
+        (1.25, 0.5, 0.0, Phase.RECOVER, False),  # by something else
+        (0.8, 0.2, 0.0, Phase.LANDING, False),  # by a hover thrust that is wrong
+    ],
+)
 def test_what_is_felt_to_be_held_is_within_reach_whatever_late_pictures_say(
-    of_hover: float, within: bool
+    of_hover: float, below_m: float, age_s: float, phase: Phase, within: bool
 ) -> None:
-    """They have the target 0.2 m above. In the air so much thrust would lift it, or so little let
-    it sink, and from there no way down is told that nobody felt."""
-    felt, state = Felt(), state_in(Phase.RECOVER, z_m=HANG_Z_M - 0.2)
+    """They have the target above. In the air so much thrust would lift it, or so little let it
+    sink, and from there no way down is told that nobody felt."""
+    felt, state, z_m = Felt(), state_in(phase, z_m=HANG_Z_M - below_m), HANG_Z_M - below_m
     for i in range(round(0.9 / TURN_S)):
         t_s = BEGIN_S + TURN_S * (i + 1)
-        tel = telemetry(t_s, HANG_Z_M - 0.2, thrust=of_hover * HOVER_THRUST)
+        tel = telemetry(t_s, z_m, thrust=of_hover * HOVER_THRUST)
         target = target_at(t_s, body_m=tel.position_m)
-        obs = observation(t_s, telemetry=tel, target=target, new_frame=TURN_S * i < 0.3)
+        obs = observation(
+            t_s, telemetry=tel, target=target, new_frame=TURN_S * i < 0.2, position_age_s=age_s
+        )
         state, _ = planner.step(state, felt(obs), PROFILE)
     assert (state.reach_s is not None) is within
-    landing = lander.begun(state, obs, PROFILE)
-    assert (lander.reach_of(Context(landing, obs, PROFILE)) is lander.Reach.MAGNET) is within
+    if within:
+        landing = lander.begun(state, obs, PROFILE)
+        assert lander.reach_of(Context(landing, obs, PROFILE)) is lander.Reach.MAGNET
 
 
 @pytest.mark.parametrize(("aside_m", "sigma_m"), [(0.03, 1e-3), (0.02, 0.01), (0.0, math.inf)])
