@@ -233,6 +233,7 @@ def test_an_estimate_that_moves_otherwise_than_it_feels_is_told_from_one_that_wa
     assert beside_mps(1) < 0.05
     assert beside_mps(-1) > 0.3
     assert beside_mps(-1, pushed_g=2.0 * PUSHED_G) == 0.0
+    assert beside_mps(-1, pushed_g=0.09, samples=20) == 0.0  # a gust of 1 m/s in a second
     assert beside_mps(-1, offset_g=1.2 * PUSHED_G) > 0.3
 
 
