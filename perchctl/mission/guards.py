@@ -30,7 +30,7 @@ ABOVE_START_M = 0.1
 OTHERWISE_S = 0.1
 ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
 WALKED = frozenset({Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND})
-SWINGS_MPS = 0.9
+SWINGS_MPS = 0.5
 """Nothing sinks so fast where it hovers or walks up by itself: position control swings it."""
 BELOW_S = 0.3
 WEAK_S = 2.0

@@ -123,7 +123,7 @@ def test_a_draught_is_not_another_world(
 @pytest.mark.parametrize(
     ("phase", "climb_mps", "lands"),
     [
-        (Phase.ASCEND, -1.0, True), (Phase.ALIGN, -1.0, True), (Phase.ASCEND, -0.7, False),
+        (Phase.ASCEND, -0.6, True), (Phase.ALIGN, -1.0, True), (Phase.ASCEND, -0.4, False),
         (Phase.ASCEND, 1.0, False), (Phase.RECOVER, -1.0, False), (Phase.APPROACH, -1.0, False),
     ],
 )  # fmt: skip
