@@ -399,6 +399,11 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
     if state.last is not None and obs.t_s - state.t_s > profile.positioning.hold_s:
         # After a hang everything from before is stale; dwell times begin anew.
         kept = {name: s for name, s in state.since.items() if name in KEPT_OVER_A_CHANGE}
+        off_s = max(obs.imu.off_s, obs.imu.silent_s)
+        if Condition.DOWN in state.since and math.isfinite(off_s):
+            # Each sample of the hang has come, and in none do the motors turn: a loop that hangs
+            # in every turn would never see a landing end.
+            kept[Condition.DOWN] = max(off_s, state.since[Condition.DOWN])
         stale_s = obs.t_s if profile.positioning.by == "target" else state.stale_s
         state = replace(state, since=kept, stale_s=stale_s, caught=True)
     if Context(state, obs, profile).position_age_s > profile.positioning.hold_s:

@@ -197,6 +197,29 @@ def test_a_landing_that_is_proven_stops_the_motors(z_m: float) -> None:
     assert any(isinstance(c, StopMotors) for c in sent)
 
 
+@pytest.mark.parametrize(
+    ("thrust", "heard", "ends"),
+    [(0.0, True, Phase.LANDED), (0.0, False, Phase.LANDING), (5000.0, True, Phase.LANDING)],
+)
+def test_a_loop_that_hangs_in_every_turn_sees_a_landing_end(
+    thrust: float, heard: bool, ends: Phase
+) -> None:
+    """Each turn is longer than what makes the samples from before it stale; those of the turn
+    itself have come, and tell whether the motors were off all the time."""
+    state, felt, turn_s = state_in(Phase.LANDING), Felt(), PROFILE.positioning.hold_s + 0.15
+    samples = int(turn_s / 0.01)
+    for i in range(1, 8 * samples):
+        tel = telemetry(10.0 + 0.01 * i, 0.02, thrust=0.0, supervisor=READY)
+        if i % samples == samples - 5:
+            tel = replace(tel, thrust=thrust)  # as something gives it shortly before each turn
+        obs = observation(tel.t_s, telemetry=tel, target=None)
+        if heard or i % samples < 2:
+            obs = felt(obs)
+        if i % samples == 0:
+            state, _ = planner.step(state, obs, PROFILE)
+    assert state.phase is ends
+
+
 # --- How old a word may be -----------------------------------------------------------------------
 
 
