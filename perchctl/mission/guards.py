@@ -14,6 +14,7 @@ from perchctl.mission.conditions import (
 )
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.hold import unplaced
+from perchctl.mission.imu import PUSHED_S
 from perchctl.mission.mounting import explained
 from perchctl.mission.state import Condition, Phase
 
@@ -25,7 +26,7 @@ LIFTED_M, SIDEWAYS_M = 0.05, 0.12
 LOW_M, ASTRAY_LOW_M, ASTRAY_LANDING_M, ASTRAY_M = 0.3, 0.22, 0.4, 0.8
 """As long as nothing but a climb was ordered, a vehicle stays within a few centimetres of its
 place (7 cm in simulated flights); later a setpoint is walked ahead of it, and a blow may carry it
-half a metre. A landing goes straight down."""
+half a metre, as does a gust. A landing goes straight down."""
 ABOVE_START_M = 0.1
 OTHERWISE_S = 0.1
 ONLY_UP = frozenset({Phase.APPROACH, Phase.SEARCH, Phase.ESTIMATE})
@@ -132,7 +133,13 @@ def is_astray(c: Context) -> bool:
         return away_m > SIDEWAYS_M
     if c.state.phase is Phase.LANDING:
         return away_m > ASTRAY_LANDING_M
-    return away_m > (ASTRAY_LOW_M if c.height_m < LOW_M or _only_climbs(c) else ASTRAY_M)
+    stays = c.height_m < LOW_M or (_only_climbs(c) and not _is_pushed(c))
+    return away_m > (ASTRAY_LOW_M if stays else ASTRAY_M)
+
+
+def _is_pushed(c: Context) -> bool:
+    """By moving air, which leads a vehicle as far off as wrong positions do, and is felt."""
+    return c.obs.imu.t_s - c.obs.imu.pushed_s <= PUSHED_S
 
 
 def _only_climbs(c: Context) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.mission import planner
 from perchctl.mission.conditions import OTHERWISE_MPS
-from perchctl.mission.imu import Reckoning
+from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.lander import LEAST_ORDERS
 from perchctl.mission.state import Phase, PlannerState
 from perchctl.vehicle import HL_ACTIVE, RawThrust, StopMotors
@@ -117,6 +117,19 @@ def test_a_draught_is_not_another_world(
     tel = telemetry(10.02, position_m=(aside_m, 0.0, z_m))
     obs = observation(10.02, telemetry=tel)
     state, _ = planner.step(state_in(phase, z_m=z_m), obs, MOCAP)
+    assert (state.row == "position-astray") is lands
+
+
+@pytest.mark.parametrize(("z_m", "pushed_s", "lands"), [
+    (0.5, 9.5, False), (0.5, 8.0, True), (0.2, 9.5, True),
+])  # fmt: skip
+def test_what_a_gust_carries_off_is_not_in_another_world(
+    z_m: float, pushed_s: float, lands: bool
+) -> None:
+    """Moving air is felt as a force from the side. Near the floor nothing asks for it."""
+    tel = telemetry(10.02, position_m=(0.3, 0.0, z_m))
+    obs = observation(10.02, telemetry=tel, imu=ImuMotion(t_s=10.02, pushed_s=pushed_s))
+    state, _ = planner.step(state_in(Phase.ESTIMATE, z_m=0.5), obs, MOCAP)
     assert (state.row == "position-astray") is lands
 
 
