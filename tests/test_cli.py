@@ -193,6 +193,7 @@ def test_nobody_is_asked_before_the_camera_answers(
     assert "clear?" not in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("terminal")
 @pytest.mark.parametrize(("answer", "flies"), [("n", False), ("", False), ("y", True)])
 def test_only_a_yes_is_consent(
@@ -294,6 +295,7 @@ def eyes() -> Iterator[str]:
         yield sim.stream_url
 
 
+@pytest.mark.long
 def test_a_silent_peer(profile: str, eyes: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
         mute.bind(("127.0.0.1", 0))
@@ -313,6 +315,7 @@ def test_a_radio_that_is_not_there(profile: str, eyes: str) -> None:
     assert "no Crazyradio is plugged in" in said.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("link", "code", "words"),
     [
@@ -342,6 +345,7 @@ def grounded() -> Iterator[SimProcess]:
         assert sim.truth()["position_m"][2] < 0.05
 
 
+@pytest.mark.long
 def test_a_calibration_of_another_size(tmp_path: Path) -> None:
     source = pictures(tmp_path / "p", (320, 240))
     said = run("fly", "-p", SHORT, "--source", source)
@@ -350,6 +354,7 @@ def test_a_calibration_of_another_size(tmp_path: Path) -> None:
         assert word in said.complaint
 
 
+@pytest.mark.long
 def test_a_recording_that_ends_before_take_off(tmp_path: Path) -> None:
     source = pictures(tmp_path / "p", count=1)
     said = run("fly", "-p", SHORT, "--source", source)

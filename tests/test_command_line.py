@@ -313,6 +313,7 @@ def test_an_ignored_ctrl_c_stays_ignored() -> None:
 # --- A full disk --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "words", [["--help"], ["fly", "--dry-run"], ["fly", "--dry-run", "--json"]]
 )

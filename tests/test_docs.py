@@ -189,12 +189,14 @@ ONCE = {tuple(cheap(line)): line for line in command_lines() if not line.startsw
 LONG = (
     "perchctl log plot",
     "perchctl log compare",
+    "perchctl log export --csv",
     "perchctl simulate",
     "perchctl calibrate images:april",
     "perchctl calibrate aideck:",
     "perchctl calibrate images:board --measured",
     "perchctl fit-weights --collect",
     "perchctl make-target --camera",
+    "perchctl make-target -p target_only --camera",
     "python docs/pictures/make.py",
 )
 

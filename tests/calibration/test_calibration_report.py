@@ -55,6 +55,7 @@ def texts(figure: Figure) -> dict[Text, tuple[float, float, float, float]]:
     return found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", ["rational_polynomial", "fisheye"])
 def test_every_text_can_be_read(model: ModelName) -> None:
     result = calibrated(model)

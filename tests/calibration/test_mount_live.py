@@ -107,6 +107,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     assert "lacks motion" in again.stderr
 
 
+@pytest.mark.long
 def test_a_vehicle_that_does_not_answer(
     sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,6 +30,7 @@ def wrong(since_s: float, for_s: float = FOR_EVER_S, **what: Any) -> dict[str, A
     return {"faults": ((since_s, since_s + for_s, CaptureFault(**what)),)}
 
 
+@pytest.mark.long
 def test_it_perches_in_another_world_though_the_body_is_hidden_for_a_moment() -> None:
     """Turned and shifted against the vehicle's own start, 0.3 s without a position."""
     it = flown(heading_rad=2.0, **wrong(IN_ALIGN_S, 0.3, occluded=True))

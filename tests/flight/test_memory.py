@@ -28,6 +28,7 @@ def held_mb(profile: Profile, seed: int) -> float:
     return int(STATM.read_text().split()[1]) * resource.getpagesize() * 1e-6
 
 
+@pytest.mark.long
 def test_a_peak_stays() -> None:
     before_mb = peak_memory_mb()
     block = bytearray(b"x") * int(1e6 * (before_mb + 60.0))  # more than was ever held

@@ -105,6 +105,7 @@ def test_each_source_that_is_opened_by_a_profile_is_turned_right(tmp_path: Path)
         np.testing.assert_array_equal(frame.image, image[:, ::-1] if mirrored else image)
 
 
+@pytest.mark.long
 def test_a_flight_with_a_camera_that_mirrors_perches() -> None:
     flown = fly_short({"camera.mirrored": True})
     assert flown.report.phase is Phase.PERCHED

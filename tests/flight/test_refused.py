@@ -71,6 +71,7 @@ def test_where_none_took_off_it_is_not_the_seeds() -> None:
     assert "every flight was refused before take-off: the battery is flat" in str(problem)
 
 
+@pytest.mark.long
 def test_the_command_says_so_after_its_table(tmp_path: Path) -> None:
     flat = tmp_path / "flat.yaml"
     flat.write_text(f"extends: {SHORT}\nsimulation:\n  battery_rest_v: [3.2, 3.3]\n")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.mission.watch import Event, Tick
@@ -38,6 +39,7 @@ def flown(log: Path | None) -> tuple[LockstepFlight, Shown]:
     return fly_lockstep(short_profile({}), SEED, log, watchers=(shown,)), shown
 
 
+@pytest.mark.long
 def test_the_planner_is_shown_the_same(tmp_path: Path) -> None:
     (bare, unlogged), (whole, logged) = flown(None), flown(tmp_path / "flight.jsonl")
     assert unlogged.commands == logged.commands

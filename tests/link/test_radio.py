@@ -126,7 +126,10 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return tmp_path_factory.getbasetemp() / "cache"
 
 
-@pytest.fixture(scope="module", params=[radiodriver.RadioDriver, OpaqueRadio])
+@pytest.fixture(
+    scope="module",
+    params=[radiodriver.RadioDriver, pytest.param(OpaqueRadio, marks=pytest.mark.long)],
+)
 def connected(request: pytest.FixtureRequest, cache: Any) -> Iterator[Flown]:
     with connection_by(request.param, cache) as flown:
         yield flown
@@ -297,6 +300,7 @@ def test_a_late_error_of_a_driver_that_was_given_up_does_not_end_the_next(flown:
     flown.heard_after_s(LAND, began_s)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("driver", [radiodriver.RadioDriver, OpaqueRadio])
 def test_the_end_of_the_first_driver_is_one_of_many(driver: type[Any], cache: Any) -> None:
     """The one that cflib opened, with cflib's own word for its end: what cflib then forgets, nobody

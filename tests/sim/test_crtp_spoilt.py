@@ -91,6 +91,7 @@ def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
             client.close()
 
 
+@pytest.mark.long
 def test_a_lost_packet_hangs_cflibs_connect(toc_cache: str) -> None:
     """Row "UdpDriver sets needs_resending=False: with loss a connect can hang for ever"."""
     link = LinkOptions(loss_rate=0.02, loss_seed=3)

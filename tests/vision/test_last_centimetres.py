@@ -60,6 +60,7 @@ def test_an_ascent_is_measured_to_the_end(build: Any, along: str) -> None:
     assert claimed.max() < 5e-4
 
 
+@pytest.mark.long
 def test_without_it_the_last_centimetres_are_blind(build: Any) -> None:
     rows = ascent(build, "height", with_attitude=True, cut=False)
     assert not any(o.poses for z, o in rows if z < 0.05)

@@ -39,6 +39,7 @@ def test_the_known_weights_come_back_through_the_file(tmp_path: Path) -> None:
         assert found["lms"][axis] == pytest.approx(found["closed_form"][axis], abs=0.01)
 
 
+@pytest.mark.long
 def test_weights_go_to_a_file_and_from_there_into_a_flight(session: Path, tmp_path: Path) -> None:
     out, plot = tmp_path / "w.yaml", tmp_path / "w.png"
     first = run(session, "-o", out, "--plot", plot)
@@ -138,6 +139,7 @@ def test_figures_have_three_digits_and_no_exponent(value: float, text: str) -> N
     assert figure(value) == text
 
 
+@pytest.mark.long
 def test_what_is_not_written_is_said(session: Path, tmp_path: Path) -> None:
     assert "no file written: name one with -o" in run(session).stderr
     bad = write(independent(3, small=(0.5,) * 4), tmp_path / "s.csv")

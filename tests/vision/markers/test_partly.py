@@ -281,6 +281,7 @@ def test_a_marker_that_fills_the_picture_is_known_by_its_cells_as_the_lens_bends
         assert np.abs(found.corners_px - true).max() < 0.5
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known_by", ["track", "bits", "other"])
 def test_where_cells_cannot_be_enough_no_fit_is_tried(known_by: KnownBy) -> None:
     # Of what a fit from 10 px beside would have taken, nothing is turned down beforehand.
