@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from perchctl.faults.effects import Effect, Reboots
@@ -16,6 +17,8 @@ LEAST_LIFT = 1.02
 """Over the weight: with less nothing is held in the air."""
 CUT_S = 1.9
 """Silence for longer ends in the firmware's cut (2.0 s after the last setpoint)."""
+LOCKS_S = 0.1
+"""The lock shows that much later than the cut: what arrives meanwhile prevents nothing."""
 TOPPLES_S, TOPPLED_UP_Z = 0.3, 0.5
 """Motors that stand still take longer than that to turn fast enough for any control."""
 WATCH_WITHIN_S = 0.1
@@ -68,6 +71,7 @@ class FactsRecorder:
         self._min_load_v = profile.safety.min_load_v
         self._vehicle = vehicle
         self._silent_s: float | None = None  # since when nothing has arrived
+        self._heard_s = -math.inf  # when the newest silence ended that was long enough for a cut
         self._landed_alone = self._locked_before = False
         self._hangs_s: float | None = None  # since when the whole weight has hung
         self._before: Sample | None = None
@@ -98,10 +102,14 @@ class FactsRecorder:
         long = self._silent_s is not None and s.t_s - self._silent_s >= CUT_S
         if long and self._landed_alone:
             self.own_landing = True
-        if long and s.locked and self.cut_s is None and not self._locked_before:
+        locks = s.locked and not self._locked_before
+        ordered = self._vehicle.firmware.supervisor.emergency  # by a packet, not by silence
+        late = s.t_s - self._heard_s <= LOCKS_S and not ordered
+        if locks and (long or late) and self.cut_s is None:
             self.cut_s = s.t_s
         self._locked_before = s.locked
         if s.uplink:
+            self._heard_s = s.t_s if long else self._heard_s
             self._silent_s = None
         elif self._silent_s is None:
             self._silent_s = s.t_s

@@ -71,6 +71,7 @@ class Recorded:
     def __init__(self, rest_v: float = 4.1) -> None:
         self.magnet = SimpleNamespace(let_go=False)
         self.planner = SimpleNamespace(active=False)
+        self.supervisor = SimpleNamespace(emergency=False)
         self.world = SimpleNamespace(
             magnet=self.magnet,
             powertrain=SimpleNamespace(strength=None),
@@ -79,7 +80,7 @@ class Recorded:
         )
         vehicle: Any = SimpleNamespace(
             world=self.world,
-            firmware=SimpleNamespace(planner=self.planner),
+            firmware=SimpleNamespace(planner=self.planner, supervisor=self.supervisor),
             scenario=SimpleNamespace(mass_kg=0.04),
         )
         self.recorder = FactsRecorder(vehicle, PROFILE)
@@ -122,6 +123,24 @@ def test_a_lock_that_no_silence_brought_is_no_cut(before: dict[str, Any]) -> Non
     it = Recorded().show(HOVER, 1.0, locked=before["locked"])
     it.show(HOVER, before["silent_s"], uplink=False, locked=before["locked"])
     assert it.show(HOVER, 1.0, uplink=False, locked=True).recorder.cut_s is None
+
+
+@pytest.mark.parametrize(
+    ("silent_s", "heard_s", "emergency", "cut"),
+    [
+        (2.0, 0.05, False, True), (2.0, 0.05, True, False), (2.0, 0.2, False, False),
+        (1.8, 0.05, False, False),
+    ],
+)  # fmt: skip
+def test_a_cut_shows_only_after_the_silence_that_brought_it(
+    silent_s: float, heard_s: float, emergency: bool, cut: bool
+) -> None:
+    """A program that goes on as the firmware cuts is heard before the lock shows. What it
+    orders itself then is no cut."""
+    it = Recorded().show(HOVER, 1.0).show(HOVER, silent_s, uplink=False).show(HOVER, heard_s)
+    it.supervisor.emergency = emergency
+    it.show(HOVER, 1.0, locked=True)
+    assert (it.recorder.cut_s is not None) is cut
 
 
 def test_a_landing_of_the_vehicle_s_own_is_kept_that_began_before_the_silence() -> None:
