@@ -17,8 +17,9 @@ FAR_BELOW_M = 0.5
 PUT_RIGHT_S = 0.5
 """Once positions from outside come again, the estimate is drawn back to them for so long: its
 steps and its speed are not the vehicle's."""
-CORRECTED_S, BLOWN_MPS = 0.2, 0.3
-"""An estimate that the newest sights agree with is no farther from the felt speed."""
+CORRECTED_S, BLOWN_MPS = 0.2, 0.2
+"""An estimate that the newest sights agree with is no farther from the felt speed: 0.06 m/s in
+flights without a fault."""
 ANSWER_S = 0.2
 """A raw thrust that is ordered shows in the telemetry within that."""
 HANGING_S = 1.0
