@@ -405,7 +405,9 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
             # in every turn would never see a landing end.
             kept[Condition.DOWN] = max(off_s, state.since[Condition.DOWN])
         stale_s = obs.t_s if profile.positioning.by == "target" else state.stale_s
-        state = replace(state, since=kept, stale_s=stale_s, caught=True)
+        # A catch is over, and its setpoint far above with it: held, it would press.
+        setpoint = state.setpoint if state.caught else None
+        state = replace(state, since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
     if Context(state, obs, profile).position_age_s > profile.positioning.hold_s:
         state = replace(state, stale_s=obs.t_s)
     if obs.jumped:

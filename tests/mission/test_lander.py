@@ -446,6 +446,10 @@ def test_after_a_hang_everything_from_before_is_stale(positioning: str) -> None:
         assert (planner.Condition.DOWN in after.since) is not stale
         assert planner.Condition.BATTERY_LOW in after.since
         assert after.caught is stale
+        # That of a catch is far above, and would press; any other is held.
+        assert (after.setpoint is None) is stale
+        held = replace(state, caught=True)
+        assert lander.observed(held, obs, profile).setpoint == held.setpoint
         if positioning == "target":
             assert (after.blind_s is not None) is stale
 
