@@ -193,7 +193,6 @@ def test_nobody_is_asked_before_the_camera_answers(
     assert "clear?" not in capsys.readouterr().err
 
 
-@pytest.mark.long
 @pytest.mark.usefixtures("terminal")
 @pytest.mark.parametrize(("answer", "flies"), [("n", False), ("", False), ("y", True)])
 def test_only_a_yes_is_consent(

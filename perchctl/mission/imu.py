@@ -63,8 +63,8 @@ BESIDE_MEMORY_S, PUSHED_G, PUSHED_S = 0.5, 0.06, 1.5
 push from the side shows in the accelerometer at once, and in the estimate a second or two later."""
 PUSH_MEMORY_S = 0.05
 """The sideways force is a mean of so long, since turning motors shake single samples by as much as
-a push gives, and each of these would end the comparison for `PUSHED_S`. So
-their limit is below what a gust of 1 m/s in a second gives, 0.09 g."""
+a push gives, and each of these would end the comparison for `PUSHED_S`. Of that mean the limit is
+below what a gust gives that gains 1 m/s in a second, 0.09 g."""
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
 """Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
 the share of the way itself, since the samples of a blow come each 10 ms."""

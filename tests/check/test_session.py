@@ -50,7 +50,6 @@ def test_a_library_that_does_not_load_ends_the_check_as_it_ends_a_flight() -> No
 # --- What goes out ----------------------------------------------------------------------
 
 
-@pytest.mark.long
 def test_nothing_arms_flies_or_turns_without_a_yes(sim: SimProcess, relay: Relay) -> None:
     """The whole check, from the first packet to the last, through the wire."""
     asked: list[str] = []
@@ -85,7 +84,6 @@ def test_a_yes_starts_the_motor_test_and_nothing_else(sim: SimProcess, relay: Re
     sim.replace_vehicle(Scenario())  # the test goes on in this one, which is deaf meanwhile
 
 
-@pytest.mark.long
 def test_a_flying_vehicle_s_motors_are_not_even_asked_for(sim: SimProcess, relay: Relay) -> None:
     asked: list[str] = []
     wait_for(sim, 1.5)

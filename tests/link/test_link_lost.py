@@ -100,7 +100,6 @@ def test_a_failed_look_at_the_estimate_commands_nothing(sim: SimProcess) -> None
 # --- started anew ----------------------------------------------------------------------------
 
 
-@pytest.mark.long
 def test_a_vehicle_that_has_started_anew_is_known_by_its_samples(sim: SimProcess) -> None:
     """By its stamps over the radio; simulated in lockstep, by the firmware's own clock."""
     with linked(sim) as link:

@@ -183,6 +183,19 @@ def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
         assert x * vy_mps - y * vx_mps == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize(("felt_mps", "lands"), [(0.15, False), (0.25, True)])
+def test_a_vehicle_that_moves_otherwise_than_its_estimate_is_not_held_by_it(
+    felt_mps: float, lands: bool
+) -> None:
+    """By such an estimate it would hold its place at that speed: 0.25 m/s is 1 m aside by the
+    time it is down."""
+    reckoning = Reckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=(felt_mps, 0.0, 0.0))
+    begin = replace(state_in(Phase.RECOVER), t_s=BEGIN_S, reckoning=reckoning)
+    obs = unseen(BEGIN_S + TURN_S, 1.0, 0.6, imu=ImuMotion(t_s=BEGIN_S + TURN_S))
+    state, _ = planner.step(begin, obs, PROFILE)
+    assert (state.row == "position-lost") is lands
+
+
 @given(aside_g=st.floats(-1.0, 1.0), ahead_g=st.floats(-1.0, 1.0), yaw_rad=st.floats(-3.1, 3.1))
 def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked(
     aside_g: float, ahead_g: float, yaw_rad: float
