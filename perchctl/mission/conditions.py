@@ -119,6 +119,15 @@ def contact_aside_m(c: Context) -> tuple[float, float]:
     return math.hypot(*reckoning.aside_m), sigma_m
 
 
+def touched_aside_m(c: Context) -> tuple[float, float] | None:
+    """The same as it was when a press that it backs off from met the target's height: what has
+    not come down since is still there, wherever the estimate has drifted to. None if it has."""
+    state = c.state
+    if state.phase is not Phase.RECOVER or state.contact_aside_m is None:
+        return None
+    return state.contact_aside_m, state.contact_sigma_m
+
+
 def contact_within_m(c: Context) -> float:
     """How far from the target's height a gear may seem to be that touches it: the contact's
     tolerance, and what the estimate may have drifted by since the last sight, bounded."""

@@ -11,6 +11,7 @@ from perchctl.mission.conditions import (
     contact_within_m,
     is_at_target,
     press_thrust,
+    touched_aside_m,
 )
 from perchctl.mission.context import HANGING_S, Context
 from perchctl.mission.hold import unplaced
@@ -195,13 +196,28 @@ def is_beside_magnet(c: Context) -> bool:
 
 
 def is_caught(c: Context) -> bool:
-    """The target's magnet holds it already."""
-    return c.held(Condition.HANGING) >= HANGING_S and is_at_target(c)
+    """The target's magnet holds it already: it hangs at the target, or where it met the target's
+    height, as far as its place there was known to within the magnet's radius."""
+    if c.held(Condition.HANGING) < HANGING_S:
+        return False
+    touched = touched_aside_m(c)
+    radius_m = c.profile.planner.perch.contact_xy_m
+    return is_at_target(c) or (touched is not None and max(touched) <= radius_m)
 
 
 def is_held(c: Context) -> bool:
-    """Something else than the target's magnet holds it: a hand, a net, another ceiling."""
+    """Something holds it: the magnet, a hand, a net, another ceiling."""
     return c.held(Condition.HANGING) >= HELD_S
+
+
+def is_held_elsewhere(c: Context) -> bool:
+    """Something else than the target's magnet holds it: it does not hang where it met the target's
+    height, or that was surely beside the magnet."""
+    touched = touched_aside_m(c)
+    if touched is None:
+        return is_held(c)
+    aside_m, sigma_m = touched
+    return is_held(c) and aside_m - sigma_m > c.profile.planner.perch.contact_xy_m
 
 
 def why_held(c: Context) -> str:
@@ -210,6 +226,16 @@ def why_held(c: Context) -> str:
         return "something holds it, and where the target is is not known"
     below = f"{abs(c.error_z_m):.2f} m {'below' if c.error_z_m >= 0.0 else 'above'}"
     return f"something holds it {below} and {aside_m:.2f} m aside of the target"
+
+
+def why_hangs_at_contact(c: Context) -> str:
+    aside_m, sigma_m = touched_aside_m(c) or contact_aside_m(c)
+    if not math.isfinite(sigma_m):
+        return "it hangs where it made contact, how far aside of the target is not known"
+    return (
+        f"it hangs where it made contact, {1e3 * aside_m:.0f} +- {1e3 * sigma_m:.0f} mm aside of "
+        f"the target"
+    )
 
 
 def why_beside_magnet(c: Context) -> str:

@@ -15,7 +15,9 @@ from perchctl.mission.conditions import (
     KEPT_OVER_A_CHANGE,
     conditions_since,
     contact_aside_m,
+    contact_within_m,
     hovers,
+    touched_aside_m,
 )
 from perchctl.mission.context import Context
 from perchctl.mission.guidance import presses
@@ -176,7 +178,7 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
     obs = c.obs
     match new.phase:
         case Phase.COMPLETE:
-            aside_m, sigma_m = contact_aside_m(c)
+            aside_m, sigma_m = touched_aside_m(c) or contact_aside_m(c)
             return replace(
                 new,
                 contact_z_m=obs.telemetry.position_m[2],
@@ -187,11 +189,15 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
         case Phase.RECOVER:
             z_m = obs.telemetry.position_m[2]
             blocked_z_m = z_m if new.row == "blocked" else old.blocked_z_m
-            touched = old.phase is Phase.PERCH or new.row == "blocked"
+            pressed = old.phase is Phase.PERCH
+            touched = pressed or new.row == "blocked"
+            at_height = pressed and abs(c.error_z_m) <= contact_within_m(c)
+            aside_m, sigma_m = contact_aside_m(c)
             return replace(
                 new,
                 stopped_s=None,
-                contact_aside_m=None,
+                contact_aside_m=aside_m if at_height else None,
+                contact_sigma_m=sigma_m,
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,

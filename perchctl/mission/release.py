@@ -144,4 +144,4 @@ def left_contact(c: Context, below_m: float) -> Context:
     contact_z_m = c.state.contact_z_m
     if contact_z_m is None or c.obs.telemetry.position_m[2] >= contact_z_m - below_m:
         return c
-    return Context(replace(c.state, contact_z_m=None), c.obs, c.profile)
+    return Context(replace(c.state, contact_z_m=None, contact_aside_m=None), c.obs, c.profile)

@@ -225,7 +225,7 @@ class PlannerState:
     battery: BatteryOutlook = field(default_factory=BatteryOutlook)  # what that is enough for
     reckoning: Reckoning = field(default_factory=Reckoning)  # speed and place by the accelerometer
     reach_s: float | None = None  # within the magnet's reach since
-    contact_aside_m: float | None = None  # gear to the target's axis, as contact was proven
+    contact_aside_m: float | None = None  # gear to the target's axis, as it made contact
     contact_sigma_m: float = 0.0  # standard deviation of that
     heading_lost: bool = False  # position control would lead away from its setpoint
     blind_s: float | None = None  # accelerometer and attitude are all there is, since

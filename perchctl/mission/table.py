@@ -17,6 +17,7 @@ from perchctl.mission.guards import (
     is_blocked_off_target,
     is_caught,
     is_held,
+    is_held_elsewhere,
     is_watched,
     pressed_blindly,
     presses_too_long,
@@ -27,6 +28,7 @@ from perchctl.mission.guards import (
     too_weak,
     why_beside_magnet,
     why_contact,
+    why_hangs_at_contact,
     why_held,
     why_not_found,
     why_pressed_blindly,
@@ -64,8 +66,12 @@ TABLE: tuple[Row, ...] = (
         is_caught, P.COMPLETE, "hanging on the magnet already",
     ),
     Row(
-        HELD, only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER), is_held,
-        P.LANDING, why_held, S.LAND, O.SAFETY,
+        HELD, only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
+        is_held_elsewhere, P.LANDING, why_held, S.LAND, O.SAFETY,
+    ),
+    Row(
+        "hangs-at-contact", only(P.RECOVER), is_held, P.LANDING, why_hangs_at_contact,
+        S.LAND, O.SAFETY,
     ),
     # --- something is in the way -----------------------------------------------
     Row(
@@ -219,7 +225,7 @@ TABLE: tuple[Row, ...] = (
     Row(
         "hung", only(P.LANDING),
         lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.HANGS, P.PERCHED,
-        "the magnet holds: hanging with the motors off",
+        "hanging with the motors off",
     ),
     Row(
         "landed", only(P.LANDING),

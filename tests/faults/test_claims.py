@@ -18,6 +18,7 @@ from perchctl.faults.claims import (
     claims_of,
     claims_of_rescue,
 )
+from perchctl.faults.oracle import SAY_OFF
 from perchctl.flight.loop import RESCUED
 from perchctl.mission.lander import Finding
 from perchctl.mission.state import TERMINALS, MotorStop, Outcome, Phase
@@ -49,9 +50,7 @@ def test_a_row_claims_what_its_sentence_says(name: str) -> None:
         said = {"locked": "locked", "tilted": "tilted", "motors cut": "motors off"}
         for word, claim in said.items():
             assert (word in row.reason) <= (claim in claims), row.reason
-        assert ("motors off" in row.reason) <= bool(
-            claims & {"hangs on the target", "hangs", "stands", "hangs or stands", "motors off"}
-        )
+        assert ("motors off" in row.reason) <= bool(claims & {"hangs on the target", *SAY_OFF})
 
 
 @pytest.mark.parametrize("outcome", Outcome)
@@ -93,7 +92,7 @@ def test_what_a_rescue_says_counts_too(found: Finding | None) -> None:
     claims = claims_of_rescue(note(f"ValueError{RESCUE}{RESCUED[found]}"))
     words = {
         "stands on the floor": "stands", "hangs on the magnet": "hangs",
-        "something holds the vehicle": "hangs",
+        "something holds the vehicle": "held off the target",
         "whether the vehicle hangs or stands": "hangs or stands",
         "could not be confirmed": "not seen down",
     }  # fmt: skip

@@ -196,9 +196,7 @@ def test_what_hangs_when_the_attempts_are_used_up_is_not_said_to_have_landed() -
     assert flown.flight.hanging
     assert flown.way[-3:] == ["RECOVER", "LANDING", "PERCHED"]
     assert flown.report.outcome is Outcome.ATTEMPTS_USED_UP
-    assert flown.report.reason == (
-        "all perching attempts are used up; the magnet holds: hanging with the motors off"
-    )
+    assert flown.report.reason == ("all perching attempts are used up; hanging with the motors off")
     assert flown.report.attempts == 1
     assert "left hanging" in EXIT_CODES[EXIT_CODE_OF[flown.report.outcome]]
 

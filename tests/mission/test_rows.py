@@ -216,8 +216,16 @@ CASES: dict[str, Case] = {
         P.PERCH, P.COMPLETE, flown(CONTACT_Z_M - 0.03, thrust=QUIET), 1.2, z_m=CONTACT_Z_M - 0.03
     ),
     "held": Case(
-        P.RECOVER, P.LANDING, flown(CONTACT_Z_M - 0.2, thrust=QUIET), 2.2, O.SAFETY,
+        P.ASCEND, P.LANDING, flown(CONTACT_Z_M - 0.2, thrust=QUIET), 2.2, O.SAFETY,
         state={"entered_s": START_S, "contact_z_m": CONTACT_Z_M - 0.2}, z_m=CONTACT_Z_M - 0.2,
+    ),
+    "hangs-at-contact": Case(
+        P.RECOVER, P.LANDING, aside(0.06, CONTACT_Z_M, thrust=QUIET), 2.2, O.SAFETY,
+        state={
+            "entered_s": START_S, "contact_z_m": CONTACT_Z_M, "contact_aside_m": 0.01,
+            "contact_sigma_m": 0.05,
+        },
+        z_m=CONTACT_Z_M,
     ),
     "cannot-rise": Case(
         P.APPROACH, P.LANDING, flown(0.3, thrust=FULL), 0.9, O.SAFETY,

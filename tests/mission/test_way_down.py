@@ -339,6 +339,84 @@ def test_only_what_hangs_at_the_target_is_caught(
     assert state.phase is to
 
 
+def backed_off_from(
+    aside_m: float, sigma_m: float, *, below_m: float = 0.0, comes_off: bool = False,
+    profile: Profile = PROFILE,
+) -> tuple[PlannerState, set[str]]:  # fmt: skip
+    """Pressed out of sight of the target, and backed off from; what it touched holds it, or lets
+    it fall to the floor 0.4 s later. The estimate goes on sliding, by 2 cm/s. Its rows, too."""
+    up_m = HANG_Z_M - below_m
+    felt, state, thrust, rows = Felt(), state_in(Phase.PERCH, z_m=up_m), 1.2, set()
+    for i in range(1, 800):
+        t_s = 10.0 + 0.02 * i
+        fell_s = t_s - state.entered_s - 0.4 if comes_off and state.phase is Phase.RECOVER else 0.0
+        z_m = max(0.0, up_m - 4.9 * max(0.0, fell_s) ** 2)
+        x_m = aside_m + 0.02 * max(0.0, t_s - 10.5)
+        tel = telemetry(
+            t_s, thrust=thrust * HOVER_THRUST, position_m=(x_m, 0.0, z_m),
+            acc_z_g=0.0 if fell_s > 0.0 < z_m else 1.0,
+        )  # fmt: skip
+        target = target_at(
+            t_s, body_m=(x_m, 0.0, up_m), sigma_m=np.full(3, sigma_m), measured=False,
+            tracked=False, measured_s=10.0,
+        )  # fmt: skip
+        unseen_s = t_s - 10.0 if profile.positioning.by == "target" else 0.0
+        obs = observation(t_s, telemetry=tel, target=target, position_age_s=unseen_s)
+        state, command = planner.step(state, felt(obs), profile)
+        rows.add(state.row)
+        if planner.is_over(state):
+            break
+        match command:
+            case RawThrust(order):
+                thrust = order / HOVER_THRUST if order > 5000 else 0.0
+            case StopMotors():
+                thrust = 0.0
+            case PositionSetpoint() if state.phase is not Phase.PERCH:
+                thrust = 0.34
+    return state, rows
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "sigma_m", "row", "ends", "outcome"),
+    [
+        (0.012, 0.022, "caught", Phase.PERCHED, Outcome.PERCHED),
+        (0.012, 0.075, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        (0.03, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        (0.012, math.inf, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        (0.06, 0.01, "held", Phase.ABORTED, Outcome.SAFETY),
+    ],
+)
+def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
+    aside_m: float, sigma_m: float, row: str, ends: Phase, outcome: Outcome
+) -> None:
+    """Not by where the estimate slides to meanwhile, 4 cm farther aside."""
+    state, rows = backed_off_from(aside_m, sigma_m)
+    assert {"beside-the-magnet", row} <= rows
+    assert (state.phase, state.outcome) == (ends, outcome)
+    assert state.contact_aside_m == pytest.approx(aside_m)
+
+
+def test_what_hangs_where_it_was_pressed_below_the_target_has_not_touched_it() -> None:
+    state, rows = backed_off_from(0.0, 1e-3, below_m=0.2)
+    assert {"blocked", "held"} <= rows
+    assert state.phase is Phase.ABORTED
+
+
+@pytest.mark.parametrize("positioning", ["deck", "target"])
+def test_what_fell_from_where_it_touched_the_target_is_not_caught_there(positioning: str) -> None:
+    profile = Profile.model_validate({"positioning": positioning})
+    _, rows = backed_off_from(0.012, 0.022, comes_off=True, profile=profile)
+    assert "beside-the-magnet" in rows
+    assert not rows & {"caught", "hangs-at-contact", "contact", "perched", "hung"}
+
+
+def test_what_has_left_its_contact_forgets_where_that_was() -> None:
+    begin = replace(state_in(Phase.RECOVER, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
+    begin = replace(begin, contact_aside_m=0.01, contact_sigma_m=0.01)
+    state, _ = planner.step(begin, observation(10.02, HANG_Z_M - 0.1), PROFILE)
+    assert (state.contact_z_m, state.contact_aside_m) == (None, None)
+
+
 @pytest.mark.parametrize("step_m", [-0.6, 0.7])
 def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) -> None:
     """The vehicle has not moved: held where it is, over a ground that is as far below."""
