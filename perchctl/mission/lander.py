@@ -479,7 +479,9 @@ def _reckon(c: Context) -> PlannerState:
     target = obs.target
     if target is not None:
         seen = obs.new_frame and target.measured
-        if seen or (c.placed and not c.by_sight):
+        # An estimate that was without a position since then was moved when that came back.
+        moved = state.stale_s is not None and state.stale_s >= target.measured_s
+        if seen or (c.placed and not c.by_sight and not moved):
             yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
             cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
             sigma_m = float(max(target.sigma_m[:2]))

@@ -413,3 +413,22 @@ def test_the_spread_of_a_contact_grows_with_what_the_estimate_may_slide(
         state, _ = planner.step(state, obs, profile)
     _, sigma_m = contact_aside_m(Context(state, obs, profile))
     assert least_m <= sigma_m <= most_m
+
+
+@pytest.mark.parametrize(("silent", "aside_m"), [(True, 0.0), (False, 0.06)])
+def test_positions_that_come_back_do_not_move_a_gear_that_has_not_moved(
+    silent: bool, aside_m: float
+) -> None:
+    """Felt to stand still at the target, out of sight: 6 cm, by which the estimate is set right
+    after half a second without a position, were its own."""
+    felt, state = Felt(), state_in(Phase.PERCH, z_m=HANG_Z_M)
+    for t_s in times(1.5):
+        since_s = t_s - 10.0
+        tel = telemetry(t_s, position_m=(0.06 if since_s > 0.9 else 0.0, 0.0, HANG_Z_M))
+        target = target_at(
+            t_s, body_m=tel.position_m, measured=since_s < 0.2, measured_s=min(t_s, 10.2)
+        )
+        gone_s = since_s - 0.3 if silent and since_s < 0.9 else 0.0
+        obs = observation(t_s, telemetry=tel, target=target, position_age_s=max(0.0, gone_s))
+        state, _ = planner.step(state, felt(obs), MOCAP)
+    assert math.hypot(*state.reckoning.aside_m) == pytest.approx(aside_m, abs=0.01)
