@@ -17,11 +17,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
 from perchctl.faults.effects import MagnetHolds
 from perchctl.faults.flight import fly_with_fault
 from perchctl.faults.oracle import drop_limit_m
-from perchctl.faults.result import FaultResult
 from perchctl.mission.state import Phase
 from perchctl.profile import load_profile
 from perchctl.sim.draw import draw_scenario

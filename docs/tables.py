@@ -20,7 +20,8 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from perchctl.errors import EXIT_CODES  # noqa: E402
-from perchctl.faults.catalogue import AIR, FAULTS, FROM_THE_START, Fault  # noqa: E402
+from perchctl.faults import FAULTS  # noqa: E402
+from perchctl.faults.catalogue import AIR, FROM_THE_START, Fault  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -78,6 +79,10 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.__main__",),
 )
 FACE = "perchctl"  # the package itself: version and public names, taken from all rooms
+
+# Packages with a face: the others take its names, and nothing from behind it.
+FACED = ("check", "cluster", "display", "faults", "replay", "report", "track")
+MOST_NAMES = 15
 
 
 @dataclass(frozen=True)
@@ -188,6 +193,18 @@ def uphill(imports: list[Import]) -> list[str]:
     ]
 
 
+def past_a_face(imports: list[Import]) -> list[str]:
+    """Imports of a module that lies behind another package's face."""
+    faces = tuple(f"perchctl.{package}" for package in FACED)
+    return [
+        str(i)
+        for i in imports
+        if is_under(i.imported, faces)
+        and i.imported not in faces
+        and room_of(i.imported) != room_of(i.importer)
+    ]
+
+
 def clocks(imports: list[Import]) -> list[str]:
     return [
         str(i)
@@ -236,6 +253,19 @@ def test_imports_point_one_way() -> None:
     assert uphill(IMPORTS) == []
 
 
+def test_packages_are_entered_by_their_faces() -> None:
+    assert not past_a_face(IMPORTS)
+
+
+@pytest.mark.parametrize("package", FACED)
+def test_a_face_has_few_names_and_each_says_what_it_is(package: str) -> None:
+    face = import_module(f"perchctl.{package}")
+    assert 0 < len(face.__all__) <= MOST_NAMES
+    for name in face.__all__:
+        thing = getattr(face, name)
+        assert not callable(thing) or thing.__doc__, name
+
+
 def test_no_module_needs_itself() -> None:
     assert cycle(IMPORTS) == []
 
@@ -268,6 +298,7 @@ BROKEN = {
         uphill,
         "link.mock",
     ),
+    "perchctl.commands.fly": ("from perchctl.check.row import Row\n", past_a_face, "check.row"),
     "perchctl.log.plot": ("import cflib.crazyflie\n", misplaced, "cflib"),
     "perchctl.log.read": ("import matplotlib\n", misplaced, "matplotlib"),
     "perchctl.vision.pose": ("from filterpy.kalman import KalmanFilter\n", misplaced, "filterpy"),

@@ -22,7 +22,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration.files import load_calibration
 from perchctl.calibration.mounting.recording import write_recordings
 from perchctl.cli import app
-from perchctl.cluster.place import place_of
+from perchctl.cluster import parse_address
 from perchctl.flight.lockstep import fly_lockstep
 from perchctl.log.jsonl import decode
 from perchctl.mission.table import TABLE
@@ -104,7 +104,7 @@ def cheap(line: str) -> list[str]:
         case ["perchctl", "simulate"]:
             if "--cluster" in words:  # the form is looked at; a cluster of one is this computer's
                 at = words.index("--cluster")
-                place = place_of(words[at + 1])
+                place = parse_address(words[at + 1])
                 words[at : at + 2] = [] if place.address else ["--cluster", "local:1"]
             if "--compare" in words:
                 words[words.index("--compare") + 1] = "quick.yaml"

@@ -91,7 +91,7 @@ def test_programs_are_told_what_an_export_lacks(logs: Path) -> None:
 def test_programs_are_told_where_a_replay_is_drawn(
     logs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("perchctl.replay.plot.plot_replay", lambda _found, _path: None)
+    monkeypatch.setattr("perchctl.replay.plot_replay", lambda _found, _path: None)
     log = str(FLIGHTS / "stopped.jsonl.gz")
     assert json.loads(run("log", "replay", log, "--json", "-o", "x.png").stdout)["plot"] == "x.png"
 

@@ -36,8 +36,11 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from perchctl.calibration.files import camera_of  # noqa: E402
-from perchctl.display.page.live import LivePage  # noqa: E402
-from perchctl.display.page.sketch import Sketch, draw  # noqa: E402
+from perchctl.display import (  # noqa: E402
+    LivePage,
+    Sketch,
+    draw_sketch,
+)
 from perchctl.display.panel import panel  # noqa: E402
 from perchctl.display.status import FlightStatus, status_rows  # noqa: E402
 from perchctl.flight.session import PLAIN_SEED  # noqa: E402
@@ -57,7 +60,7 @@ from perchctl.plot import (  # noqa: E402
     save_png,
 )
 from perchctl.profile import Profile, load_profile  # noqa: E402
-from perchctl.report.write import write_report  # noqa: E402
+from perchctl.report import write_report  # noqa: E402
 from perchctl.sim.draw import draw_scenario  # noqa: E402
 from perchctl.sim.renderer import Renderer  # noqa: E402
 from perchctl.vision.types import Frame, PipelineState  # noqa: E402
@@ -188,7 +191,7 @@ def strip(flown: Flight, file: Path) -> None:
     axes = figure.subplots(2, len(moments), height_ratios=(0.75, 2.1), squeeze=False)
     for i, (title, index) in enumerate(moments):
         picture, side = axes[0][i], axes[1][i]
-        seen = draw(flown.sketch(flown.frame(index)), flown.camera)
+        seen = draw_sketch(flown.sketch(flown.frame(index)), flown.camera)
         picture.imshow(cv2.cvtColor(seen, cv2.COLOR_BGR2RGB))
         picture.set_title(title, fontsize=10)
         picture.set_axis_off()

@@ -39,7 +39,9 @@ def row(record: Known, now: datetime) -> Row:
     return warned(NAME, f"{found}; fly refuses", advice)
 
 
-def rows(config: PositioningConfig, uri: str, now: datetime, *, simulated: bool) -> list[Row]:
+def comparison_rows(
+    config: PositioningConfig, uri: str, now: datetime, *, simulated: bool
+) -> list[Row]:
     """None with decks, nor for the simulator's own vehicle, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []

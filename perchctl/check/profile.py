@@ -35,7 +35,9 @@ LOOKS_UP = math.cos(math.radians(45.0))
 """Of the view's upward part: with less the camera does not look at the ceiling."""
 
 
-def rows(profile: Profile, *, uri: str | None = None, source: str | None = None) -> tuple[Row, ...]:
+def profile_rows(
+    profile: Profile, *, uri: str | None = None, source: str | None = None
+) -> tuple[Row, ...]:
     """A row for each question, in the order in which they matter.
 
     `uri` and `source` take the place of the profile's. Opens no link and no camera; reads the

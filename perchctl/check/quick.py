@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from perchctl.calibration.files import camera_of
-from perchctl.check import computer, profile
+from perchctl.check import computer
+from perchctl.check.profile import profile_rows
 from perchctl.check.row import Row, Verdict
 from perchctl.errors import SafetyAbort
 from perchctl.flight.session import FlyOptions
@@ -13,11 +14,11 @@ def rows(options: FlyOptions) -> list[Row]:
     """Of the computer's disk and the profile. Opens no link and no camera."""
     return [
         computer.disk_row(options.log_dir),
-        *profile.rows(options.profile, uri=options.uri, source=options.source),
+        *profile_rows(options.profile, uri=options.uri, source=options.source),
     ]
 
 
-def warnings(options: FlyOptions) -> list[str]:
+def warnings_before_flight(options: FlyOptions) -> list[str]:
     """A sentence for each row that warns. Errors: SafetyAbort for the first that fails; of the
     calibration's file InvalidValue, NotFound."""
     camera_of(options.profile.camera)

@@ -50,7 +50,7 @@ AFTERWARDS = "the motor test ends by itself within 15 s: keep clear of the prope
 
 
 @dataclass(frozen=True)
-class Wanted:
+class CheckScope:
     """What is looked at beyond what can be seen at rest, and for how long, s.
 
     `may_turn_motors` asks for leave when the moment has come; None: no motor is turned. `tell`
@@ -70,7 +70,7 @@ class Wanted:
     other_vehicles: Callable[[str], Answering] = lambda uri: scan_for([address_of(uri)])
 
 
-def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
+def check(options: FlyOptions, wanted: CheckScope) -> Iterator[Row]:
     """Rows as they are found. Errors, before anything is opened: InvalidValue, NotFound (the
     profile's files), UsageError (a library that is missing, or does not load)."""
     check_options(options)
@@ -116,14 +116,14 @@ def check(options: FlyOptions, wanted: Wanted) -> Iterator[Row]:
     yield from quick.rows(options)
 
 
-def found_by_scan(uri: str | None) -> list[Row]:
+def scan_rows(uri: str | None) -> list[Row]:
     """`--scan`: what answers, at the usual address and at that of `uri`. Errors: InvalidValue."""
     if uri is not None:
         check_uri(uri)
     return scan.rows(scan_for([address_of(uri or "")]))
 
 
-def _no_vehicle(options: FlyOptions, error: ConnectionFailed, wanted: Wanted) -> Iterator[Row]:
+def _no_vehicle(options: FlyOptions, error: ConnectionFailed, wanted: CheckScope) -> Iterator[Row]:
     found, _, help_text = str(error).partition("\n")
     advice = help_text
     if not help_text:
@@ -143,7 +143,9 @@ def _with_capture_at(profile: Profile, simulated: tuple[str, str] | None) -> Pro
     return profile.model_copy(update={"positioning": positioning})
 
 
-def _opened_capture(config: PositioningConfig, wanted: Wanted, stack: contextlib.ExitStack) -> Room:
+def _opened_capture(
+    config: PositioningConfig, wanted: CheckScope, stack: contextlib.ExitStack
+) -> Room:
     if config.by != "mocap":
         return None
     wanted.tell(f"connecting to {label(config)}")
@@ -158,7 +160,7 @@ def _opened_capture(config: PositioningConfig, wanted: Wanted, stack: contextlib
 
 
 def _room(
-    room: Room, heard: Callable[[], list[Telemetry]], profile: Profile, wanted: Wanted
+    room: Room, heard: Callable[[], list[Telemetry]], profile: Profile, wanted: CheckScope
 ) -> Iterator[Row]:
     """The rows of the motion capture; none with decks."""
     if room is None:
@@ -171,7 +173,7 @@ def _room(
     yield from capture.rows(seen, profile)
 
 
-def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> Row:
+def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: CheckScope) -> Row:
     """By its own position, or by a motion capture against its attitude."""
     if profile.positioning.by == "target":
         return skipped(lift.NAME, "only in flight it is told its position, by the target")
@@ -192,11 +194,13 @@ def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: Wanted) -> R
 
 
 def _compared(uri: str, profile: Profile) -> list[Row]:
-    return compared.rows(profile.positioning, uri, wall_date(), simulated=uri.startswith("sim://"))
+    return compared.comparison_rows(
+        profile.positioning, uri, wall_date(), simulated=uri.startswith("sim://")
+    )
 
 
 def _vehicle(
-    probe: ProbeLink, uri: str, profile: Profile, room: Room, wanted: Wanted
+    probe: ProbeLink, uri: str, profile: Profile, room: Room, wanted: CheckScope
 ) -> Iterator[Row]:
     wanted.tell(f"listening to the vehicle for {wanted.listen_s:g} s")
     seen = link.look(probe, uri, wanted.listen_s)
@@ -213,7 +217,7 @@ def _vehicle(
 
 
 def _with_a_hand(
-    probe: ProbeLink, uri: str, room: Room, profile: Profile, wanted: Wanted
+    probe: ProbeLink, uri: str, room: Room, profile: Profile, wanted: CheckScope
 ) -> Iterator[Row]:
     """What somebody has to lift it for, or to keep clear of; it may end with a dead vehicle."""
     if wanted.lift:
@@ -254,7 +258,11 @@ def _source(
 
 
 def _camera(
-    heard: Listened, source: FrameSource, pipeline: Pipeline, options: FlyOptions, wanted: Wanted
+    heard: Listened,
+    source: FrameSource,
+    pipeline: Pipeline,
+    options: FlyOptions,
+    wanted: CheckScope,
 ) -> Generator[Row, None, Rehearsal | None]:
     """Yields the rows; returns the rehearsal, None where there could be none."""
     size = camera.size_row(source.size_px, pipeline.camera.size_px)

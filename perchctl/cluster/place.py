@@ -22,7 +22,7 @@ class Place:
         return self.address or f"local:{self.workers}"
 
 
-def place_of(text: str) -> Place:
+def parse_address(text: str) -> Place:
     """Of ``local:N``, ``HOST:PORT`` or ``tcp://HOST:PORT``. Errors: UsageError."""
     kind, _, number = text.partition(":")
     if kind == "local":

@@ -22,7 +22,7 @@ from perchctl.camera.source import FrameSource
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import Sketch
 from perchctl.errors import InvalidValue
 from perchctl.files import write_files
 from perchctl.target.boards import Board

@@ -27,8 +27,7 @@ from perchctl.camera.source import FrameSource, check_size
 from perchctl.commands.interrupt import Stopper, unheeded
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page
-from perchctl.display.page.live import LivePage
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import LivePage, Sketch
 from perchctl.errors import Interrupted, InvalidValue, SafetyAbort
 from perchctl.link.motion import MotionLink
 from perchctl.profile import Profile

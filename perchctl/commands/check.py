@@ -9,8 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from perchctl.check.row import Row, Verdict
-from perchctl.check.session import Wanted, check, found_by_scan
+from perchctl.check import CheckScope, Row, Verdict, check, scan_rows
 from perchctl.commands.check_cameras import list_cameras
 from perchctl.commands.fly import FlyRequest, resolve
 from perchctl.commands.interrupt import interruptible, unheeded
@@ -48,7 +47,7 @@ class CheckRequest:
     as_json: bool = False
 
 
-def run(request: CheckRequest, wanted: Wanted | None = None) -> int:
+def run(request: CheckRequest, wanted: CheckScope | None = None) -> int:
     """Look, print what was found, also so far as Ctrl-C let it come; returns the exit code.
 
     `wanted` takes the place of what the request wants. Errors: those of the request and of the
@@ -94,10 +93,10 @@ def _refuse_ignored(request: CheckRequest) -> None:
         raise UsageError("--cameras only lists this computer's cameras: give it --json at most")
 
 
-def _rows(request: CheckRequest, wanted: Wanted) -> Iterator[Row]:
+def _rows(request: CheckRequest, wanted: CheckScope) -> Iterator[Row]:
     if request.scan:
         say("scanning all channels and rates")
-        yield from found_by_scan(request.uri)
+        yield from scan_rows(request.uri)
         return
     options = resolve(
         FlyRequest(
@@ -111,9 +110,9 @@ def _rows(request: CheckRequest, wanted: Wanted) -> Iterator[Row]:
     yield from check(options, wanted)
 
 
-def _wanted(request: CheckRequest) -> Wanted:
+def _wanted(request: CheckRequest) -> CheckScope:
     may_turn = (lambda: request.yes or _confirmed()) if request.prop_test else None
-    return Wanted(may_turn_motors=may_turn, lift=request.lift, tell=say)
+    return CheckScope(may_turn_motors=may_turn, lift=request.lift, tell=say)
 
 
 def _confirmed() -> bool:

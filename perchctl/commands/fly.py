@@ -11,17 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.calibration.files import camera_of
-from perchctl.check import quick
+from perchctl.check import warnings_before_flight
 from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.fly_plan import plan, plan_text, weights_text
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import confirmed, print_record, say, tell
 from perchctl.commands.page import page_port
 from perchctl.commands.positioning import positioned
-from perchctl.display.page.flight import FlightPage, flight_page
-from perchctl.display.page.told import card_of, failed_card
-from perchctl.display.panel import make_reporter
-from perchctl.display.watch import DisplayWatcher
+from perchctl.display import (
+    DisplayWatcher,
+    FlightPage,
+    failed_card,
+    flight_page,
+    make_reporter,
+    summary_card,
+)
 from perchctl.errors import (
     EXIT_CODES,
     AttemptsUsedUp,
@@ -87,7 +91,7 @@ def run(request: FlyRequest) -> int:
         else:
             print(plan_text(options))
         return 0
-    for warning in quick.warnings(options):
+    for warning in warnings_before_flight(options):
         say(f"check: {warning}")
     check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
     asks = not (request.yes or options.simulated)
@@ -155,7 +159,7 @@ def fly(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False
         assert summary is not None
         tell(summary_text(summary, log.path))
         if page is not None:
-            page.end(card_of(summary, log.path))
+            page.end(summary_card(summary, log.path))
     code = exit_code(result.report.outcome, summary)
     plot = drawn(lambda: plot_of(log.path, options.profile))
     if plot is not None:

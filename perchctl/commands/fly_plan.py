@@ -8,9 +8,7 @@ from typing import Any
 
 from perchctl.calibration.files import camera_of
 from perchctl.camera.credentials import profile_record, without_password
-from perchctl.check import compared
-from perchctl.check.profile import rows
-from perchctl.check.row import Row, Verdict
+from perchctl.check import Row, Verdict, comparison_rows, profile_rows
 from perchctl.flight.clock import wall_date
 from perchctl.flight.session import FlyOptions
 from perchctl.profile import Profile, find_calibration, find_weights, read_weights
@@ -39,7 +37,7 @@ def plan(options: FlyOptions) -> dict[str, Any]:
         "check": [
             dataclasses.asdict(row)
             for row in (
-                *rows(options.profile, uri=options.uri, source=options.source),
+                *profile_rows(options.profile, uri=options.uri, source=options.source),
                 *_compared(options),
             )
         ],
@@ -122,7 +120,7 @@ def _compared_lines(options: FlyOptions) -> list[str]:
 
 
 def _compared(options: FlyOptions) -> list[Row]:
-    return compared.rows(
+    return comparison_rows(
         options.profile.positioning, options.uri, wall_date(), simulated=options.simulated
     )
 

@@ -16,10 +16,15 @@ from perchctl.log.recording import pictures_of, recording_of
 from perchctl.log.setup import profile_of
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.changed import changed
-from perchctl.replay.run import check_readable, replay
-from perchctl.replay.sense import Picture
-from perchctl.replay.told import replay_lines, replay_record
-from perchctl.replay.whatif import changes_of, gates_of
+from perchctl.replay import (
+    Picture,
+    changed_gates,
+    check_readable,
+    pose_changes,
+    replay,
+    replay_lines,
+    replay_record,
+)
 
 
 @dataclass(frozen=True)
@@ -47,10 +52,10 @@ def run(request: ReplayRequest) -> int:
     found = replay(log, _pictures(request, path), wanted)
     if wanted is not None and not found.changed:
         say("nothing was changed: that is what was flown")
-    gates = gates_of(found) if found.changed else []
-    changes = changes_of(found) if found.changed else []
+    gates = changed_gates(found) if found.changed else []
+    changes = pose_changes(found) if found.changed else []
     if request.output is not None:
-        from perchctl.replay.plot import plot_replay
+        from perchctl.replay import plot_replay
 
         plot_replay(found, request.output)
     if request.as_json:

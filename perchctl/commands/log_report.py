@@ -9,9 +9,14 @@ from perchctl.commands.log_file import log_file
 from perchctl.commands.output import print_record, say
 from perchctl.errors import UsageError
 from perchctl.files import check_output, same_file
-from perchctl.report.page import counted
-from perchctl.report.told import Told
-from perchctl.report.write import SUFFIXES, report_path_of, session_path_of, write_report
+from perchctl.report import (
+    REPORT_SUFFIXES,
+    ReportedFlight,
+    flight_counts_text,
+    report_path_of,
+    session_path_of,
+    write_report,
+)
 
 
 @dataclass(frozen=True)
@@ -33,13 +38,15 @@ def run(request: ReportRequest) -> int:
     output = output or session_path_of(files)
     if any(same_file(output, path) for path in files):
         raise UsageError(f"{output} is one of the logs; write the page to another file")
-    check_output(output, SUFFIXES, request.force, "a page for a browser")
+    check_output(output, REPORT_SUFFIXES, request.force, "a page for a browser")
     flights = write_report(files, output)
     if request.as_json:
         print_record(_record(output, flights))
     else:
         print(output)
-        say(counted(flights) if len(flights) > 1 else f"one flight: {flights[0].outcome}")
+        say(
+            flight_counts_text(flights) if len(flights) > 1 else f"one flight: {flights[0].outcome}"
+        )
     return 0
 
 
@@ -56,7 +63,7 @@ def _files(request: ReportRequest) -> tuple[Path, ...]:
     return tuple(files)
 
 
-def _record(output: Path, flights: tuple[Told, ...]) -> dict[str, object]:
+def _record(output: Path, flights: tuple[ReportedFlight, ...]) -> dict[str, object]:
     return {
         "report": str(output),
         "bytes": output.stat().st_size,

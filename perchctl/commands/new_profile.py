@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from perchctl.camera.credentials import profile_record
-from perchctl.check.profile import rows
-from perchctl.check.row import Verdict
+from perchctl.check import Verdict, profile_rows
 from perchctl.commands.new_profile_answers import (
     NONE_YET,
     QUESTIONS,
@@ -171,7 +170,7 @@ def _ask_terminal(question: str) -> str:
 
 def _report(request: NewProfileRequest, profile: Profile, answers: Mapping[str, str]) -> None:
     """What was written, and what in it is doubtful."""
-    doubts = [row for row in rows(profile) if row.verdict in (Verdict.WARN, Verdict.FAIL)]
+    doubts = [row for row in profile_rows(profile) if row.verdict in (Verdict.WARN, Verdict.FAIL)]
     if answers["calibration"] == NONE_YET:
         doubts = [row for row in doubts if row.name != "calibration file"]
         own = not profile.camera.source.startswith("sim:")

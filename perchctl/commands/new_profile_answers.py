@@ -17,7 +17,7 @@ from perchctl.calibration.files import load_calibration
 from perchctl.camera.aideck import aideck_address
 from perchctl.camera.credentials import without_password
 from perchctl.camera.open import ALLOWED, SCHEMES, is_live, scheme_of
-from perchctl.check.limits import OVERDUE
+from perchctl.check import OVERDUE
 from perchctl.errors import InvalidValue
 from perchctl.link.uri import check_uri
 from perchctl.profile import Profile, find_calibration, load_profile

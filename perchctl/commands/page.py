@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 
 from perchctl.commands.output import say
-from perchctl.display.page.live import LivePage
+from perchctl.display import LivePage
 from perchctl.vision.types import CameraModel
 
 

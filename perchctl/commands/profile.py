@@ -7,8 +7,7 @@ import json
 from dataclasses import dataclass
 
 from perchctl.camera.credentials import profile_record, without_passwords
-from perchctl.check.profile import rows
-from perchctl.check.row import Verdict
+from perchctl.check import Verdict, profile_rows
 from perchctl.commands.output import print_record, say
 from perchctl.errors import UsageError
 from perchctl.profile import find_profile, load_profile
@@ -38,7 +37,7 @@ def run(request: ProfileRequest) -> int:
         return 0
     name = request.profile or DEFAULT_PROFILE
     profile = load_profile(name)
-    found = rows(profile)
+    found = profile_rows(profile)
     if request.as_json:
         record = {
             "profile_file": str(find_profile(name)),

@@ -9,10 +9,14 @@ from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.output import print_record, say
 from perchctl.commands.simulate_request import SimulateRequest, and_problem, fly_each, tell_logs
 from perchctl.errors import PerchError
-from perchctl.faults.campaign import run_fault_campaign
-from perchctl.faults.catalogue import FAULTS, selected
-from perchctl.faults.result import FaultResult
-from perchctl.faults.summary import fault_summary, fault_table
+from perchctl.faults import (
+    FAULTS,
+    FaultResult,
+    fault_summary,
+    fault_table,
+    run_fault_campaign,
+    select_faults,
+)
 from perchctl.flight.results import aligned
 from perchctl.log.jsonl import to_plain
 from perchctl.profile import Profile
@@ -23,7 +27,7 @@ def run_faults(request: SimulateRequest) -> int:
     if request.faults == "list":
         _list(request.as_json)
         return 0
-    names = tuple(fault.name for fault in selected(request.faults or "all"))
+    names = tuple(fault.name for fault in select_faults(request.faults or "all"))
     profile = request.loaded()
     if request.only is not None:
         request = replace(request, log_dir=request.log_folder(profile))
@@ -39,7 +43,7 @@ def run_faults(request: SimulateRequest) -> int:
             print(fault_table(results), flush=True)
         tell_logs(results, request.log_dir, request.keep)
         if request.heat_map is not None:
-            from perchctl.faults.plot import plot_heat_map
+            from perchctl.faults import plot_heat_map
 
             plot_heat_map(results, request.heat_map)
             say(f"{request.heat_map} is drawn")

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from importlib.util import find_spec
 from pathlib import Path
 
-from perchctl.cluster.place import place_of
+from perchctl.cluster import parse_address
 from perchctl.commands.output import say
 from perchctl.errors import no_cluster
 from perchctl.flight.hands import job_processes
@@ -31,10 +31,10 @@ def hands_of(
         raise no_cluster()
     try:
         with uninterrupted():
-            from perchctl.cluster.hands import cluster_hands
+            from perchctl.cluster import cluster_hands
     except ImportError as error:
         raise no_cluster(str(error)) from error
-    with cluster_hands(place_of(cluster), profiles, log_dir) as hands:
+    with cluster_hands(parse_address(cluster), profiles, log_dir) as hands:
         for note in hands.notes:
             say(note)
         yield hands, hands.width

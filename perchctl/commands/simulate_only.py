@@ -8,7 +8,7 @@ from functools import partial
 from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.output import print_record
 from perchctl.commands.simulate_request import SimulateRequest, fly_each
-from perchctl.display.status import timed_text
+from perchctl.display import timed_event_text
 from perchctl.errors import PerchError
 from perchctl.flight.campaign import LoggedFlight, fly_all, fly_logged
 from perchctl.log.summary import summary_text
@@ -33,7 +33,7 @@ def _tell(flight: LoggedFlight, profile: Profile, as_json: bool) -> None:
     if not as_json:
         start_s = flight.events[0].t_s
         for event in flight.events:
-            print(timed_text(event, start_s))
+            print(timed_event_text(event, start_s))
         print(summary_text(flight.summary, flight.log), flush=True)
     plot = None
     with contextlib.suppress(KeyboardInterrupt):  # the flight is flown, and is told all the same

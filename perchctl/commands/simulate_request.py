@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol, TypeVar
 
-from perchctl.cluster.place import place_of
+from perchctl.cluster import parse_address
 from perchctl.commands.output import say
 from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import Ended, progress_bar
@@ -135,7 +135,7 @@ class SimulateRequest:
             one = f"--only {self.only} repeats the one flight of seed {self.only}"
             _refuse(one, many, ", or --only")
         if self.cluster is not None:
-            place_of(self.cluster)
+            parse_address(self.cluster)
             if self.jobs is not None:
                 raise UsageError(
                     f"--cluster {self.cluster} flies as many at a time as it has workers: "

@@ -22,18 +22,17 @@ from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import count_bar
-from perchctl.display.page.flight import AXES_OF_SIDE
-from perchctl.display.page.live import LivePage
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import AXES_OF_SIDE, LivePage, Sketch
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
 from perchctl.profile import Profile, find_calibration, load_profile
 from perchctl.target.print_check import PrintCheck
-from perchctl.track.outputs import OutputOptions, Outputs
-from perchctl.track.result import Tracked
-from perchctl.track.tracker import (
+from perchctl.track import (
     Notes,
+    OutputOptions,
+    Outputs,
     Tally,
+    Tracked,
     Tracker,
     camera_pipeline,
     sketch_of,

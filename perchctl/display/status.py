@@ -103,7 +103,7 @@ def event_text(event: Event) -> str:
     return f"{text} (simulated: {event.simulated})" if event.simulated else text
 
 
-def timed_text(event: Event, start_s: float) -> str:
+def timed_event_text(event: Event, start_s: float) -> str:
     """The line with the time since the start."""
     return f"[{event.t_s - start_s:7.2f} s] {event_text(event)}"
 

@@ -232,7 +232,7 @@ class Case:
     first_hold: float | None = None
 
 
-def selected(names: str) -> tuple[Fault, ...]:
+def select_faults(names: str) -> tuple[Fault, ...]:
     """Faults by `all` or names with commas between them. Errors: UsageError."""
     if names == "all":
         return FAULTS

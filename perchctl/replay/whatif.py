@@ -48,7 +48,7 @@ class Change:
     only_changed: int
 
 
-def gates_of(replay: Replay) -> list[Gate]:
+def changed_gates(replay: Replay) -> list[Gate]:
     """Those that would have fallen at other times. The other side is decided anew, too, by the
     flown profile: what a log does not hold is compared as well."""
     turns = [each.turn for each in replay.decided]
@@ -59,7 +59,7 @@ def gates_of(replay: Replay) -> list[Gate]:
     return [gate for gate in gates if gate.flown_s != gate.changed_s]
 
 
-def changes_of(replay: Replay) -> list[Change]:
+def pose_changes(replay: Replay) -> list[Change]:
     """Of each source of poses, and of the filter; empty without pictures."""
     if replay.seen is None:
         return []

@@ -12,12 +12,12 @@ from perchctl.log.read import values_of
 from perchctl.report import sections
 from perchctl.report.markup import Markup, table, tag
 from perchctl.report.plot import trend
-from perchctl.report.told import Told
+from perchctl.report.told import ReportedFlight
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """No script, nothing from elsewhere: the browser holds the page to it."""
 SESSION = "flights"
-PARTS: tuple[tuple[str, Callable[[Told], Markup | None]], ...] = (
+PARTS: tuple[tuple[str, Callable[[ReportedFlight], Markup | None]], ...] = (
     ("What happened", sections.story),
     ("What to change", sections.advice),
     ("Phases", sections.phases),
@@ -31,12 +31,12 @@ PARTS: tuple[tuple[str, Callable[[Told], Markup | None]], ...] = (
 )
 
 
-def page_of(flights: Sequence[Told]) -> str:
+def page_of(flights: Sequence[ReportedFlight]) -> str:
     """HTML that needs nothing else. `flights` has at least one. Raises InvalidValue for a value
     that no flight writes."""
     several = len(flights) > 1
     title = f"{len(flights)} flights" if several else flights[0].name
-    parts = [tag("h1", counted(flights) if several else "A flight with perchctl")]
+    parts = [tag("h1", flight_counts_text(flights) if several else "A flight with perchctl")]
     back = SESSION if several else ""
     each = [_flight(told, number, back) for number, told in enumerate(flights, start=1)]
     if several:
@@ -55,7 +55,7 @@ def page_of(flights: Sequence[Told]) -> str:
     return f"<!doctype html>\n{html}\n"
 
 
-def _flight(told: Told, number: int, back: str) -> Markup:
+def _flight(told: ReportedFlight, number: int, back: str) -> Markup:
     with values_of(told.log.path):
         parts = [sections.headline(told, back)]
         for title, make in PARTS:
@@ -71,7 +71,7 @@ def _own_ids(markup: Markup, prefix: str) -> Markup:
     return Markup(re.sub(r'(<use href="#|url\(#)', rf"\g<1>{prefix}", own))
 
 
-def _session(flights: Sequence[Told]) -> Markup:
+def _session(flights: Sequence[ReportedFlight]) -> Markup:
     rows = [
         (
             tag("a", str(number), href=f"#flight-{number}"),
@@ -104,7 +104,7 @@ def _session(flights: Sequence[Told]) -> Markup:
     return _own_ids(tag("section", parts, id=SESSION), "session-")
 
 
-def counted(flights: Sequence[Told]) -> str:
+def flight_counts_text(flights: Sequence[ReportedFlight]) -> str:
     """``4 flights: 3 perched, 1 landed``."""
     outcomes = [told.outcome for told in flights]
     each = ", ".join(f"{outcomes.count(name)} {name}" for name in dict.fromkeys(outcomes))

@@ -10,7 +10,7 @@ from perchctl.report.markup import Markup, pairs, table, tag, text
 from perchctl.report.plot import battery_plot, flight_plots, histogram
 from perchctl.report.sight import Seen, part_of
 from perchctl.report.story import PAPERS
-from perchctl.report.told import UNFINISHED, Told
+from perchctl.report.told import UNFINISHED, ReportedFlight
 from perchctl.report.words import count, kept_together, length, milliseconds, share
 
 WORDS = {
@@ -23,7 +23,7 @@ WORDS = {
 GRADES = {"perched": "good", "landed": "warn"}
 
 
-def headline(told: Told, back: str = "") -> Markup:
+def headline(told: ReportedFlight, back: str = "") -> Markup:
     """How it ended, and what one asks first; with a way back to the place `back`."""
     flight = told.summary
     title = WORDS.get(told.outcome, told.outcome)
@@ -60,11 +60,11 @@ def _way(back: str) -> list[str]:
     return [" · ", tag("a", "all flights", href=f"#{back}")] if back else []
 
 
-def _adds(cause: str, told: Told) -> bool:
+def _adds(cause: str, told: ReportedFlight) -> bool:
     return bool(cause) and cause != told.summary.outcome
 
 
-def _faults(told: Told) -> list[str]:
+def _faults(told: ReportedFlight) -> list[str]:
     """What the log lacks."""
     flight, log, found = told.summary, told.log, []
     if not log.records:
@@ -84,7 +84,7 @@ def _faults(told: Told) -> list[str]:
     return found
 
 
-def story(told: Told) -> Markup | None:
+def story(told: ReportedFlight) -> Markup | None:
     rows = [
         tag("li", [tag("time", f"{s.t_s:.1f} s"), tag("span", _prose(s.text))], class_=s.grade)
         for s in told.story
@@ -92,7 +92,7 @@ def story(told: Told) -> Markup | None:
     return tag("ol", rows, class_="story") if rows else None
 
 
-def advice(told: Told) -> Markup | None:
+def advice(told: ReportedFlight) -> Markup | None:
     parts = []
     if told.advice:
         rows = [
@@ -123,7 +123,7 @@ def advice(told: Told) -> Markup | None:
     return Markup("".join(parts)) if parts else None
 
 
-def phases(told: Told) -> Markup | None:
+def phases(told: ReportedFlight) -> Markup | None:
     """The strip over time, and under it the paper's seven."""
     steps = told.track.steps
     if not steps:
@@ -171,7 +171,7 @@ def _spent(stays: int, duration_s: float) -> str:
     return f"{duration_s:.1f} s" + (f" in {stays} stays" if stays > 1 else "")
 
 
-def pictures(told: Told) -> Markup | None:
+def pictures(told: ReportedFlight) -> Markup | None:
     if not told.log.records:
         return None
     if told.pictures is None:
@@ -196,7 +196,7 @@ def pictures(told: Told) -> Markup | None:
     return text([*lost, shown])
 
 
-def plots(told: Told) -> Markup | None:
+def plots(told: ReportedFlight) -> Markup | None:
     drawn = [
         tag("figure", [tag("figcaption", title), figure])
         for title, figure in flight_plots(told.track)
@@ -204,7 +204,7 @@ def plots(told: Told) -> Markup | None:
     return tag("div", drawn, class_="plots") if drawn else None
 
 
-def vision(told: Told) -> Markup | None:
+def vision(told: ReportedFlight) -> Markup | None:
     sight = told.sight
     if not sight.whole.frames:
         return tag("p", "No frame reached the pipeline.") if told.log.records else None
@@ -241,7 +241,7 @@ def _px(value: float) -> str:
     return f"{value:.1f}"
 
 
-def link(told: Told) -> Markup | None:
+def link(told: ReportedFlight) -> Markup | None:
     health = told.link
     if not told.log.records:
         return None
@@ -269,7 +269,7 @@ def _stretches(old: tuple[tuple[float, float, float], ...]) -> str:
     return first if len(old) <= 4 else f"{first}, and {len(old) - 4} more"
 
 
-def outside(told: Told) -> Markup | None:
+def outside(told: ReportedFlight) -> Markup | None:
     health = told.outside
     if health is None:
         return None
@@ -285,7 +285,7 @@ def outside(told: Told) -> Markup | None:
     return pairs(facts)
 
 
-def battery(told: Told) -> Markup | None:
+def battery(told: ReportedFlight) -> Markup | None:
     energy = told.energy
     if not math.isfinite(energy.lowest_v):
         return tag("p", "The log holds no reading of the battery.") if told.log.records else None
@@ -316,7 +316,7 @@ def battery(told: Told) -> Markup | None:
     return Markup(pairs(facts) + tag("div", [tag("div", spent), shown], class_="plots"))
 
 
-def timing(told: Told) -> Markup | None:
+def timing(told: ReportedFlight) -> Markup | None:
     if not told.log.records:
         return None
     timings = timings_of(told.track)

@@ -23,7 +23,7 @@ UNFINISHED = "unfinished"
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class ReportedFlight:
     """One flight. `pictures` is None where no recording was made; `picture_problem` says why some
     could not be read."""
 
@@ -73,7 +73,7 @@ class Told:
         return sum(stays) if stays else math.nan
 
 
-def tell(log: FlightLog, recorded: Recorded | None = None) -> Told:
+def tell(log: FlightLog, recorded: Recorded | None = None) -> ReportedFlight:
     """Works it all out. `recorded`: the pictures beside the log, None where there are none."""
     track = Track(log)
     sight, link, outside = sight_of(track), link_of(track), outside_of(track)
@@ -83,7 +83,7 @@ def tell(log: FlightLog, recorded: Recorded | None = None) -> Told:
     if recorded is not None:
         shown, problem = shown_of(decisions_of(track), recorded)
         problem = problem.replace(f"{log.path.parent}{os.sep}", "")
-    return Told(
+    return ReportedFlight(
         track,
         summary_of(log),
         story_of(track),

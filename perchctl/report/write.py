@@ -10,15 +10,15 @@ from perchctl.log.place import beside
 from perchctl.log.read import read_log, values_of
 from perchctl.log.recording import pictures_of, recording_of
 from perchctl.report.page import page_of
-from perchctl.report.told import Told, tell
+from perchctl.report.told import ReportedFlight, tell
 
-SUFFIXES = (".html", ".htm")
+REPORT_SUFFIXES = (".html", ".htm")
 SESSION_NAME = "session.html"
 
 
 def report_path_of(log_path: Path) -> Path:
     """Where a flight's report stands: beside its log, by its name."""
-    return beside(log_path, SUFFIXES[0])
+    return beside(log_path, REPORT_SUFFIXES[0])
 
 
 def session_path_of(log_paths: Sequence[Path]) -> Path:
@@ -26,7 +26,7 @@ def session_path_of(log_paths: Sequence[Path]) -> Path:
     return log_paths[0].with_name(SESSION_NAME)
 
 
-def told_of(log_path: Path) -> Told:
+def told_of(log_path: Path) -> ReportedFlight:
     """One flight, with what was recorded beside its log. A recording that cannot be read costs
     the pictures only.
 
@@ -39,7 +39,7 @@ def told_of(log_path: Path) -> Told:
         return tell(log, lambda numbers: pictures_of(recording, exact=False, numbers=numbers))
 
 
-def write_report(log_paths: Sequence[Path], output: Path) -> tuple[Told, ...]:
+def write_report(log_paths: Sequence[Path], output: Path) -> tuple[ReportedFlight, ...]:
     """Writes the page, whole or not at all; returns what it tells.
 
     Raises NotFound and InvalidValue, as `read_log` and `write_files`.

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perchctl.display.page.sketch import Sketch, draw
+from perchctl.display import Sketch, draw_sketch
 from perchctl.files import PartFile, cannot_be_written
 from perchctl.track.result import CSV_COLUMNS, Tracked, csv_row
 from perchctl.vision.types import CameraModel
@@ -104,7 +104,7 @@ class OverlayFile(_ResultFile):
     def add(self, t_s: float, sketch: Sketch) -> None:
         from av import VideoFrame
 
-        picture = draw(sketch, self._camera)
+        picture = draw_sketch(sketch, self._camera)
         more_x, more_y = (size % 2 for size in self._camera.size_px)
         picture = np.pad(picture, ((0, more_y), (0, more_x), (0, 0)), mode="edge")
         frame = VideoFrame.from_ndarray(picture, format="bgr24")

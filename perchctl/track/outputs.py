@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TextIO
 
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import Sketch
 from perchctl.track.files import CsvFile, OverlayFile
 from perchctl.track.result import Tracked, text_line, text_rows, track_record
 from perchctl.vision.types import CameraModel

@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 
 from perchctl.camera.health import HealthState, Verdict, assess
 from perchctl.camera.mirror import mirrored_note
-from perchctl.display.page.live import State
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import PageState, Sketch
 from perchctl.pipeline import (
     FieldState,
     Pipeline,
@@ -188,6 +187,8 @@ def _kind(note: str) -> str:
 
 
 def sketch_of(frame: Frame, tracked: Tracked, axis_m: float) -> Sketch:
+    """Return the frame with the outlines of its markers and, where there is a target, its axes,
+    each `axis_m` long."""
     target = tracked.target
     found = ((name, tracked.get(name)) for name in MARKERS)
     return Sketch(
@@ -197,8 +198,8 @@ def sketch_of(frame: Frame, tracked: Tracked, axis_m: float) -> Sketch:
     )
 
 
-def track_state(tracked: Tracked, notes: tuple[str, ...]) -> State:
-    """The frame for the page."""
+def track_state(tracked: Tracked, notes: tuple[str, ...]) -> PageState:
+    """Return what the live page shows of a frame, ready for JSON."""
     return {
         "rows": [list(row) for row in text_rows(tracked)],
         "note": "; ".join(notes),

@@ -16,8 +16,7 @@ from perchctl.calibration.guided import Moment, capture
 from perchctl.calibration.novelty import Capture, Signature, consider, hint, progress, signature
 from perchctl.calibration.types import View
 from perchctl.commands.calibrate_live import captured_views, coverage_bars, page_state
-from perchctl.display.page.live import LivePage
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
 from perchctl.vision.types import Frame
 from tests.helpers.boards import (

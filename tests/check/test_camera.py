@@ -19,11 +19,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration.files import camera_of
 from perchctl.camera.health import MEANING
 from perchctl.camera.mirror import mirrored_note
-from perchctl.check import camera, computer
+from perchctl.check import Row, Verdict, camera, computer
 from perchctl.check.camera import Optical
 from perchctl.check.pictures import Blur, Light
 from perchctl.check.rehearsal import Rehearsal, Silent, rehearse
-from perchctl.check.row import Row, Verdict
 from perchctl.errors import NotFound
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.effects import FOR_EVER, CameraFault

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perchctl.check import capture
-from perchctl.check.row import Row, Verdict
+from perchctl.check import Row, Verdict, capture
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.positioning.types import BodyPose, CaptureFrame
 from perchctl.profile import Profile

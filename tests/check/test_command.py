@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import camera, compared, gone, session
-from perchctl.check.row import Row, Verdict, failed, passed, skipped, warned
-from perchctl.check.session import Wanted
+from perchctl.check import CheckScope, Row, Verdict, camera, compared, gone, session
+from perchctl.check.row import failed, passed, skipped, warned
 from perchctl.cli import app
 from perchctl.commands import check as command
 from perchctl.commands.check import CheckRequest, exit_code, run, table
@@ -35,7 +34,7 @@ def invoke(*words: str) -> Any:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "_wanted", lambda request: Wanted(**QUICK))
+    monkeypatch.setattr(command, "_wanted", lambda request: CheckScope(**QUICK))
 
 
 def test_json_is_a_list_of_rows(quick: None) -> None:
@@ -93,7 +92,7 @@ def test_ctrl_c_ends_with_what_was_found(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
-    code = run(CheckRequest(), Wanted(**QUICK, tell=tell))
+    code = run(CheckRequest(), CheckScope(**QUICK, tell=tell))
     printed = capsys.readouterr()
     assert code == 130
     assert "Ctrl-C" in printed.err

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.check import compared
-from perchctl.check.row import Verdict
+from perchctl.check import Verdict, compared
 from perchctl.cli import app
 from perchctl.flight.clock import wall_date
 from perchctl.profile.positioning import PositioningConfig

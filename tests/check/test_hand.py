@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.check import hand
-from perchctl.check.row import Row, Verdict
+from perchctl.check import Row, Verdict, hand
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
 from perchctl.positioning.judge import Placed
 from perchctl.positioning.types import BodyPose

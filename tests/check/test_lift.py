@@ -16,9 +16,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
 
-from perchctl.check import compared, hand
-from perchctl.check.row import Row, Verdict
-from perchctl.check.session import Wanted, check
+from perchctl.check import CheckScope, Row, Verdict, check, compared, hand
 from perchctl.errors import SafetyAbort
 from perchctl.flight.positions import check_compared
 from perchctl.profile import Profile
@@ -84,7 +82,7 @@ class Lab:
                 self.sim.carry(lifted_and_turned(HOME))
 
         self._put_down()
-        quick = Wanted(**QUICK)
+        quick = CheckScope(**QUICK)
         wanted = replace(quick, lift=True, lift_s=within_s, listen_s=0.5, capture_s=0.5, tell=tell)
         found = check(options(self.sim.uri, profile=self.profile), wanted)
         return {row.name: row for row in found}

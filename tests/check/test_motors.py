@@ -14,10 +14,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import gone, health, lift, session
+from perchctl.check import CheckScope, Row, Verdict, gone, health, lift, session
 from perchctl.check.link import Vehicle
-from perchctl.check.row import Row, Verdict
-from perchctl.check.session import Wanted
 from perchctl.sim.scenario import Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.vehicle import FLYING, LOCKED, Telemetry
@@ -241,7 +239,7 @@ def by_hand(rig: Lockstep, moment: str, told: bool, patch: pytest.MonkeyPatch) -
     rig.start_health_test = start  # type: ignore[method-assign]
     patch.setattr(session.link, "look", lambda *_: Vehicle(NOWHERE, telemetry=AT_REST))
     patch.setattr(session, "time", SimpleNamespace(sleep=rig.wait))
-    wanted = Wanted(yes, lift=True, lift_s=0.5, tell=at)
+    wanted = CheckScope(yes, lift=True, lift_s=0.5, tell=at)
     rows = session._vehicle(rig, NOWHERE, PROFILE, None, wanted)  # type: ignore[arg-type]
     return {row.name: row for row in rows}
 

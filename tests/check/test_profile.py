@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
+from perchctl.check import Row, Verdict, profile_rows
 from perchctl.check.limits import DOUBTFUL
-from perchctl.check.profile import rows
-from perchctl.check.row import Row, Verdict
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.places import data_folder
 from tests.helpers.flights import short_profile
@@ -53,13 +52,13 @@ CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (
 
 
 def row_of(profile: Profile, name: str, **options: str) -> Row:
-    (row,) = (row for row in rows(profile, **options) if row.name == name)
+    (row,) = (row for row in profile_rows(profile, **options) if row.name == name)
     return row
 
 
 @pytest.mark.parametrize(("name", "changes", "words"), CASES, ids=str)
 def test_what_is_doubtful_is_a_warning(name: str, changes: Mapping[str, Any], words: str) -> None:
-    found = rows(short_profile(changes, base="sim"))
+    found = profile_rows(short_profile(changes, base="sim"))
     (row,) = (row for row in found if row.verdict is not Verdict.PASS)
     assert (row.name, row.verdict) == (name, Verdict.WARN)
     assert words in row.found
@@ -78,11 +77,11 @@ def test_each_doubtful_limit_is_broken_once() -> None:
 
 @pytest.mark.parametrize("name", ["sim", "paper", "fpv"])
 def test_a_shipped_profile_is_above_doubt(name: str) -> None:
-    assert {row.verdict for row in rows(load_profile(name))} == {Verdict.PASS}
+    assert {row.verdict for row in profile_rows(load_profile(name))} == {Verdict.PASS}
 
 
 def test_every_row_has_a_name_of_its_own() -> None:
-    names = [row.name for row in rows(load_profile("sim"))]
+    names = [row.name for row in profile_rows(load_profile("sim"))]
     assert len(set(names)) == len(names)
 
 

@@ -13,9 +13,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import camera, health, session
-from perchctl.check.row import Row, Verdict
-from perchctl.check.session import Wanted, check
+from perchctl.check import CheckScope, Row, Verdict, camera, check, health, session
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
 from perchctl.link.scan import Answering, address_of, scan
@@ -41,7 +39,7 @@ def test_a_library_that_does_not_load_ends_the_check_as_it_ends_a_flight() -> No
         raise broken_motion_capture("libvrpn.so.7: cannot open")
 
     profile = short_profile({"positioning.by": "mocap", "positioning.host": "lab"})
-    wanted = Wanted(**QUICK, open_capture=broken)
+    wanted = CheckScope(**QUICK, open_capture=broken)
     with pytest.raises(UsageError, match="cannot be loaded: libvrpn") as refused:
         next(check(options(NOWHERE, profile=profile), wanted))
     assert refused.value.exit_code == 2
@@ -59,7 +57,7 @@ def test_nothing_arms_flies_or_turns_without_a_yes(sim: SimProcess, relay: Relay
         return False
 
     wait_for(sim, 1.5)
-    rows = list(check(options(relay.uri, sim.stream_url), Wanted(no, lift=True, **QUICK)))
+    rows = list(check(options(relay.uri, sim.stream_url), CheckScope(no, lift=True, **QUICK)))
     by_name = {row.name: row for row in rows}
     assert by_name["address"].verdict is Verdict.PASS
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
@@ -73,7 +71,7 @@ def test_nothing_arms_flies_or_turns_without_a_yes(sim: SimProcess, relay: Relay
 
 def test_a_yes_starts_the_motor_test_and_nothing_else(sim: SimProcess, relay: Relay) -> None:
     wait_for(sim, 1.5)
-    rows = {row.name: row for row in check(options(relay.uri), Wanted(lambda: True, **QUICK))}
+    rows = {row.name: row for row in check(options(relay.uri), CheckScope(lambda: True, **QUICK))}
     begun = [packet.data[2:] for packet in relay.writes()]
     assert begun == [b"\1"]  # no result within 0.2 s: it may still run, and no other beside it
     assert rows["propellers"].verdict is Verdict.WARN
@@ -90,7 +88,7 @@ def test_a_flying_vehicle_s_motors_are_not_even_asked_for(sim: SimProcess, relay
     sim.set_pose((0.0, 0.0, 0.5), hold=True)
     try:
         wait_for(sim, 0.3)
-        wanted = Wanted(lambda: bool(asked.append("?")) or True, **QUICK)
+        wanted = CheckScope(lambda: bool(asked.append("?")) or True, **QUICK)
         rows = {row.name: row for row in check(options(relay.uri), wanted)}
     finally:
         sim.set_pose((0.0, 0.0, 0.012))
@@ -109,7 +107,7 @@ def nobody(**profile: Any) -> Profile:
 
 def test_a_vehicle_that_does_not_answer_leaves_its_rows_skipped() -> None:
     there = Answering(("radio://0/60/2M", NOWHERE))
-    wanted = Wanted(**(QUICK | {"other_vehicles": lambda uri: there}))
+    wanted = CheckScope(**(QUICK | {"other_vehicles": lambda uri: there}))
     rows = list(check(options(NOWHERE, profile=nobody()), wanted))
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
     assert rows[0].verdict is Verdict.FAIL
@@ -125,7 +123,7 @@ def test_pictures_of_another_size_fail_their_row(
     cv2.imwrite(str(tmp_path / "small.png"), np.full((240, 320), 99, np.uint8))
     monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
     simulated = options("sim://", f"images:{tmp_path}")
-    rows = {row.name: row for row in check(simulated, Wanted(**QUICK))}
+    rows = {row.name: row for row in check(simulated, CheckScope(**QUICK))}
     assert rows["size"].verdict is Verdict.FAIL
     assert rows["propellers"].advice == "add --prop-test"  # and nobody was asked
     assert rows["lifted"].advice.startswith("add --lift")
@@ -140,7 +138,7 @@ def test_a_link_that_is_lost_on_the_way_is_told() -> None:
             if text.startswith("listening"):
                 passing.stop()
 
-        wanted = Wanted(**(QUICK | {"listen_s": 0.5}), tell=tell)
+        wanted = CheckScope(**(QUICK | {"listen_s": 0.5}), tell=tell)
         rows = {row.name: row for row in check(options(passing.uri), wanted)}
     assert rows["packets"].verdict is Verdict.FAIL
     assert "the link was lost" in rows["packets"].found
@@ -158,7 +156,7 @@ def test_ctrl_c_in_the_motor_test_says_that_it_goes_on(
 
     monkeypatch.setattr(health, "run", interrupted)
     wait_for(sim, 1.5)
-    rows = check(options(sim.uri), Wanted(lambda: True, **QUICK, tell=said.append))
+    rows = check(options(sim.uri), CheckScope(lambda: True, **QUICK, tell=said.append))
     with pytest.raises(KeyboardInterrupt):
         list(rows)
     assert "keep clear" in said[-1]
@@ -194,7 +192,7 @@ def test_a_scan_names_what_answers() -> None:
     answerer = Answerer()
     try:
         found = scan([None, 0xE7E7E7E701])
-        rows = {row.found: row for row in session.found_by_scan(None)}
+        rows = {row.found: row for row in session.scan_rows(None)}
     finally:
         answerer.socket.close()
     assert answerer.uri in found.uris

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.check import link, sight
-from perchctl.check.profile import rows as profile_rows
+from perchctl.check import Row, Verdict, link, profile_rows, sight
 from perchctl.check.rehearsal import Looked, Rehearsal, _only_heard
-from perchctl.check.row import Row, Verdict
 from perchctl.profile import Profile, load_profile
 from perchctl.target.design import GearRanges, Ranges, make_design
 from perchctl.target.limits import Optics

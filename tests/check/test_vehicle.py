@@ -13,9 +13,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import link
+from perchctl.check import Row, Verdict, link
 from perchctl.check.link import Vehicle
-from perchctl.check.row import Row, Verdict
 from perchctl.link.probe import Echoes, ProbeLink
 from perchctl.profile import LinkConfig, Profile
 from perchctl.sim.crtp.server import LinkOptions

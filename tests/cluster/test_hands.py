@@ -17,9 +17,9 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
+from perchctl.cluster import cluster_hands, parse_address
 from perchctl.cluster import hands as cluster
-from perchctl.cluster.hands import ClusterHands, cluster_hands
-from perchctl.cluster.place import place_of
+from perchctl.cluster.hands import ClusterHands
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
 from perchctl.flight.campaign import FLOWN_AGAIN, fly_all, run_campaign
 from perchctl.flight.record import flown_record
@@ -48,7 +48,7 @@ AT_ONCE_S = 20.0
 
 @pytest.fixture(scope="module")
 def local(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ClusterHands]:
-    with cluster_hands(place_of("local:2"), [load_profile(SHORT)]) as hands:
+    with cluster_hands(parse_address("local:2"), [load_profile(SHORT)]) as hands:
         yield hands
 
 
@@ -107,7 +107,7 @@ def test_a_real_flight_survives_a_worker_that_is_killed_in_the_middle(
 def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No process, no folder, and no page's port of dask's."""
     monkeypatch.chdir(tmp_path)
-    with cluster_hands(place_of("local:1"), []) as hands:
+    with cluster_hands(parse_address("local:1"), []) as hands:
         assert hands.local is not None
         (pid,) = hands.local.pids
         folder = folder_of(hands)
@@ -125,7 +125,7 @@ def test_a_worker_that_cannot_start_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("perchctl.cluster.local.serve", ends_badly)
     with (
         pytest.raises(PerchError, match=r"worker 0 of .* local:1 ends at its start \(exit 3"),
-        cluster_hands(place_of("local:1"), []),
+        cluster_hands(parse_address("local:1"), []),
     ):
         raise AssertionError
 
@@ -157,7 +157,9 @@ def test_two_workers_one_of_which_is_killed(tmp_path: Path) -> None:
     logs.mkdir()
     with scheduler(tmp_path) as (address, process), ExitStack() as stack:
         workers = [stack.enter_context(worker(address, tmp_path)) for _ in range(2)]
-        hands = stack.enter_context(cluster_hands(place_of(address), [load_profile("sim")], logs))
+        hands = stack.enter_context(
+            cluster_hands(parse_address(address), [load_profile("sim")], logs)
+        )
         flown = fly_all(partial(is_lost, folder=marks, times=1), [0, 1, 2, 3], hands)
         assert [flight.seed for flight in flown] == [0, 1, 2, 3]
         assert {flight.pid for flight in flown} <= {each.pid for each in workers}
@@ -189,16 +191,16 @@ def test_workers_that_must_not_fly_and_none_at_all(
         monkeypatch.setattr(cluster, "WORKERS_S", 0.3)
         with (
             pytest.raises(ConnectionFailed, match=r"has had no worker for .* dask worker tcp://"),
-            cluster_hands(place_of(address), []),
+            cluster_hands(parse_address(address), []),
         ):
             raise AssertionError
         monkeypatch.setattr(cluster, "WORKERS_S", 60.0)
         unfit = partial(pytest.raises, InvalidValue, match=r"^worker tcp://127.* the source ")
-        with worker(address, tmp_path), cluster_hands(place_of(address), []) as hands:
+        with worker(address, tmp_path), cluster_hands(parse_address(address), []) as hands:
             assert fly_all(ends_at_once, [1], hands)
             hands.submit(ends_first_only, 1)
             with worker(address, tmp_path, root=other):  # comes later
                 with unfit():
                     fly_all(ends_at_once, range(2, 4), hands)
-                with unfit(), cluster_hands(place_of(address), []):
+                with unfit(), cluster_hands(parse_address(address), []):
                     raise AssertionError

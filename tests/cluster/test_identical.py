@@ -12,8 +12,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
-from perchctl.cluster.hands import cluster_hands
-from perchctl.cluster.place import place_of
+from perchctl.cluster import cluster_hands, parse_address
 from perchctl.flight.campaign import fly_all, run_campaign
 from perchctl.flight.hands import job_processes
 from perchctl.flight.record import flown_record
@@ -41,7 +40,7 @@ def test_forty_seeds_in_one_process_in_two_and_on_a_cluster(tmp_path: Path) -> N
         assert flown(two) == alone
     told: list[FlightResult] = []
     fly = partial(dies_in_flight, profile, tmp_path, DEADLY)
-    with cluster_hands(place_of("local:2"), [profile]) as hands:
+    with cluster_hands(parse_address("local:2"), [profile]) as hands:
         results = fly_all(fly, SEEDS, hands, told.append)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(map(str, DEADLY))
     assert [flown_record(result) for result in results] == alone

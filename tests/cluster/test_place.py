@@ -11,7 +11,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.cluster.place import Place, place_of
+from perchctl.cluster import parse_address
+from perchctl.cluster.place import Place
 from perchctl.commands.simulate_request import SimulateRequest
 from perchctl.errors import UsageError
 from tests.helpers.commands import elsewhere, run  # noqa: F401
@@ -29,8 +30,8 @@ from tests.helpers.flights import SHORT
     ],
 )
 def test_an_address_is_read(text: str, place: Place) -> None:
-    assert place_of(text) == place
-    assert place_of(str(place)) == place
+    assert parse_address(text) == place
+    assert parse_address(str(place)) == place
 
 
 @pytest.mark.parametrize(
@@ -43,7 +44,7 @@ def test_an_address_is_read(text: str, place: Place) -> None:
 )  # fmt: skip
 def test_what_is_none_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"must be .* as in --cluster"):
-        place_of(text)
+        parse_address(text)
 
 
 @pytest.mark.parametrize(

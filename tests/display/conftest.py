@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from perchctl.display.page.live import LivePage
+from perchctl.display import LivePage
 from tests.helpers.live_page import Stops
 from tests.helpers.recording import camera
 

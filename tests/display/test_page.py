@@ -12,9 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.display.page.live import LivePage
+from perchctl.display import LivePage, Sketch
 from perchctl.display.page.server import MAX_STREAMS
-from perchctl.display.page.sketch import Sketch
 from perchctl.errors import InvalidValue
 from tests.helpers.live_page import CORNERS, ask
 from tests.helpers.recording import camera

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from perchctl.display.page.live import LivePage
+from perchctl.display import LivePage
 from tests.helpers.browser import Browser, browsing, why_no_browser
 from tests.helpers.recording import camera
 

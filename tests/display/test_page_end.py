@@ -14,9 +14,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from perchctl.commands import fly
-from perchctl.display.page.flight import FlightPage
-from perchctl.display.page.live import LivePage
-from perchctl.display.page.told import answered, card_of, failed_card
+from perchctl.display import FlightPage, LivePage, failed_card, summary_card
+from perchctl.display.page.told import answered
 from perchctl.errors import Interrupted
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.session import FlyOptions, SessionResult
@@ -187,7 +186,7 @@ SUMMARY = FlightSummary(
 
 def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) -> None:
     log = tmp_path / "my flights" / "flight.jsonl"
-    card = card_of(SUMMARY, log)
+    card = summary_card(SUMMARY, log)
     assert (card["outcome"], card["good"]) == ("PERCHED", True)
     assert card["reason"] == SUMMARY.reason
     rows = dict(card["rows"])
@@ -196,7 +195,7 @@ def test_the_card_tells_outcome_reason_miss_and_where_to_look(tmp_path: Path) ->
     assert rows["report"] == f"perchctl log report '{log}'"
     assert "cause" not in rows
     landed = replace(SUMMARY, outcome="landed", cause="safety abort", miss_m=None, locked=True)
-    rows = dict(card_of(landed, log)["rows"])
+    rows = dict(summary_card(landed, log)["rows"])
     assert rows["cause"] == "safety abort"
     assert "miss" not in rows
     assert "restart" in rows["vehicle"]

@@ -16,9 +16,7 @@ import pytest
 
 from perchctl.commands.fly import live_page
 from perchctl.commands.track import TrackRequest, resolve, track
-from perchctl.display.page.flight import FlightPage
-from perchctl.display.page.live import LivePage
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import FlightPage, LivePage, Sketch
 from perchctl.flight.operator import AGAIN_S, HELD_S, OperatorSwitch
 from perchctl.flight.session import FlyOptions
 from perchctl.mission.state import Operator, Phase, PlannerState
@@ -193,10 +191,10 @@ def test_track_serves_its_numbers_while_it_runs(
 
 
 def test_an_axis_behind_the_camera_is_left_out() -> None:
-    from perchctl.display.page.sketch import draw
+    from perchctl.display import draw_sketch
 
     image = picture(VIEWS["away"])
     pose = (np.array([0.0, 0.0, 0.0]), np.array([0.0, 0.0, -0.2]), 0.075)
     wild = (("large", np.full((4, 2), 1e9)), ("small", np.full((4, 2), np.nan)))
-    drawn = draw(Sketch(image, wild, pose), camera())
+    drawn = draw_sketch(Sketch(image, wild, pose), camera())
     assert (drawn == image[..., None]).all()

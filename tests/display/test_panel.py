@@ -14,9 +14,10 @@ import pytest
 from rich.console import Console
 from rich.text import Text
 
-from perchctl.display.panel import Reporter, make_reporter, panel
+from perchctl.display import DisplayWatcher, make_reporter
+from perchctl.display.panel import Reporter, panel
 from perchctl.display.status import FlightStatus, status_rows
-from perchctl.display.watch import DisplayWatcher, status_of
+from perchctl.display.watch import status_of
 from perchctl.log.read import read_log
 from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter

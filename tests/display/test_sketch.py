@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.display.page.sketch import Sketch, draw
+from perchctl.display import Sketch, draw_sketch
 from tests.helpers.recording import camera
 
 LINES = ("frame  151   5.000 s", "target  x +1.23  y -4.56  z 45.67 cm", "yaw +135.71 deg")
@@ -17,7 +17,7 @@ def test_the_dark_rim_lies_around_the_letters_and_nowhere_else(size_px: tuple[in
     """A font may have wider glyphs where they are thicker: a thick text under a thin one is
     then a second text beside it."""
     width, height = size_px
-    drawn = draw(Sketch(np.full((height, width), 110, np.uint8), text=LINES), camera())
+    drawn = draw_sketch(Sketch(np.full((height, width), 110, np.uint8), text=LINES), camera())
     light, dark = (drawn[:, :, 0] > 150).astype(np.uint8), drawn[:, :, 0] < 70
     assert light.sum() > 300
     reach = 2 * max(1, round(height / 480)) + 3
@@ -27,17 +27,17 @@ def test_the_dark_rim_lies_around_the_letters_and_nowhere_else(size_px: tuple[in
 
 
 def test_white_letters_can_be_read_on_white() -> None:
-    drawn = draw(Sketch(np.full((480, 640), 255, np.uint8), text=LINES), camera())
+    drawn = draw_sketch(Sketch(np.full((480, 640), 255, np.uint8), text=LINES), camera())
     assert (drawn < 70).sum() > 300
 
 
 def test_a_line_that_is_too_long_is_written_smaller() -> None:
     line = "come nearer, until the board fills a third of the picture; " * 3
-    drawn = draw(Sketch(np.full((480, 640), 110, np.uint8), text=(line,)), camera())
+    drawn = draw_sketch(Sketch(np.full((480, 640), 110, np.uint8), text=(line,)), camera())
     columns = np.flatnonzero((drawn != 110).any(axis=(0, 2)))
     assert columns.min() < 10
     assert 590 < columns.max() < 638
 
 
 def test_nothing_is_written_without_text() -> None:
-    assert (draw(Sketch(np.full((480, 640), 110, np.uint8)), camera()) == 110).all()
+    assert (draw_sketch(Sketch(np.full((480, 640), 110, np.uint8)), camera()) == 110).all()

@@ -10,16 +10,8 @@ import numpy as np
 import pytest
 
 from perchctl.errors import UsageError
-from perchctl.faults.catalogue import (
-    AIR,
-    BY_NAME,
-    FAULTS,
-    USUAL_S,
-    Fault,
-    case_of,
-    draw_case,
-    selected,
-)
+from perchctl.faults import FAULTS, select_faults
+from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, case_of, draw_case
 from perchctl.faults.effects import Operator
 from perchctl.faults.oracle import second_press_s
 from perchctl.flight.operator import OperatorSwitch
@@ -82,8 +74,10 @@ def test_a_key_that_is_held_is_no_stop_and_one_that_is_hammered_is(name: str, st
 
 
 def test_a_selection_by_name() -> None:
-    assert selected("all") == FAULTS
-    assert [fault.name for fault in selected("hung, killed")] == ["hung", "killed"]
+    assert select_faults("all") == FAULTS
+    assert [fault.name for fault in select_faults("hung, killed")] == ["hung", "killed"]
     with pytest.raises(UsageError, match=r"'hanged' is unknown.*--faults list"):
-        selected("killed,hanged")
-    assert {draw_case(seed, SCENARIO, selected("slow")).fault.name for seed in range(5)} == {"slow"}
+        select_faults("killed,hanged")
+    assert {draw_case(seed, SCENARIO, select_faults("slow")).fault.name for seed in range(5)} == {
+        "slow"
+    }

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
+from perchctl.faults import FAULTS
 from perchctl.faults import effects as e
-from perchctl.faults.catalogue import FAULTS, Case, draw_case
+from perchctl.faults.catalogue import Case, draw_case
 from perchctl.faults.expected_outcomes import (
     BROWN_OUT,
     CUT,

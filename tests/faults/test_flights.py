@@ -22,17 +22,16 @@ from typer.testing import CliRunner
 from perchctl.cli import app
 from perchctl.commands.positioning import POSITIONINGS, positioned
 from perchctl.errors import SafetyAbort
+from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table, plot_heat_map
 from perchctl.faults import flight as faulty
-from perchctl.faults.catalogue import BY_NAME, FAULTS, case_of
+from perchctl.faults.catalogue import BY_NAME, case_of
 from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
 from perchctl.faults.effects import FOR_EVER, DeckSilent
 from perchctl.faults.flight import fly_fault_seed, fly_with_fault
 from perchctl.faults.oracle import FLAGS
-from perchctl.faults.plot import plot_heat_map
 from perchctl.faults.program import PlantedError
 from perchctl.faults.promises import PROMISE_OF, PROMISES
-from perchctl.faults.result import FaultResult
-from perchctl.faults.summary import fault_summary, fault_table, worst_first
+from perchctl.faults.summary import worst_first
 from perchctl.flight.record import flown_record
 from perchctl.mission import planner
 from perchctl.mission.state import Phase

@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.faults.catalogue import FAULTS, draw_case
+from perchctl.faults import FAULTS, FaultResult
+from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import _parameters
-from perchctl.faults.result import FaultResult
 from perchctl.flight.record import flown_record, result_from, result_record
 from perchctl.flight.results import FlightResult
 from perchctl.profile import load_profile

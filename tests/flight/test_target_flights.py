@@ -9,7 +9,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.faults.catalogue import FAULTS, draw_case
+from perchctl.faults import FAULTS
+from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import FaultyFlight
 from perchctl.flight.campaign import fly_seed
 from perchctl.flight.lockstep import fly_lockstep

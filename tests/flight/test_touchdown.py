@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.display.page.told import card_of
+from perchctl.display import card_of
 from perchctl.log.read import read_log
 from perchctl.log.shown import show_record, show_text
 from perchctl.log.summary import FlightSummary, summary_of, summary_text

@@ -15,7 +15,7 @@ from perchctl.log.read import read_log
 from perchctl.log.recording import export_mcap
 from perchctl.log.shown import show_record, show_text
 from perchctl.mission import conditions
-from perchctl.replay.run import replay
+from perchctl.replay import replay
 from perchctl.report.track import Track
 from tests.helpers.recorded import messages
 from tests.replay.test_corpus import FOLDER

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
+from perchctl.check import Verdict
 from perchctl.check import compared as check_compared
-from perchctl.check.row import Verdict, failed, passed, skipped, warned
+from perchctl.check.row import failed, passed, skipped, warned
 from perchctl.cli import app
 from perchctl.errors import SafetyAbort
 from perchctl.flight import positions
@@ -223,7 +224,7 @@ def test_decks_and_the_simulator_s_own_room_ask_for_none() -> None:
     deck = CONFIG.model_copy(update={"by": "deck"})
     for config, simulated in ((deck, False), (CONFIG, True)):
         positions.check_compared(config, URI, simulated=simulated)
-        assert check_compared.rows(config, URI, NOW, simulated=simulated) == []
+        assert check_compared.comparison_rows(config, URI, NOW, simulated=simulated) == []
 
 
 # --- `fly` -------------------------------------------------------------------------------

@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from perchctl.check.profile import rows
-from perchctl.check.row import Verdict
+from perchctl.check import Verdict, profile_rows
 from perchctl.cli import app
 from perchctl.commands.new_profile import NewProfileRequest, run
 from perchctl.commands.new_profile_answers import QUESTIONS, WRITTEN
@@ -220,7 +219,7 @@ def test_small_and_nothing_are_taken(given: dict[str, str], tmp_path: Path) -> N
 def test_a_landing_from_under_any_ceiling_has_the_time(ceiling_m: str, tmp_path: Path) -> None:
     run(NewProfileRequest(tmp_path / "m.yaml", {"ceiling": ceiling_m}, defaults=True))
     mine = load_profile(str(tmp_path / "m.yaml"))
-    (row,) = (row for row in rows(mine) if row.name == "time limits")
+    (row,) = (row for row in profile_rows(mine) if row.name == "time limits")
     assert row.verdict is Verdict.PASS, row.found
 
 

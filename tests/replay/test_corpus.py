@@ -15,7 +15,8 @@ from perchctl.log.read import FlightLog, read_log
 from perchctl.log.setup import other_computer
 from perchctl.log.write import SCHEMA_VERSION
 from perchctl.mission.state import Phase
-from perchctl.replay.run import Replay, replay
+from perchctl.replay import replay
+from perchctl.replay.run import Replay
 from perchctl.replay.told import difference_text
 from tests.helpers.flights import ROOT
 

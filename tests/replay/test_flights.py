@@ -8,14 +8,14 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.faults.catalogue import FAULTS
+from perchctl.faults import FAULTS
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.flight.campaign import fly_seed
 from perchctl.log.read import read_log
 from perchctl.log.recording import pictures_of
 from perchctl.profile.changed import changed
-from perchctl.replay.run import Replay, replay
-from perchctl.replay.whatif import changes_of
+from perchctl.replay import pose_changes, replay
+from perchctl.replay.run import Replay
 from tests.helpers.flights import short_profile
 
 EVERY_FAULT = tuple(fault.name for fault in FAULTS)
@@ -68,7 +68,7 @@ def test_a_recorded_flight_is_seen_again(tmp_path: Path) -> None:
     nearer = changed(short_profile(), ["vehicle.gear_body_m=[0, 0, 0.031]"])
     found = replay(log, pictures_of(path), nearer)
     assert found.changed == ("vehicle.gear_body_m",)
-    joint = next(change for change in changes_of(found) if change.name == "joint")
+    joint = next(change for change in pose_changes(found) if change.name == "joint")
     moved_m = 0.031 - short_profile().vehicle.gear_body_m[2]
     assert joint.z_m == pytest.approx(abs(moved_m), rel=0.05)
     assert (joint.only_flown, joint.only_changed) == (0, 0)

@@ -25,10 +25,10 @@ from perchctl.log.write import FlightLogWriter, make_header
 from perchctl.mission import conditions, guidance, planner
 from perchctl.profile import Profile
 from perchctl.profile.changed import changed
+from perchctl.replay import changed_gates, replay, replay_lines, replay_record
 from perchctl.replay.compare import first_differing, same
-from perchctl.replay.run import changed_keys, replay
-from perchctl.replay.told import replay_lines, replay_record
-from perchctl.replay.whatif import CAUTION, Gate, gates_of
+from perchctl.replay.run import changed_keys
+from perchctl.replay.whatif import CAUTION, Gate
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.commands import run
 from tests.replay.test_corpus import FOLDER, corpus
@@ -279,12 +279,12 @@ def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
     assert found.changed == ("planner.ascend.settle_dwell_s",)
     assert found.first is not None
     assert (found.first.recorded, found.first.replayed) == ("PERCH", "ASCEND")
-    gate = next(g for g in gates_of(found) if g.name == "row settled")
+    gate = next(g for g in changed_gates(found) if g.name == "row settled")
     assert gate.flown_s == (found.first.t_s,)
-    text = "\n".join(replay_lines(found, gates_of(found), []))
+    text = "\n".join(replay_lines(found, changed_gates(found), []))
     assert "gate:      row settled: at " in text
     assert CAUTION in text
-    record = replay_record(found, gates_of(found), [])
+    record = replay_record(found, changed_gates(found), [])
     assert record["what_if"]["changed"] == ["planner.ascend.settle_dwell_s"]
     assert record["first_difference"]["field"] == "phase"
     json.dumps(record, allow_nan=False)
@@ -295,7 +295,7 @@ def test_what_if_nothing_would_differ() -> None:
     wider = changed(profile_of(log.header), ["safety.max_height_m=9"])
     found = replay(log, None, wider)
     assert found.same
-    assert gates_of(found) == []
+    assert changed_gates(found) == []
     assert any("no command would have been another" in s for s in replay_lines(found, [], []))
 
 

@@ -18,7 +18,7 @@ from perchctl.calibration.files import load_calibration
 from perchctl.log.read import read_log
 from perchctl.log.recording import pictures_of
 from perchctl.profile import find_calibration, load_profile
-from perchctl.replay.run import replay
+from perchctl.replay import replay
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.process.handle import SimProcess
 from tests.helpers.flights import ROOT, SEED, SHORT

@@ -24,7 +24,8 @@ import pytest
 from perchctl.log.exact import to_exact
 from perchctl.log.recording import pictures_of
 from perchctl.log.setup import other_computer
-from perchctl.replay.run import Replay, replay
+from perchctl.replay import replay
+from perchctl.replay.run import Replay
 from perchctl.replay.told import difference_text
 from perchctl.vision import filter as the_filter
 from perchctl.vision import solve

@@ -20,9 +20,8 @@ from perchctl.mission.state import Operator, Phase
 from perchctl.mission.watch import Tick
 from perchctl.pipeline import FieldState, Pipeline
 from perchctl.profile.changed import changed
-from perchctl.replay.run import Replay, replay
-from perchctl.replay.sense import Picture
-from perchctl.replay.told import replay_lines, replay_record
+from perchctl.replay import Picture, replay, replay_lines, replay_record
+from perchctl.replay.run import Replay
 from perchctl.vision.types import Frame
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle

@@ -24,10 +24,10 @@ from perchctl.profile import Profile
 from perchctl.profile.changed import changed
 from perchctl.profile.mission import SafetyConfig
 from perchctl.profile.positioning import PositioningConfig
+from perchctl.replay import replay, replay_lines, replay_record
 from perchctl.replay.compare import first_differing, same
-from perchctl.replay.run import Replay, replay
+from perchctl.replay.run import Replay
 from perchctl.replay.shown import shown
-from perchctl.replay.told import replay_lines, replay_record
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import Frame
 from tests.helpers.loop_rig import PROFILE, Camera, Rig

@@ -13,14 +13,13 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 import cv2
 
+from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
 from perchctl.faults.effects import FOR_EVER, CameraFault, Effect, Killed
 from perchctl.faults.flight import fly_with_fault
-from perchctl.faults.result import FaultResult
 from perchctl.log.read import read_log
 from perchctl.mission.state import Phase
-from perchctl.report.told import Told
-from perchctl.report.write import write_report
+from perchctl.report import ReportedFlight, write_report
 from perchctl.sim.draw import draw_scenario
 from tests.helpers.browser import Browser, browsing, why_no_browser
 from tests.helpers.flights import SEED, short_profile
@@ -58,7 +57,7 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, F
     return folder, results
 
 
-def told(flights: tuple[Path, dict[str, FaultResult]], name: str) -> Told:
+def told(flights: tuple[Path, dict[str, FaultResult]], name: str) -> ReportedFlight:
     from perchctl.report.write import told_of
 
     return told_of(flights[0] / f"{name}.jsonl")

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue
+from perchctl.report import ReportedFlight, report_path_of
 from perchctl.report.page import page_of
 from perchctl.report.plot import flight_plots
-from perchctl.report.told import Told, tell
+from perchctl.report.told import tell
 from perchctl.report.track import Track
-from perchctl.report.write import report_path_of
 from tests.helpers.commands import elsewhere, run  # noqa: F401 - a fixture
 from tests.helpers.told import Change, flown_s, made, written
 
@@ -63,7 +63,7 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.text).replace("\N{NO-BREAK SPACE}", " ").split())
 
 
-def told(change: Change = lambda record: None, **more: Any) -> Told:
+def told(change: Change = lambda record: None, **more: Any) -> ReportedFlight:
     return tell(made(change, **more))
 
 
@@ -190,7 +190,7 @@ def test_what_is_text_stays_text() -> None:
 
 @words_only
 def test_no_folder_of_the_computer_is_on_the_page(tmp_path: Path) -> None:
-    from perchctl.report.write import write_report
+    from perchctl.report import write_report
 
     log = written(tmp_path / "deep" / "flight.jsonl")
     write_report([log], tmp_path / "page.html")

@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from perchctl.track import Notes, Tally, Tracked
 from perchctl.track.jumps import jumped
-from perchctl.track.result import Tracked
-from perchctl.track.tracker import Notes, Tally
 from perchctl.vision.types import MarkerPose
 
 FRAME_S = 1.0 / 30.0

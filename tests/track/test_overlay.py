@@ -8,7 +8,7 @@ import av
 import numpy as np
 import pytest
 
-from perchctl.display.page.sketch import Sketch
+from perchctl.display import Sketch
 from perchctl.errors import InvalidValue
 from perchctl.track.files import OverlayFile
 from perchctl.vision.types import CameraModel

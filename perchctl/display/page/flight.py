@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from perchctl.camera.source import FrameSource, WatchedSource
-from perchctl.display.page.live import LivePage, State
+from perchctl.display.page.live import LivePage, PageState
 from perchctl.display.page.sketch import Sketch
 from perchctl.display.page.told import Card, answered
 from perchctl.display.status import status_rows
@@ -92,7 +92,7 @@ def sketch_of(frame: Frame, output: PipelineOutput | None, axis_m: float) -> Ske
     )
 
 
-def flight_state(tick: Tick, stop_did: str = "") -> State:
+def flight_state(tick: Tick, stop_did: str = "") -> PageState:
     """The tick for the page: phase, battery, the rows of the terminal's panel, whether the flight
     is over, and what it did for STOP."""
     status = status_of(tick)

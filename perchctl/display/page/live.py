@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 
 from perchctl.display.page.server import PageServer
-from perchctl.display.page.sketch import Sketch, draw, draw_flat
+from perchctl.display.page.sketch import Sketch, draw_flat, draw_sketch
 from perchctl.errors import InvalidValue
 from perchctl.vision.types import CameraModel
 
@@ -28,7 +28,7 @@ READS_S, LAST_READ_S = 2.5, 2.0
 _RATE_FRAMES = 30  # over which the frame rate is taken
 _RATE_STALE_S = 1.0
 
-State = dict[str, Any]
+PageState = dict[str, Any]
 
 
 class LivePage:
@@ -67,10 +67,10 @@ class LivePage:
         self._frame: int | None = None
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._jpegs: dict[bool, tuple[int, bytes]] = {}
-        self._describe: Callable[[], State] = dict
+        self._describe: Callable[[], PageState] = dict
         self._told_s: float | None = None  # None: nothing is due
         self._read_s: float | None = None
-        self._card: State | None = None
+        self._card: PageState | None = None
         self._card_read = False
         try:
             self._server = PageServer(self, port)
@@ -100,13 +100,13 @@ class LivePage:
             self._number += 1
             self._changed.notify_all()
 
-    def tell(self, describe: Callable[[], State], *, live: bool = True) -> None:
+    def tell(self, describe: Callable[[], PageState], *, live: bool = True) -> None:
         """The newest numbers; formatted only when a reader polls. While they are `live`, others
         are due at once, and the page says when they stay away."""
         self._describe = describe
         self._told_s = self._clock() if live else None
 
-    def end(self, card: State) -> None:
+    def end(self, card: PageState) -> None:
         """How it ended: what it shows now stays, with this card. Waits, bounded, until a reader
         that is there has it."""
         with self._changed:
@@ -121,7 +121,7 @@ class LivePage:
 
     # --- for the server's threads --------------------------------------------
 
-    def state(self) -> State:
+    def state(self) -> PageState:
         """What the page polls: `describe`'s keys (rows of a name, a text and, for a bar, a share
         0..1; note, phase, battery, over, stop_did), and title, rate_hz, stop (``none``, ``ready``,
         ``requested``, ``over``), age_s of these numbers (None where no others are due), card
@@ -145,7 +145,7 @@ class LivePage:
         self._read_s = self._clock()
         return described | fixed | {"page_problem": self.problem}
 
-    def was_read(self, state: State) -> None:
+    def was_read(self, state: PageState) -> None:
         """That state has reached a reader."""
         if state.get("card") is not None:
             with self._changed:
@@ -171,7 +171,7 @@ class LivePage:
         with self._drawing:  # once, for all readers
             known = self._jpegs.get(flat)
             if known is None or known[0] < newest:
-                picture = draw_flat(sketch) if flat else draw(sketch, self.camera)
+                picture = draw_flat(sketch) if flat else draw_sketch(sketch, self.camera)
                 if picture is None:
                     return None
                 quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]

@@ -41,7 +41,7 @@ class Sketch:
     flat_places_px: NDArray[np.float32] | None = None
 
 
-def draw(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
+def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
     """The picture in colour (blue, green, red), (h, w, 3) uint8."""
     picture = np.asarray(cv2.cvtColor(sketch.image, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
     for name, corners in sketch.outlines:

@@ -39,7 +39,7 @@ def answered(events: Sequence[Event], pressed_s: float | None) -> str:
     return "; ".join(parts)
 
 
-def card_of(summary: FlightSummary, log: Path) -> Card:
+def summary_card(summary: FlightSummary, log: Path) -> Card:
     """How the flight ended, and where to look next."""
     rows = [["cause", summary.cause]] if summary.cause not in ("", summary.outcome) else []
     if summary.miss_m is not None:

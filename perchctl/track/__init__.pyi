@@ -1,0 +1,9 @@
+from .outputs import OutputOptions as OutputOptions
+from .outputs import Outputs as Outputs
+from .result import Tracked as Tracked
+from .tracker import Notes as Notes
+from .tracker import Tally as Tally
+from .tracker import Tracker as Tracker
+from .tracker import camera_pipeline as camera_pipeline
+from .tracker import sketch_of as sketch_of
+from .tracker import track_state as track_state
