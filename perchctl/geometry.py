@@ -18,6 +18,7 @@ Conventions (`docs/conventions.md` has them all):
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,3 +152,11 @@ def circular_mean(weights: Array, angles_rad: Array) -> float:
     ref = float(angles_rad[0])
     deltas = [wrap_rad(float(a) - ref) for a in angles_rad]
     return wrap_rad(ref + float(np.dot(weights, deltas)))
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A position (3,), m, in the estimate's world, and a heading, rad."""
+
+    position_m: Array
+    yaw_rad: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 # Supervisor bits (docs/firmware.md, "Supervisor").
@@ -59,6 +60,9 @@ class ExternalPosition:
     position_m: tuple[float, float, float]
     quaternion: tuple[float, float, float, float] | None = None
 
+
+SendPosition = Callable[[ExternalPosition], object]
+"""Sends one to the vehicle's estimator; returns False where it did not go out."""
 
 POSITION_DECKS = ("bcFlow2", "bcFlow", "bcLighthouse4", "bcLoco", "bcDWM1000")
 """Those that measure a position, or a speed over ground, by the firmware's `deck` parameters."""

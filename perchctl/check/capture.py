@@ -15,8 +15,7 @@ import numpy as np
 from perchctl.check.row import Row, by_limits, failed, passed, skipped, worse
 from perchctl.flight import criteria, outside
 from perchctl.geometry import Array
-from perchctl.positioning.judge import Placed, label, place_of
-from perchctl.positioning.types import CaptureFrame, CaptureSource
+from perchctl.positioning import CaptureFrame, CaptureSource, Placed
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry
@@ -50,7 +49,7 @@ class Listened:
     def places(self, config: PositioningConfig) -> list[Placed]:
         """Of the vehicle's body, at the moments of exposure, oldest first."""
         return [
-            place_of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
+            Placed.of(frame.bodies[config.body], config, frame.t_s - config.latency_s)
             for frame, _ in self.frames
             if config.body in frame.bodies
         ]
@@ -89,15 +88,15 @@ def refused(why: str, config: PositioningConfig) -> list[Row]:
     advice = "does it stream, is positioning.host right, does a firewall stop it?"
     return [
         failed("capture", why, advice),
-        *(skipped(name, f"no {label(config)}") for name in NAMES[1:]),
+        *(skipped(name, f"no {config.label}") for name in NAMES[1:]),
     ]
 
 
 def rows(heard: Listened, profile: Profile) -> list[Row]:
     config = profile.positioning
     if not heard.frames:
-        return refused(heard.problem or f"{label(config)} sends no frame", config)
-    first = passed("capture", f"{label(config)} sends")
+        return refused(heard.problem or f"{config.label} sends no frame", config)
+    first = passed("capture", f"{config.label} sends")
     places = heard.places(config)
     if not places:
         others = sorted({name for frame, _ in heard.frames for name in frame.bodies})

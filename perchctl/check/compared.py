@@ -6,7 +6,12 @@ from datetime import datetime
 
 from perchctl.check.row import Row, Verdict, failed, passed, warned
 from perchctl.link.claim import vehicle_of
-from perchctl.positioning.compared import Compared, Known, keep, newest, objection, told
+from perchctl.positioning import (
+    Comparison,
+    ComparisonRecord,
+    load_comparison,
+    save_comparison,
+)
 from perchctl.profile.positioning import PositioningConfig
 
 NAME = "compared"
@@ -16,13 +21,13 @@ def kept(lifted: Row, config: PositioningConfig, uri: str, now: datetime) -> Row
     """Write down what the hand found, and the row of it. A lift that told nothing is none."""
     vehicle = vehicle_of(uri)
     if lifted.verdict is Verdict.SKIPPED:
-        return row(newest(config, vehicle), now)
-    record = Compared(now, lifted.verdict is Verdict.PASS, lifted.found)
-    why = keep(config, vehicle, record)
+        return row(load_comparison(config, vehicle), now)
+    record = Comparison(now, lifted.verdict is Verdict.PASS, lifted.found)
+    why = save_comparison(config, vehicle, record)
     if why is None:
         return row(record, now)
-    standing = newest(config, vehicle)
-    if not record.passed and objection(standing, now) is None:
+    standing = load_comparison(config, vehicle)
+    if not record.passed and standing.objection(now) is None:
         return failed(
             NAME, f"what was found could not be written, and fly goes by an older pass: {why}",
             "free some space, or give back the right to write there; do not fly before",
@@ -30,11 +35,11 @@ def kept(lifted: Row, config: PositioningConfig, uri: str, now: datetime) -> Row
     return warned(NAME, f"not written, so fly does not know of it: {why}", "then once more")
 
 
-def row(record: Known, now: datetime) -> Row:
-    objected = objection(record, now)
+def row(record: ComparisonRecord, now: datetime) -> Row:
+    objected = record.objection(now)
     if objected is None:
-        assert isinstance(record, Compared)
-        return passed(NAME, told(record, now))
+        assert isinstance(record, Comparison)
+        return passed(NAME, record.text(now))
     found, advice = objected
     return warned(NAME, f"{found}; fly refuses", advice)
 
@@ -45,4 +50,4 @@ def comparison_rows(
     """None with decks, nor for the simulator's own vehicle, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []
-    return [row(newest(config, vehicle_of(uri)), now)]
+    return [row(load_comparison(config, vehicle_of(uri)), now)]

@@ -25,7 +25,7 @@ from perchctl.check.row import Row, failed, passed, skipped, warned
 from perchctl.flight.history import History, attitude_at
 from perchctl.flight.outside import nearest_axis
 from perchctl.geometry import Array, rotation_from_rpy, rpy_from_rotation
-from perchctl.positioning.judge import Placed
+from perchctl.positioning import Placed
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry
 

@@ -16,7 +16,6 @@ from perchctl.flight.criteria import Problem
 from perchctl.link.prepare import NEEDED_PROTOCOL
 from perchctl.link.probe import Echoes, ProbeLink
 from perchctl.link.variables import EXTERNAL, decks_of
-from perchctl.positioning.judge import label
 from perchctl.profile import Profile
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
 
@@ -270,7 +269,7 @@ def _positioning(vehicle: Vehicle, profile: Profile) -> Row:
     if problem is not None:
         return failed("positioning", problem.found, problem.advice)
     if profile.positioning.by == "mocap":
-        return passed("positioning", f"by {label(profile.positioning)}, see its rows")
+        return passed("positioning", f"by {profile.positioning.label}, see its rows")
     if profile.positioning.by == "target":
         return passed("positioning", f"by the target, see {' and '.join(sight.NAMES)}")
     decks = _position_decks(vehicle, profile)

@@ -38,9 +38,7 @@ from perchctl.link.scan import Answering, address_of
 from perchctl.link.scan import scan as scan_for
 from perchctl.link.uri import check_uri
 from perchctl.pipeline import Pipeline, make_pipeline
-from perchctl.positioning.capture import open_capture
-from perchctl.positioning.judge import label
-from perchctl.positioning.types import CaptureSource
+from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry
@@ -148,7 +146,7 @@ def _opened_capture(
 ) -> Room:
     if config.by != "mocap":
         return None
-    wanted.tell(f"connecting to {label(config)}")
+    wanted.tell(f"connecting to {config.label}")
     try:
         opened = wanted.open_capture(config)
     except UsageError:
@@ -168,7 +166,7 @@ def _room(
     if isinstance(room, str):
         yield from capture.refused(room, profile.positioning)
         return
-    wanted.tell(f"listening to {label(profile.positioning)} for {wanted.capture_s:g} s")
+    wanted.tell(f"listening to {profile.positioning.label} for {wanted.capture_s:g} s")
     seen = capture.listen(heard, room, time.monotonic, time.sleep, wanted.capture_s)
     yield from capture.rows(seen, profile)
 
@@ -181,7 +179,7 @@ def _lifted(probe: ProbeLink, room: Room, profile: Profile, wanted: CheckScope) 
         wanted.tell(f"now, within {wanted.lift_s:g} s: {lift.HOW}")
         return lift.row(lift.lift_of(lift.watch(probe, time.sleep, wanted.lift_s)))
     if isinstance(room, str):
-        return skipped(lift.NAME, f"no {label(profile.positioning)}")
+        return skipped(lift.NAME, f"no {profile.positioning.label}")
     config = profile.positioning
     wanted.tell(f"now, within {wanted.lift_s:g} s: {hand.HOW}")
 

@@ -7,7 +7,9 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +18,8 @@ from perchctl.camera.open import open_source
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
-from perchctl.errors import InvalidValue, UsageError, no_simulator
-from perchctl.positioning.capture import open_named
+from perchctl.errors import InvalidValue, UsageError, no_motion_capture, no_simulator
+from perchctl.positioning import open_capture
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vision.types import CameraModel
@@ -29,7 +31,14 @@ from perchctl.weights.collect import (
     rows_of,
 )
 from perchctl.weights.dialogue import Experiment
-from perchctl.weights.truth import EstimateTruth, MocapTruth, Truth, TypedTruth, four_numbers
+from perchctl.weights.truth import (
+    EstimateTruth,
+    Frames,
+    MocapTruth,
+    Truth,
+    TypedTruth,
+    four_numbers,
+)
 
 TRUTHS = ("typed", "mocap", "estimate", "sim")
 VEHICLE, TARGET = "cf", "target"
@@ -180,3 +189,13 @@ def _ask(question: str) -> str:
     if not line:
         raise EOFError
     return line.rstrip("\n")
+
+
+def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) -> Frames:
+    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
+    kind, _, host = system.partition(":")
+    if find_spec("motioncapture") is None:
+        raise no_motion_capture(needed_by)
+    # Unchecked, since `check_reachable` has the sentence for a kind that is none.
+    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
+    return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))

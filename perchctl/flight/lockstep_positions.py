@@ -9,9 +9,7 @@ from perchctl.errors import ConnectionFailed
 from perchctl.geometry import yaw_of
 from perchctl.link.mock import MockLink
 from perchctl.link.outside import RESET, parameters_of
-from perchctl.positioning.feed import PositionFeed
-from perchctl.positioning.judge import label
-from perchctl.positioning.thread import PERIOD_S
+from perchctl.positioning import FeedThread, PositionFeed
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.sim.capture.server import SYSTEM
@@ -41,13 +39,13 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
         return None
     config = config.model_copy(update={"system": SYSTEM, "host": "sim"})
     feed = PositionFeed(LockstepCapture(capture), link.external, config)
-    link.each(PERIOD_S, feed.turn)
+    link.each(FeedThread.PERIOD_S, feed.turn)
     end_s = link.now_s + FIRST_FRAME_S
     while (place := feed.place()) is None:
         if link.now_s >= end_s:
-            why = feed.status(link.now_s).problem or f"nothing comes from {label(config)}"
+            why = feed.status(link.now_s).problem or f"nothing comes from {config.label}"
             raise ConnectionFailed(f"no position within {FIRST_FRAME_S:g} s: {why}")
-        link.advance_to(link.now_s + PERIOD_S)
+        link.advance_to(link.now_s + FeedThread.PERIOD_S)
     x, y, z = (float(part) for part in place.position_m)
     _start_at(link, config, x, y, z, yaw_of(place.R))
     return feed

@@ -50,7 +50,7 @@ from perchctl.mission.watch import (
     Watcher,
 )
 from perchctl.pipeline import Pipeline
-from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, Idle

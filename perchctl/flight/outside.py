@@ -22,7 +22,7 @@ from perchctl.geometry import (
     wrap_rad,
     yaw_of,
 )
-from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition, Telemetry
 

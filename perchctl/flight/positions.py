@@ -12,12 +12,15 @@ from perchctl.flight.preflight import refuse_strange
 from perchctl.link.cflib_link import CflibLink
 from perchctl.link.claim import vehicle_of
 from perchctl.link.outside import check_parameters
-from perchctl.positioning.capture import check_reachable, open_capture
-from perchctl.positioning.compared import newest, objection
-from perchctl.positioning.feed import PositionFeed
-from perchctl.positioning.standing import StandingFeed
-from perchctl.positioning.thread import FeedThread
-from perchctl.positioning.types import CaptureSource
+from perchctl.positioning import (
+    CaptureSource,
+    FeedThread,
+    PositionFeed,
+    StandingFeed,
+    check_reachable,
+    load_comparison,
+    open_capture,
+)
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 
@@ -43,7 +46,7 @@ def check_compared(config: PositioningConfig, uri: str, *, simulated: bool) -> N
     built."""
     if config.by != "mocap" or simulated:
         return
-    objected = objection(newest(config, vehicle_of(uri)), wall_date())
+    objected = load_comparison(config, vehicle_of(uri)).objection(wall_date())
     if objected is not None:
         raise SafetyAbort(": ".join(objected))
 

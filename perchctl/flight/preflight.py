@@ -17,10 +17,9 @@ from perchctl.flight.criteria import (
 )
 from perchctl.flight.outside import AtRest, apart, measurer, missing, strange
 from perchctl.flight.view import not_in_view, out_of_view
+from perchctl.geometry import Place
 from perchctl.link.protocol import Link
-from perchctl.positioning.feed import FeedStatus
-from perchctl.positioning.place import Place
-from perchctl.positioning.sight import UNSEEN
+from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import CameraModel, TargetEstimate
@@ -117,7 +116,7 @@ def still_waiting_for(
         what = f"a good picture ({camera_problem or 'none has come'})"
         return _bounded(what, waited_s, profile.camera.start_timeout_s)
     if outside is not None and by_sight and (problem := missing(outside, profile)):
-        if waited_s > limit_s and problem.found == UNSEEN:
+        if waited_s > limit_s and outside.is_unseen:
             problem = not_in_view(target, camera_problem, telemetry, profile, camera)
         what = f"a sight of the target, which measures the position ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)

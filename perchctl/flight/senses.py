@@ -24,10 +24,9 @@ from perchctl.mission.felt import FeltWatch, felt
 from perchctl.mission.state import Observation
 from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
-from perchctl.positioning.feed import Send
 from perchctl.profile import Profile, SafetyConfig
 from perchctl.values import replace
-from perchctl.vehicle import Telemetry
+from perchctl.vehicle import SendPosition, Telemetry
 from perchctl.vision.consistency import Consistency, solved
 from perchctl.vision.fields import BLENDED, INTERLACED
 from perchctl.vision.own import ANOTHERS
@@ -78,7 +77,7 @@ class Senses:
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     noticed: Noticed = field(default_factory=Noticed)
     felt: FeltWatch = field(default_factory=FeltWatch)
-    send: Send = lambda place: True
+    send: SendPosition = lambda place: True
     recorded: bool = False  # the turns are: with the pictures' checksums and the present's spread
     sights: Sights | None = field(init=False, default=None)
     sends_sights: bool = True  # until the way down goes on without them

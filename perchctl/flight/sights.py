@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from perchctl.flight.history import History, attitude_at, attitude_of
 from perchctl.pipeline import Pipeline
-from perchctl.positioning.feed import FeedStatus, Send
-from perchctl.positioning.place import steered, touching
-from perchctl.positioning.sight import SightFeed
+from perchctl.positioning import FeedStatus, SightFeed
 from perchctl.profile import Profile
+from perchctl.vehicle import SendPosition
 from perchctl.vision.tracks import surest_of
 from perchctl.vision.types import Measured, TargetEstimate
 
@@ -30,8 +29,7 @@ FROZEN_S = 0.06
 class Sights:
     """Of one flight. `status` goes to the planner as that of a motion capture does."""
 
-    def __init__(self, send: Send, pipeline: Pipeline, profile: Profile) -> None:
-        self._setup = pipeline.pose
+    def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
         self.feed = SightFeed(send, profile, pipeline.pose)
         self._touches = False
 
@@ -41,15 +39,15 @@ class Sights:
     def begin(self, history: History, now_s: float, *, touches: bool) -> None:
         """A turn, before its picture. `touches`: contact was proven, and nothing has shown since
         that it ended."""
-        newest, target = history.newest, self.feed.target
+        newest = history.newest
         self._touches = touches
         if newest is None or not is_carried(history, now_s):
             return
-        if target is None:
+        touching_m = self.feed.touching(newest.yaw_rad)
+        if touching_m is None:
             self.feed.stand(now_s)
         elif touches:
-            yaw_rad = newest.yaw_rad + self.feed.off.yaw_rad
-            self.feed.known(touching(target, yaw_rad, self._setup.gear_body_m), now_s)
+            self.feed.known(touching_m, now_s)
 
     def see(self, measured: Measured, history: History, now_s: float) -> None:
         """A picture. What is pressed or hangs needs none, and the last ones were of before."""
@@ -63,9 +61,9 @@ class Sights:
     def steered(self, target: TargetEstimate | None, history: History) -> TargetEstimate | None:
         """The target where it stands; as it is seen until its place is known."""
         newest = history.newest
-        if target is None or newest is None or self.feed.target is None:
+        if target is None or newest is None:
             return target
-        return steered(target, self.feed.target, self.feed.off, attitude_of(newest), self._setup)
+        return self.feed.steered(target, attitude_of(newest))
 
 
 def is_carried(history: History, now_s: float) -> bool:

@@ -10,7 +10,7 @@ from perchctl.flight.senses import Senses
 from perchctl.mission.state import Observation, PlannerState
 from perchctl.mission.turn import Outside, Turn, TurnRole, TurnTiming
 from perchctl.mission.watch import TurnWatcher, Watcher
-from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning import FeedStatus
 from perchctl.values import replace
 from perchctl.vehicle import Command
 

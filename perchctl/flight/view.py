@@ -12,8 +12,7 @@ import numpy as np
 
 from perchctl.errors import distinct_figures
 from perchctl.flight.criteria import Problem
-from perchctl.geometry import rot_z
-from perchctl.positioning.place import Place
+from perchctl.geometry import Place, rot_z
 from perchctl.profile import Profile
 from perchctl.target.overhead import (
     Sight,

@@ -17,8 +17,7 @@ from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.link.evidence import is_placed, may_fly
 from perchctl.link.prepare import order_parameter, set_parameters
-from perchctl.positioning.feed import FeedStatus
-from perchctl.positioning.judge import Placed, label
+from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry
 
@@ -101,7 +100,7 @@ class Settling:
                 f"told that it stands: {found}; do positions arrive?"
             )
         raise TimedOut(
-            f"the estimate of {self._uri} does not come to where {label(self._config)} sees the "
+            f"the estimate of {self._uri} does not come to where {self._config.label} sees the "
             f"vehicle: {found}; do positions arrive, and is this its rigid body?"
         )
 

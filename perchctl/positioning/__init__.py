@@ -1,1 +1,5 @@
-"""Where the vehicle's estimate gets its place from, when its decks do not give it."""
+"""Where a vehicle without a deck has its position from: a motion capture, or the target itself."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -14,7 +14,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from importlib.util import find_spec
-from typing import Any
 
 from perchctl.children import Channel, accept, end, introduce, listen, new_token, spawn
 from perchctl.errors import (
@@ -24,7 +23,6 @@ from perchctl.errors import (
     no_motion_capture,
 )
 from perchctl.positioning.child import Arrived, CaptureSetup, Connected, Failed, NotLoaded
-from perchctl.positioning.judge import label
 from perchctl.positioning.types import BodyPose, CaptureFrame
 from perchctl.profile.positioning import CAPTURE_SYSTEMS, PositioningConfig, host_fault
 
@@ -76,16 +74,6 @@ def setup_of(config: PositioningConfig) -> CaptureSetup:
     )
 
 
-def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) -> MotionCapture:
-    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
-    kind, _, host = system.partition(":")
-    if find_spec("motioncapture") is None:
-        raise no_motion_capture(needed_by)
-    # Unchecked, since `check_reachable` has the sentence for a kind that is none.
-    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
-    return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))
-
-
 def open_capture(
     config: PositioningConfig, clock: Callable[[], float] = time.monotonic
 ) -> MotionCapture:
@@ -95,7 +83,7 @@ def open_capture(
     without an answer in `config.connect_timeout_s`.
     """
     check_reachable(config)
-    return MotionCapture.start(setup_of(config), label(config), config.body, clock)
+    return MotionCapture.start(setup_of(config), config.label, config.body, clock)
 
 
 class MotionCapture:

@@ -44,75 +44,82 @@ class SetUp:
     body_position_m: tuple[float, ...]
 
 
+class ComparisonRecord:
+    """What is known of a vehicle's comparison with its motion capture. `now` has a time zone, in
+    which dates are told."""
+
+    def objection(self, now: datetime) -> tuple[str, str] | None:
+        """Why no flight may rely on it: what was found, and what to do. None where it passed, and
+        not long ago."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class Compared:
+class NeverCompared(ComparisonRecord):
+    """There is no record."""
+
+    def objection(self, now: datetime) -> tuple[str, str] | None:
+        return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
+
+
+@dataclass(frozen=True)
+class OthersCompared(ComparisonRecord):
+    """Records there are of this very capture and body, and of other vehicles only."""
+
+    vehicle: str
+    others: tuple[str, ...]
+
+    def objection(self, now: datetime) -> tuple[str, str] | None:
+        found = (
+            f"the motion capture was compared with another vehicle ({', '.join(self.others)}), "
+            f"and never with this one ({self.vehicle})"
+        )
+        return found, f"{AGAIN}, once"
+
+
+@dataclass(frozen=True)
+class Unreadable(ComparisonRecord):
+    """There is a record, and nobody knows what it says."""
+
+    path: Path
+    why: str
+
+    def objection(self, now: datetime) -> tuple[str, str] | None:
+        found = f"whether the motion capture was compared is not known: {self.path} {self.why}"
+        return found, f"remove that file, then {AGAIN}"
+
+
+@dataclass(frozen=True)
+class Comparison(ComparisonRecord):
     """A comparison's date (with its time zone), whether it passed, and what it found."""
 
     at: datetime
     passed: bool
     found: str
 
+    def objection(self, now: datetime) -> tuple[str, str] | None:
+        when = _told(self.at, now)
+        if not self.passed:
+            return f"{self.found} (found by check --lift on {when})", f"mend that, then {AGAIN}"
+        age_s = (now - self.at).total_seconds()
+        if age_s < -AHEAD_S:
+            found = f"the motion capture was compared on {when}, which is yet to come"
+            return found, f"set this computer's clock, then {AGAIN}"
+        if age_s > VALID_S:
+            hours = age_s / 3600.0
+            old = f"{hours:.0f} h" if hours < 72.0 else f"{hours / 24.0:.0f} days"
+            found = f"the motion capture was last compared {old} ago, on {when} (24 h at most)"
+            return found, AGAIN
+        return None
 
-@dataclass(frozen=True)
-class Unreadable:
-    """There is a record, and nobody knows what it says."""
-
-    path: Path
-    why: str
-
-
-@dataclass(frozen=True)
-class OfOthers:
-    """Records there are of this very capture and body, and of other vehicles only."""
-
-    vehicle: str
-    others: tuple[str, ...]
-
-
-Known = Compared | OfOthers | Unreadable | None
-"""None: it was never compared."""
+    def text(self, now: datetime) -> str:
+        """Of a comparison that passed."""
+        return f"compared by hand on {_told(self.at, now)}"
 
 
 def set_up_of(config: PositioningConfig, vehicle: str) -> SetUp:
     rpy, place = (tuple(map(float, v)) for v in (config.body_rpy_deg, config.body_position_m))
     return SetUp(vehicle, config.system, config.host, config.body, rpy, place)
-
-
-# --- Judging: pure -----------------------------------------------------------------------
-
-
-def objection(record: Known, now: datetime) -> tuple[str, str] | None:
-    """Why no flight may rely on it: what was found, and what to do. None where it passed, and not
-    long ago. `now` has a time zone, in which dates are told."""
-    if record is None:
-        return "the motion capture was never compared with this vehicle", f"{AGAIN}, once"
-    if isinstance(record, OfOthers):
-        found = (
-            f"the motion capture was compared with another vehicle ({', '.join(record.others)}), "
-            f"and never with this one ({record.vehicle})"
-        )
-        return found, f"{AGAIN}, once"
-    if isinstance(record, Unreadable):
-        found = f"whether the motion capture was compared is not known: {record.path} {record.why}"
-        return found, f"remove that file, then {AGAIN}"
-    when = _told(record.at, now)
-    if not record.passed:
-        return f"{record.found} (found by check --lift on {when})", f"mend that, then {AGAIN}"
-    age_s = (now - record.at).total_seconds()
-    if age_s < -AHEAD_S:
-        found = f"the motion capture was compared on {when}, which is yet to come"
-        return found, f"set this computer's clock, then {AGAIN}"
-    if age_s > VALID_S:
-        hours = age_s / 3600.0
-        old = f"{hours:.0f} h" if hours < 72.0 else f"{hours / 24.0:.0f} days"
-        found = f"the motion capture was last compared {old} ago, on {when} (24 h at most)"
-        return found, AGAIN
-    return None
-
-
-def told(record: Compared, now: datetime) -> str:
-    """Of a comparison that passed."""
-    return f"compared by hand on {_told(record.at, now)}"
 
 
 def _told(at: datetime, now: datetime) -> str:
@@ -125,7 +132,7 @@ def _told(at: datetime, now: datetime) -> str:
 _MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 
 
-def encoded(set_up: SetUp, record: Compared) -> bytes:
+def encoded(set_up: SetUp, record: Comparison) -> bytes:
     values = {
         "set_up": asdict(set_up),
         "at": record.at.astimezone(UTC).isoformat(),
@@ -135,7 +142,7 @@ def encoded(set_up: SetUp, record: Compared) -> bytes:
     return (json.dumps(values, indent=1) + "\n").encode()
 
 
-def decoded(data: bytes, set_up: SetUp) -> Compared:
+def decoded(data: bytes, set_up: SetUp) -> Comparison:
     """Errors: ValueError, with what is wrong of it, for what is none or is of another set-up."""
     try:
         values = json.loads(data)
@@ -149,7 +156,7 @@ def decoded(data: bytes, set_up: SetUp) -> Compared:
         raise ValueError("is damaged")
     if of != json.loads(json.dumps(asdict(set_up))):
         raise ValueError("is of another set-up")
-    return Compared(at, passed, _one_line(found))
+    return Comparison(at, passed, _one_line(found))
 
 
 _LONG_AGO, _LONG = datetime(2000, 1, 1, tzinfo=UTC), timedelta(days=365_000)
@@ -168,14 +175,14 @@ def path_of(set_up: SetUp) -> Path:
     return user_state_folder() / "compared" / f"{name}.json"
 
 
-def newest(config: PositioningConfig, vehicle: str) -> Known:
+def load_comparison(config: PositioningConfig, vehicle: str) -> ComparisonRecord:
     """What is known of this vehicle in this set-up."""
     set_up = set_up_of(config, vehicle)
     path = path_of(set_up)
     data = _read(path)
     if data is None:
         others = _others(set_up)
-        return OfOthers(vehicle, others) if others else None
+        return OthersCompared(vehicle, others) if others else NeverCompared()
     if isinstance(data, Unreadable):
         return data
     try:
@@ -218,7 +225,7 @@ def _others(set_up: SetUp) -> tuple[str, ...]:
     return tuple(sorted(found - {set_up.vehicle}))
 
 
-def keep(config: PositioningConfig, vehicle: str, record: Compared) -> str | None:
+def save_comparison(config: PositioningConfig, vehicle: str, record: Comparison) -> str | None:
     """Write it down; what was there of this vehicle in this set-up is gone. None, or why it could
     not be written: one that passed must not stand, then, where the newest did not, and is taken
     away if it can be."""

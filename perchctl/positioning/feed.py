@@ -12,11 +12,14 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
-from perchctl.positioning.judge import Judge, Placed, label
+import numpy as np
+
+from perchctl.positioning.judge import Judge, Placed
 from perchctl.positioning.types import CaptureSource
 from perchctl.profile.positioning import PositioningConfig
-from perchctl.vehicle import ExternalPosition
+from perchctl.vehicle import ExternalPosition, SendPosition
 
 QUIET_S = 0.1
 """Without a position for so long, or for two periods, it is said why. One frame that is missing
@@ -24,11 +27,10 @@ among good ones is none of the pilot's business."""
 HANGS_S = 0.2
 """The turns come every 10 ms, or as often as a simulated flight's loop turns."""
 RATE_OVER_S = 1.0
+END_TIMEOUT_S = 1.0
+UNSEEN = "the target is not seen"
 STOPPED = "the positions contradict the accelerometer, and are not sent any more"
 BUSY = "the link is busy with something else, and a position does not wait"
-
-Send = Callable[[ExternalPosition], object]
-"""`Link.external`; False: it did not go out."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,19 @@ class FeedStatus:
     rate_hz: float = 0.0
     measured: ExternalPosition | None = None
 
+    @property
+    def is_unseen(self) -> bool:
+        """Whether none is sent since the target is not in the picture."""
+        return self.problem == UNSEEN
+
 
 class PositionFeed:
     """No thread and no clock: `turn` is called about 100 times a second, by a `FeedThread` or
     in lockstep; `status` from any thread."""
 
-    def __init__(self, source: CaptureSource, send: Send, config: PositioningConfig) -> None:
+    def __init__(
+        self, source: CaptureSource, send: SendPosition, config: PositioningConfig
+    ) -> None:
         self._source, self._send, self._config = source, send, config
         self._judge = Judge(config)
         self._period_s = 1.0 / config.rate_hz
@@ -126,7 +135,7 @@ class PositionFeed:
         return None
 
     def _why(self, now_s: float) -> str:
-        who = label(self._config)
+        who = self._config.label
         if self._turned_s is None:
             return f"nothing has been asked of {who} yet"
         if now_s - self._turned_s > HANGS_S:
@@ -138,3 +147,75 @@ class PositionFeed:
         if self._framed_s == -math.inf:
             return f"no frame has come from {who} yet"
         return f"no frame has come from {who} for {now_s - self._framed_s:.1f} s"
+
+
+class StandingFeed:
+    """A vehicle that stands at the origin: what its estimator is told while it is reset, where the
+    target is the positioning system and has not been measured yet.
+
+    `turn` by a `FeedThread`; `status` and `place` from any thread."""
+
+    def __init__(self, send: SendPosition, ground_z_m: float) -> None:
+        self._send, self._place = send, ExternalPosition((0.0, 0.0, ground_z_m))
+        self._lock = threading.Lock()
+        self._sent_s, self._count = -math.inf, 0
+        self._problem: str | None = None
+
+    def turn(self, now_s: float) -> None:
+        """Raises nothing: what goes wrong is the status's problem."""
+        try:
+            problem = BUSY if self._send(self._place) is False else None
+        except Exception as error:  # of the link
+            problem = f"the position cannot be passed on: {type(error).__name__}: {error}"
+        with self._lock:
+            self._problem = problem
+            if problem is None:
+                self._sent_s, self._count = now_s, self._count + 1
+
+    def status(self, now_s: float) -> FeedStatus:
+        with self._lock:
+            age_s = now_s - self._sent_s
+            return FeedStatus(age_s, self._problem, self._count, self._place)
+
+    def place(self) -> Placed:
+        """Level, with its front along x: so the world is defined."""
+        return Placed(self._sent_s, np.array(self._place.position_m), np.eye(3))
+
+
+class Turned(Protocol):
+    """What is told the time, and raises nothing."""
+
+    def turn(self, now_s: float) -> None: ...
+
+
+class FeedThread:
+    """Turns `feed` every `period_s` from `start` until `close`.
+
+    `clock`: seconds, monotonic, the flight loop's. A turn may hang in the library of the link;
+    then `PositionFeed.status` says so, and `close` does not wait for it for long.
+    """
+
+    PERIOD_S = 0.01
+
+    def __init__(
+        self, feed: Turned, clock: Callable[[], float], period_s: float = PERIOD_S
+    ) -> None:
+        self._feed, self._clock, self._period_s = feed, clock, period_s
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="perchctl-positions", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def close(self) -> None:
+        """No position is sent any more."""
+        self._ended.set()
+        if self._thread.ident is not None:
+            self._thread.join(END_TIMEOUT_S)
+
+    def _run(self) -> None:
+        due_s = self._clock()
+        while not self._ended.is_set():
+            self._feed.turn(self._clock())
+            due_s = max(due_s + self._period_s, self._clock() - self._period_s)
+            self._ended.wait(max(0.0, due_s - self._clock()))

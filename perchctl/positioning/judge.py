@@ -46,19 +46,19 @@ class Placed:
     position_m: Array
     R: Array
 
+    @classmethod
+    def of(cls, pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> Placed:
+        """Of the vehicle's body, from the rigid body's axes as the capture system has defined
+        them: ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
+        roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
+        length = math.sqrt(sum(part * part for part in pose.quaternion))
+        w, x, y, z = (part / length for part in pose.quaternion)
+        R = rotation_from_quaternion((w, x, y, z)) @ rotation_from_rpy(roll, pitch, yaw).T
+        return cls(t_s, np.asarray(pose.position_m) - R @ np.asarray(config.body_position_m), R)
+
     def external(self, *, pose: bool) -> ExternalPosition:
         x, y, z = (float(part) for part in self.position_m)
         return ExternalPosition((x, y, z), quaternion_from_rotation(self.R) if pose else None)
-
-
-def place_of(pose: BodyPose, config: PositioningConfig, t_s: float = 0.0) -> Placed:
-    """The vehicle's body axes, from the rigid body's as the capture system has defined it:
-    ``T_world_body = T_world_rigid @ inv(T_body_rigid)``."""
-    roll, pitch, yaw = (math.radians(angle) for angle in config.body_rpy_deg)
-    length = math.sqrt(sum(part * part for part in pose.quaternion))
-    w, x, y, z = (part / length for part in pose.quaternion)
-    R = rotation_from_quaternion((w, x, y, z)) @ rotation_from_rpy(roll, pitch, yaw).T
-    return Placed(t_s, np.asarray(pose.position_m) - R @ np.asarray(config.body_position_m), R)
 
 
 class Judge:
@@ -67,7 +67,7 @@ class Judge:
 
     def __init__(self, config: PositioningConfig) -> None:
         self._config = config
-        self._who = f"the rigid body {config.body!r} of the {label(config)}"
+        self._who = f"the rigid body {config.body!r} of the {config.label}"
         self._arrived_s = -math.inf
         self._newest: BodyPose | None = None
         self._believed: Placed | None = None
@@ -108,7 +108,7 @@ class Judge:
             return None
         self._newest = pose
         return self._followed(
-            place_of(pose, self._config, arrived_s - self._config.latency_s), now_s
+            Placed.of(pose, self._config, arrived_s - self._config.latency_s), now_s
         )
 
     def _followed(self, placed: Placed, now_s: float) -> Placed | None:
@@ -138,7 +138,7 @@ class Judge:
         others = sorted(name for name, t_s in self._seen.items() if now_s - t_s <= SEEN_S)
         others = [name for name in others if name != self._config.body]
         return (
-            f"{label(self._config)} does not see the rigid body {self._config.body!r}; "
+            f"{self._config.label} does not see the rigid body {self._config.body!r}; "
             f"it sees {', '.join(others) or 'none'}"
         )
 
@@ -147,13 +147,6 @@ class Judge:
             f"{self._who} is frozen: all of its numbers repeat, and a measured pose has noise; "
             f"is it hidden, or the capture paused?"
         )
-
-
-def label(config: PositioningConfig) -> str:
-    """For a sentence: which motion capture, or what else knows where the vehicle is."""
-    if config.by == "target":
-        return "the sight of the target"
-    return f"motion capture at {config.system}:{config.host}"
 
 
 def _is_pose(pose: BodyPose) -> bool:

@@ -19,13 +19,14 @@ from collections import deque
 
 import numpy as np
 
-from perchctl.geometry import quaternion_from_rpy, wrap_rad
-from perchctl.positioning.feed import RATE_OVER_S, FeedStatus, Send
-from perchctl.positioning.place import NOWHERE, Place, body_place, target_place
+from perchctl.geometry import Place, quaternion_from_rpy, rot_z, wrap_rad
+from perchctl.positioning.feed import RATE_OVER_S, UNSEEN, FeedStatus
 from perchctl.profile import Profile
-from perchctl.vehicle import ExternalPosition
-from perchctl.vision.pose import PoseSetup
-from perchctl.vision.types import Attitude, MarkerPose
+from perchctl.values import replace
+from perchctl.vehicle import ExternalPosition, SendPosition
+from perchctl.vision.places import to_level, to_world
+from perchctl.vision.pose import PoseSetup, level_rotation
+from perchctl.vision.types import Attitude, MarkerPose, TargetEstimate
 
 GROUND_FRAMES = 15
 """From rest, half a second of a camera of 30 Hz: their median is where the target is."""
@@ -37,7 +38,20 @@ GATE_LONGEST_S = 4.0
 WORST_SIGMA_M = 0.05
 NEAR_M, FAR_M, NEAR_S, FAR_S = 0.3, 1.0, 0.3, 1.0
 """In so long what the estimate is beside the sights is learned: slowly where a pixel is more."""
-UNSEEN = "the target is not seen"
+NOWHERE = Place(np.zeros(3), 0.0)
+"""No difference between two places."""
+
+
+def target_place(pose: MarkerPose, attitude: Attitude, setup: PoseSetup) -> Place:
+    """The target's, where the body is at `attitude`, which has its position."""
+    return Place(*to_world(pose.e_m, pose.e_yaw_rad, attitude, setup))
+
+
+def body_place(pose: MarkerPose, attitude: Attitude, target: Place, setup: PoseSetup) -> Place:
+    """The body's, where the target stands still. Of `attitude` roll and pitch count alone."""
+    yaw_rad = wrap_rad(target.yaw_rad - pose.e_yaw_rad)
+    way_m = pose.e_m + level_rotation(attitude).dot(setup.gear_body_m)
+    return Place(target.position_m - rot_z(yaw_rad).dot(way_m), yaw_rad)
 
 
 class SightFeed:
@@ -48,7 +62,7 @@ class SightFeed:
     estimator that is told late places, by biased sensors, stays behind them.
     """
 
-    def __init__(self, send: Send, profile: Profile, setup: PoseSetup) -> None:
+    def __init__(self, send: SendPosition, profile: Profile, setup: PoseSetup) -> None:
         self._send, self._config, self._setup = send, profile.positioning, setup
         self._origin_m = (0.0, 0.0, profile.safety.ground_z_m)
         self._period_s = 1.0 / self._config.rate_hz
@@ -71,6 +85,27 @@ class SightFeed:
     def known(self, position_m: tuple[float, float, float], now_s: float) -> None:
         """The place is known without a picture: standing, pressed or hanging."""
         self._hand_over(ExternalPosition(position_m), now_s, now_s)
+
+    def touching(self, yaw_rad: float) -> tuple[float, float, float] | None:
+        """The body's position, m, with the gear in the target's centre, level, where its estimate
+        has that heading; None before the target's place is known."""
+        if self.target is None:
+            return None
+        way_m = rot_z(yaw_rad + self.off.yaw_rad).dot(self._setup.gear_body_m)
+        x, y, z = self.target.position_m - way_m
+        return float(x), float(y), float(z)
+
+    def steered(self, seen: TargetEstimate, now: Attitude) -> TargetEstimate:
+        """What is seen, with the place where the target stands: it stands still, and the body is
+        beside its estimate now as it was of late (`off`). Until its place is known, as seen."""
+        if self.target is None:
+            return seen
+        world_m = self.target.position_m - self.off.position_m
+        world_yaw_rad = wrap_rad(self.target.yaw_rad - self.off.yaw_rad)
+        e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, now, self._setup)
+        return replace(
+            seen, e_m=e_m, e_yaw_rad=e_yaw_rad, world_m=world_m, world_yaw_rad=world_yaw_rad
+        )
 
     def see(
         self, pose: MarkerPose, then: Attitude, now: Attitude, now_s: float, *, at_rest: bool

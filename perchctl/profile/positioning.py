@@ -81,6 +81,13 @@ class PositioningConfig(Section):
         "has them",
     )
 
+    @property
+    def label(self) -> str:
+        """For a sentence: which motion capture, or what else knows where the vehicle is."""
+        if self.by == "target":
+            return "the sight of the target"
+        return f"motion capture at {self.system}:{self.host}"
+
     @model_validator(mode="before")
     @classmethod
     def _one_word(cls, values: Any) -> Any:

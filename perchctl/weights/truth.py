@@ -17,8 +17,7 @@ import numpy as np
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, TimedOut
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
-from perchctl.positioning.judge import place_of
-from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.positioning import BodyPose, CaptureFrame, Placed
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import Attitude
@@ -91,7 +90,7 @@ class TypedTruth:
 
 
 class Frames(Protocol):
-    """The part of `perchctl.positioning.capture.MotionCapture` that is needed here."""
+    """The part of `perchctl.positioning.CaptureSource` that is needed here."""
 
     def frames(self) -> list[CaptureFrame]: ...
 
@@ -179,7 +178,7 @@ _AS_IT_IS = PositioningConfig()
 def _measured(
     pose: BodyPose, mounted: PositioningConfig
 ) -> tuple[Array, tuple[float, float, float]]:
-    placed = place_of(pose, mounted)
+    placed = Placed.of(pose, mounted)
     return placed.position_m, rpy_from_rotation(placed.R)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from perchctl.check import Row, Verdict, capture
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry

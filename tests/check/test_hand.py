@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from perchctl.check import Row, Verdict, hand
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
-from perchctl.positioning.judge import Placed
-from perchctl.positioning.types import BodyPose
+from perchctl.positioning import BodyPose, Placed
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.sim.carried import Stop, Way, lifted_and_turned
 from perchctl.vehicle import Telemetry
@@ -57,7 +56,7 @@ def recorded(
     """The row of what a capture says that has the vehicle as ``world R body``, and of what the
     vehicle says itself, from a heading of its own: both with noise, the capture late."""
     from perchctl.geometry import quaternion_from_rotation
-    from perchctl.positioning.judge import place_of
+    from perchctl.positioning import Placed
 
     rng = np.random.default_rng(seed)
     heading = rng.uniform(-math.pi, math.pi)
@@ -78,7 +77,7 @@ def recorded(
         R_seen = world @ R @ body @ rotation_from_rpy(*rng.normal(0.0, 0.005, 3))
         place = scale * (mirror @ world @ (origin + place + rng.normal(0.0, 0.001, 3)))
         pose = BodyPose(tuple(place), quaternion_from_rotation(R_seen))
-        places.append(place_of(pose, config, float(t_s)))
+        places.append(Placed.of(pose, config, float(t_s)))
     return hand.row(hand.paired(samples, places), config)
 
 

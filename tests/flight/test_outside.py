@@ -20,7 +20,7 @@ from perchctl.flight.outside import AtRest, apart, strange, with_another_up
 from perchctl.flight.preflight import refuse_strange
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.mission.state import Operator, Outcome
-from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition, MeasuredBy, PositionSetpoint

@@ -28,7 +28,7 @@ from perchctl.flight.clock import WallClock
 from perchctl.flight.positions import at_hand, opened_capture, started_feed
 from perchctl.flight.session import FlyOptions, check_options
 from perchctl.link.cflib_link import CflibLink
-from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning import FeedStatus
 from perchctl.profile import LinkConfig, Profile, find_profile, load_profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings

@@ -14,8 +14,8 @@ from perchctl.calibration.files import camera_of
 from perchctl.flight.history import History, extended
 from perchctl.flight.senses import Senses
 from perchctl.flight.sights import CARRIED_FOR_S, Sights, is_carried
+from perchctl.geometry import Place
 from perchctl.pipeline import make_pipeline
-from perchctl.positioning.place import Place, touching
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry
 from perchctl.vision.types import MarkerPose, Measured
@@ -52,9 +52,7 @@ def test_what_hangs_is_told_where() -> None:
     sights, sent = hung()
     samples = at_rest()
     sights.begin(history(samples), samples[-1].t_s, touches=True)
-    assert [place.position_m for place in sent] == [
-        touching(TARGET, 0.0, PIPELINE.pose.gear_body_m)
-    ]
+    assert [place.position_m for place in sent] == [sights.feed.touching(0.0)]
     assert sights.status(samples[-1].t_s).age_s == 0.0
 
 

@@ -18,10 +18,9 @@ from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.outside import AtRest, strange
 from perchctl.flight.preflight import refuse_out_of_view, refuse_strange, still_waiting_for
 from perchctl.flight.view import LEAN_DEG, out_of_view, place_seen, seen_at
-from perchctl.geometry import rot_z
-from perchctl.positioning.feed import FeedStatus
-from perchctl.positioning.place import Place
-from perchctl.positioning.sight import UNSEEN
+from perchctl.geometry import Place, rot_z
+from perchctl.positioning import FeedStatus
+from perchctl.positioning.feed import UNSEEN
 from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition
 from perchctl.vision.types import CameraModel

@@ -10,7 +10,7 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.link.claim import vehicle_of
-from perchctl.positioning.compared import Compared, keep
+from perchctl.positioning import Comparison, save_comparison
 from perchctl.profile.positioning import PositioningConfig
 
 
@@ -47,4 +47,4 @@ def compared(
 ) -> None:
     """As if `perchctl check --lift` had found that, so long ago."""
     at = datetime.now(UTC) - timedelta(seconds=ago_s)
-    assert keep(config, vehicle_of(uri), Compared(at, passed, found)) is None
+    assert save_comparison(config, vehicle_of(uri), Comparison(at, passed, found)) is None

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from perchctl.calibration.files import camera_of
-from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.positioning.place import Place
+from perchctl.geometry import Array, Place, rot_z, wrap_rad
 from perchctl.profile import Profile
 from perchctl.profile.load import load_profile
 from perchctl.vision.pose import PoseSetup, level_rotation, make_pose_setup

@@ -27,8 +27,7 @@ from perchctl.link.outside import (
     check_parameters,
     parameters_of,
 )
-from perchctl.positioning.feed import FeedStatus
-from perchctl.positioning.judge import Placed
+from perchctl.positioning import FeedStatus, Placed
 from perchctl.profile import LinkConfig
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import FLYING, ExternalPosition, Telemetry

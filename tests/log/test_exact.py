@@ -20,7 +20,7 @@ from perchctl.log.turn import turn_line, turn_of
 from perchctl.mission.sent import Sent
 from perchctl.mission.state import Condition, Observation, Operator, Outcome, Phase
 from perchctl.mission.turn import FrameSeen, Outside, PoseSeen, Taken, Turn, TurnTiming
-from perchctl.positioning.feed import FeedStatus
+from perchctl.positioning import FeedStatus
 from perchctl.vehicle import (
     Command,
     EmergencyStop,

@@ -14,11 +14,10 @@ import pytest
 
 import perchctl
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
+from perchctl.positioning import FeedThread, PositionFeed, open_capture
 from perchctl.positioning import capture as capture_module
-from perchctl.positioning.capture import MotionCapture, open_capture, setup_of
+from perchctl.positioning.capture import MotionCapture, setup_of
 from perchctl.positioning.child import CaptureSetup
-from perchctl.positioning.feed import PositionFeed
-from perchctl.positioning.thread import FeedThread
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 from tests.positioning.fake_library import write_library

@@ -19,7 +19,14 @@ from perchctl.cli import app
 from perchctl.errors import SafetyAbort
 from perchctl.flight import positions
 from perchctl.positioning import compared
-from perchctl.positioning.compared import Compared, Unreadable, decoded, encoded, objection
+from perchctl.positioning.compared import (
+    Comparison,
+    ComparisonRecord,
+    NeverCompared,
+    Unreadable,
+    decoded,
+    encoded,
+)
 from perchctl.profile.positioning import PositioningConfig
 from tests.helpers.capture import compared as was_compared
 
@@ -42,8 +49,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state"
 
 
-def ago(seconds: float, passes: bool = True, found: str = "fine") -> Compared:
-    return Compared(NOW - timedelta(seconds=seconds), passes, found)
+def ago(seconds: float, passes: bool = True, found: str = "fine") -> Comparison:
+    return Comparison(NOW - timedelta(seconds=seconds), passes, found)
 
 
 # --- The judgement -----------------------------------------------------------------------
@@ -54,21 +61,19 @@ def test_only_a_pass_of_the_last_day_is_flown_by(seconds: float, passes: bool) -
     allowed = passes and -compared.AHEAD_S <= seconds <= DAY_S
     age_s = (NOW - ago(seconds).at).total_seconds()  # of whole microseconds
     if min(abs(age_s - DAY_S), abs(age_s + compared.AHEAD_S)) > 1e-3:
-        assert (objection(ago(seconds, passes), NOW) is None) is allowed
+        assert (ago(seconds, passes).objection(NOW) is None) is allowed
 
 
 @pytest.mark.parametrize(("record", "words"), [
-    (None, "was never compared with this vehicle: run perchctl check --lift"),
+    (NeverCompared(), "was never compared with this vehicle: run perchctl check --lift"),
     (ago(30 * 3600.0), "last compared 30 h ago, on 21 Nov 09:00 (24 h at most)"),
     (ago(400 * DAY_S), "last compared 400 days ago, on 18 Oct 2025 15:00"),
     (ago(-7200.0), "compared on 22 Nov 17:00, which is yet to come: set this computer's clock"),
     (ago(3000.0, False, SWAPPED), f"{SWAPPED} (found by check --lift on 22 Nov 14:10): mend"),
     (Unreadable(Path("x.json"), "is damaged"), "is not known: x.json is damaged: remove"),
 ])  # fmt: skip
-def test_each_objection_says_what_is_and_what_to_do(
-    record: Compared | Unreadable | None, words: str
-) -> None:
-    said = objection(record, NOW)
+def test_each_objection_says_what_is_and_what_to_do(record: ComparisonRecord, words: str) -> None:
+    said = record.objection(NOW)
     assert said is not None
     assert words in ": ".join(said)
     assert "check --lift" in said[1]
@@ -80,7 +85,7 @@ def test_each_objection_says_what_is_and_what_to_do(
 @given(st.text(), st.booleans(), st.datetimes(datetime(2001, 1, 1), datetime(2900, 1, 1)))
 def test_what_is_written_is_read(found: str, passes: bool, at: datetime) -> None:
     set_up = compared.set_up_of(CONFIG, VEHICLE)
-    record = Compared(at.replace(tzinfo=UTC), passes, found)
+    record = Comparison(at.replace(tzinfo=UTC), passes, found)
     back = decoded(encoded(set_up, record), set_up)
     assert (back.at, back.passed) == (record.at, passes)
     assert back.found.isprintable()
@@ -103,11 +108,11 @@ def test_what_is_no_record_is_told_as_such(data: bytes) -> None:
 def test_another_set_up_was_never_compared(change: dict[str, Any], folder: Path) -> None:
     was_compared(CONFIG, URI)
     other = CONFIG.model_copy(update=change)
-    assert compared.newest(other, VEHICLE) is None
+    assert compared.load_comparison(other, VEHICLE) == NeverCompared()
     # Nor by a file that was copied to its place.
     (mine, theirs) = (compared.path_of(compared.set_up_of(c, VEHICLE)) for c in (CONFIG, other))
     theirs.write_bytes(mine.read_bytes())
-    assert isinstance(compared.newest(other, VEHICLE), Unreadable)
+    assert isinstance(compared.load_comparison(other, VEHICLE), Unreadable)
 
 
 def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
@@ -122,12 +127,12 @@ def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
     # Nor by a file that was copied to its place; what is damaged beside it is no vehicle.
     (mine, theirs) = (compared.path_of(compared.set_up_of(CONFIG, v)) for v in (VEHICLE, OTHER))
     mine.write_bytes(theirs.read_bytes())
-    assert isinstance(compared.newest(CONFIG, VEHICLE), Unreadable)
+    assert isinstance(compared.load_comparison(CONFIG, VEHICLE), Unreadable)
     mine.unlink()
     theirs.write_bytes(b"{")
-    assert compared.newest(CONFIG, VEHICLE) is None
+    assert compared.load_comparison(CONFIG, VEHICLE) == NeverCompared()
     was_compared(CONFIG.model_copy(update={"host": "lab2"}), OTHER_URI)
-    assert compared.newest(CONFIG, VEHICLE) is None
+    assert compared.load_comparison(CONFIG, VEHICLE) == NeverCompared()
 
 
 def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:
@@ -140,7 +145,7 @@ def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:
 def test_what_says_nothing_of_the_axes_is_no_other_set_up() -> None:
     was_compared(CONFIG, URI)
     same = CONFIG.model_copy(update={"rate_hz": 50.0, "send": "pose", "hold_s": 0.2})
-    assert isinstance(compared.newest(same, VEHICLE), Compared)
+    assert isinstance(compared.load_comparison(same, VEHICLE), Comparison)
 
 
 def spoil(how: str) -> None:

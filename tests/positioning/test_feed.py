@@ -20,10 +20,17 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from perchctl.positioning import thread
-from perchctl.positioning.feed import QUIET_S, FeedStatus, PositionFeed
-from perchctl.positioning.judge import STALE_S, place_of
-from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.positioning import (
+    BodyPose,
+    CaptureFrame,
+    FeedStatus,
+    FeedThread,
+    Placed,
+    PositionFeed,
+)
+from perchctl.positioning import feed as feeding
+from perchctl.positioning.feed import QUIET_S
+from perchctl.positioning.judge import STALE_S
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 
@@ -116,7 +123,7 @@ def test_the_marker_frame_is_turned_and_moved_into_the_body_axes(
     T_world_body = make_T(rotation_from_rpy(*body_rpy), position_m)
     T_world_rigid = T_world_body @ make_T(rotation_from_rpy(*rigid_rpy), offset_m)
     pose = BodyPose(tuple(T_world_rigid[:3, 3]), quaternion_from_rotation(T_world_rigid[:3, :3]))
-    placed = place_of(pose, config)
+    placed = Placed.of(pose, config)
     np.testing.assert_allclose(make_T(placed.R, placed.position_m), T_world_body, atol=1e-8)
     np.testing.assert_allclose(invert_T(T_world_body) @ make_T(placed.R, placed.position_m),
                                np.eye(4), atol=1e-7)  # fmt: skip
@@ -367,7 +374,7 @@ def test_a_noise_free_copy_differs_only_by_its_numbers() -> None:
 def test_a_thread_that_hangs_in_the_link_is_named_and_holds_nobody_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(thread, "END_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(feeding, "END_TIMEOUT_S", 0.05)
     capture, entered, free = Script(), threading.Event(), threading.Event()
     capture.frame = CaptureFrame(time.monotonic(), {"cf": BodyPose((1.0, 0.0, 0.5), LEVEL)})
     sent: list[ExternalPosition] = []
@@ -379,7 +386,7 @@ def test_a_thread_that_hangs_in_the_link_is_named_and_holds_nobody_up(
         return True
 
     feed = PositionFeed(capture, hang, CONFIG)
-    turning = thread.FeedThread(feed, time.monotonic)
+    turning = FeedThread(feed, time.monotonic)
     turning.start()
     assert entered.wait(10.0)
     status = feed.status(time.monotonic() + 1.0)

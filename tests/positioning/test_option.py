@@ -13,9 +13,9 @@ from typer.testing import CliRunner, Result
 
 from perchctl.cli import app
 from perchctl.commands.complete import positionings
+from perchctl.commands.fit_weights_collect import open_named
 from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
-from perchctl.positioning.capture import open_named
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.startup import failure_record

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.positioning.place import Place, body_place, steered, target_place, touching
-from perchctl.positioning.sight import GROUND_FRAMES, OLDEST_S, SightFeed
+from perchctl.geometry import Place
+from perchctl.positioning import SightFeed
+from perchctl.positioning.sight import GROUND_FRAMES, OLDEST_S, body_place, target_place
 from perchctl.vehicle import ExternalPosition
 from perchctl.vision.types import Attitude, MarkerPose
 from tests.helpers.mission import target_at
@@ -78,7 +79,10 @@ def test_a_body_is_where_the_target_is_seen_from(
 
 @given(yaw=angle)
 def test_a_touching_gear_is_in_the_targets_centre(yaw: float) -> None:
-    place_m = touching(TARGET, yaw, SETUP.gear_body_m)
+    it = feed(Sent())
+    it.target = TARGET
+    place_m = it.touching(yaw)
+    assert place_m is not None
     np.testing.assert_allclose(seen(TARGET, attitude(0.0, place_m, yaw)).e_m, 0.0, atol=1e-12)
 
 
@@ -89,8 +93,9 @@ def test_what_steers_is_the_true_way_whatever_the_estimate_is_beside(
     """A steady error of the estimate, in place and in heading, moves the goal with it."""
     true = attitude(1.0, (0.1, 0.2, 1.0), yaw)
     believed = attitude(1.0, (0.1 + dx, 0.2 + dy, 1.0), yaw + turned)
-    off = Place(np.array([-dx, -dy, 0.0]), -turned)
-    target = steered(target_at(1.0), TARGET, off, believed, SETUP)
+    it = feed(Sent())
+    it.target, it.off = TARGET, Place(np.array([-dx, -dy, 0.0]), -turned)
+    target = it.steered(target_at(1.0), believed)
     assert target.world_m is not None
     goal_m = np.asarray(target.world_m) - np.array(believed.position_m)
     np.testing.assert_allclose(goal_m, TARGET.position_m - np.array(true.position_m), atol=1e-9)

@@ -13,8 +13,7 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.positioning.judge import place_of
-from perchctl.positioning.types import CaptureFrame
+from perchctl.positioning import CaptureFrame, Placed
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.sim.capture.settings import (
     MILLIMETRES,
@@ -99,7 +98,7 @@ def test_a_body_s_own_axes_are_undone_by_the_profile_s() -> None:
     R = rotation_from_rpy(0.1, -0.2, 1.3)
     seen = last(settings, room=Room(quaternion=quaternion_from_rotation(R)))
     config = PositioningConfig(by="mocap", body_rpy_deg=rpy_deg, body_position_m=offset_m)
-    placed = place_of(seen.bodies["crazyflie"], config)
+    placed = Placed.of(seen.bodies["crazyflie"], config)
     assert placed.position_m == pytest.approx(AT)
     assert np.allclose(placed.R, R, atol=1e-6)
 

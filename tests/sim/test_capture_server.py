@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.sim.capture import natnet
 from perchctl.sim.capture.server import SYSTEM, CaptureServer
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings

@@ -17,8 +17,7 @@ from perchctl.commands.fit_weights_collect import _truth
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, UsageError
 from perchctl.geometry import rot_z
-from perchctl.positioning import capture
-from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.positioning import BodyPose, CaptureFrame, capture
 from perchctl.profile import find_calibration, load_profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.weights import truth
@@ -198,9 +197,10 @@ def test_motion_capture_is_asked_for_with_its_computer(monkeypatch: pytest.Monke
         with pytest.raises(UsageError, match="--mocap TYPE:HOST"):
             _truth(CollectRequest(truth="mocap", mocap=mocap), load_profile("sim"), lambda: 0.0)
     monkeypatch.setattr(capture, "find_spec", lambda name: object())
+    monkeypatch.setattr(fit_weights_collect, "find_spec", lambda name: object())
     with pytest.raises(InvalidValue, match="'nokov' is unknown; allowed are vicon, optitrack"):
         _truth(CollectRequest(truth="mocap", mocap="nokov:h"), load_profile("sim"), lambda: 0.0)
-    monkeypatch.setattr(capture, "find_spec", lambda name: None)
+    monkeypatch.setattr(fit_weights_collect, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match="--truth mocap needs the library motioncapture"):
         _truth(CollectRequest(truth="mocap", mocap="vicon:h"), load_profile("sim"), lambda: 0.0)
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from perchctl.errors import ConnectionFailed
-from perchctl.positioning.types import CaptureFrame
+from perchctl.positioning import CaptureFrame
 from perchctl.sim.capture import natnet
 
 SYSTEM = "optitrack"

@@ -15,7 +15,7 @@ from perchctl.geometry import (
     rotation_from_quaternion,
     rotation_from_rpy,
 )
-from perchctl.positioning.types import BodyPose, CaptureFrame
+from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings, OtherBody, axes_matrix
 
 _STREAM = 13
