@@ -81,7 +81,17 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 FACE = "perchctl"  # the package itself: version and public names, taken from all rooms
 
 # Packages with a face: the others take its names, and nothing from behind it.
-FACED = ("check", "cluster", "display", "faults", "positioning", "replay", "report", "track")
+FACED = (
+    "check",
+    "cluster",
+    "display",
+    "faults",
+    "positioning",
+    "replay",
+    "report",
+    "track",
+    "weights",
+)
 MOST_NAMES = 15
 
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-
-import numpy as np
 
 from perchctl.commands.fit_weights_request import CollectRequest, FitRequest
 from perchctl.commands.output import print_record, say
@@ -17,24 +13,15 @@ from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, Usa
 from perchctl.files import check_output, same_file, write_files
 from perchctl.profile import Profile, find_weights, load_profile
 from perchctl.profile.places import data_folder, user_config_folder
-from perchctl.weights.check import check
-from perchctl.weights.evidence import FITTED, Fitted, evidence, fit_all, on_other_data
-from perchctl.weights.files import write_weights
-from perchctl.weights.fit import (
-    Errors,
-    Sums,
-    biases,
-    check_determined,
-    errors_of,
-    odd_positions,
-    sums_of,
+from perchctl.weights import (
+    FITTED,
+    LmsOptions,
+    Result,
+    fit_weights,
+    report_text,
+    weights_record,
+    write_weights,
 )
-from perchctl.weights.lms import LmsOptions
-from perchctl.weights.repeated import refuse_repeated
-from perchctl.weights.report import report_text
-from perchctl.weights.result import Result, file_content, weights_record
-from perchctl.weights.table import chunks_of, read_csv
-from perchctl.weights.types import AXES, Measurements, joined
 
 __all__ = ["CollectRequest", "FitRequest", "run"]
 
@@ -67,7 +54,7 @@ def run(request: FitRequest) -> int:
         from perchctl.commands.fit_weights_collect import collect
 
         collect(request.collecting, session)
-    result = fit(options)
+    result = fit_weights(options.data, options.lms, options.method, options.test, count_bar)
     if not options.as_json:
         print(report_text(result), flush=True)
     plot, file, problem = None, None, None
@@ -127,76 +114,10 @@ def resolve(request: FitRequest) -> FitOptions:
     )
 
 
-def fit(options: FitOptions) -> Result:
-    """Read all data and fit. Errors: NotFound, InvalidValue."""
-    with ExitStack() as stack:
-        total = sum(chunks_of(path) for path in options.data)
-        advance = stack.enter_context(count_bar("reading [MB]", total))
-        parts = [_read(path, advance) for path in options.data]
-    tested = None if options.test is None else _read(options.test, lambda: None)
-    data = joined(parts)
-    refuse_repeated(parts, tested)
-    errors = errors_of(data)
-    sums = sums_of(errors)
-    check_determined(errors, sums)
-    with count_bar("fitting", None) as advance:
-        fits, runs = fit_all(errors, sums, options.lms, advance)
-    proof = evidence(errors, sums, fits)
-    other = None if tested is None else on_other_data(errors_of(tested), fits)
-    return Result(
-        errors=errors,
-        sums=sums,
-        bias=biases(sums),
-        fits=fits,
-        runs=runs,
-        evidence=proof,
-        other=other,
-        other_name=str(options.test) if options.test is not None else "",
-        chosen=options.method,
-        notes=(*data.notes, *_notes(errors, sums, fits)),
-        sha256=data.sha256,
-    )
-
-
-def _notes(errors: Errors, sums: Sums, fits: Mapping[str, Fitted]) -> list[str]:
-    """Sentences on clipped weights, odd positions, and too few of them."""
-    notes = []
-    for name, found in fits.items():
-        outside = [
-            f"{axis} {w:.3f}"
-            for axis, w in zip(AXES, found.raw, strict=True)
-            if not 0.0 <= w <= 1.0
-        ]
-        if outside:
-            notes.append(f"{name}: clipped to 0 .. 1: {', '.join(outside)}")
-    for number, axis, off in odd_positions(errors, sums):
-        size = f"{np.degrees(off):.1f} deg" if axis == "yaw" else f"{off * 1e3:.1f} mm"
-        notes.append(
-            f"position {number}: both markers are off by {size} in {axis} more than elsewhere; "
-            f"was its actual pose taken down wrongly?"
-        )
-    if len(errors.positions) < 5:
-        notes.append(
-            f"{len(errors.positions)} positions are few: intervals are wide (10 are usual)"
-        )
-    return notes
-
-
-def _read(path: Path, advance: Callable[[], None]) -> Measurements:
-    if path.suffix.lower() == ".jsonl":
-        from perchctl.weights.flight_logs import read_flight_log
-
-        data = read_flight_log(path)
-    else:
-        data = read_csv(path, advance)
-    check(data)
-    return data
-
-
 def _draw(options: FitOptions, result: Result) -> Path | None:
     if options.plot is None:
         return None
-    from perchctl.weights.plot import draw_weights
+    from perchctl.weights import draw_weights  # matplotlib takes a second to load
 
     write_files({options.plot: draw_weights(result)})
     say(f"plot: {options.plot}")
@@ -228,11 +149,7 @@ def _write(options: FitOptions, result: Result) -> Path | None:
         say(sentence)
         return None
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    content = file_content(result, date)
-    if options.anyway:
-        content["weights"] = dict(content["fitted"])
-        content["axes"] = dict.fromkeys(AXES, "merged")
-    write_weights(target, content)
+    write_weights(target, result, date, anyway=options.anyway)
     say(f"weights: {target}")
     if options.profile.merge.method != "weights":
         say(

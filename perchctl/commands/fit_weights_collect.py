@@ -7,9 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,24 +16,15 @@ from perchctl.camera.open import open_source
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
-from perchctl.errors import InvalidValue, UsageError, no_motion_capture, no_simulator
-from perchctl.positioning import open_capture
+from perchctl.errors import InvalidValue, UsageError, no_simulator
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vision.types import CameraModel
-from perchctl.weights.collect import (
-    MarkerReader,
-    SessionFile,
-    collecting_pipeline,
-    fault_of,
-    rows_of,
-)
-from perchctl.weights.dialogue import Experiment
-from perchctl.weights.truth import (
+from perchctl.weights import (
     EstimateTruth,
-    Frames,
+    Experiment,
     MocapTruth,
-    Truth,
+    SessionFile,
     TypedTruth,
     four_numbers,
 )
@@ -80,27 +69,17 @@ def _collect_simulated(
     request: CollectRequest, path: Path, profile: Profile, camera: CameraModel
 ) -> None:
     try:
-        from perchctl.weights.simulated import Stand
+        from perchctl.weights import SimulatedStand
     except ImportError as error:
         raise no_simulator(error.name) from None
 
     session = _open_session(path, request.frames)
-    stand = Stand(profile, camera, request.positions, request.seed, request.noise, request.blur)
-    setup = collecting_pipeline(profile, camera)
+    stand = SimulatedStand(
+        profile, camera, request.positions, request.seed, request.noise, request.blur
+    )
     left = max(0, request.positions - len(session.done))
     with count_bar("frames", left * request.frames) as advance:
-        for position in range(session.next_position, session.next_position + left):
-            place, reader, readings = stand.place(position), MarkerReader(setup), []
-            for frame in stand.frames(position, place, request.frames):
-                readings.append(reader.read(frame))
-                advance()
-            fault = fault_of(readings)
-            if fault is not None:
-                raise InvalidValue(
-                    f"position {position} of the simulated experiment cannot be used ({fault}); "
-                    f"less --noise or --blur, or another --seed, makes it seen"
-                )
-            session.append(position, rows_of(position, readings, place.actual))
+        stand.fill(session, left, request.frames, advance)
 
 
 def _collect_with_person(
@@ -129,7 +108,8 @@ def _collect_with_person(
         experiment = Experiment(
             _open_session(path, request.frames),
             source,
-            collecting_pipeline(profile, camera),
+            profile,
+            camera,
             truth,
             ask=_ask,
             say=say,
@@ -140,7 +120,9 @@ def _collect_with_person(
         experiment.run(request.positions, request.frames)
 
 
-def _truth(request: CollectRequest, profile: Profile, now: Callable[[], float]) -> Truth:
+def _truth(
+    request: CollectRequest, profile: Profile, now: Callable[[], float]
+) -> TypedTruth | MocapTruth | EstimateTruth:
     gear = np.asarray(profile.vehicle.gear_body_m, dtype=np.float64)
     given = None if request.target is None else four_numbers(request.target, _DEGREES)
     if request.truth == "typed":
@@ -148,14 +130,7 @@ def _truth(request: CollectRequest, profile: Profile, now: Callable[[], float]) 
     if request.truth == "mocap":
         own = profile.positioning if profile.positioning.by == "mocap" else None
         mocap, (body, target) = _capture_of(request, own)
-        return MocapTruth(
-            open_named(mocap, body, "--truth mocap"),
-            mocap,
-            body,
-            target if given is None else given,
-            gear,
-            own,
-        )
+        return MocapTruth.open(mocap, body, target if given is None else given, gear, own)
     from perchctl.link.estimate import EstimateLink
 
     link = EstimateLink(profile.link.uri if request.uri is None else request.uri, profile.link, now)
@@ -189,13 +164,3 @@ def _ask(question: str) -> str:
     if not line:
         raise EOFError
     return line.rstrip("\n")
-
-
-def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) -> Frames:
-    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
-    kind, _, host = system.partition(":")
-    if find_spec("motioncapture") is None:
-        raise no_motion_capture(needed_by)
-    # Unchecked, since `check_reachable` has the sentence for a kind that is none.
-    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
-    return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))

@@ -53,7 +53,7 @@ class FittedData(BaseModel):
 
 
 class FittedWeights(BaseModel):
-    """A weights file, as far as a flight needs it (`perchctl.weights.files` writes more)."""
+    """A weights file, as far as a flight needs it (`perchctl.weights.write_weights` writes more)."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 

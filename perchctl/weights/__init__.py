@@ -1,0 +1,5 @@
+"""The paper's merge weights: data from a session or from flights, the fit, and how sure it is."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

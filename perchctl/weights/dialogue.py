@@ -11,12 +11,13 @@ import numpy as np
 from perchctl.camera.source import FrameSource, check_size
 from perchctl.errors import Interrupted, InvalidValue, NotFound, TimedOut
 from perchctl.geometry import Array, wrap_rad
-from perchctl.pipeline import Pipeline
-from perchctl.vision.types import Frame
+from perchctl.profile import Profile
+from perchctl.vision.types import CameraModel, Frame
 from perchctl.weights.collect import (
     MarkerReader,
     MarkerReading,
     SessionFile,
+    collecting_pipeline,
     fault_of,
     rows_of,
     typical,
@@ -41,7 +42,8 @@ class Experiment:
         self,
         session: SessionFile,
         source: FrameSource,
-        setup: Pipeline,
+        profile: Profile,
+        camera: CameraModel,
         truth: Truth,
         ask: Ask,
         say: Callable[[str], None],
@@ -49,7 +51,8 @@ class Experiment:
         now: Callable[[], float],
         wait: Callable[[float], None],
     ) -> None:
-        self._session, self._source, self._setup, self._truth = session, source, setup, truth
+        self._session, self._source, self._truth = session, source, truth
+        self._setup = collecting_pipeline(profile, camera)
         self._ask, self._say, self._bar, self._now, self._wait = ask, say, bar, now, wait
 
     def run(self, positions: int, frames: int) -> None:

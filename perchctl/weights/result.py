@@ -1,18 +1,52 @@
-"""All that a fit found out, as one value, as one JSON record, and as a weights file's content."""
+"""The fit from data files: all that it found out, as one value, one JSON record, and the weights
+file that a profile names (`merge.weights_file`)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
+from perchctl.files import write_files
 from perchctl.geometry import Array
-from perchctl.weights.evidence import FITTED, SINGLE, Evidence, Fitted
-from perchctl.weights.fit import Bias, Errors, Sums
-from perchctl.weights.lms import LmsRun
-from perchctl.weights.types import AXES, PAPER_WEIGHTS, UNITS
+from perchctl.weights.check import check
+from perchctl.weights.evidence import (
+    FITTED,
+    SINGLE,
+    Evidence,
+    Fitted,
+    evidence,
+    fit_all,
+    on_other_data,
+)
+from perchctl.weights.fit import (
+    Bias,
+    Errors,
+    Sums,
+    biases,
+    check_determined,
+    errors_of,
+    odd_positions,
+    sums_of,
+)
+from perchctl.weights.flight_logs import read_flight_log
+from perchctl.weights.lms import LmsOptions, LmsRun
+from perchctl.weights.repeated import refuse_repeated
+from perchctl.weights.table import chunks_of, read_csv
+from perchctl.weights.types import AXES, PAPER_WEIGHTS, UNITS, Measurements, joined
+
+FORMAT = "perchctl-merge-weights"
+_HEAD = """\
+# Merge weights of the large marker (the small one's are 1 - w), fitted by perchctl
+# fit-weights. Named by a profile: merge: {method: weights, weights_file: THIS_FILE}
+"""
+Bar = Callable[[str, int | None], AbstractContextManager[Callable[[], None]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +75,70 @@ class Result:
         better single marker, elsewhere that marker alone, (4,)."""
         alone = np.where(self.evidence.better == 0, 1.0, 0.0)
         return np.where(self.proven, self.fits[self.chosen].weights, alone)
+
+
+def fit_weights(
+    paths: Sequence[Path], lms: LmsOptions, chosen: str, test: Path | None, bar: Bar
+) -> Result:
+    """Read all data and fit the weights to it by each method; `chosen` is the one that is
+    offered, `test` other data to judge it by. `bar` shows progress. Errors: NotFound,
+    InvalidValue."""
+    with bar("reading [MB]", sum(chunks_of(path) for path in paths)) as advance:
+        parts = [_read(path, advance) for path in paths]
+    tested = None if test is None else _read(test, lambda: None)
+    data = joined(parts)
+    refuse_repeated(parts, tested)
+    errors = errors_of(data)
+    sums = sums_of(errors)
+    check_determined(errors, sums)
+    with bar("fitting", None) as advance:
+        fits, runs = fit_all(errors, sums, lms, advance)
+    proof = evidence(errors, sums, fits)
+    other = None if tested is None else on_other_data(errors_of(tested), fits)
+    return Result(
+        errors=errors,
+        sums=sums,
+        bias=biases(sums),
+        fits=fits,
+        runs=runs,
+        evidence=proof,
+        other=other,
+        other_name=str(test) if test is not None else "",
+        chosen=chosen,
+        notes=(*data.notes, *_notes(errors, sums, fits)),
+        sha256=data.sha256,
+    )
+
+
+def _notes(errors: Errors, sums: Sums, fits: Mapping[str, Fitted]) -> list[str]:
+    """Sentences on clipped weights, odd positions, and too few of them."""
+    notes = []
+    for name, found in fits.items():
+        outside = [
+            f"{axis} {w:.3f}"
+            for axis, w in zip(AXES, found.raw, strict=True)
+            if not 0.0 <= w <= 1.0
+        ]
+        if outside:
+            notes.append(f"{name}: clipped to 0 .. 1: {', '.join(outside)}")
+    for number, axis, off in odd_positions(errors, sums):
+        size = f"{np.degrees(off):.1f} deg" if axis == "yaw" else f"{off * 1e3:.1f} mm"
+        notes.append(
+            f"position {number}: both markers are off by {size} in {axis} more than elsewhere; "
+            f"was its actual pose taken down wrongly?"
+        )
+    if len(errors.positions) < 5:
+        notes.append(
+            f"{len(errors.positions)} positions are few: intervals are wide (10 are usual)"
+        )
+    return notes
+
+
+def _read(path: Path, advance: Callable[[], None]) -> Measurements:
+    logged = path.suffix.lower() == ".jsonl"
+    data = read_flight_log(path) if logged else read_csv(path, advance)
+    check(data)
+    return data
 
 
 def by_axis(values: Array) -> dict[str, float | None]:
@@ -106,7 +204,18 @@ def _errors_record(evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def file_content(result: Result, date: str) -> dict[str, Any]:
+def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> None:
+    """Write the weights file: those that are recommended, or, `anyway`, all that were fitted.
+    Errors: InvalidValue when it cannot be written; the old one then stays."""
+    content = _file_content(result, date)
+    if anyway:
+        content["weights"] = dict(content["fitted"])
+        content["axes"] = dict.fromkeys(AXES, "merged")
+    text = _HEAD + yaml.safe_dump({"format": FORMAT, **content}, sort_keys=False)
+    write_files({path: text.encode("utf-8")})
+
+
+def _file_content(result: Result, date: str) -> dict[str, Any]:
     """What a weights file holds. Errors in m and rad, on positions not fitted to."""
     rounded = {axis: round(float(w), 6) for axis, w in by_axis(result.recommended).items() if w
                is not None}  # fmt: skip

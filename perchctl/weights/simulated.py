@@ -7,7 +7,7 @@ and offset are drawn. The picture is the simulator's, noise and blur are the exp
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,13 @@ from perchctl.sim.scenario import Scenario
 from perchctl.vision.camera_model import project
 from perchctl.vision.pose import rotation_vector, square
 from perchctl.vision.types import CameraModel, Frame
+from perchctl.weights.collect import (
+    MarkerReader,
+    SessionFile,
+    collecting_pipeline,
+    fault_of,
+    rows_of,
+)
 
 MARGIN_PX = 4.0
 FRAME_S = 1.0 / 30.0
@@ -35,7 +42,7 @@ class Place:
     actual: Array
 
 
-class Stand:
+class SimulatedStand:
     """The simulated camera on its stand. Same seed, same places, same pictures."""
 
     def __init__(
@@ -58,6 +65,25 @@ class Stand:
         )
         self._renderer = Renderer(self._scenario, camera, profile.target, seed)
         self._corners = square(profile.target.large.side_m)
+
+    def fill(
+        self, session: SessionFile, positions: int, frames: int, advance: Callable[[], None]
+    ) -> None:
+        """Append so many positions to the session; `advance` is called with each frame.
+        Errors: InvalidValue."""
+        setup = collecting_pipeline(self._profile, self._camera)
+        for position in range(session.next_position, session.next_position + positions):
+            place, reader, readings = self.place(position), MarkerReader(setup), []
+            for frame in self.frames(position, place, frames):
+                readings.append(reader.read(frame))
+                advance()
+            fault = fault_of(readings)
+            if fault is not None:
+                raise InvalidValue(
+                    f"position {position} of the simulated experiment cannot be used ({fault}); "
+                    f"less --noise or --blur, or another --seed, makes it seen"
+                )
+            session.append(position, rows_of(position, readings, place.actual))
 
     def place(self, position: int) -> Place:
         """The place of a position, counted from 1: its distance falls into its own share of

@@ -11,13 +11,21 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from importlib.util import find_spec
+from typing import Any, Protocol
 
 import numpy as np
 
-from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, TimedOut
+from perchctl.errors import (
+    ConnectionFailed,
+    InvalidValue,
+    NotFound,
+    PerchError,
+    TimedOut,
+    no_motion_capture,
+)
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
-from perchctl.positioning import BodyPose, CaptureFrame, Placed
+from perchctl.positioning import BodyPose, CaptureFrame, Placed, open_capture
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.vehicle import Telemetry
 from perchctl.vision.types import Attitude
@@ -127,6 +135,15 @@ class MocapTruth:
         self._mounted = mounted or _AS_IT_IS
         self._clock, self._wait = now, wait
 
+    @classmethod
+    def open(
+        cls, system: str, body: str, target: str | Array, gear_body_m: Array,
+        mounted: PositioningConfig | None = None,
+    ) -> MocapTruth:  # fmt: skip
+        """Connect to the motion capture. Errors: InvalidValue, UsageError, ConnectionFailed."""
+        capture = open_named(system, body, "--truth mocap")
+        return cls(capture, system, body, target, gear_body_m, mounted)
+
     def actual(self, ask: Ask) -> Actual:
         """Errors: ConnectionFailed, NotFound."""
         self._capture.frames()  # those of before are gone
@@ -173,6 +190,16 @@ class MocapTruth:
 
 
 _AS_IT_IS = PositioningConfig()
+
+
+def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) -> Frames:
+    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
+    kind, _, host = system.partition(":")
+    if find_spec("motioncapture") is None:
+        raise no_motion_capture(needed_by)
+    # Unchecked, since `check_reachable` has the sentence for a kind that is none.
+    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
+    return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))
 
 
 def _measured(

@@ -13,12 +13,12 @@ from typer.testing import CliRunner, Result
 
 from perchctl.cli import app
 from perchctl.commands.complete import positionings
-from perchctl.commands.fit_weights_collect import open_named
 from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile
 from perchctl.profile.positioning import PositioningConfig
 from perchctl.startup import failure_record
+from perchctl.weights.truth import open_named
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
 

@@ -158,7 +158,7 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
     def draw(_result: object) -> bytes:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("perchctl.weights.plot.draw_weights", draw)
+    monkeypatch.setattr("perchctl.weights.draw_weights", draw)
     done = run(session, "--plot", tmp_path / "w.png", *(["--json"] if as_json else []))
     assert done.exit_code == 130
     if as_json:

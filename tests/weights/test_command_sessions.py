@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from perchctl.calibration.files import load_calibration
-from perchctl.commands import fit_weights_collect
 from perchctl.commands.fit_weights_collect import _truth
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, UsageError
@@ -20,8 +19,8 @@ from perchctl.geometry import rot_z
 from perchctl.positioning import BodyPose, CaptureFrame, capture
 from perchctl.profile import find_calibration, load_profile
 from perchctl.profile.positioning import PositioningConfig
-from perchctl.weights import truth
-from perchctl.weights.collect import MarkerReader, SessionFile, collecting_pipeline, fault_of
+from perchctl.weights import SessionFile, truth
+from perchctl.weights.collect import MarkerReader, collecting_pipeline, fault_of
 from perchctl.weights.table import HEADER, NEEDED, read_csv
 from tests.helpers.fit_weights import run
 
@@ -62,11 +61,11 @@ def test_a_file_that_is_no_session_is_left_alone(session: Path) -> None:
 
 
 def test_shaken_and_half_seen_positions_are_refused() -> None:
-    from perchctl.weights.simulated import Stand
+    from perchctl.weights import SimulatedStand
 
     profile = load_profile("sim")
     camera = load_calibration(find_calibration(profile.camera.calibration))
-    stand = Stand(profile, camera, 2, 0, 4.0, 1.0)
+    stand = SimulatedStand(profile, camera, 2, 0, 4.0, 1.0)
     place = stand.place(1)
     reader = MarkerReader(collecting_pipeline(profile, camera))
     good = [reader.read(frame) for frame in stand.frames(1, place, 6)]
@@ -83,11 +82,11 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
 
 def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
     """Pictures of two places; the person mistypes, doubts, stops, and goes on."""
-    from perchctl.weights.simulated import Stand
+    from perchctl.weights import SimulatedStand
 
     profile = load_profile("sim")
     camera = load_calibration(find_calibration(profile.camera.calibration))
-    stand = Stand(profile, camera, 2, 0, 4.0, 1.0)
+    stand = SimulatedStand(profile, camera, 2, 0, 4.0, 1.0)
     pictures, typed = tmp_path / "pictures", []
     pictures.mkdir()
     for position, name in ((1, "a"), (1, "b"), (2, "c")):
@@ -197,10 +196,10 @@ def test_motion_capture_is_asked_for_with_its_computer(monkeypatch: pytest.Monke
         with pytest.raises(UsageError, match="--mocap TYPE:HOST"):
             _truth(CollectRequest(truth="mocap", mocap=mocap), load_profile("sim"), lambda: 0.0)
     monkeypatch.setattr(capture, "find_spec", lambda name: object())
-    monkeypatch.setattr(fit_weights_collect, "find_spec", lambda name: object())
+    monkeypatch.setattr(truth, "find_spec", lambda name: object())
     with pytest.raises(InvalidValue, match="'nokov' is unknown; allowed are vicon, optitrack"):
         _truth(CollectRequest(truth="mocap", mocap="nokov:h"), load_profile("sim"), lambda: 0.0)
-    monkeypatch.setattr(fit_weights_collect, "find_spec", lambda name: None)
+    monkeypatch.setattr(truth, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match="--truth mocap needs the library motioncapture"):
         _truth(CollectRequest(truth="mocap", mocap="vicon:h"), load_profile("sim"), lambda: 0.0)
 
@@ -214,7 +213,7 @@ def test_motion_capture_is_the_profile_s_where_no_option_names_it(
         asked.append((system, body))
         return Recorded()
 
-    monkeypatch.setattr(fit_weights_collect, "open_named", opened)
+    monkeypatch.setattr(truth, "open_named", opened)
     own = PositioningConfig(by="mocap", system="qualisys", host="lab:22223", body="cf2")
     plain = load_profile("sim")
     lab = plain.model_copy(update={"positioning": own})
