@@ -21,14 +21,13 @@ import cv2
 import numpy as np
 from common import Picture, camera_pose, in_view, renderer, rms, setup_with, table, true_corners
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.camera.mosaic import without_mosaic
+from perchctl.flight import FlightResult
 from perchctl.flight.campaign import fly_seed
-from perchctl.flight.results import FlightResult
 from perchctl.geometry import Array
 from perchctl.profile import Profile, load_profile
-from perchctl.vision.markers.detect import detect
-from perchctl.vision.types import MARKERS, Frame
+from perchctl.vision import MARKERS, Frame, detect_markers
 
 CALIBRATION = "example_aideck_324x244.yaml"
 CORNERS = ((10.0, 0.1), (10.0, 0.25), (20.0, 0.1), (20.0, 0.25))
@@ -125,7 +124,9 @@ def mosaic(number: int) -> int:
                 pictures = {"grey camera": delivered(clean + noise, as_jpeg)}
                 pictures |= {n: w(delivered(coloured + noise, as_jpeg)) for n, w in WAYS.items()}
                 for way, image in pictures.items():
-                    found = detect(Frame(0, 0.0, image, fields="whole"), None, setup, camera)
+                    found = detect_markers(
+                        Frame(0, 0.0, image, fields="whole"), None, setup, camera
+                    )
                     for name in names:
                         seen = getattr(found, name)
                         if seen is not None:

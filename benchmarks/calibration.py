@@ -19,11 +19,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from perchctl.calibration import BoardView, calibrate_camera
 from perchctl.calibration.detect import find_board
 from perchctl.calibration.lens import parameters_of
 from perchctl.calibration.predict import position_errors_mm, ray_difference_px
-from perchctl.calibration.solve import calibrate
-from perchctl.calibration.types import View
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
@@ -36,7 +35,7 @@ from tests.helpers.boards import (
 RANGES_M = (0.05, 0.1, 0.3, 1.0, 1.5)
 
 
-def views_of(seed: int, corners_only: bool) -> tuple[list[View], object]:
+def views_of(seed: int, corners_only: bool) -> tuple[list[BoardView], object]:
     rng = np.random.default_rng([seed, 20])
     camera = draw_camera(rng)
     board = CHARUCO if seed % 2 == 0 else CHESSBOARD
@@ -49,7 +48,7 @@ def views_of(seed: int, corners_only: bool) -> tuple[list[View], object]:
         angle, motion = rng.uniform(0, np.pi), rng.uniform(0.0, 1.5)
         moved = (motion * np.cos(angle), motion * np.sin(angle))
         seen = find_board(renderer.render(pose, rng, blur_px, noise, moved), board, f"view {i}")
-        if isinstance(seen, View):
+        if isinstance(seen, BoardView):
             views.append(seen)
     return views, camera
 
@@ -63,7 +62,7 @@ def main() -> None:
     for seed in range(options.seeds):
         start_s = time.perf_counter()
         views, truth = views_of(seed, options.corners)
-        result = calibrate(views, "synthetic")
+        result = calibrate_camera(views, "synthetic")
         off = (result.solution.parameters - parameters_of(truth)) / result.solution.std
         line = (
             f"seed {seed:2d}: {len(result.views)} of {len(views)} views, "

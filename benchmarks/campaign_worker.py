@@ -139,7 +139,7 @@ def _peak_mb() -> float:
 def main() -> None:
     import perchctl
     from perchctl.flight.campaign import fly_seed  # noqa: F401 - what a process loads first
-    from perchctl.profile.load import load_profile
+    from perchctl.profile import load_profile
 
     profile = load_profile(sys.argv[1])
     home = str(Path(perchctl.__file__).resolve().parents[1])

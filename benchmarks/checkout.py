@@ -102,7 +102,7 @@ def _pipeline(keys: dict[str, dict[str, Any]], camera: Any) -> Any:
 
 def _seen(frames: list[tuple[float, Picture]], pipeline: Any) -> tuple[Any, ...]:
     from perchctl import pipeline as room
-    from perchctl.vision.types import Frame, PipelineState
+    from perchctl.vision import Frame, PipelineState
 
     state, output, t_s = PipelineState(), None, 0.0
     fields = room.FieldState() if hasattr(room, "FieldState") else None
@@ -126,7 +126,7 @@ def _serve() -> None:
     import cv2
 
     import perchctl
-    from perchctl.vision.types import CameraModel
+    from perchctl.vision import CameraModel
 
     cv2.setNumThreads(1)
     requests, answers = sys.stdin.buffer, sys.stdout.buffer

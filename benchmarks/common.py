@@ -35,13 +35,17 @@ from perchctl.profile import (  # noqa: E402
     PoseConfig,
     Profile,
     TargetConfig,
+    aruco_dictionary,
 )
-from perchctl.profile.dictionaries import predefined  # noqa: E402
-from perchctl.sim.renderer import Renderer  # noqa: E402
-from perchctl.sim.scenario import Scenario  # noqa: E402
-from perchctl.vision.camera_model import project  # noqa: E402
-from perchctl.vision.pose import square  # noqa: E402
-from perchctl.vision.types import CameraModel  # noqa: E402
+from perchctl.sim import (  # noqa: E402
+    Renderer,
+    Scenario,
+)
+from perchctl.vision import (  # noqa: E402
+    CameraModel,
+    project,
+    square_corners,
+)
 
 Picture = NDArray[np.uint8]
 SCENES = ROOT / ".." / "shared" / "data" / "scenes"
@@ -106,7 +110,7 @@ def marker_pose(T_world_cam: Array) -> tuple[Array, Array]:
 
 
 def true_corners(T_world_cam: Array, marker: str, camera: CameraModel = CAMERA) -> Array:
-    return project(square(SIDES_M[marker]), *marker_pose(T_world_cam), camera)
+    return project(square_corners(SIDES_M[marker]), *marker_pose(T_world_cam), camera)
 
 
 def in_view(corners_px: Array, camera: CameraModel = CAMERA) -> bool:
@@ -117,8 +121,8 @@ def in_view(corners_px: Array, camera: CameraModel = CAMERA) -> bool:
 def plain_detectors() -> tuple[Any, Any]:
     """Two detectors of the whole dictionaries with OpenCV's defaults: the paper's way."""
     return (
-        cv2.aruco.ArucoDetector(predefined(TARGET.large.dictionary)),
-        cv2.aruco.ArucoDetector(predefined(TARGET.small.dictionary)),
+        cv2.aruco.ArucoDetector(aruco_dictionary(TARGET.large.dictionary)),
+        cv2.aruco.ArucoDetector(aruco_dictionary(TARGET.small.dictionary)),
     )
 
 

@@ -22,10 +22,8 @@ from common import CAMERA, Picture, arguments, setup_with, table
 from decoys_tracked import report_tracked
 
 from perchctl.geometry import Array
-from perchctl.profile import MarkerConfig
-from perchctl.profile.dictionaries import predefined
-from perchctl.vision.markers.detect import detect
-from perchctl.vision.types import Frame
+from perchctl.profile import MarkerConfig, aruco_dictionary
+from perchctl.vision import Frame, detect_markers
 
 BLURS_PX = (0.6, 1.0, 1.5, 2.0, 2.8, 4.0)
 CELLS_IN_BLURS = (0.7, 3.0)
@@ -41,7 +39,7 @@ Sheet = Callable[[Rng], Array]
 
 
 def bits(dictionary: str, index: int) -> Array:
-    source = predefined(dictionary)
+    source = aruco_dictionary(dictionary)
     rows = np.ascontiguousarray(source.bytesList[index : index + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize), float)
 
@@ -50,7 +48,7 @@ def bits(dictionary: str, index: int) -> Array:
 def beside(marker: MarkerConfig, wrong_bits: int) -> tuple[int, ...]:
     """The dictionary's ids so many bits away, in the nearest turn."""
     own = bits(marker.dictionary, marker.id)
-    ids = range(len(predefined(marker.dictionary).bytesList))
+    ids = range(len(aruco_dictionary(marker.dictionary).bytesList))
     return tuple(
         i
         for i in ids
@@ -140,7 +138,7 @@ def main() -> int:
             for i in range(pictures):
                 rng = np.random.default_rng([number, int(10 * blur_px), i])
                 frame = Frame(0, 0.0, make(rng, blur_px))
-                result = detect(frame, None, SETUP.detector, CAMERA)
+                result = detect_markers(frame, None, SETUP.detector, CAMERA)
                 seen += result.large is not None or result.small is not None
             good = good and (name in OWN or seen <= MOST_FOREIGN * pictures)
             found.append(str(seen))

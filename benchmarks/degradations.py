@@ -28,7 +28,7 @@ from checkout import Checkout, Seen, Stream
 from common import CAMERA, camera_pose, in_view, marker_pose, renderer, rms, table, true_corners
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.sim.renderer import Renderer
+from perchctl.sim import Renderer
 from perchctl.sim.shutter import Shutter
 
 NEAR_M = 0.25

@@ -20,12 +20,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from perchctl.flight.lockstep import fly_lockstep
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, EventKind, Tick
+from perchctl.flight import fly_lockstep
+from perchctl.mission import Event, EventKind, Phase, Tick
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario, draw_scenario
 
 WEAK = ("low charge", "high resistance", "old")
 GOOD = "good"

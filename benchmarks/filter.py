@@ -27,15 +27,15 @@ from perchctl.geometry import (
 )
 from perchctl.pipeline import Pipeline, follow
 from perchctl.profile import KalmanConfig
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import square
-from perchctl.vision.types import (
+from perchctl.vision import (
     MARKERS,
     Attitude,
     Detection,
     Detections,
     PipelineOutput,
     PipelineState,
+    project,
+    square_corners,
 )
 
 RATE_HZ = 30.0
@@ -109,7 +109,7 @@ def corners(moment: Moment, sigma_px: float, index: int, rng: np.random.Generato
     rvec = np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=float).ravel()
     seen = {}
     for name in MARKERS:
-        true = project(square(SIDES_M[name]), rvec, T[:3, 3], CAMERA)
+        true = project(square_corners(SIDES_M[name]), rvec, T[:3, 3], CAMERA)
         sides = np.linalg.norm(true - np.roll(true, 1, axis=0), axis=1)
         if in_view(true) and sides.min() > LEAST_SIDE_PX:
             noisy = true + rng.normal(0.0, sigma_px, (4, 2))

@@ -16,8 +16,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from perchctl.log.read import read_log
-from perchctl.mission.state import SEVEN
+from perchctl.log import read_log
+from perchctl.mission import SEVEN_PHASES
 from perchctl.vehicle import LOCKED
 
 TIMEOUT_S = 120.0
@@ -49,7 +49,7 @@ def main() -> int:
     good = True
     print(f"{'Ctrl-C in':<10} {'exit':>4}  {'ended':<8} locked")
     with tempfile.TemporaryDirectory() as folder:
-        for phase in SEVEN:
+        for phase in SEVEN_PHASES:
             code, ended, locked = interrupt_in(phase.value, options.seed, Path(folder))
             good = good and code == 130 and ended in ("LANDED", "PERCHED") and not locked
             print(f"{phase.value:<10} {code:>4}  {ended:<8} {locked}", flush=True)

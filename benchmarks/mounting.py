@@ -21,14 +21,18 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from perchctl.calibration.files import camera_of
-from perchctl.calibration.mounting.recording import Recording
+from perchctl.calibration import (
+    MountingRecording,
+    profile_camera,
+    rotation_vectors,
+    solve_carry,
+    solve_pivot,
+)
 from perchctl.calibration.mounting.result import IN_95
-from perchctl.calibration.mounting.solve import solve_carry, solve_pivot
-from perchctl.calibration.mounting.turns import turn_vector
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
-from perchctl.sim.hand import Hand, draw_hand, record
+from perchctl.sim import draw_hand, record_hand
+from perchctl.sim.hand import Hand
 from tests.helpers.mounting import seen
 
 GOALS = {"turn, deg": (0.15, 0.5), "latency, ms": (3.0, 8.0), "gear's tip, mm": (0.4, 1.2)}
@@ -37,8 +41,8 @@ COVERED = (0.90, 0.99)
 PROFILE = load_profile("sim")
 
 
-def recording(hand: Hand, bare: bool) -> Recording:
-    return seen(hand) if bare else record(hand, PROFILE, camera_of(PROFILE.camera))
+def recording(hand: Hand, bare: bool) -> MountingRecording:
+    return seen(hand) if bare else record_hand(hand, PROFILE, profile_camera(PROFILE.camera))
 
 
 def errors_of(seed: int, bare: bool) -> tuple[dict[str, float], list[float]]:
@@ -47,7 +51,7 @@ def errors_of(seed: int, bare: bool) -> tuple[dict[str, float], list[float]]:
     carried = solve_carry(recording(hands["carry"], bare))
     pivoted = solve_pivot(recording(hands["pivot"], bare), PROFILE.target.size_sigma)
     truth = hands["carry"]
-    turn = turn_vector((carried.R_body_cam @ truth.T_body_cam[:3, :3].T)[None])
+    turn = rotation_vectors((carried.R_body_cam @ truth.T_body_cam[:3, :3].T)[None])
     angles = (np.array(carried.rpy_deg) - truth.rpy_deg + 180.0) % 360.0 - 180.0
     late_s = carried.latency_s - truth.latency_s
     tip_m = np.array(pivoted.gear_cam_m) - truth.gear_cam_m

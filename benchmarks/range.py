@@ -23,9 +23,8 @@ from common import (
 )
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.detect import detect
+from perchctl.vision import MARKERS, Detection, Detections, Frame, detect_markers
 from perchctl.vision.markers.square import side_lengths_px
-from perchctl.vision.types import MARKERS, Detection, Detections, Frame
 
 SIDES_PX = (
     64,
@@ -135,7 +134,7 @@ def finder(method: str, marker: str) -> Callable[[View], Array | None]:
 
     def ours(view: View) -> Array | None:
         before = view.before if method == "tracked" else None
-        seen = detect(Frame(1, 1 / 30, view.image), before, setup, CAMERA)
+        seen = detect_markers(Frame(1, 1 / 30, view.image), before, setup, CAMERA)
         found = getattr(seen, marker)
         return None if found is None else np.asarray(found.corners_px)
 

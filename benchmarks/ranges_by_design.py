@@ -18,12 +18,11 @@ import numpy as np
 
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
-from perchctl.target.design import design_ranges
-from perchctl.target.limits import FOUND_RATE, TRIALS, Optics
+from perchctl.sim import Renderer, Scenario
+from perchctl.target import Optics, design_ranges
+from perchctl.target.limits import FOUND_RATE, TRIALS
 from perchctl.target.reading import PlainReader
-from perchctl.vision.types import CameraModel, MarkerName
+from perchctl.vision import CameraModel, MarkerName
 
 FOCAL_PX = (250.0, 380.0, 600.0)
 BLUR_PX = (0.6, 1.5, 2.5)

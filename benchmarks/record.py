@@ -30,16 +30,23 @@ from common import CAMERA, setup_with, table
 from numpy.typing import NDArray
 from speed import RATE_HZ, sequence
 
-from perchctl.camera.source import FrameSource, SourceAround
+from perchctl.camera import FrameSource, WrappedSource
+from perchctl.log import LogWatcher
 from perchctl.log.recording.end import RecordingEnd
-from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import Observation, PlannerState
-from perchctl.mission.turn import FrameSeen, PoseSeen, Taken, Turn, TurnTiming
-from perchctl.mission.watch import Tick
+from perchctl.mission import (
+    FrameSeen,
+    Observation,
+    PlannerState,
+    PoseSeen,
+    Tick,
+    Turn,
+    TurnInputs,
+    TurnTiming,
+)
 from perchctl.pipeline import FieldState, pictures, step
 from perchctl.profile import Profile
 from perchctl.vehicle import PositionSetpoint, Telemetry
-from perchctl.vision.types import Frame, PipelineOutput, PipelineState
+from perchctl.vision import Frame, PipelineOutput, PipelineState
 
 GOAL_MS = 0.3
 BLOCK_S = 1.0
@@ -51,7 +58,7 @@ JUDGED = PARTS[:2]
 Times = dict[tuple[str, bool], list[float]]
 
 
-class Camera(SourceAround):
+class Camera(WrappedSource):
     """Gives the sequence's frames at their rate, over and over."""
 
     def __init__(self, frames: list[Frame], began_s: float) -> None:
@@ -136,7 +143,7 @@ def tick_of(number: int, t_s: float, frame: Frame | None, output: PipelineOutput
     found = {} if output is None else output.poses
     obs = Observation(t_s, samples[-1], target, output is not None, 0.03, battery_age_s=1.0)
     turn = Turn(
-        number, "flown", t_s, t_s, Taken(samples, frame=seen),
+        number, "flown", t_s, t_s, TurnInputs(samples, frame=seen),
         {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in found.items()},
         obs, command, state.phase, "seek", reason="the target is looked for",
         timing=TurnTiming(0.004, 0.0003, 0.0001, 0.005),

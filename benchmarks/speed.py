@@ -24,8 +24,14 @@ from common import (
 
 from perchctl.geometry import Array
 from perchctl.pipeline import FieldState, pictures, step
-from perchctl.vision.markers.detect import detect
-from perchctl.vision.types import Attitude, Detections, Frame, PipelineOutput, PipelineState
+from perchctl.vision import (
+    Attitude,
+    Detections,
+    Frame,
+    PipelineOutput,
+    PipelineState,
+    detect_markers,
+)
 
 RATE_HZ, PASSES = 30.0, 15
 BASE, WHOLE = "two full-frame detectors", "frame to target pose"
@@ -84,7 +90,7 @@ def main() -> None:
 
     def detection(k: int) -> Found:
         nonlocal last
-        seen = detect(frames[k][0], last, setup.detector, CAMERA)
+        seen = detect_markers(frames[k][0], last, setup.detector, CAMERA)
         last = seen if seen.large or seen.small else last
         return {"large": seen.large, "small": seen.small}
 

@@ -13,7 +13,7 @@ from common import CAMERA, Picture, marker_pose, true_corners
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project, undistort
+from perchctl.vision import project, undistort
 
 Rng = np.random.Generator
 Spoil = Callable[[Picture, Array, Rng], Picture]

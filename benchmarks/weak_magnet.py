@@ -22,9 +22,9 @@ from perchctl.faults.catalogue import BY_NAME, Case
 from perchctl.faults.effects import MagnetHolds
 from perchctl.faults.flight import fly_with_fault
 from perchctl.faults.oracle import drop_limit_m
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase
 from perchctl.profile import load_profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 
 MASS_KG, LOWEST_CEILING_M, ATTEMPTS, STREAM = 0.042, 1.85, 2, 77
 

@@ -11,13 +11,12 @@ __version__ = "0.2.0"
 TYPE_CHECKING = False  # typing's own takes longer to load than all of this
 
 if TYPE_CHECKING:
-    from perchctl.calibration.files import load_calibration
-    from perchctl.flight.lockstep import fly_lockstep
-    from perchctl.log.plot import plot_flight
-    from perchctl.log.read import read_log
+    from perchctl.calibration import load_calibration
+    from perchctl.flight import fly_lockstep
+    from perchctl.log import plot_flight, read_log
     from perchctl.pipeline import estimate, make_pipeline, step
     from perchctl.profile import load_profile
-    from perchctl.vision.types import Attitude, Frame, PipelineState
+    from perchctl.vision import Attitude, Frame, PipelineState
 
 _HOMES = {
     "Attitude": "perchctl.vision.types",

@@ -13,39 +13,51 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.profile import KalmanConfig, Mounting, Profile
-from perchctl.profile.mask import read_mask
+from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision.fields import FieldsMode, FieldState, looked_at, separated
-from perchctl.vision.filter import MAX_GAP_S, predicted
-from perchctl.vision.markers.cut import prepare
-from perchctl.vision.markers.detect import DetectorSetup, detect, make_detector
-from perchctl.vision.markers.mask import GearMask, make_mask
-from perchctl.vision.merge import stage_of
-from perchctl.vision.merged_target import spread_in_world, told_in_level, told_in_world
-from perchctl.vision.own import Chooser, OwnPlace
-from perchctl.vision.places import to_level
-from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
-from perchctl.vision.predict import expected_corners, sighted
-from perchctl.vision.solve import Candidate
-from perchctl.vision.strategies import MergeStrategy, Prior, make_strategy
-from perchctl.vision.tracks import (
-    Followed,
-    TrackSetup,
-    followed_on,
-    make_track_setup,
-    surest_of,
-)
-from perchctl.vision.types import (
+from perchctl.vision import (
+    MAX_TRACK_GAP_S,
     Attitude,
     CameraModel,
     Detections,
+    DetectorSetup,
+    FieldsMode,
+    FieldState,
     Frame,
+    GearMask,
+    MergePrior,
+    MergeStrategy,
+    OwnTargetPlace,
     PictureKind,
     PipelineOutput,
     PipelineState,
+    PoseCandidate,
+    PoseSetup,
     Stage,
     TargetEstimate,
+    TargetSelector,
+    TrackedFrame,
+    TrackSetup,
+    classify_fields,
+    detect_markers,
+    estimate_in_level,
+    estimate_in_world,
+    expected_corners,
+    make_aruco_detector,
+    make_mask,
+    make_pose_setup,
+    make_strategy,
+    make_track_setup,
+    normal_cam,
+    predict_track,
+    prepare_cut_markers,
+    separate_fields,
+    spread_in_world,
+    stage_of,
+    surest_pose,
+    to_level,
+    update_sight,
+    update_tracks,
 )
 
 __all__ = [
@@ -90,9 +102,11 @@ def make_pipeline(
         profile.camera.readout_s,
     )  # fmt: skip
     strategy = make_strategy(profile.merge, pose)
-    detector = make_detector(profile.detector, profile.target, _mask(profile, camera, covered))
+    detector = make_aruco_detector(
+        profile.detector, profile.target, _mask(profile, camera, covered)
+    )
     if detector.cut:
-        prepare(detector.patterns, camera)
+        prepare_cut_markers(detector.patterns, camera)
     return Pipeline(
         detector=detector,
         pose=pose,
@@ -116,12 +130,12 @@ def _mask(
     return make_mask(covered[:, ::-1] if profile.camera.mirrored else covered)
 
 
-def _own_place(profile: Profile) -> OwnPlace:
+def _own_place(profile: Profile) -> OwnTargetPlace:
     """The target's, or else where the vehicle is sent to look for it."""
     target = profile.target
     if target.expected_xy_m is not None:
-        return OwnPlace(target.expected_xy_m, target.expected_within_m)
-    return OwnPlace(profile.planner.approach_xy_m)
+        return OwnTargetPlace(target.expected_xy_m, target.expected_within_m)
+    return OwnTargetPlace(profile.planner.approach_xy_m)
 
 
 def camera_profile(profile: Profile) -> Profile:
@@ -142,7 +156,7 @@ def pictures(
 ) -> tuple[FieldState, tuple[Frame, ...]]:
     """What a stream's frame holds, each for a `step` of its own: one picture, or the two
     fields of an interlaced camera in their order of time, each with its own time."""
-    return separated(state, frame, pipeline.fields)
+    return separate_fields(state, frame, pipeline.fields)
 
 
 def step(
@@ -157,13 +171,15 @@ def step(
     What runs in each tracked frame multiplies its matrices by `dot`: `@` takes twice as long for
     a few numbers, and a frame has a hundred such products.
     """
-    frame = looked_at(frame, pipeline.fields)
+    frame = classify_fields(frame, pipeline.fields)
     expected, near = expected_corners(state.sighting, frame.t_s, attitude, pipeline.pose)
     # A first picture is searched by all means.
     first = state.last is None and state.stranger is None and state.empty_frames == 0
     empty = None if first else state.empty_frames
-    own = Chooser(pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
-    detections = detect(frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own)
+    own = TargetSelector(pipeline.tracks.own, frame.t_s, attitude, pipeline.pose)
+    detections = detect_markers(
+        frame, state.last, pipeline.detector, pipeline.camera, expected, empty, own
+    )
     return _followed(state, detections, near, attitude, pipeline, frame.fields or "whole")
 
 
@@ -178,7 +194,7 @@ def follow(
 def _followed(
     state: PipelineState,
     detections: Detections,
-    near: Candidate | None,
+    near: PoseCandidate | None,
     attitude: Attitude | None,
     pipeline: Pipeline,
     fields: PictureKind = "whole",
@@ -186,10 +202,10 @@ def _followed(
     """`near` is the pose that is expected."""
     sighting, t_s = state.sighting, detections.t_s
     normal = normal_cam(sighting.pose) if sighting is not None and attitude is None else None
-    measured = pipeline.strategy.measure(detections, Prior(attitude, near, normal))
+    measured = pipeline.strategy.measure(detections, MergePrior(attitude, near, normal))
 
     in_world = pipeline.kalman.frame == "world" and attitude is not None
-    followed = followed_on(state, measured, t_s, attitude, in_world, pipeline.tracks)
+    followed = update_tracks(state, measured, t_s, attitude, in_world, pipeline.tracks)
     measured, taken = followed.measured, followed.taken
 
     both = detections.large is not None and detections.small is not None
@@ -197,10 +213,10 @@ def _followed(
     disagreeing = state.disagreeing_frames
     if both and taken:
         disagreeing = disagreeing + 1 if measured.contradicting else 0
-    surest = surest_of(measured)
+    surest = surest_pose(measured)
     sees = surest is not None and taken
     if surest is not None and sees:
-        sighting = sighted(sighting, surest, attitude, pipeline.pose)
+        sighting = update_sight(sighting, surest, attitude, pipeline.pose)
     target = _at_frame(followed, state.target, t_s, attitude, in_world, pipeline)
     new = PipelineState(
         tracks=followed.tracks,
@@ -255,24 +271,24 @@ def estimate(
     if not state.in_world:
         return _carried(target, t_s, attitude, pipeline)
     world = pipeline.tracks.world
-    tracks = {n: predicted(t, t_s, world, spread) for n, t in state.tracks.items()}
+    tracks = {n: predict_track(t, t_s, world, spread) for n, t in state.tracks.items()}
     merged = pipeline.strategy.merge(tracks, state.measured.fed)
     assert merged is not None
-    now = replace(target, t_s=t_s, **told_in_world(merged, attitude, pipeline.pose))
+    now = replace(target, t_s=t_s, **estimate_in_world(merged, attitude, pipeline.pose))
     if not spread:
         return now
     return replace(now, **spread_in_world(merged, attitude, world, pipeline.pose))
 
 
 def _still_useful(last: Detections | None, t_s: float) -> Detections | None:
-    return last if last is not None and 0.0 <= t_s - last.t_s <= MAX_GAP_S else None
+    return last if last is not None and 0.0 <= t_s - last.t_s <= MAX_TRACK_GAP_S else None
 
 
 # --- from the tracks to the target -------------------------------------------------
 
 
 def _at_frame(
-    followed: Followed,
+    followed: TrackedFrame,
     before: TargetEstimate | None,
     t_s: float,
     attitude: Attitude | None,
@@ -288,10 +304,10 @@ def _at_frame(
     small = measured and merged.stage in (Stage.BOTH, Stage.SMALL)
     never = -np.inf
     if attitude is not None and in_world:
-        place = told_in_world(merged, attitude, pipeline.pose)
+        place = estimate_in_world(merged, attitude, pipeline.pose)
         place |= spread_in_world(merged, attitude, pipeline.tracks.world, pipeline.pose)
     else:
-        place = told_in_level(merged, attitude, pipeline.pose)
+        place = estimate_in_level(merged, attitude, pipeline.pose)
     return TargetEstimate(
         t_s=t_s,
         measured_s=t_s if measured else never if before is None else before.measured_s,

@@ -19,14 +19,14 @@ import typer
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import __version__
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.cli import app
 from perchctl.cli.app import reported
 from perchctl.commands.output import confirmed
 from perchctl.errors import EXIT_CODES, Interrupted
-from perchctl.flight.session import PLAIN_SEED
+from perchctl.flight import PLAIN_SEED
+from perchctl.sim import SimProcess
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.handle import SimProcess
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 from tests.helpers.flights import ROOT, SHORT
 

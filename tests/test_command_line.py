@@ -22,10 +22,9 @@ from perchctl.cli import app
 from perchctl.commands import complete
 from perchctl.commands.fly import FlyRequest, fly, resolve
 from perchctl.errors import EXIT_CODES, ConnectionFailed
-from perchctl.flight.session import SessionResult
+from perchctl.flight import SessionResult
 from perchctl.link.connection import open_connection, plain_cause
-from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.watch import FlightReport
+from perchctl.mission import FlightReport, Outcome, Phase
 from tests.helpers.flights import ROOT
 
 COMMANDS = (
@@ -238,7 +237,7 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
         assert flown[0].startswith("LANDED: Ctrl-C")
         os.kill(os.getpid(), 2)  # Ctrl-C
 
-    monkeypatch.setattr("perchctl.log.plot.plot_flight", draw)
+    monkeypatch.setattr("perchctl.log.plot_flight", draw)
     code = fly(resolve(FlyRequest()), True, None)
     out, err = capsys.readouterr()
     told = json.loads(out)
@@ -250,7 +249,7 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
 def test_the_object_names_the_plot(
     flown: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("perchctl.log.plot.plot_flight", lambda *_: None)
+    monkeypatch.setattr("perchctl.log.plot_flight", lambda *_: None)
     fly(resolve(FlyRequest()), True, None)
     told = json.loads(capsys.readouterr().out)
     assert told["plot"] == told["log"].replace(".jsonl", ".png")
@@ -261,7 +260,7 @@ def test_ctrl_c_behind_the_landing_does_not_replace_the_result(
     flown: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Pressed while the log is closed, which may take seconds on a slow disk."""
-    from perchctl.log.watch import LogWatcher
+    from perchctl.log import LogWatcher
 
     close = LogWatcher.close
 
@@ -270,7 +269,7 @@ def test_ctrl_c_behind_the_landing_does_not_replace_the_result(
         return close(self, *arguments)
 
     monkeypatch.setattr(LogWatcher, "close", slow)
-    monkeypatch.setattr("perchctl.log.plot.plot_flight", lambda *_: None)
+    monkeypatch.setattr("perchctl.log.plot_flight", lambda *_: None)
     assert fly(resolve(FlyRequest()), True, None) == 130
     assert json.loads(capsys.readouterr().out)["outcome"] == "landed"
 

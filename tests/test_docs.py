@@ -19,12 +19,11 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import load_calibration
-from perchctl.calibration.mounting.recording import write_recordings
+from perchctl.calibration import load_calibration, write_recordings
 from perchctl.cli import app
 from perchctl.cluster import parse_address
-from perchctl.flight.lockstep import fly_lockstep
-from perchctl.log.jsonl import decode
+from perchctl.flight import fly_lockstep
+from perchctl.log import decode_line
 from perchctl.mission.table import TABLE
 from perchctl.profile import Profile, load_profile
 from perchctl.profile.keys import keys
@@ -470,5 +469,5 @@ def test_pictures_are_small_made_by_the_command_and_shown() -> None:
 
 def test_a_log_s_first_line_explains_its_fields(short_log: Path) -> None:
     """As the page of the log says."""
-    header = decode(short_log.read_bytes().splitlines()[0])
+    header = decode_line(short_log.read_bytes().splitlines()[0])
     assert {"profile", "fields", "seed"} <= set(header)

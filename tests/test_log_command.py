@@ -98,7 +98,7 @@ def test_programs_are_told_where_a_replay_is_drawn(
 
 def test_a_plot_s_name_is_its_form(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Path] = []
-    monkeypatch.setattr("perchctl.log.plot.plot_flight", lambda _log, path: drawn.append(path))
+    monkeypatch.setattr("perchctl.log.plot_flight", lambda _log, path: drawn.append(path))
     old = "perchctl-logs/flight_old.jsonl"
     assert run("log", "plot", old).stdout == "plot:      perchctl-logs/flight_old.png\n"
     assert json.loads(run("log", "plot", old, "-o", "x.PDF", "--json").stdout)["plot"] == "x.PDF"

@@ -20,12 +20,11 @@ from perchctl.commands import (
     simulate_sweep,
     simulate_until,
 )
-from perchctl.flight import failure
-from perchctl.flight.failure import Ended, Kind
-from perchctl.flight.results import FlightResult
-from perchctl.flight.variants import Variant, VariantResult
+from perchctl.flight import EndedFlight, FlightResult, VariantResult, failure
+from perchctl.flight.failure import Kind
+from perchctl.flight.variants import Variant
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import ROOT
 from tests.helpers.results import landed, perched
@@ -145,29 +144,31 @@ def test_until_ends_where_the_rate_is_known() -> None:
     assert bound.stdout.endswith("not yet narrower than 0.5 % after 7 flights\n")
 
 
-FAILS = Ended(3, Kind("landed", "battery-low", False, False), "battery at 2.91 V under load")
+FAILS = EndedFlight(3, Kind("landed", "battery-low", False, False), "battery at 2.91 V under load")
 
 
-def ends(profile: Profile, seed: int) -> Ended:
+def ends(profile: Profile, seed: int) -> EndedFlight:
     """Fails where it is off its heading and the wind blows."""
     scenario = draw_scenario(profile, seed)
     if abs(scenario.target_yaw_rad) > 0.3 and scenario.draught_mps != (0.0, 0.0, 0.0):
         return FAILS
-    return Ended(seed, Kind("perched", "", False, False), "hanging still")
+    return EndedFlight(seed, Kind("perched", "", False, False), "hanging still")
 
 
 @pytest.fixture
 def failing(monkeypatch: pytest.MonkeyPatch) -> int:
     """A seed that does; it is flown in this process."""
 
-    def flown_here(fly: Callable[[Any], Ended], keys: Iterable[Any], *rest: Any) -> list[Ended]:
+    def flown_here(
+        fly: Callable[[Any], EndedFlight], keys: Iterable[Any], *rest: Any
+    ) -> list[EndedFlight]:
         found = [fly(key) for key in keys]
         for ended in found:
             if len(rest) > 1:
                 rest[1](ended)
         return found
 
-    def toned(_fly: object, profiles: Sequence[Profile], seed: int, number: int) -> Ended:
+    def toned(_fly: object, profiles: Sequence[Profile], seed: int, number: int) -> EndedFlight:
         return ends(profiles[number], seed)
 
     monkeypatch.setattr(simulate_minimise, "fly_to_its_end", ends)

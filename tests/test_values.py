@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from perchctl.mission.state import PlannerState
+from perchctl.mission import PlannerState
 from perchctl.values import replace
 
 

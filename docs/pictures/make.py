@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[2]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
-from perchctl.calibration.files import camera_of  # noqa: E402
+from perchctl.calibration import profile_camera  # noqa: E402
 from perchctl.display import (  # noqa: E402
     LivePage,
     Sketch,
@@ -43,11 +43,14 @@ from perchctl.display import (  # noqa: E402
 )
 from perchctl.display.panel import panel  # noqa: E402
 from perchctl.display.status import FlightStatus, status_rows  # noqa: E402
-from perchctl.flight.session import PLAIN_SEED  # noqa: E402
+from perchctl.flight import PLAIN_SEED  # noqa: E402
 from perchctl.geometry import Array, make_T, rotation_from_rpy  # noqa: E402
-from perchctl.log.plot import plot_flight  # noqa: E402
-from perchctl.log.read import FlightLog, read_log  # noqa: E402
-from perchctl.mission.state import BatteryOutlook  # noqa: E402
+from perchctl.log import (  # noqa: E402
+    FlightLog,
+    plot_flight,
+    read_log,
+)
+from perchctl.mission import BatteryOutlook  # noqa: E402
 from perchctl.pipeline import make_pipeline, step  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
@@ -61,9 +64,11 @@ from perchctl.plot import (  # noqa: E402
 )
 from perchctl.profile import Profile, load_profile  # noqa: E402
 from perchctl.report import write_report  # noqa: E402
-from perchctl.sim.draw import draw_scenario  # noqa: E402
-from perchctl.sim.renderer import Renderer  # noqa: E402
-from perchctl.vision.types import Frame, PipelineState  # noqa: E402
+from perchctl.sim import (  # noqa: E402
+    Renderer,
+    draw_scenario,
+)
+from perchctl.vision import Frame, PipelineState  # noqa: E402
 
 PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
 NEAR_WIDTH_M = 0.2
@@ -86,7 +91,7 @@ class Flight:
 
     @cached_property
     def camera(self) -> Any:
-        return camera_of(self.profile.camera)
+        return profile_camera(self.profile.camera)
 
     @cached_property
     def renderer(self) -> Renderer:

@@ -18,10 +18,9 @@ from perchctl.calibration.lens import (
     parameters_of,
     project_with_derivatives,
 )
-from perchctl.calibration.types import Solution, View
+from perchctl.calibration.types import BoardView, Solution
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import undistort
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, undistort
 
 MAX_ITERATIONS = 60
 _FOCAL_GUESSES = (0.35, 0.55, 0.85, 1.3, 2.2)  # of the longer side of the picture
@@ -85,7 +84,7 @@ class NoSolution(ArithmeticError):
     """No start led to a camera."""
 
 
-def pose_of(view: View, camera: CameraModel) -> Array | None:
+def pose_of(view: BoardView, camera: CameraModel) -> Array | None:
     """The board's rvec and tvec (6,) seen by a known camera, or None."""
     normalised = undistort(view.corners_px, camera)
     good = np.isfinite(normalised).all(axis=1) & (np.abs(normalised) < 50.0).all(axis=1)
@@ -107,7 +106,7 @@ def pose_of(view: View, camera: CameraModel) -> Array | None:
     return pose if np.isfinite(pose).all() and pose[5] > 0 else None
 
 
-def start_fit(views: Sequence[View], model: str) -> Fit:
+def start_fit(views: Sequence[BoardView], model: str) -> Fit:
     """Solve from nothing: several focal lengths are tried, the best end wins.
 
     Raises NoSolution.
@@ -125,7 +124,7 @@ def start_fit(views: Sequence[View], model: str) -> Fit:
     return refit(views, best)
 
 
-def fit_from(views: Sequence[View], camera: CameraModel) -> Fit:
+def fit_from(views: Sequence[BoardView], camera: CameraModel) -> Fit:
     """Solve all parameters from a camera that is nearly right. Raises NoSolution."""
     fit = _from(views, camera.model, parameters_of(camera), MAX_ITERATIONS)
     if fit is None:
@@ -133,7 +132,7 @@ def fit_from(views: Sequence[View], camera: CameraModel) -> Fit:
     return fit
 
 
-def refit(views: Sequence[View], near: Fit, weights: Sequence[Array] | None = None) -> Fit:
+def refit(views: Sequence[BoardView], near: Fit, weights: Sequence[Array] | None = None) -> Fit:
     """Solve again from a fit of the same views, with other corners' weights."""
     fit = _solve(views, near.model, near.parameters, near.poses, weights, MAX_ITERATIONS)
     if fit is None:
@@ -141,7 +140,7 @@ def refit(views: Sequence[View], near: Fit, weights: Sequence[Array] | None = No
     return fit
 
 
-def poses_only(views: Sequence[View], camera: CameraModel) -> Fit | None:
+def poses_only(views: Sequence[BoardView], camera: CameraModel) -> Fit | None:
     """Best poses for a camera held fixed; None where a view does not fit it at all."""
     poses = _poses(views, camera)
     if poses is None:
@@ -155,18 +154,18 @@ def as_solution(fit: Fit, covariance: Array) -> Solution:
     return Solution(fit.camera, fit.poses, fit.residuals, fit.rms_px, covariance)
 
 
-def _poses(views: Sequence[View], camera: CameraModel) -> Array | None:
+def _poses(views: Sequence[BoardView], camera: CameraModel) -> Array | None:
     poses = [pose_of(view, camera) for view in views]
     return None if any(p is None for p in poses) else np.array(poses)
 
 
-def _from(views: Sequence[View], model: str, start: Array, iterations: int) -> Fit | None:
+def _from(views: Sequence[BoardView], model: str, start: Array, iterations: int) -> Fit | None:
     poses = _poses(views, make_camera(model, views[0].size_px, start))
     return None if poses is None else _solve(views, model, start, poses, None, iterations)
 
 
 def _solve(
-    views: Sequence[View],
+    views: Sequence[BoardView],
     model: str,
     parameters: Array,
     poses: Array,

@@ -24,10 +24,10 @@ from perchctl.calibration.covariance import lens_covariance
 from perchctl.calibration.enough import tilts_deg
 from perchctl.calibration.predict import RANGES_M, position_errors_mm, predict_errors
 from perchctl.calibration.robust import reject, weighted_fit
-from perchctl.calibration.types import Rejection, View
+from perchctl.calibration.types import BoardView, Rejection
 from perchctl.calibration.verdict import limit_mm
 from perchctl.errors import InvalidValue
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 MIN_CHECK_VIEWS = 3
 RMS_FACTOR = 2.0
@@ -56,7 +56,7 @@ class CheckResult:
     deviations: tuple[Deviation, ...]
 
 
-def check(camera: CameraModel, views: Sequence[View]) -> CheckResult:
+def check_calibration(camera: CameraModel, views: Sequence[BoardView]) -> CheckResult:
     """Judge a calibration by new views of a board.
 
     Raises InvalidValue for too few views, or views that do not fix it.
@@ -106,7 +106,7 @@ def check(camera: CameraModel, views: Sequence[View]) -> CheckResult:
     )
 
 
-def _nearer(views: Sequence[View], fit: Fit, camera: CameraModel) -> Fit:
+def _nearer(views: Sequence[BoardView], fit: Fit, camera: CameraModel) -> Fit:
     """The better of the free solutions from nothing and from the file's camera."""
     try:
         other = fit_from(views, camera)
@@ -138,7 +138,7 @@ def _share(deviation: Deviation) -> float:
     return deviation.mm / limit_mm(deviation.z_m)
 
 
-def _check_evidence(views: Sequence[View], free: Fit, deviations: Sequence[Deviation]) -> None:
+def _check_evidence(views: Sequence[BoardView], free: Fit, deviations: Sequence[Deviation]) -> None:
     """Raises InvalidValue where the pictures could not show a wrong focal length."""
     unsure = not deviations or any(
         d.mm95 > UNSURE_FACTOR * limit_mm(d.z_m) for d in deviations if d.z_m in RANGES_M

@@ -15,14 +15,14 @@ import numpy as np
 
 from perchctl.calibration.bundle import Fit, NoSolution, poses_only, refit
 from perchctl.calibration.lens import MODEL_NAMES
-from perchctl.calibration.types import ModelScore, View
+from perchctl.calibration.types import BoardView, ModelScore
 
 FOLDS = 10
 MIN_GAIN = 0.02
 MIN_SIGMAS = 2.0
 
 
-def score(views: Sequence[View], fit: Fit) -> ModelScore:
+def score(views: Sequence[BoardView], fit: Fit) -> ModelScore:
     """Cross-validation of one model; `fit` is its solution of all these views."""
     held_out = np.full(len(views), np.nan)
     folds = min(FOLDS, len(views))

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from perchctl.calibration.saddle import Room, fit_saddles
 from perchctl.calibration.tags import find_tags
-from perchctl.calibration.types import Grey, View
+from perchctl.calibration.types import BoardView, Grey
 from perchctl.geometry import Array
-from perchctl.target.board_drawing import TAG_BORDER_CELLS, tag_cells
-from perchctl.target.boards import Board, Kind
-from perchctl.vision.fields import field_picture, is_combed
+from perchctl.target import TAG_BORDER_CELLS, Board, BoardKind, tag_cells
+from perchctl.vision import field_picture, is_combed
 
 MIN_CORNERS = 6
 """Fewer give a pose, but nothing about the lens."""
@@ -32,7 +31,7 @@ _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
 
 
-def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -> View | str:
+def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -> BoardView | str:
     """The view of a board, or why there is none.
 
     Args:
@@ -50,7 +49,7 @@ def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -
     return _whole(image, board, name, refine)
 
 
-def _half_way(a: View | str, b: View | str) -> View | str:
+def _half_way(a: BoardView | str, b: BoardView | str) -> BoardView | str:
     """The mean of the corners that both fields show; without a second field, the one."""
     if isinstance(a, str) or isinstance(b, str):
         return b if isinstance(a, str) else a
@@ -63,7 +62,7 @@ def _half_way(a: View | str, b: View | str) -> View | str:
     return replace(a, ids=a.ids[in_a], object_m=a.object_m[in_a], corners_px=middle)
 
 
-def _whole(image: Grey, board: Board, name: str, refine: bool) -> View | str:
+def _whole(image: Grey, board: Board, name: str, refine: bool) -> BoardView | str:
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
     small = image
@@ -81,12 +80,14 @@ def _whole(image: Grey, board: Board, name: str, refine: bool) -> View | str:
     if not refine:
         if board.kind != "charuco":
             corners = _fixed_window(image, corners, _WINDOW_PX[board.kind])
-        return View(name, (w, h), ids, object_m, corners)
+        return BoardView(name, (w, h), ids, object_m, corners)
     along, down = _local_axes(_cells(board, ids), corners)
     fit = fit_saddles(image, corners, along, down, _room(board))
     if fit.ok.sum() < MIN_CORNERS:
         return f"only {int(fit.ok.sum())} corners are sharp enough to be measured"
-    good = View(name, (w, h), ids, object_m, fit.corners_px, float(np.median(fit.width_px[fit.ok])))
+    good = BoardView(
+        name, (w, h), ids, object_m, fit.corners_px, float(np.median(fit.width_px[fit.ok]))
+    )
     return good.keep(fit.ok)
 
 
@@ -149,7 +150,7 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
     return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
 
 
-_FINDERS: dict[Kind, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
+_FINDERS: dict[BoardKind, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
     "chessboard": _chessboard,
     "charuco": _charuco,
     "aprilgrid": _aprilgrid,

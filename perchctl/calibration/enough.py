@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.types import View
+from perchctl.calibration.types import BoardView
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 
@@ -27,7 +27,7 @@ _NAMES = (
 )
 
 
-def check_views(views: Sequence[View], pictures: int) -> None:
+def check_views(views: Sequence[BoardView], pictures: int) -> None:
     """Raises InvalidValue when there are too few views to begin with."""
     if len(views) < MIN_VIEWS:
         of = f"of {pictures} pictures" if pictures > len(views) else "pictures"
@@ -38,7 +38,7 @@ def check_views(views: Sequence[View], pictures: int) -> None:
         )
 
 
-def check_variety(views: Sequence[View], poses: Array) -> None:
+def check_variety(views: Sequence[BoardView], poses: Array) -> None:
     """Raises InvalidValue when views are all frontal or leave most of the image empty."""
     tilts = tilts_deg(poses)
     tilted = int((tilts >= MIN_TILT_DEG).sum())
@@ -75,7 +75,7 @@ def tilts_deg(poses: Array) -> Array:
     return np.asarray(np.degrees(np.arccos(np.minimum(np.abs(normals), 1.0))), dtype=np.float64)
 
 
-def coverage(views: Sequence[View]) -> NDArray[np.bool_]:
+def coverage(views: Sequence[BoardView]) -> NDArray[np.bool_]:
     """Cells of the picture (rows, columns) that lie inside of some board's corners."""
     rows, columns = CELLS
     map_ = np.zeros(CELLS, dtype=np.uint8)

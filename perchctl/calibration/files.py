@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.profile import CameraConfig, find_calibration
-from perchctl.profile.plain_yaml import parse_yaml
-from perchctl.vision.types import CameraModel
+from perchctl.profile import CameraConfig, find_calibration, parse_yaml
+from perchctl.vision import CameraModel
 
 KALIBR_MODELS = {"radtan": "plumb_bob", "equidistant": "equidistant", "none": "plumb_bob"}
 """Kalibr's distortion models and their names in ROS; its radtan is k1 k2 p1 p2, k3 = 0."""
@@ -24,7 +23,7 @@ class SizeMissing(InvalidValue):
     """A calibration does not say for pictures of which size it holds."""
 
 
-def camera_of(config: CameraConfig) -> CameraModel:
+def profile_camera(config: CameraConfig) -> CameraModel:
     """The calibrated camera of a profile. Errors: those of `load_calibration`."""
     return load_calibration(config.calibration, cam=config.cam)
 
@@ -37,7 +36,7 @@ def load_sized(file: Path | str, cam: str | None = None) -> CameraModel | None:
         return None
 
 
-def assumed_size(file: Path | str, size_px: tuple[int, int]) -> str:
+def assumed_size_warning(file: Path | str, size_px: tuple[int, int]) -> str:
     """The warning that goes with a size taken from the first picture."""
     w, h = size_px
     return (

@@ -12,18 +12,18 @@ import numpy as np
 from perchctl.calibration.detect import find_board
 from perchctl.calibration.enough import MIN_VIEWS
 from perchctl.calibration.novelty import Capture, consider, progress
-from perchctl.calibration.types import Grey, View
-from perchctl.camera.source import FrameSource
+from perchctl.calibration.types import BoardView, Grey
+from perchctl.camera import FrameSource
 from perchctl.errors import TimedOut
 from perchctl.geometry import Array
-from perchctl.target.boards import Board
+from perchctl.target import Board
 
 POLL_S = 0.005
 GONE_AFTER_S = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class CaptureMoment:
     """What to show of a frame: the picture, the corners found, the coverage, the advice, and
     the views taken until then."""
 
@@ -34,17 +34,17 @@ class Moment:
     taken: int
     advice: str
     shot: bool
-    views: tuple[View, ...] = ()
+    views: tuple[BoardView, ...] = ()
 
 
-def capture(
+def capture_views(
     source: FrameSource,
     board: Board,
-    show: Callable[[Moment], None],
+    show: Callable[[CaptureMoment], None],
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
     stopped: Callable[[], bool] = lambda: False,
-) -> list[View]:
+) -> list[BoardView]:
     """Views taken, until all is covered or `stopped`; `show` gets each frame, those that are
     taken with `Moment.shot`.
 
@@ -73,9 +73,9 @@ def capture(
         name = f"view {len(state.taken) + 1}"
         seen = find_board(frame.image, board, name)
         state = consider(state, seen, board)
-        corners = seen.corners_px if isinstance(seen, View) else np.empty((0, 2))
+        corners = seen.corners_px if isinstance(seen, BoardView) else np.empty((0, 2))
         show(
-            Moment(
+            CaptureMoment(
                 frame.index,
                 frame.image,
                 corners,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 ModelName = Literal["plumb_bob", "rational_polynomial", "fisheye"]
 MODEL_NAMES: tuple[ModelName, ...] = get_args(ModelName)  # the simplest first

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from perchctl.calibration.types import View
+from perchctl.calibration.types import BoardView
 from perchctl.geometry import Array
-from perchctl.target.boards import Board
+from perchctl.target import Board
 
 AXES = ("x", "y", "size", "tilt")
 GOALS = {"x": 0.5, "y": 0.5, "size": 0.3, "tilt": 0.4}
@@ -44,7 +44,7 @@ class Signature:
         return np.array([self.x, self.y, self.size, 0.7 * self.tilt_x, 0.7 * self.tilt_y])
 
 
-def signature(view: View, board: Board) -> Signature:
+def signature(view: BoardView, board: Board) -> Signature:
     """From the homography board -> picture; tilt is the change of scale across the board."""
     w, h = view.size_px
     middle = view.corners_px.mean(axis=0) / (w, h)
@@ -89,7 +89,7 @@ def is_new(candidate: Signature, taken: Sequence[Signature]) -> bool:
     return all(candidate.distance(s) > NEW_BEYOND for s in taken)
 
 
-def pick(views: Sequence[View], board: Board) -> list[View]:
+def pick(views: Sequence[BoardView], board: Board) -> list[BoardView]:
     """The sharp and different ones of a video's views, at most `MOST_VIEWS`, in order.
 
     The one most unlike those taken is taken next (the sharper the better), until what is
@@ -122,9 +122,9 @@ class Capture:
     advice: what to do next, for the person with the board.
     """
 
-    taken: tuple[View, ...] = ()
+    taken: tuple[BoardView, ...] = ()
     signatures: tuple[Signature, ...] = ()
-    last: View | None = None
+    last: BoardView | None = None
     advice: str = "show the board to the camera"
     shot: bool = False  # the newest frame was taken
 
@@ -133,7 +133,7 @@ class Capture:
         return is_covered(self.signatures)
 
 
-def consider(capture: Capture, seen: View | str, board: Board) -> Capture:
+def consider(capture: Capture, seen: BoardView | str, board: Board) -> Capture:
     """The automatic shutter: takes the view when it is new, sharp and still."""
     taken, signatures = capture.taken, capture.signatures
     if isinstance(seen, str):
@@ -151,7 +151,7 @@ def consider(capture: Capture, seen: View | str, board: Board) -> Capture:
     return Capture((*taken, seen), grown, seen, f"taken, {len(grown)} views", True)
 
 
-def _moved_px(before: View | None, now: View) -> float:
+def _moved_px(before: BoardView | None, now: BoardView) -> float:
     if before is None:
         return float("inf")
     _, a, b = np.intersect1d(before.ids, now.ids, return_indices=True)

@@ -12,11 +12,11 @@ import numpy as np
 
 from perchctl.calibration.detect import find_board
 from perchctl.calibration.novelty import pick
-from perchctl.calibration.types import Grey, Rejection, View
-from perchctl.camera.files import BrokenPicture, VideoSource, image_files, read_grey
+from perchctl.calibration.types import BoardView, Grey, Rejection
+from perchctl.camera import BrokenPicture, VideoSource, image_files, read_grey
 from perchctl.errors import InvalidValue
-from perchctl.target.boards import Board
-from perchctl.vision.fields import field_picture, is_combed
+from perchctl.target import Board
+from perchctl.vision import field_picture, is_combed
 
 VIDEO_WINDOW = 8
 """Of so many frames in a row only the sharpest is searched for the board."""
@@ -31,7 +31,7 @@ def views_of_images(
     refine: bool = True,
     progress: Progress = lambda done, total: None,
     skip_broken: bool = False,
-) -> tuple[list[View], list[Rejection]]:
+) -> tuple[list[BoardView], list[Rejection]]:
     """Every picture of a folder or glob (or those given): the views, and those without a board.
 
     Args:
@@ -45,7 +45,7 @@ def views_of_images(
 
     broken: dict[str, str] = {}
 
-    def look(job: tuple[str, Path]) -> tuple[str, tuple[int, int] | None, View | str]:
+    def look(job: tuple[str, Path]) -> tuple[str, tuple[int, int] | None, BoardView | str]:
         name, path = job
         try:
             image = read_grey(path)
@@ -57,7 +57,7 @@ def views_of_images(
         size_px = (image.shape[1], image.shape[0])
         return name, size_px, find_board(image, board, name, refine)
 
-    views: list[View] = []
+    views: list[BoardView] = []
     missing: list[Rejection] = []
     first: tuple[str, tuple[int, int]] | None = None
     with _pool() as pool:
@@ -93,24 +93,24 @@ def _broken_text(broken: Mapping[str, str], count: int) -> str:
 
 def views_of_video(
     path: Path, board: Board, refine: bool = True, progress: Progress = lambda done, total: None
-) -> tuple[list[View], list[Rejection]]:
+) -> tuple[list[BoardView], list[Rejection]]:
     """The sharp and different views of a video.
 
     Raises NotFound or InvalidValue for a file that is none.
     """
     source = VideoSource(path)
     try:
-        found: list[View] = []
+        found: list[BoardView] = []
         searched = 0
 
-        def look(job: tuple[str, Grey]) -> View | str:
+        def look(job: tuple[str, Grey]) -> BoardView | str:
             return find_board(job[1], board, job[0], refine)
 
         with _pool() as pool:
             for batch in _batches(_sharpest(source), 4 * _workers()):
                 for seen in pool.map(look, batch):
                     searched += 1
-                    if isinstance(seen, View):
+                    if isinstance(seen, BoardView):
                         found.append(seen)
                 progress(searched, None)
     finally:
@@ -156,8 +156,10 @@ def _batches(items: Iterable[tuple[str, Grey]], size: int) -> Iterator[list[tupl
         yield batch
 
 
-def _sort(seen: View | str, name: str, views: list[View], missing: list[Rejection]) -> None:
-    if isinstance(seen, View):
+def _sort(
+    seen: BoardView | str, name: str, views: list[BoardView], missing: list[Rejection]
+) -> None:
+    if isinstance(seen, BoardView):
         views.append(seen)
     else:
         missing.append(Rejection(name, seen))

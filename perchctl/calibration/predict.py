@@ -24,10 +24,9 @@ from perchctl.calibration.lens import (
     project_with_derivatives,
     rays_of,
 )
-from perchctl.calibration.types import RangeError, View
+from perchctl.calibration.types import BoardView, RangeError
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import distort, project, undistort
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, distort, project, undistort
 
 RANGES_M = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 1.25, 1.5)
 LARGE_M, SMALL_M = 0.150, 0.025
@@ -77,7 +76,7 @@ def position_errors_mm(
     for place in places(truth, z_m, covered):
         corners_m = target_m(truth, place, z_m)
         seen = project(corners_m, _TURNED, place, truth)
-        view = View("", truth.size_px, np.arange(len(corners_m)), corners_m, seen)
+        view = BoardView("", truth.size_px, np.arange(len(corners_m)), corners_m, seen)
         solved = poses_only([view], camera)
         errors.append(
             np.inf if solved is None else 1e3 * np.linalg.norm(solved.poses[0, 3:] - place)

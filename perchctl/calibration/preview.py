@@ -17,16 +17,15 @@ from numpy.typing import NDArray
 from perchctl.calibration.bundle import NoSolution, start_fit
 from perchctl.calibration.enough import MIN_VIEWS
 from perchctl.calibration.solve import robust_fit, usable
-from perchctl.calibration.types import View
+from perchctl.calibration.types import BoardView
 from perchctl.errors import InvalidValue
-from perchctl.vision.camera_model import distort, undistort
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, distort, undistort
 
 _WIDEST = 2.5  # tangent of half of the widest field that is drawn flat: 68 deg
 
 
 @dataclass(frozen=True, eq=False)
-class Flat:
+class UndistortedView:
     """How to draw the camera's pictures without its distortion.
 
     Attributes:
@@ -42,11 +41,11 @@ class LensPreview:
     """`offer` the views, and take the newest `flat`: None until a lens is found."""
 
     def __init__(self) -> None:
-        self.flat: Flat | None = None
+        self.flat: UndistortedView | None = None
         self._offered = 0
         self._thread: threading.Thread | None = None
 
-    def offer(self, views: Sequence[View]) -> None:
+    def offer(self, views: Sequence[BoardView]) -> None:
         """Solve from these views, if they are enough, more than before, and no other solve is
         under way. Returns at once."""
         if len(views) < MIN_VIEWS or len(views) == self._offered:
@@ -64,13 +63,13 @@ class LensPreview:
         if self._thread is not None:
             self._thread.join()
 
-    def _solve(self, views: tuple[View, ...]) -> None:
+    def _solve(self, views: tuple[BoardView, ...]) -> None:
         camera = _lens_of(views)
         if camera is not None:
-            self.flat = Flat(flat_places_px(camera), len(views))
+            self.flat = UndistortedView(flat_places_px(camera), len(views))
 
 
-def _lens_of(views: Sequence[View]) -> CameraModel | None:
+def _lens_of(views: Sequence[BoardView]) -> CameraModel | None:
     """By the model that the views follow, or the fisheye's, which never folds back."""
     try:
         robust = robust_fit(views)

@@ -12,7 +12,7 @@ from perchctl.calibration.check import CheckResult
 from perchctl.calibration.lens import PARAMETERS
 from perchctl.calibration.types import Calibration, Rejection
 from perchctl.calibration.verdict import level, limit_mm, sentence
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 _MOST_MISSING = 8
 """Pictures without a board that are named one by one."""
@@ -63,6 +63,7 @@ def calibration_record(result: Calibration, file: Path, picture: Path | None) ->
 
 
 def camera_record(camera: CameraModel) -> dict[str, Any]:
+    """The camera model as JSON's own types: lengths in pixels, distances in metres."""
     K = camera.K
     return {
         "fx": float(K[0, 0]),

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from perchctl.calibration.bundle import Fit, refit, start_fit
 from perchctl.calibration.detect import MIN_CORNERS
-from perchctl.calibration.types import Rejection, View
+from perchctl.calibration.types import BoardView, Rejection
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 
@@ -44,11 +44,11 @@ class Robust:
     """fit: of `views`, which are those kept, without their rejected corners."""
 
     fit: Fit
-    views: tuple[View, ...]
+    views: tuple[BoardView, ...]
     rejections: tuple[Rejection, ...]
 
 
-def weighted_fit(views: Sequence[View], model: str) -> tuple[Fit, float]:
+def weighted_fit(views: Sequence[BoardView], model: str) -> tuple[Fit, float]:
     """Step 1: the solution that outliers do not bend, and its median spread s in px."""
     fit = start_fit(views, model)
     spread = spread_px(fit.residuals)
@@ -63,7 +63,7 @@ def weighted_fit(views: Sequence[View], model: str) -> tuple[Fit, float]:
     return fit, spread
 
 
-def reject(views: Sequence[View], start: Fit) -> Robust:
+def reject(views: Sequence[BoardView], start: Fit) -> Robust:
     """Steps 2 to 4 from the weighted solution of all views; InvalidValue when too many go."""
     kept, fit = list(views), start
     out_corners: dict[str, set[int]] = {v.name: set() for v in views}
@@ -105,7 +105,7 @@ def reject(views: Sequence[View], start: Fit) -> Robust:
     return Robust(fit, tuple(kept), tuple(rejections))
 
 
-def keep_all(views: Sequence[View], model: str) -> Robust:
+def keep_all(views: Sequence[BoardView], model: str) -> Robust:
     """No rejection at all: the plain least squares of every corner."""
     return Robust(start_fit(views, model), tuple(views), ())
 
@@ -117,7 +117,7 @@ def spread_px(residuals: Sequence[Array]) -> float:
 
 
 def _judge(
-    views: Sequence[View], fit: Fit, counts: dict[str, int]
+    views: Sequence[BoardView], fit: Fit, counts: dict[str, int]
 ) -> tuple[list[NDArray[np.bool_]], dict[str, str]]:
     """Corners to keep in each view, and views to leave out with the reason."""
     overall = spread_px(fit.residuals)

@@ -12,19 +12,19 @@ from perchctl.calibration.tags import detect_tags
 from perchctl.calibration.types import Grey
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.profile.dictionaries import dictionary_names, id_count, predefined
-from perchctl.target.boards import TAG_DICTIONARY, Board
+from perchctl.profile import aruco_dictionary, dictionary_names, dictionary_size
+from perchctl.target import TAG_DICTIONARY, Board
 
 _LARGER = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 _MAX_SIDE = 20
 _SEARCH_PX = 1200
 _MAX_MISFIT = 0.2  # of a marker's side
-_TAGS = id_count(TAG_DICTIONARY)
+_TAGS = dictionary_size(TAG_DICTIONARY)
 _LEAST_GRID = 4
 """Smaller grids are seen in many things that are no chessboard."""
 
 
-def seen_instead(images: Sequence[Grey], board: Board) -> str:
+def board_seen_instead(images: Sequence[Grey], board: Board) -> str:
     """A half sentence for the error message: what the pictures do show."""
     small = [_shrunk(image) for image in images]
     if board.kind != "aprilgrid" and any(len(detect_tags(s, _TAGS)) >= 4 for s in small):
@@ -45,7 +45,7 @@ def seen_instead(images: Sequence[Grey], board: Board) -> str:
     return ""
 
 
-def larger_than(images: Sequence[Grey], board: Board) -> str:
+def larger_board(images: Sequence[Grey], board: Board) -> str:
     """The board's notation when the pictures show a larger one of which the named
     board is a part, else empty. A part calibrates, but is hardly what was meant."""
     looks = {
@@ -78,7 +78,7 @@ def _larger_grid(image: Grey, board: Board) -> tuple[int, int] | None:
 def _larger_charuco(image: Grey, board: Board) -> tuple[int, int] | None:
     """More rows: numbers go on behind the board's last."""
     assert board.dictionary is not None
-    _, ids, _ = cv2.aruco.ArucoDetector(predefined(board.dictionary)).detectMarkers(image)
+    _, ids, _ = cv2.aruco.ArucoDetector(aruco_dictionary(board.dictionary)).detectMarkers(image)
     numbers = np.array([] if ids is None else ids, dtype=np.float64).ravel()
     if len(numbers) < 4 or (numbers >= board.columns * board.rows // 2).sum() < 2:
         return None
@@ -146,7 +146,7 @@ def _grid(image: Grey) -> tuple[int, int] | None:
 def _charuco_size(image: Grey, board: Board) -> str | None:
     """The layout in which the markers' numbers lie on a plane."""
     assert board.dictionary is not None
-    detector = cv2.aruco.ArucoDetector(predefined(board.dictionary))
+    detector = cv2.aruco.ArucoDetector(aruco_dictionary(board.dictionary))
     corners, ids, _ = detector.detectMarkers(image)
     if ids is None or len(ids) < 4:
         return None
@@ -214,7 +214,7 @@ def _dictionary(image: Grey, board: Board) -> str | None:
     for name in dictionary_names():
         if name.rsplit("_", 1)[0] == own or "APRILTAG" in name:
             continue
-        _, ids, _ = cv2.aruco.ArucoDetector(predefined(name)).detectMarkers(image)
+        _, ids, _ = cv2.aruco.ArucoDetector(aruco_dictionary(name)).detectMarkers(image)
         counts[name] = 0 if ids is None else len(ids)
     best = max(counts.values(), default=0)
     if best < 4:
@@ -225,7 +225,7 @@ def _dictionary(image: Grey, board: Board) -> str | None:
 
 def _markers(image: Grey) -> bool:
     for name in ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_ARUCO_ORIGINAL"):
-        _, ids, _ = cv2.aruco.ArucoDetector(predefined(name)).detectMarkers(image)
+        _, ids, _ = cv2.aruco.ArucoDetector(aruco_dictionary(name)).detectMarkers(image)
         if ids is not None and len(ids) >= 4:
             return True
     return False

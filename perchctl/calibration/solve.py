@@ -23,19 +23,19 @@ from perchctl.calibration.enough import (
 from perchctl.calibration.lens import MODEL_NAMES, pixel_grid
 from perchctl.calibration.predict import predict_errors, ray_errors_px
 from perchctl.calibration.robust import Robust, keep_all, reject, weighted_fit
-from perchctl.calibration.types import Calibration, Lack, ModelScore, Rejection, View
+from perchctl.calibration.types import BoardView, Calibration, Lack, ModelScore, Rejection
 from perchctl.errors import InvalidValue
-from perchctl.vision.camera_model import distort, undistort
+from perchctl.vision import distort, undistort
 
-AUTO = "auto"
+AUTO_MODEL = "auto"
 FOLDS_BACK = "folds back inside of the picture"
 _EASIER = 0.95  # a richer model must leave at most this part of the simpler one's spread
 
 
-def calibrate(
-    views: Sequence[View],
+def calibrate_camera(
+    views: Sequence[BoardView],
     board: str,
-    model: str = AUTO,
+    model: str = AUTO_MODEL,
     rejecting: bool = True,
     missing: Sequence[Rejection] = (),
 ) -> Calibration:
@@ -58,7 +58,7 @@ def calibrate(
     check_variety(robust.views, robust.fit.poses)
     fits, scores = _fit_models(robust)
     recommended = recommend(scores)
-    fit = _chosen(fits, scores, recommended if model == AUTO else model)
+    fit = _chosen(fits, scores, recommended if model == AUTO_MODEL else model)
     covariance = lens_covariance(fit)
     solution = as_solution(fit, covariance)
     check_focal(solution.std, solution.parameters)
@@ -128,7 +128,7 @@ def _lacks(fit: Fit, views: int, covered: NDArray[np.bool_]) -> list[Lack]:
     return lacks
 
 
-def robust_fit(views: Sequence[View], rejecting: bool = True) -> Robust:
+def robust_fit(views: Sequence[BoardView], rejecting: bool = True) -> Robust:
     """The views without outliers, and the camera that they were judged by: the simplest model
     that follows the lens. One that cannot would call the views at the picture's rim outliers.
 

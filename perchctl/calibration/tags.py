@@ -13,9 +13,8 @@ import numpy as np
 
 from perchctl.calibration.types import Grey
 from perchctl.geometry import Array
-from perchctl.profile.dictionaries import predefined
-from perchctl.target.board_drawing import TAG_BORDER_CELLS, tag_cells
-from perchctl.target.boards import TAG_DICTIONARY, Board
+from perchctl.profile import aruco_dictionary
+from perchctl.target import TAG_BORDER_CELLS, TAG_DICTIONARY, Board, tag_cells
 
 _SEARCH_PX = 1600
 _MOST_ENLARGED = 2.0
@@ -71,7 +70,7 @@ def detect_tags(image: Grey, count: int) -> dict[int, Array]:
 
 
 def _detector(darker: float) -> cv2.aruco.ArucoDetector:
-    detector = cv2.aruco.ArucoDetector(predefined(TAG_DICTIONARY))
+    detector = cv2.aruco.ArucoDetector(aruco_dictionary(TAG_DICTIONARY))
     finding = detector.getDetectorParameters()
     finding.markerBorderBits = TAG_BORDER_CELLS
     finding.minMarkerPerimeterRate = 0.01

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 Grey = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """One picture of the board.
 
     Attributes:
@@ -36,9 +36,9 @@ class View:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def keep(self, which: NDArray[np.bool_]) -> View:
+    def keep(self, which: NDArray[np.bool_]) -> BoardView:
         """The same view with some of its corners."""
-        return View(
+        return BoardView(
             self.name,
             self.size_px,
             self.ids[which],
@@ -140,8 +140,8 @@ class Calibration:
 
     board: str
     solution: Solution
-    views: tuple[View, ...]
-    seen: tuple[View, ...]
+    views: tuple[BoardView, ...]
+    seen: tuple[BoardView, ...]
     rejections: tuple[Rejection, ...]
     missing: tuple[Rejection, ...]
     scores: tuple[ModelScore, ...]

@@ -14,7 +14,7 @@ import numpy as np
 from perchctl.calibration.lens import PARAMETERS, parameters_of
 from perchctl.calibration.types import Calibration
 from perchctl.geometry import Array
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 ROS_NAMES = {"fisheye": "equidistant"}
 

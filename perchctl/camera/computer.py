@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.camera.v4l2 import (
-    Control,
+    CameraControl,
     Mode,
     Opener,
     card_of,
@@ -23,7 +23,7 @@ NAMES = Path("/sys/class/video4linux")
 
 
 @dataclass(frozen=True)
-class Camera:
+class ConnectedCamera:
     """`stable_path` names it wherever it is plugged in, where the system keeps such a link;
     `problem` says why the driver was not asked for modes and controls."""
 
@@ -31,7 +31,7 @@ class Camera:
     name: str = ""
     stable_path: str = ""
     modes: tuple[Mode, ...] = ()
-    controls: tuple[tuple[Control, int | None], ...] = ()
+    controls: tuple[tuple[CameraControl, int | None], ...] = ()
     problem: str = ""
 
     @property
@@ -48,9 +48,9 @@ def camera_numbers(devices: Path = DEVICES) -> list[int]:
     return sorted(int(n) for n in numbers if n.isascii() and n.isdigit())
 
 
-def cameras(
+def find_cameras(
     opener: Opener = open_driver, devices: Path = DEVICES, names: Path = NAMES, asked: bool = False
-) -> list[Camera]:
+) -> list[ConnectedCamera]:
     """Those that give pictures; a node that cannot be asked counts as one.
 
     `asked`: also for modes and controls. Opens each for a moment, streams from none.
@@ -60,7 +60,7 @@ def cameras(
     for number in camera_numbers(devices):
         name, problem = _name_of(number, names), ""
         modes: tuple[Mode, ...] = ()
-        controls: tuple[tuple[Control, int | None], ...] = ()
+        controls: tuple[tuple[CameraControl, int | None], ...] = ()
         try:
             with opener(number) as call:
                 name, gives_pictures = card_of(call)
@@ -71,11 +71,13 @@ def cameras(
                     controls = tuple((c, _read(call, c)) for c in controls_of(call).values())
         except OSError as error:
             problem = f"it cannot be asked: {error.strerror or error}"
-        found.append(Camera(number, name, stable.get(number, ""), modes, controls, problem))
+        found.append(
+            ConnectedCamera(number, name, stable.get(number, ""), modes, controls, problem)
+        )
     return found
 
 
-def _read(call: Callable[[int, bytearray], None], control: Control) -> int | None:
+def _read(call: Callable[[int, bytearray], None], control: CameraControl) -> int | None:
     try:
         return value_of(call, control)
     except OSError:
@@ -115,7 +117,7 @@ def camera_number(
             f"camera source 'camera:{text}' lacks a camera's number or name, as in camera:0 or "
             f"camera:USB Video; perchctl check --cameras lists them"
         )
-    known = cameras(opener, devices, names)
+    known = find_cameras(opener, devices, names)
     fitting = _fitting(wanted, known)
     if len(fitting) == 1:
         return fitting[0].number
@@ -136,12 +138,12 @@ def finder_of(
 
     Errors of that function: NotFound.
     """
-    before = next((c for c in cameras(opener, devices, names) if c.number == number), None)
+    before = next((c for c in find_cameras(opener, devices, names) if c.number == number), None)
 
     def find() -> int:
         if before is None or not (before.stable_path or before.name):
             return number
-        known = cameras(opener, devices, names)
+        known = find_cameras(opener, devices, names)
         back = [c.number for c in known if c.stable_path and c.stable_path == before.stable_path]
         if not back and not before.stable_path:
             back = [c.number for c in known if c.name == before.name]
@@ -155,7 +157,7 @@ def finder_of(
     return find
 
 
-def _fitting(wanted: str, known: Sequence[Camera]) -> list[Camera]:
+def _fitting(wanted: str, known: Sequence[ConnectedCamera]) -> list[ConnectedCamera]:
     """By the whole name, else by a part of it or of the path."""
     low = wanted.casefold()
     if wanted.startswith("/"):
@@ -167,7 +169,7 @@ def _fitting(wanted: str, known: Sequence[Camera]) -> list[Camera]:
     ]
 
 
-def listed(known: Sequence[Camera], paths: bool = False) -> str:
+def listed(known: Sequence[ConnectedCamera], paths: bool = False) -> str:
     """For a sentence."""
     return ", ".join(
         f"{c} at {c.stable_path}" if paths and c.stable_path else str(c) for c in known

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from perchctl.camera.v4l2 import Call, Control, controls_of, set_value, value_of
+from perchctl.camera.v4l2 import Call, CameraControl, controls_of, set_value, value_of
 from perchctl.errors import InvalidValue
 
 Wanted = Mapping[str, int | str]
@@ -57,7 +57,7 @@ def _held(call: Call, name: str) -> str:
     return " while an automatic control has it: fix that one in camera.controls, too"
 
 
-def _value(controls: Mapping[str, Control], name: str, value: int | str, source: str) -> int:
+def _value(controls: Mapping[str, CameraControl], name: str, value: int | str, source: str) -> int:
     control = controls.get(name)
     if control is None:
         has = f"it has {', '.join(controls)}" if controls else "its driver has none at all"
@@ -74,7 +74,7 @@ def _value(controls: Mapping[str, Control], name: str, value: int | str, source:
     return value
 
 
-def _entry(control: Control, value: int | str, key: str) -> int:
+def _entry(control: CameraControl, value: int | str, key: str) -> int:
     for index, text in control.menu:
         if value == index or (isinstance(value, str) and value.lower() == text.lower()):
             return index
@@ -82,7 +82,7 @@ def _entry(control: Control, value: int | str, key: str) -> int:
     raise InvalidValue(f"{key}: found {value!r}; allowed are {entries}")
 
 
-def _range(control: Control) -> str:
+def _range(control: CameraControl) -> str:
     if control.kind == "boolean":
         return "0 (off) or 1 (on)"
     steps = f" in steps of {control.step}" if control.step > 1 else ""

@@ -15,7 +15,7 @@ from typing import Any
 
 import cv2
 
-from perchctl.camera.computer import cameras, listed
+from perchctl.camera.computer import find_cameras, listed
 from perchctl.camera.controls import Wanted, set_controls, strayed_controls
 from perchctl.camera.source import Clock, LiveSource, one_line
 from perchctl.camera.v4l2 import (
@@ -58,7 +58,7 @@ def asked_of(config: CameraConfig | None, size_px: tuple[int, int] | None) -> As
 
 def device_listing() -> list[str]:
     """The cameras that can be named: ``camera:0 (USB Video)``, ... (Linux)."""
-    return [str(camera) for camera in cameras()]
+    return [str(camera) for camera in find_cameras()]
 
 
 def open_capture(number: int, asked: Asked) -> Any:
@@ -74,7 +74,7 @@ def open_capture(number: int, asked: Asked) -> Any:
             f"camera:{number} exists but cannot be opened; close other programs that use it "
             f"and check that you may read /dev/video{number}"
         )
-    known = cameras()
+    known = find_cameras()
     there = f"there are {listed(known)}" if known else "no /dev/video* exists"
     raise NotFound(f"camera:{number} was not found; {there}; plug in the receiver or camera")
 

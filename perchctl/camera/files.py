@@ -15,7 +15,7 @@ from perchctl.camera.credentials import without_password
 from perchctl.camera.jpeg import grey_pixels, size_in
 from perchctl.camera.source import to_grey
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 DEFAULT_RATE_HZ = 30.0
 MOST_FILE_PX = 1 << 27
@@ -159,12 +159,12 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     except OSError as error:
         raise BrokenPicture(path, f"cannot be read: {error.strerror or error}") from None
     try:
-        return picture_in(data)
+        return decode_picture(data)
     except ValueError as error:
         raise BrokenPicture(path, str(error)) from None
 
 
-def picture_in(data: bytes) -> NDArray[np.uint8]:
+def decode_picture(data: bytes) -> NDArray[np.uint8]:
     """The grey picture of a file's bytes.
 
     Raises ValueError with what stands behind the file's name: it is cut off, a JPEG or PNG of

@@ -1,6 +1,6 @@
 """Whether a frame can be a measurement at all: frozen, snow, uniform, dark.
 
-Pure: `assess` is ``(state, frame) -> (state, verdict)``. A frame judged bad
+Pure: `assess_frame` is ``(state, frame) -> (state, verdict)``. A frame judged bad
 gives no measurement; the detector need not search it.
 """
 
@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.camera.repeats import same_bytes
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 Kind = Literal["ok", "repeated", "frozen", "snow", "uniform", "dark"]
 
-MEANING: dict[Kind, str] = {
+VERDICT_TEXTS: dict[Kind, str] = {
     "ok": "the picture is usable",
     "repeated": "the same picture as before",
     "frozen": "the picture stands still",
@@ -61,7 +61,7 @@ class HealthState:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class HealthVerdict:
     """`repeats`: times in a row that this same picture came again;
     `unchanged_s`: how long ago the picture last changed."""
 
@@ -75,12 +75,12 @@ class Verdict:
 
     @property
     def text(self) -> str:
-        return MEANING[self.kind]
+        return VERDICT_TEXTS[self.kind]
 
 
-def assess(
+def assess_frame(
     state: HealthState, frame: Frame, live: bool = True, limits: HealthLimits | None = None
-) -> tuple[HealthState, Verdict]:
+) -> tuple[HealthState, HealthVerdict]:
     """Judge one frame.
 
     A camera's noise makes each live picture differ from the last, so equal bytes
@@ -94,11 +94,11 @@ def assess(
         state = HealthState(state.picture, state.changed_at_s, state.repeats + 1)
         unchanged_s = frame.t_s - state.changed_at_s
         frozen = unchanged_s >= limits.frozen_after_s
-        return state, Verdict("frozen" if frozen else "repeated", state.repeats, unchanged_s)
+        return state, HealthVerdict("frozen" if frozen else "repeated", state.repeats, unchanged_s)
     if live and frame.repeated:
         repeats = state.repeats + 1
-        return HealthState(image, state.changed_at_s, repeats), Verdict("repeated", repeats)
-    return HealthState(image, frame.t_s, 0), Verdict(content(image, limits))
+        return HealthState(image, state.changed_at_s, repeats), HealthVerdict("repeated", repeats)
+    return HealthState(image, frame.t_s, 0), HealthVerdict(content(image, limits))
 
 
 def content(image: NDArray[np.uint8], limits: HealthLimits) -> Kind:

@@ -13,7 +13,7 @@ from perchctl.camera.credentials import without_password
 from perchctl.camera.device import CaptureSource, DeviceSource, asked_of
 from perchctl.camera.files import DEFAULT_RATE_HZ, IMAGE_SUFFIXES, ImagesSource, VideoSource
 from perchctl.camera.gst import open_pipeline
-from perchctl.camera.mirror import as_profiled
+from perchctl.camera.mirror import mirrored_as_profiled
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.rtsp import RtspSource
 from perchctl.camera.source import Clock, FrameSource, LiveSource
@@ -25,7 +25,7 @@ REAL = (
     "camera:N, camera:NAME, video:FILE, images:DIR (or a pattern), http://HOST:PORT/PATH, "
     f"rtsp://HOST/PATH, {FORM}, gst:PIPELINE"
 )
-ALLOWED = f"{REAL}, sim:"
+ALLOWED_SOURCES = f"{REAL}, sim:"
 
 FIRST_FRAME_WITHIN_S = 8.0
 SCHEMES = ("camera", "video", "images", "http", "https", "rtsp", "aideck", "gst", "sim")
@@ -63,7 +63,7 @@ def is_live(spec: str) -> bool:
     return scheme_of(spec) not in RECORDED
 
 
-def of_pictures(spec: str) -> bool:
+def is_pictures(spec: str) -> bool:
     """Whether the source is files of pictures, which may or may not belong together."""
     return scheme_of(spec) == "images"
 
@@ -86,7 +86,7 @@ def open_source(
     """Open the source and wait for its first frame.
 
     Args:
-        spec: one of `ALLOWED`; ``sim:`` belongs to the simulated vehicle, which
+        spec: one of `ALLOWED_SOURCES`; ``sim:`` belongs to the simulated vehicle, which
             resolves it to its own stream before this function is called.
         latency_s: time from exposure to arrival, taken off live frames' times.
         size_px: wanted width and height (requested of ``camera:N`` only).
@@ -103,7 +103,7 @@ def open_source(
         first frame in time.
     """
     source = _opened(spec, latency_s, size_px, clock, timeout_s, pictures_hz, config, tell)
-    return source if config is None else as_profiled(source, config)
+    return source if config is None else mirrored_as_profiled(source, config)
 
 
 def _opened(
@@ -149,7 +149,7 @@ def _opened(
             f"other sources are {REAL}"
         )
     shown = without_password(spec)
-    raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
+    raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED_SOURCES}")
 
 
 def _stream(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from perchctl.camera.repeats import Grey, RepeatState, repeated
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 
 class NewestSlot:

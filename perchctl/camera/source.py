@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from perchctl.camera.credentials import without_password
 from perchctl.camera.slot import NewestSlot
 from perchctl.errors import InvalidValue
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame
 
 Grey = NDArray[np.uint8]
 Clock = Callable[[], float]
@@ -201,7 +201,7 @@ class LiveSource:
         self._first.set()
 
 
-class SourceAround:
+class WrappedSource:
     """A source around another one: everything is the inner one's, but for what a subclass
     does to its frames."""
 
@@ -237,7 +237,7 @@ class SourceAround:
         self._source.close()
 
 
-class WatchedSource(SourceAround):
+class WatchedSource(WrappedSource):
     """The same source; each frame that it gives is shown to `seen`, which must not raise."""
 
     def __init__(self, source: FrameSource, seen: Callable[[Frame], None]) -> None:

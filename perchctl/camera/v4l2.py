@@ -61,7 +61,7 @@ class Mode:
 
 
 @dataclass(frozen=True)
-class Control:
+class CameraControl:
     """`name` as V4L2's own tools write it; `menu` holds the entries of one that has such."""
 
     id: int
@@ -178,9 +178,9 @@ def delivered_of(call: Call) -> Delivered:
     return Delivered(fourcc_text(pixels), (width, height), rate_hz)
 
 
-def controls_of(call: Call) -> dict[str, Control]:
+def controls_of(call: Call) -> dict[str, CameraControl]:
     """By name, in the driver's order: those that have one value."""
-    found: dict[str, Control] = {}
+    found: dict[str, CameraControl] = {}
     last = 0
     for _ in range(_MOST):
         data = bytearray(68)
@@ -196,7 +196,7 @@ def controls_of(call: Call) -> dict[str, Control]:
             break  # a driver that does not go on
         last = number
         if kind in _VALUED and not flags & (_DISABLED | _WRITE_ONLY):
-            control = Control(
+            control = CameraControl(
                 number, control_name(_text(name)), _VALUED[kind], low, high, step, default, flags,
                 _menu(call, number, low, high, kind) if kind in (_MENU, _INTEGER_MENU) else (),
             )  # fmt: skip
@@ -217,14 +217,14 @@ def _menu(call: Call, control: int, low: int, high: int, kind: int) -> tuple[tup
     return tuple(entries)
 
 
-def value_of(call: Call, control: Control) -> int:
+def value_of(call: Call, control: CameraControl) -> int:
     """Errors: OSError."""
     data = bytearray(struct.pack("=Ii", control.id, 0))
     call(G_CTRL, data)
     return int(struct.unpack("=Ii", data)[1])
 
 
-def set_value(call: Call, control: Control, value: int) -> None:
+def set_value(call: Call, control: CameraControl, value: int) -> None:
     """Errors: OSError."""
     call(S_CTRL, bytearray(struct.pack("=Ii", control.id, value)))
 

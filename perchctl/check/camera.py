@@ -8,21 +8,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import mean, median
 
-from perchctl.camera.health import MEANING
-from perchctl.camera.mirror import MIRRORED, mirrored_note
+from perchctl.camera import MIRRORED_TEXT, VERDICT_TEXTS, mirrored_note
 from perchctl.check.computer import LEAST_RATED, frame_period_s, percentile
 from perchctl.check.pictures import Blur, Light, blur_of, light_of, noise_of
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import Row, by_limits, failed, passed, skipped, warned
 from perchctl.errors import PerchError
-from perchctl.flight import criteria
-from perchctl.flight.senses import MIRRORED_FRAMES
+from perchctl.flight import MIRRORED_FRAMES, too_near_problem
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
-from perchctl.target.blind import blind_lines
-from perchctl.target.design import Design, cm, design_ranges, make_design
-from perchctl.target.limits import Optics
-from perchctl.vision.fields import BLENDED
+from perchctl.target import Optics, TargetDesign, blind_lines, cm_text, design_ranges, make_design
+from perchctl.vision import BLENDED
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
 """An AI-deck's program as it comes gives 8, and a simulated one perches with 7."""
@@ -46,10 +42,10 @@ _SEE = "see docs/check.md"
 _AGAIN = "plug the receiver or camera in again"
 _LIGHT = "more light, a longer exposure, or the lens cap off"
 _ADVICE = {
-    MEANING["frozen"]: _AGAIN,
-    MEANING["snow"]: "set the receiver to the camera's channel, switch the camera on",
-    MEANING["uniform"]: "uncover the lens, switch the camera on",
-    MEANING["dark"]: _LIGHT,
+    VERDICT_TEXTS["frozen"]: _AGAIN,
+    VERDICT_TEXTS["snow"]: "set the receiver to the camera's channel, switch the camera on",
+    VERDICT_TEXTS["uniform"]: "uncover the lens, switch the camera on",
+    VERDICT_TEXTS["dark"]: _LIGHT,
 }
 PICTURE_NAMES = (
     "frame rate", "lost frames", "picture age", "pictures", "light", "noise", "focus", "mirrored",
@@ -109,7 +105,9 @@ def size_row(size_px: tuple[int, int] | None, wanted_px: tuple[int, int]) -> Row
     )  # fmt: skip
 
 
-def rows(rehearsal: Rehearsal, optical: Optical, design: Design, profile: Profile) -> list[Row]:
+def rows(
+    rehearsal: Rehearsal, optical: Optical, design: TargetDesign, profile: Profile
+) -> list[Row]:
     """After camera and size: what the pictures show. `design` is `design_of` them."""
     if not rehearsal.pictures:
         why = rehearsal.problem or "no picture came in the rehearsal"
@@ -191,7 +189,7 @@ def _pictures(rehearsal: Rehearsal) -> Row:
     text, count = rehearsal.problems.most_common(1)[0]
     share = sum(rehearsal.problems.values()) / rehearsal.pictures
     found = f"{count} of {rehearsal.pictures}: {text}"
-    advice = "see mirrored" if text.startswith(MIRRORED) else _ADVICE.get(text, _SEE)
+    advice = "see mirrored" if text.startswith(MIRRORED_TEXT) else _ADVICE.get(text, _SEE)
     return by_limits("pictures", share, BAD_WARN, BAD_FAIL, found, advice)
 
 
@@ -243,7 +241,7 @@ def _target(rehearsal: Rehearsal) -> Row:
     if target is not None:
         away_m = math.hypot(*(float(e) for e in target.e_m))
         found += f", {away_m:.2f} m from the gear (+- {1e3 * _spread_m(rehearsal):.0f} mm)"
-        if problem := criteria.within_reach(target):
+        if problem := too_near_problem(target):
             return failed("target", problem.found, problem.advice)
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
         return warned("target", found, "nearer, sharper, or more light: see ranges and focus")
@@ -265,7 +263,7 @@ def _print(rehearsal: Rehearsal) -> Row:
 
 def design_of(
     rehearsal: Rehearsal, optical: Optical, pipeline: Pipeline, profile: Profile
-) -> Design:
+) -> TargetDesign:
     """The target's ranges with the blur and noise of these pictures, and under this ceiling
     where the target was seen from a known height."""
     usual = Optics()
@@ -282,10 +280,10 @@ def design_of(
     return make_design(target, model, optics, profile, ceiling_m, ranges)
 
 
-def _ranges(design: Design, measured: bool) -> Row:
+def _ranges(design: TargetDesign, measured: bool) -> Row:
     r = design.ranges
     each = (("z1", r.z1_m), ("z2", r.z2_m), ("z3", r.z3_m))
-    found = ", ".join(f"{n} {'never' if z is None else f'{cm(z)} cm'}" for n, z in each)
+    found = ", ".join(f"{n} {'never' if z is None else f'{cm_text(z)} cm'}" for n, z in each)
     optics = f"blur {design.optics.blur_px:g} px, noise {design.optics.noise:g}"
     if not measured:
         return skipped("ranges", f"{found} with a guessed {optics}", "see focus")
@@ -295,7 +293,7 @@ def _ranges(design: Design, measured: bool) -> Row:
     return passed("ranges", f"{found} ({optics})")
 
 
-def _blind(design: Design) -> Row:
+def _blind(design: TargetDesign) -> Row:
     """From where on nothing is measured any more, and whether a turn of the camera helps."""
     found, *advice = blind_lines(design.mount)
     return warned("blind", found, advice[0]) if advice else passed("blind", found)

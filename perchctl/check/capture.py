@@ -13,11 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.check.row import Row, by_limits, failed, passed, skipped, worse
-from perchctl.flight import criteria, outside
+from perchctl.flight import (
+    external_height_problem,
+    millimetres_problem,
+    motion_problem,
+    tilt_problem,
+    world_problem,
+)
 from perchctl.geometry import Array
 from perchctl.positioning import CaptureFrame, CaptureSource, Placed
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
 LISTEN_S = 2.0
@@ -176,11 +181,11 @@ def _place(heard: Listened, places: list[Placed], profile: Profile) -> Row:
     newest = heard.telemetry[-1] if heard.telemetry else None
     place = places[-1].external(pose=True)
     if newest is None:
-        problem = outside.in_millimetres(place, profile) or outside.off_the_ground(place, profile)
-    elif criteria.tilted(newest, profile) or criteria.moving(newest):
+        problem = millimetres_problem(place, profile) or external_height_problem(place, profile)
+    elif tilt_problem(newest, profile) or motion_problem(newest):
         return skipped("body place", "the vehicle does not stand level and still")
     else:
-        problem = outside.strange(place, newest, profile)
+        problem = world_problem(place, newest, profile)
     if problem is not None:
         return failed("body place", problem.found, problem.advice)
     x, y, z = place.position_m

@@ -5,21 +5,21 @@ from __future__ import annotations
 from datetime import datetime
 
 from perchctl.check.row import Row, Verdict, failed, passed, warned
-from perchctl.link.claim import vehicle_of
+from perchctl.link import vehicle_uri
 from perchctl.positioning import (
     Comparison,
     ComparisonRecord,
     load_comparison,
     save_comparison,
 )
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 
 NAME = "compared"
 
 
 def kept(lifted: Row, config: PositioningConfig, uri: str, now: datetime) -> Row:
     """Write down what the hand found, and the row of it. A lift that told nothing is none."""
-    vehicle = vehicle_of(uri)
+    vehicle = vehicle_uri(uri)
     if lifted.verdict is Verdict.SKIPPED:
         return row(load_comparison(config, vehicle), now)
     record = Comparison(now, lifted.verdict is Verdict.PASS, lifted.found)
@@ -50,4 +50,4 @@ def comparison_rows(
     """None with decks, nor for the simulator's own vehicle, whose room is right as it is built."""
     if config.by != "mocap" or simulated:
         return []
-    return [row(load_comparison(config, vehicle_of(uri)), now)]
+    return [row(load_comparison(config, vehicle_uri(uri)), now)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from perchctl.check.row import Row, failed
-from perchctl.link.probe import ProbeLink
+from perchctl.link import ProbeLink
 
 NAME = "link"
 GONE_S = 1.0

@@ -22,11 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.check.row import Row, failed, passed, skipped, warned
-from perchctl.flight.history import History, attitude_at
-from perchctl.flight.outside import nearest_axis
+from perchctl.flight import History, attitude_at, nearest_axis
 from perchctl.geometry import Array, rotation_from_rpy, rpy_from_rotation
 from perchctl.positioning import Placed
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.vehicle import Telemetry
 
 NAME = "lifted"

@@ -12,8 +12,14 @@ from dataclasses import dataclass
 
 from perchctl.check.gone import gone
 from perchctl.check.row import Row, failed, passed, skipped, warned
-from perchctl.flight import criteria
-from perchctl.link.probe import HealthTest, ProbeLink
+from perchctl.flight import (
+    forbidden_problem,
+    height_problem,
+    motion_problem,
+    tilt_problem,
+    unsettled_problem,
+)
+from perchctl.link import HealthTest, ProbeLink
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 
@@ -58,11 +64,11 @@ def hindrance(telemetry: Telemetry | None, age_s: float, profile: Profile) -> st
     if telemetry is None or age_s > profile.safety.proof_age_s:
         return "nothing fresh is known of the vehicle"
     problem = (
-        criteria.forbidden(telemetry)
-        or criteria.unsettled(telemetry, profile)
-        or criteria.off_the_ground(telemetry, profile)
-        or criteria.tilted(telemetry, profile)
-        or criteria.moving(telemetry)
+        forbidden_problem(telemetry)
+        or unsettled_problem(telemetry, profile)
+        or height_problem(telemetry, profile)
+        or tilt_problem(telemetry, profile)
+        or motion_problem(telemetry)
     )
     return "" if problem is None else problem.found
 

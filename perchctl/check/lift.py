@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from perchctl.check.row import Row, failed, passed, skipped, warned
-from perchctl.link.probe import ProbeLink
+from perchctl.link import ProbeLink
 from perchctl.vehicle import Telemetry
 
 NAME = "lifted"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from perchctl.profile.limits import REACHED, Limit
+from perchctl.profile import REACHED_SHARE, Limit
 
 OVERSHOOT_M = 0.1
 """So far a climb passes its setpoint (docs/firmware.md, "Position take-off")."""
@@ -27,7 +27,7 @@ OVERDUE = 0.5
 
 
 def _least_time_s(takeoff_m: float, takeoff_mps: float, *dwells_s: float) -> float:
-    return REACHED * takeoff_m / takeoff_mps + sum(dwells_s)
+    return REACHED_SHARE * takeoff_m / takeoff_mps + sum(dwells_s)
 
 
 DOUBTFUL: Mapping[str, tuple[Limit, ...]] = {

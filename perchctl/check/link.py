@@ -11,11 +11,18 @@ from dataclasses import dataclass, field
 
 from perchctl.check import sight
 from perchctl.check.row import Row, by_limits, failed, passed, skipped, warned, worse
-from perchctl.flight import criteria
-from perchctl.flight.criteria import Problem
-from perchctl.link.prepare import NEEDED_PROTOCOL
-from perchctl.link.probe import Echoes, ProbeLink
-from perchctl.link.variables import EXTERNAL, decks_of
+from perchctl.flight import (
+    Problem,
+    battery_problem,
+    forbidden_problem,
+    height_problem,
+    motion_problem,
+    not_allowed_problem,
+    tilt_deg,
+    unmeasured_problem,
+    unsettled_problem,
+)
+from perchctl.link import EXTERNAL_POSITION_TICK, NEEDED_PROTOCOL, Echoes, ProbeLink, decks_found
 from perchctl.profile import Profile
 from perchctl.vehicle import LOW_POWER, NO_BATTERY_READING_V, MeasuredBy, Telemetry
 
@@ -59,7 +66,7 @@ class Vehicle:
 
     @property
     def measured_by(self) -> MeasuredBy:
-        return MeasuredBy(decks_of(self.parameters), self.external)
+        return MeasuredBy(decks_found(self.parameters), self.external)
 
 
 NAMES = (
@@ -72,13 +79,13 @@ NAMES = (
 
 def look(link: ProbeLink, uri: str, listen_s: float = LISTEN_S) -> Vehicle:
     """Ask a connected vehicle, and listen to it for so long."""
-    before = link.variables([EXTERNAL]).get(EXTERNAL)
+    before = link.variables([EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
     link.telemetry()
     echoes = link.echoes(listen_s)
     samples = link.telemetry()
     span_s = samples[-1].t_s - samples[0].t_s if len(samples) > 1 else 0.0
-    values = link.variables([RSSI, EXTERNAL])
-    after = values.get(EXTERNAL)
+    values = link.variables([RSSI, EXTERNAL_POSITION_TICK])
+    after = values.get(EXTERNAL_POSITION_TICK)
     rssi = values.get(RSSI)
     later = link.telemetry() or samples
     return Vehicle(
@@ -232,7 +239,7 @@ def _at_rest(vehicle: Vehicle, profile: Profile) -> list[Row]:
         _estimator(vehicle, t, profile),
         _ground(t, profile),
         _level(t, profile),
-        _by("still", criteria.moving(t), f"{t.acc_z_g:.2f} g"),
+        _by("still", motion_problem(t), f"{t.acc_z_g:.2f} g"),
         told,
         _battery(t, profile),
     ]
@@ -246,7 +253,7 @@ def _by(name: str, problem: Problem | None, found: str) -> Row:
 
 
 def _supervisor(t: Telemetry) -> Row:
-    problem = criteria.forbidden(t) or criteria.not_allowed(t)
+    problem = forbidden_problem(t) or not_allowed_problem(t)
     return _by("supervisor", problem, f"ready (0x{t.supervisor:04X})")
 
 
@@ -265,7 +272,7 @@ def _position_decks(vehicle: Vehicle, profile: Profile) -> tuple[str, ...]:
 
 def _positioning(vehicle: Vehicle, profile: Profile) -> Row:
     by = vehicle.measured_by
-    problem = criteria.unmeasured(by, profile)
+    problem = unmeasured_problem(by, profile)
     if problem is not None:
         return failed("positioning", problem.found, problem.advice)
     if profile.positioning.by == "mocap":
@@ -283,7 +290,7 @@ BY_FLY = "positions are sent by fly, which waits for the estimate to agree"
 def _estimator(vehicle: Vehicle, t: Telemetry, profile: Profile) -> Row:
     if profile.positioning.by != "deck" and not _position_decks(vehicle, profile):
         return skipped("estimator", BY_FLY)
-    problem = criteria.unsettled(t, profile)
+    problem = unsettled_problem(t, profile)
     if problem is not None:
         return failed("estimator", problem.found, "is there a positioning system? wait a little")
     kind = profile.link.parameters.get(ESTIMATOR, vehicle.parameters.get(ESTIMATOR))
@@ -304,16 +311,16 @@ def _ground(t: Telemetry, profile: Profile) -> Row:
         return skipped("ground", BY_FLY)
     if not all(math.isfinite(v) for v in t.position_m):
         return failed("ground", "the position is no number", "restart the vehicle")
-    return _by("ground", criteria.off_the_ground(t, profile), f"at {t.position_m[2]:.2f} m")
+    return _by("ground", height_problem(t, profile), f"at {t.position_m[2]:.2f} m")
 
 
 def _level(t: Telemetry, profile: Profile) -> Row:
-    tilt_deg = criteria.tilt_deg(t)
+    found_deg = tilt_deg(t)
     roll_deg, pitch_deg = math.degrees(t.roll_rad), math.degrees(t.pitch_rad)
     found = f"roll {roll_deg:.1f}, pitch {pitch_deg:.1f} deg"
     advice = "put it on level ground; if that is level, restart it there"
     limit_deg = profile.safety.start_tilt_deg
-    return by_limits("level", tilt_deg, min(LEVEL_WARN_DEG, limit_deg), limit_deg, found, advice)
+    return by_limits("level", found_deg, min(LEVEL_WARN_DEG, limit_deg), limit_deg, found, advice)
 
 
 def _parameters(vehicle: Vehicle, profile: Profile) -> Row:
@@ -336,7 +343,7 @@ def _parameters(vehicle: Vehicle, profile: Profile) -> Row:
 def _battery(t: Telemetry, profile: Profile) -> Row:
     if not t.battery_v >= NO_BATTERY_READING_V:
         return skipped("battery", "no reading", "restart the vehicle")
-    if problem := criteria.battery_low(t, profile):
+    if problem := battery_problem(t, profile):
         return failed("battery", problem.found, problem.advice)
     found = f"{t.battery_v:.2f} V at rest"
     if t.battery_state == LOW_POWER:

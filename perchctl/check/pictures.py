@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from perchctl.check.rehearsal import Looked
 from perchctl.pipeline import Pipeline
-from perchctl.vision.markers.lines import refine_lines
-from perchctl.vision.types import MARKERS
+from perchctl.vision import MARKERS, refine_lines
 
 Grey = NDArray[np.uint8]
 WHITE, BLACK = 250, 5

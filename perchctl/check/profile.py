@@ -10,19 +10,15 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.credentials import without_password
+from perchctl.calibration import profile_camera
+from perchctl.camera import without_password
 from perchctl.check import sight
 from perchctl.check.limits import DOUBTFUL
 from perchctl.check.row import Row, Verdict
 from perchctl.errors import PerchError
 from perchctl.geometry import Array
-from perchctl.profile import Profile, find_calibration
-from perchctl.profile.limits import Limit
-from perchctl.profile.places import data_folder
-from perchctl.target.blind import sees_small
-from perchctl.target.checks import check_target
-from perchctl.target.lengths import millimetres
+from perchctl.profile import Limit, Profile, data_folder, find_calibration
+from perchctl.target import check_target, mm_text, sees_small_marker
 
 FAR_M = 0.15
 """No gear and no camera is farther from the centre of a vehicle of 42 g."""
@@ -116,7 +112,7 @@ def _place(name: str, key: str, place_m: Sequence[float]) -> Row:
 
 
 def _mm(place_m: Sequence[float]) -> str:
-    return f"{' '.join(millimetres(part) for part in place_m)} mm"
+    return f"{' '.join(mm_text(part) for part in place_m)} mm"
 
 
 def _camera_turn(profile: Profile) -> Row:
@@ -151,8 +147,8 @@ def _view(profile: Profile) -> Array:
 def _markers(profile: Profile) -> Row:
     large, small = profile.target.large, profile.target.small
     found = (
-        f"{millimetres(large.side_m)} mm {large.dictionary}/{large.id} around "
-        f"{millimetres(small.side_m)} mm {small.dictionary}/{small.id}"
+        f"{mm_text(large.side_m)} mm {large.dictionary}/{large.id} around "
+        f"{mm_text(small.side_m)} mm {small.dictionary}/{small.id}"
     )
     try:
         # The magnet is no part of a profile: one that just covers the small marker.
@@ -165,12 +161,12 @@ def _markers(profile: Profile) -> Row:
 def _standoff(profile: Profile) -> Row:
     """Settled counts only what shows the small marker."""
     name, ascend = "stand-off", profile.planner.ascend
-    shown = f"at {millimetres(ascend.standoff_m)} mm under the target the small marker is"
+    shown = f"at {mm_text(ascend.standoff_m)} mm under the target the small marker is"
     try:
-        camera = camera_of(profile.camera)
+        camera = profile_camera(profile.camera)
     except PerchError as error:
         return Row(name, Verdict.SKIPPED, f"no calibration to tell by: {error}")
-    if sees_small(camera, profile, ascend.standoff_m):
+    if sees_small_marker(camera, profile, ascend.standoff_m):
         return Row(name, Verdict.PASS, f"{shown} in the picture")
     return Row(
         name,
@@ -199,7 +195,7 @@ def _limits(name: str, limits: Sequence[Limit], profile: Profile) -> Row:
 def _sight(profile: Profile, simulated: bool) -> list[Row]:
     """Where the target is the positioning system."""
     try:
-        camera = camera_of(profile.camera)
+        camera = profile_camera(profile.camera)
     except PerchError:
         camera = None
     return sight.of_profile(profile, camera, simulated)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.check import computer
 from perchctl.check.profile import profile_rows
 from perchctl.check.row import Row, Verdict
 from perchctl.errors import SafetyAbort
-from perchctl.flight.session import FlyOptions
+from perchctl.flight import FlyOptions
 
 
 def rows(options: FlyOptions) -> list[Row]:
@@ -21,7 +21,7 @@ def rows(options: FlyOptions) -> list[Row]:
 def warnings_before_flight(options: FlyOptions) -> list[str]:
     """A sentence for each row that warns. Errors: SafetyAbort for the first that fails; of the
     calibration's file InvalidValue, NotFound."""
-    camera_of(options.profile.camera)
+    profile_camera(options.profile.camera)
     found = rows(options)
     for row in found:
         if row.verdict is Verdict.FAIL:

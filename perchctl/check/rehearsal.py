@@ -11,16 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from perchctl.camera.source import FrameSource, SourceAround
-from perchctl.flight.clock import Clock
-from perchctl.flight.senses import Senses
-from perchctl.link.protocol import Guard, ToldSent, tell_nobody
+from perchctl.camera import FrameSource, WrappedSource
+from perchctl.flight import Clock, Senses
+from perchctl.link import Guard, SentCallback, ignore_sent
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
-from perchctl.target.print_check import PrintCheck, PrintVerdict
+from perchctl.target import PrintCheck, PrintVerdict
 from perchctl.values import replace
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
-from perchctl.vision.types import Detections, Frame, TargetEstimate
+from perchctl.vision import Detections, Frame, TargetEstimate
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3
@@ -49,7 +48,7 @@ class Silent:
     def problem(self, now_s: float) -> str | None:
         return None
 
-    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         return None
 
     def close(self) -> None:
@@ -104,7 +103,7 @@ class Rehearsal:
     print_verdict: PrintVerdict | None = None
 
 
-class _Noted(SourceAround):
+class _Noted(WrappedSource):
     """Remembers the newest picture."""
 
     newest: Frame | None = None

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from perchctl.check.row import Row, failed, passed, skipped
-from perchctl.link.scan import Answering
-from perchctl.link.uri import UDEV_HELP
+from perchctl.link import UDEV_HELP, ScanResult
 
 NO_ANSWER = "switch the vehicle on; a radio's address other than E7E7E7E7E7 goes with -u"
 
 
-def rows(answering: Answering) -> list[Row]:
+def rows(answering: ScanResult) -> list[Row]:
     """One for the radio, one for each vehicle."""
     radio = passed("radio", "scanned: channels 0 to 125 at 250K, 1M, 2M")
     if answering.radio:
@@ -18,7 +17,7 @@ def rows(answering: Answering) -> list[Row]:
     return [radio, *(found or [failed("address", "nothing answers", NO_ANSWER)])]
 
 
-def others(uri: str, answering: Answering) -> str:
+def others(uri: str, answering: ScanResult) -> str:
     """What to do about a vehicle that does not answer, given those that do."""
     there = [each for each in answering.uris if each != uri]
     if there:

@@ -7,11 +7,8 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.credentials import without_password
-from perchctl.camera.device import device_listing
-from perchctl.camera.open import open_source
-from perchctl.camera.source import FrameSource
+from perchctl.calibration import profile_camera
+from perchctl.camera import FrameSource, device_listing, open_source, without_password
 from perchctl.check import (
     camera,
     capture,
@@ -30,17 +27,19 @@ from perchctl.check.lift import WITHIN_S as LIFT_S
 from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
 from perchctl.check.row import Row, failed, passed, skipped
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
-from perchctl.flight.clock import WallClock, wall_date
-from perchctl.flight.positions import at_hand
-from perchctl.flight.session import FlyOptions, check_options, simulated_vehicle
-from perchctl.link.probe import ProbeLink
-from perchctl.link.scan import Answering, address_of
-from perchctl.link.scan import scan as scan_for
-from perchctl.link.uri import check_uri
+from perchctl.flight import (
+    FlyOptions,
+    WallClock,
+    capture_for_vehicle,
+    check_options,
+    simulated_vehicle,
+    wall_date,
+)
+from perchctl.link import ProbeLink, ScanResult, address_of, check_uri
+from perchctl.link import find_vehicles as scan_for
 from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.positioning import CaptureSource, open_capture
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 
 NO_VEHICLE = "the vehicle does not answer"
@@ -65,7 +64,7 @@ class CheckScope:
     tell: Callable[[str], None] = lambda text: None
     open_capture: Callable[[PositioningConfig], CaptureSource] = open_capture
     capture_s: float = capture.LISTEN_S
-    other_vehicles: Callable[[str], Answering] = lambda uri: scan_for([address_of(uri)])
+    other_vehicles: Callable[[str], ScanResult] = lambda uri: scan_for([address_of(uri)])
 
 
 def check(options: FlyOptions, wanted: CheckScope) -> Iterator[Row]:
@@ -73,7 +72,7 @@ def check(options: FlyOptions, wanted: CheckScope) -> Iterator[Row]:
     profile's files), UsageError (a library that is missing, or does not load)."""
     check_options(options)
     profile = options.profile
-    calibrated = camera_of(profile.camera)
+    calibrated = profile_camera(profile.camera)
     pipeline = make_pipeline(profile, calibrated)
     rehearsal: Rehearsal | None = None
     with contextlib.ExitStack() as stack:
@@ -137,7 +136,7 @@ Room = CaptureSource | str | None
 
 
 def _with_capture_at(profile: Profile, simulated: tuple[str, str] | None) -> Profile:
-    positioning = at_hand(profile.positioning, simulated)
+    positioning = capture_for_vehicle(profile.positioning, simulated)
     return profile.model_copy(update={"positioning": positioning})
 
 
@@ -246,7 +245,7 @@ def _source(
     spec: str, options: FlyOptions, stack: contextlib.ExitStack, remarks: list[str]
 ) -> FrameSource:
     config = options.profile.camera
-    size_px = camera_of(config).size_px
+    size_px = profile_camera(config).size_px
     source = open_source(
         spec, config.start_latency_s, size_px, time.monotonic, config.start_timeout_s,
         config=config, tell=remarks.append,

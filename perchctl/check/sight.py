@@ -7,12 +7,10 @@ import math
 
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import Row, failed, passed, skipped, warned
-from perchctl.flight.view import out_of_view, place_seen, seen_at
+from perchctl.flight import out_of_view, place_seen, target_from
 from perchctl.profile import Profile
-from perchctl.target.design import Design
-from perchctl.target.lengths import millimetres
-from perchctl.target.overhead import aside_words, edge_room, overhead
-from perchctl.vision.types import CameraModel
+from perchctl.target import TargetDesign, edge_margin, mm_text, offset_text, overhead_view
+from perchctl.vision import CameraModel
 
 NAMES = ("sight range", "in view")
 SEEN_WARN = 0.5
@@ -32,7 +30,11 @@ def unseen(why: str, profile: Profile) -> list[Row]:
 
 
 def rows(
-    rehearsal: Rehearsal, design: Design, measured: bool, profile: Profile, camera: CameraModel
+    rehearsal: Rehearsal,
+    design: TargetDesign,
+    measured: bool,
+    profile: Profile,
+    camera: CameraModel,
 ) -> list[Row]:
     """None where something else measures the position. `measured`: the blur that `design` is for
     is that of these pictures."""
@@ -54,7 +56,11 @@ def of_profile(profile: Profile, camera: CameraModel | None, simulated: bool) ->
 
 
 def _range(
-    rehearsal: Rehearsal, design: Design, measured: bool, profile: Profile, camera: CameraModel
+    rehearsal: Rehearsal,
+    design: TargetDesign,
+    measured: bool,
+    profile: Profile,
+    camera: CameraModel,
 ) -> Row:
     """With this camera, and its blur where that is known."""
     name = NAMES[0]
@@ -63,7 +69,9 @@ def _range(
         return failed(
             name, "no marker is read through this blur and noise", "a sharper picture is needed"
         )
-    where = overhead(profile.target, camera, profile.camera.mount, plain_px if measured else None)
+    where = overhead_view(
+        profile.target, camera, profile.camera.mount, plain_px if measured else None
+    )
     if not where.reaches:
         return failed(name, f"the target has to be {where.words}", "see camera turn")
     found = f"the target has to be {where.words}"
@@ -71,7 +79,7 @@ def _range(
         return skipped(name, f"with a sharp picture {found}", "see focus")
     if rehearsal.target is not None:
         place = place_seen(rehearsal.target, profile)
-        seen = seen_at((0.0, 0.0, profile.safety.ground_z_m), 0.0, place, profile, camera)
+        seen = target_from((0.0, 0.0, profile.safety.ground_z_m), 0.0, place, profile, camera)
         if seen.height_m > where.highest_m:
             return warned(name, f"it is {seen.height_m:.1f} m above it; {found}", LARGER)
     return passed(name, found)
@@ -81,7 +89,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Row
     """From where the vehicle stands, and on its way up: what `fly` refuses fails."""
     name = NAMES[1]
     if not rehearsal.found:
-        where = overhead(profile.target, camera, profile.camera.mount).words
+        where = overhead_view(profile.target, camera, profile.camera.mount).words
         return failed(name, "no, and fly refuses", f"put the vehicle under the target: {where}")
     found = f"in {100 * rehearsal.found // rehearsal.pictures} % of the pictures"
     if rehearsal.found < SEEN_WARN * rehearsal.pictures:
@@ -93,7 +101,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Row
     problem = out_of_view(place, feet, 0.0, profile, camera)
     if problem is not None:
         return failed(name, problem.found, problem.advice)
-    sight = seen_at(feet, 0.0, place, profile, camera)
+    sight = target_from(feet, 0.0, place, profile, camera)
     found += (
         f", {math.hypot(*sight.aside_m):.2f} m aside of the camera's axis "
         f"{sight.height_m:.2f} m above it"
@@ -101,7 +109,7 @@ def _in_view(rehearsal: Rehearsal, profile: Profile, camera: CameraModel) -> Row
     room = _room(rehearsal, camera)
     if room is not None and room < ROOM_WARN:
         found += f", only {100.0 * max(0.0, room):.0f} % of the picture's width from its edge"
-        return warned(name, found, f"put the vehicle {aside_words(sight.aside_m)} from here")
+        return warned(name, found, f"put the vehicle {offset_text(sight.aside_m)} from here")
     return passed(name, found)
 
 
@@ -110,7 +118,7 @@ def _room(rehearsal: Rehearsal, camera: CameraModel) -> float | None:
     for looked in reversed(rehearsal.looked):
         large = looked.detections.large
         if large is not None:
-            return edge_room(large.corners_px, camera.size_px)
+            return edge_margin(large.corners_px, camera.size_px)
     return None
 
 
@@ -132,8 +140,8 @@ def _size(profile: Profile, camera: CameraModel | None, simulated: bool) -> Row:
     if camera is None:
         return skipped(name, "no calibration to tell by")
     mount = profile.camera.mount
-    highest_m = overhead(profile.target, camera, mount).highest_m
-    side = millimetres(profile.target.large.side_m)
+    highest_m = overhead_view(profile.target, camera, mount).highest_m
+    side = mm_text(profile.target.large.side_m)
     found = f"{side} mm, seen from the ground up to {highest_m:.1f} m above the camera"
     ceiling_m = profile.simulation.ceiling_z_m[1]
     if simulated and ceiling_m - mount.position_m[2] > highest_m:

@@ -11,7 +11,7 @@ from typing import Any
 from perchctl.cluster.wanted import Answer, Wanted
 from perchctl.cluster.worker import asked_first, unfit
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.log.arithmetic import arithmetic
+from perchctl.log import arithmetic_fingerprint
 
 ANSWERS_S = 60.0
 SEEN_S = 10.0
@@ -53,7 +53,7 @@ async def ask_all(client: Any, asked: Wanted) -> list[str]:
     if problems:
         more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         raise InvalidValue(problems[0] + more)
-    others = sum(answer.arithmetic != arithmetic() for answer in fit.values())
+    others = sum(answer.arithmetic != arithmetic_fingerprint() for answer in fit.values())
     if not others:
         return []
     return [

@@ -29,8 +29,7 @@ from perchctl.cluster.place import Place
 from perchctl.cluster.wanted import Wanted, wanted
 from perchctl.cluster.worker import fly_order
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
-from perchctl.flight.hands import order_of
-from perchctl.flight.uninterrupted import uninterrupted
+from perchctl.flight import defer_interrupts, flight_order
 from perchctl.profile import Profile
 
 R = TypeVar("R")
@@ -73,7 +72,7 @@ class ClusterHands(Executor):
     def start(self) -> None:
         """Returns as flights can be handed over. Errors: PerchError."""
         resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
-        with uninterrupted():  # threads and processes have the mask of who starts them
+        with defer_interrupts():  # threads and processes have the mask of who starts them
             self._thread.start()
         self._ready.result()
 
@@ -214,7 +213,7 @@ class ClusterHands(Executor):
         self, future: Future[Any], fn: Callable[..., Any], args: tuple[Any, ...]
     ) -> None:
         try:
-            order = order_of(fn, args)
+            order = flight_order(fn, args)
         except Exception as error:  # nothing that can be sent
             future.set_exception(error)
             return

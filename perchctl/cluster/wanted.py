@@ -18,13 +18,12 @@ from pathlib import Path
 import cv2
 
 import perchctl
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.errors import PerchError
 from perchctl.files import cannot_be_written
-from perchctl.flight.results_file import commit_of, profile_sha256
-from perchctl.log.arithmetic import arithmetic
-from perchctl.profile import Profile
-from perchctl.profile.mask import read_mask
+from perchctl.flight import commit_of, profile_sha256
+from perchctl.log import arithmetic_fingerprint
+from perchctl.profile import Profile, read_mask
 
 _LIBRARIES = ("numpy", "mujoco", "filterpy", "distributed")
 """Beside OpenCV, which comes under several names: what a flight's figures are made by, and what
@@ -142,7 +141,7 @@ def answer_to(asked: Wanted, threads: int, name: str = "") -> Answer:
     )
     if problem is not None:
         return Answer(host, problem)
-    return Answer(host, None, arithmetic(), name)
+    return Answer(host, None, arithmetic_fingerprint(), name)
 
 
 def _other_program(asked: Wanted) -> str | None:
@@ -180,7 +179,7 @@ def _other_data(asked: Wanted) -> str | None:
         if profile_sha256(profile) == sha256:
             continue
         try:
-            camera = camera_of(profile.camera)
+            camera = profile_camera(profile.camera)
             if profile.camera.mask is not None:
                 read_mask(profile.camera.mask, camera.size_px)
         except PerchError as error:

@@ -9,7 +9,7 @@ from distributed import get_worker
 
 from perchctl.cluster.wanted import Answer, Wanted, answer_to
 from perchctl.errors import InvalidValue
-from perchctl.flight.hands import answered
+from perchctl.flight import run_order
 
 _asked: dict[str, Answer] = {}
 
@@ -26,7 +26,7 @@ def asked_first(wanted: Wanted, dask_worker: Any = None) -> Answer:
 
 def fly_order(order: bytes, wanted: Wanted) -> bytes:
     """One flight; on a worker that came later it is asked now. Returns what
-    `perchctl.flight.hands.answered` does."""
+    `perchctl.flight.hands.run_order` does."""
     worker = get_worker()
     answer = _asked.get(wanted.campaign)
     if answer is None:
@@ -35,7 +35,7 @@ def fly_order(order: bytes, wanted: Wanted) -> bytes:
     if answer.problem is not None:
         told = unfit(worker.address, answer)
         return pickle.dumps((False, InvalidValue(told)))
-    return answered(order)
+    return run_order(order)
 
 
 def unfit(address: str, answer: Answer) -> str:

@@ -7,22 +7,29 @@ import itertools
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from perchctl.calibration.check import check
-from perchctl.calibration.files import assumed_size, load_calibration, load_sized
-from perchctl.calibration.lens import MODEL_NAMES
-from perchctl.calibration.pictures import views_of_images, views_of_video
-from perchctl.calibration.report import (
+from perchctl.calibration import (
+    AUTO_MODEL,
+    MODEL_NAMES,
+    BoardView,
+    Calibration,
+    Rejection,
+    assumed_size_warning,
+    board_seen_instead,
+    calibrate_camera,
     calibration_lines,
     calibration_record,
+    calibration_text,
     camera_record,
+    camera_text,
+    check_calibration,
     check_record,
+    larger_board,
+    load_calibration,
+    load_sized,
+    views_of_images,
+    views_of_video,
 )
-from perchctl.calibration.seen import larger_than, seen_instead
-from perchctl.calibration.solve import AUTO, calibrate
-from perchctl.calibration.types import Calibration, Rejection, View
-from perchctl.calibration.writing import calibration_text, camera_text
-from perchctl.camera.open import is_live
-from perchctl.camera.source import check_size
+from perchctl.camera import check_size, is_live
 from perchctl.commands.calibrate_board import board_of
 from perchctl.commands.calibrate_live import captured_views
 from perchctl.commands.calibrate_mask import write_mask
@@ -34,7 +41,7 @@ from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
-from perchctl.target.boards import Board
+from perchctl.target import Board
 
 FOLDER = Path("calib")
 _TYPED = {"reject": "no-reject"}
@@ -53,7 +60,7 @@ class CalibrateRequest:
     output: Path | None = None
     size: str | None = None
     name: str = "camera"
-    model: str = AUTO
+    model: str = AUTO_MODEL
     force: bool = False
     check: Path | None = None
     convert: Path | None = None
@@ -74,7 +81,7 @@ class CalibrateRequest:
 class _Found:
     """Views of the source, and pictures without the board."""
 
-    views: list[View]
+    views: list[BoardView]
     missing: list[Rejection]
 
     @property
@@ -129,7 +136,7 @@ def run(request: CalibrateRequest) -> int:
 def _refuse_beside(asked: str, request: CalibrateRequest, *options: str) -> None:
     """Raises UsageError for an option that would be ignored."""
     given = {
-        "--model": request.model != AUTO,
+        "--model": request.model != AUTO_MODEL,
         "--output": request.output is not None,
         "--view": request.view,
     }
@@ -160,8 +167,8 @@ def _mount(request: CalibrateRequest) -> int:
 
 
 def _check_request(request: CalibrateRequest) -> None:
-    if request.model not in (AUTO, *MODEL_NAMES):
-        allowed = ", ".join((AUTO, *MODEL_NAMES))
+    if request.model not in (AUTO_MODEL, *MODEL_NAMES):
+        allowed = ", ".join((AUTO_MODEL, *MODEL_NAMES))
         raise InvalidValue(f"lens model {request.model!r} is unknown; allowed are {allowed}")
     if request.output is not None:
         _check_output(request.output, request.force)
@@ -177,7 +184,9 @@ def _calibrate(request: CalibrateRequest, source: Source, board: Board) -> int:
     _check_output(output, request.force)
     missing = f", {len(found.missing)} without" if found.missing else ""
     say(f"{len(found.views)} views of the board{missing}")
-    result = calibrate(found.views, board.notation(), request.model, request.reject, found.missing)
+    result = calibrate_camera(
+        found.views, board.notation(), request.model, request.reject, found.missing
+    )
     text = calibration_text(result, request.name, _now())
     write_files({output: text.encode()})
     for line in calibration_lines(result):
@@ -192,7 +201,7 @@ def _calibrate(request: CalibrateRequest, source: Source, board: Board) -> int:
 
 
 def _draw(result: Calibration, picture: Path) -> Path:
-    from perchctl.calibration.plot import draw_calibration
+    from perchctl.calibration import draw_calibration
 
     write_files({picture: draw_calibration(result)})
     return picture
@@ -204,9 +213,9 @@ def _check(request: CalibrateRequest, file: Path, source: Source, board: Board) 
     found = _find_views(request, source, board)
     if camera is None:
         camera = load_calibration(file, found.size_px, request.cam)
-        say(assumed_size(file, found.size_px))
+        say(assumed_size_warning(file, found.size_px))
     check_size(found.size_px, camera, str(source))
-    result = check(camera, found.views)
+    result = check_calibration(camera, found.views)
     for item in found.missing:
         say(f"{item.view}: {item.reason}")
     for item in result.rejections:
@@ -285,12 +294,12 @@ def _find_views(request: CalibrateRequest, source: Source, board: Board) -> _Fou
             views, missing = views_of_video(Path(source.place), board, refine, progress)
     if not views:
         count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
-        other = seen_instead(source.samples(), board)
+        other = board_seen_instead(source.samples(), board)
         hint = other or "is it wholly in view, sharp, and --board its true layout?"
         raise InvalidValue(
             f"none of {count} of {source} shows the board {board.notation()}; {hint}"
         )
-    whole = larger_than(source.samples(), board)
+    whole = larger_board(source.samples(), board)
     if whole:
         raise InvalidValue(
             f"the pictures show a larger board than {board.notation()}: use --board {whole}"
@@ -298,7 +307,7 @@ def _find_views(request: CalibrateRequest, source: Source, board: Board) -> _Fou
     return _Found(views, missing)
 
 
-def _live_views(request: CalibrateRequest, source: Source, board: Board) -> list[View]:
+def _live_views(request: CalibrateRequest, source: Source, board: Board) -> list[BoardView]:
     frames = source.open()
     try:
         assert frames.size_px is not None  # the first frame is there

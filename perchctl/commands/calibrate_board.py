@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from perchctl.errors import UsageError
-from perchctl.target.boards import Board, parse_board
-from perchctl.target.lengths import millimetres, parse_length
-from perchctl.target.measured import NOTABLE_SCALE_ERROR
+from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board, parse_length
 
 
 def board_of(notation: str, width: str | None, height: str | None) -> tuple[Board, list[str]]:
@@ -30,8 +28,8 @@ def board_of(notation: str, width: str | None, height: str | None) -> tuple[Boar
     for name, meant_m, is_m, scale in zip(
         ("width", "height"), board.size_m, sides_m, board.scale, strict=True
     ):
-        off = f"{100 * (scale - 1):+.2f} % against {millimetres(meant_m)} mm"
-        notes.append(f"{name}: {millimetres(is_m)} mm, {off}")
+        off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
+        notes.append(f"{name}: {mm_text(is_m)} mm, {off}")
         if abs(scale - 1) > NOTABLE_SCALE_ERROR:
             notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
     return board, notes

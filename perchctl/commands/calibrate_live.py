@@ -15,18 +15,23 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from perchctl.calibration.guided import Moment, capture
-from perchctl.calibration.preview import Flat, LensPreview
-from perchctl.calibration.types import Grey, View
-from perchctl.camera.source import FrameSource
+from perchctl.calibration import (
+    BoardView,
+    CaptureMoment,
+    Grey,
+    LensPreview,
+    UndistortedView,
+    capture_views,
+)
+from perchctl.camera import FrameSource
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page
 from perchctl.display import Sketch
 from perchctl.errors import InvalidValue
 from perchctl.files import write_files
-from perchctl.target.boards import Board
-from perchctl.vision.types import CameraModel
+from perchctl.target import Board
+from perchctl.vision import CameraModel
 
 _BAR_WIDTH = 30
 _REFRESH_HZ = 8
@@ -35,7 +40,7 @@ _SIZE_UNTIL_KNOWN_PX = (640, 480)
 
 def captured_views(
     source: FrameSource, board: Board, pictures: Path | None, port: int | None
-) -> list[View]:
+) -> list[BoardView]:
     """Views of a live camera, taken until all is covered or Ctrl-C ends it.
 
     Args:
@@ -43,7 +48,7 @@ def captured_views(
         port: of the live page; None: no page.
 
     Raises:
-        InvalidValue: no view was taken. Those of `capture`.
+        InvalidValue: no view was taken. Those of `capture_views`.
     """
     keeper = _Keeper(pictures)
     with contextlib.ExitStack() as stack:
@@ -55,7 +60,7 @@ def captured_views(
         bars = stack.enter_context(coverage_bars())
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 
-        def show(moment: Moment) -> None:
+        def show(moment: CaptureMoment) -> None:
             if moment.shot:
                 keeper.keep(moment.image)
             bars(moment.covered, moment.taken, moment.advice)
@@ -65,7 +70,7 @@ def captured_views(
                 page.show(moment.index, sketch_of(moment, flat))
                 page.tell(lambda: page_state(moment, flat))
 
-        views = capture(source, board, show, stopped=stop.requested.is_set)
+        views = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not views:
         raise InvalidValue(
             f"no view of the board {board.notation()} was taken from {source.describe()}"
@@ -115,7 +120,7 @@ def _any_camera(size_px: tuple[int, int]) -> CameraModel:
     return CameraModel(size_px, K, np.zeros(5))
 
 
-def sketch_of(moment: Moment, flat: Flat | None) -> Sketch:
+def sketch_of(moment: CaptureMoment, flat: UndistortedView | None) -> Sketch:
     outlines: tuple[tuple[str, Any], ...] = ()
     if len(moment.corners_px) >= 3:
         hull = cv2.convexHull(moment.corners_px.astype(np.float32)).reshape(-1, 2)
@@ -124,7 +129,7 @@ def sketch_of(moment: Moment, flat: Flat | None) -> Sketch:
     return Sketch(moment.image, outlines, None, (moment.advice,), places_px)
 
 
-def page_state(moment: Moment, flat: Flat | None) -> dict[str, Any]:
+def page_state(moment: CaptureMoment, flat: UndistortedView | None) -> dict[str, Any]:
     rows: list[list[str | float]] = [
         [name, f"{100 * share:.0f} %", share] for name, share in moment.covered.items()
     ]

@@ -7,9 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from perchctl.calibration.gear import learn_gear, mask_png
-from perchctl.calibration.types import Grey
-from perchctl.camera.source import FrameSource
+from perchctl.calibration import Grey, learn_gear, mask_png
+from perchctl.camera import FrameSource
 from perchctl.commands.calibrate_source import Source
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import print_record, say

@@ -9,15 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.calibration.mounting.recording import Part, Recording, read_recordings
-from perchctl.calibration.mounting.report import (
-    Comparison,
+from perchctl.calibration import (
+    MountingPart,
+    MountingRecording,
+    MountingReport,
     keys_text,
     mounting_lines,
     mounting_record,
+    pose_basis,
+    read_recordings,
+    solve_carry,
+    solve_pivot,
 )
-from perchctl.calibration.mounting.seen import seen_by
-from perchctl.calibration.mounting.solve import solve_carry, solve_pivot
 from perchctl.commands.calibrate_mount_request import MountOptions, MountRequest, resolve
 from perchctl.commands.interrupt import drawn
 from perchctl.commands.output import print_record, say, tell
@@ -25,8 +28,7 @@ from perchctl.commands.page import page_port
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, NotFound, PerchError, no_simulator
 from perchctl.files import write_files
-from perchctl.profile import load_profile
-from perchctl.profile.edit import write_values
+from perchctl.profile import load_profile, write_profile_values
 
 DEFAULT_SEED = 0
 
@@ -56,7 +58,7 @@ def measure_mount(
     if options.into is not None:
         try:
             _check_unchanged(options)
-            aside = write_values(options.into, comparison.profile_values())
+            aside = write_profile_values(options.into, comparison.profile_values())
             written = options.into
             say(f"wrote these into {written}; as it was before it is {aside}")
         except (InvalidValue, NotFound) as error:  # the numbers stand
@@ -82,7 +84,7 @@ def measure_mount(
     return code
 
 
-def solved(options: MountOptions, recordings: Sequence[Recording]) -> Comparison:
+def solved(options: MountOptions, recordings: Sequence[MountingRecording]) -> MountingReport:
     """Of each part there is. Errors: InvalidValue."""
     by_part = {recording.part: recording for recording in recordings}
     carry, pivot = by_part.get("carry"), by_part.get("pivot")
@@ -96,12 +98,12 @@ def solved(options: MountOptions, recordings: Sequence[Recording]) -> Comparison
             raise
         other = "pivot" if carried is None else "carry"
         raise InvalidValue(f"{error} (--part {other} takes the {other} alone)") from None
-    return Comparison(options.profile, carried, pivoted)
+    return MountingReport(options.profile, carried, pivoted)
 
 
 def _recordings(
     options: MountOptions, port: int | None
-) -> tuple[Sequence[Recording], Mapping[str, Any] | None]:
+) -> tuple[Sequence[MountingRecording], Mapping[str, Any] | None]:
     """And in the simulator what is true."""
     if options.request.truth is not None:
         return _simulated(options)
@@ -124,9 +126,9 @@ def _recordings(
     return recorded(setup), None
 
 
-def _check_seen_by(recordings: Sequence[Recording], options: MountOptions) -> None:
+def _check_seen_by(recordings: Sequence[MountingRecording], options: MountOptions) -> None:
     """Whether the poses rest on the sizes and the lens that the profile has now."""
-    now = seen_by(options.profile, options.camera)
+    now = pose_basis(options.profile, options.camera)
     for recording in recordings:
         if not recording.seen_by:
             say(f"the {recording.part} does not say by which sizes and lens it was seen: unchecked")
@@ -137,10 +139,10 @@ def _check_seen_by(recordings: Sequence[Recording], options: MountOptions) -> No
             )
 
 
-def read_parts(logs: Sequence[Path], part: str | None) -> list[Recording]:
+def read_parts(logs: Sequence[Path], part: str | None) -> list[MountingRecording]:
     """Each part once, or the one that is asked for. Errors: NotFound, InvalidValue."""
     named = [(path, recording) for path in logs for recording in read_recordings(path)]
-    places: dict[Part, Path] = {}
+    places: dict[MountingPart, Path] = {}
     for path, recording in named:
         if part not in (None, "both", recording.part):
             continue
@@ -161,9 +163,9 @@ def read_parts(logs: Sequence[Path], part: str | None) -> list[Recording]:
     return [recording for _, recording in named if recording.part in places]
 
 
-def _simulated(options: MountOptions) -> tuple[Sequence[Recording], Mapping[str, Any]]:
+def _simulated(options: MountOptions) -> tuple[Sequence[MountingRecording], Mapping[str, Any]]:
     try:
-        from perchctl.sim.hand import draw_hand, record
+        from perchctl.sim import draw_hand, record_hand
     except ImportError as error:
         raise no_simulator(error.name) from None
     seed = DEFAULT_SEED if options.request.seed is None else options.request.seed
@@ -172,7 +174,7 @@ def _simulated(options: MountOptions) -> tuple[Sequence[Recording], Mapping[str,
     rate_hz = profile.simulation.camera_rate_hz
     with count_bar("pictures", round(rate_hz * sum(hand.seconds for hand in hands))) as advance:
         for hand in hands:
-            recordings.append(record(hand, profile, options.camera, told=advance))
+            recordings.append(record_hand(hand, profile, options.camera, told=advance))
     hand = hands[0]  # of one seed both parts have the same vehicle
     true = {"rpy_deg": hand.rpy_deg, "latency_s": hand.latency_s, "gear_cam_m": hand.gear_cam_m}
     return recordings, {key: np.asarray(value).tolist() for key, value in true.items()}
@@ -202,8 +204,8 @@ def _logs(options: MountOptions) -> tuple[Path, ...]:
     return options.request.logs or ((options.log,) if options.log.exists() else ())
 
 
-def _draw(comparison: Comparison, picture: Path) -> Path | None:
-    from perchctl.calibration.mounting.plot import draw_mounting
+def _draw(comparison: MountingReport, picture: Path) -> Path | None:
+    from perchctl.calibration import draw_mounting
 
     try:
         write_files({picture: draw_mounting(comparison)})

@@ -18,22 +18,29 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from perchctl.calibration.mounting.capture import LEAST_S, Moment, Sensors, Tape, capture
-from perchctl.calibration.mounting.eye import Eye
-from perchctl.calibration.mounting.recording import Part, Recording, write_recordings
-from perchctl.calibration.mounting.seen import seen_by
-from perchctl.camera.open import open_source
-from perchctl.camera.source import FrameSource, check_size
+from perchctl.calibration import (
+    LEAST_S,
+    Eye,
+    Moment,
+    MountingPart,
+    MountingRecording,
+    MountingTape,
+    VehicleSensors,
+    capture,
+    pose_basis,
+    write_recordings,
+)
+from perchctl.camera import FrameSource, check_size, open_source
 from perchctl.commands.interrupt import Stopper, unheeded
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import Interrupted, InvalidValue, SafetyAbort
-from perchctl.link.motion import MotionLink
+from perchctl.link import MotionLink
 from perchctl.profile import Profile
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
-HOW: dict[Part, str] = {
+HOW: dict[MountingPart, str] = {
     "carry": "carry: hold the vehicle under the target (or the target before its camera); turn it "
     "about all its axes and move it, the target in view",
     "pivot": "pivot: stand the tip of the gear on one point that does not move, the target in "
@@ -51,14 +58,14 @@ class LiveSetup:
     camera: CameraModel
     source: str
     uri: str | None
-    parts: tuple[Part, ...]
+    parts: tuple[MountingPart, ...]
     log: Path
     again: str
     """The command line that measures from the recording."""
     port: int | None = None
 
 
-def recorded(setup: LiveSetup) -> tuple[Recording, ...]:
+def recorded(setup: LiveSetup) -> tuple[MountingRecording, ...]:
     """Both parts, or the one that is asked for, and their file.
 
     What was recorded is kept, however it ends.
@@ -72,7 +79,7 @@ def recorded(setup: LiveSetup) -> tuple[Recording, ...]:
     def now() -> float:
         return time.monotonic() - start_s
 
-    tapes: list[Tape] = []
+    tapes: list[MountingTape] = []
     with contextlib.ExitStack() as stack:
         # Its pictures keep the camera's own time: what is taken off it is what is measured.
         config = setup.profile.camera
@@ -87,15 +94,17 @@ def recorded(setup: LiveSetup) -> tuple[Recording, ...]:
         stack.callback(_keep, tapes, setup)
         for part in setup.parts:
             _await_person(part)
-            tapes.append(Tape(part, seen_by(setup.profile, setup.camera)))
+            tapes.append(MountingTape(part, pose_basis(setup.profile, setup.camera)))
             eye = Eye(setup.profile, setup.camera, source.live)
             _record(tapes[-1], source, eye, sensors, page, now)
     return tuple(tape.recording() for tape in tapes)
 
 
-def _vehicle(setup: LiveSetup, now: Callable[[], float], stack: contextlib.ExitStack) -> Sensors:
+def _vehicle(
+    setup: LiveSetup, now: Callable[[], float], stack: contextlib.ExitStack
+) -> VehicleSensors:
     if setup.uri is None:
-        return Sensors()
+        return VehicleSensors()
     link = MotionLink(setup.uri, setup.profile.link, now)
     say(f"connecting to {setup.uri}, to read from it and nothing else")
     link.connect()
@@ -110,10 +119,10 @@ def _vehicle(setup: LiveSetup, now: Callable[[], float], stack: contextlib.ExitS
         return link.problem(now_s)
 
     problem(now())
-    return Sensors(link.samples, problem)
+    return VehicleSensors(link.samples, problem)
 
 
-def _await_person(part: Part) -> None:
+def _await_person(part: MountingPart) -> None:
     """Until Enter, where somebody can press it. Ctrl-C ends at once here."""
     say(HOW[part])
     if not sys.stdin.isatty():
@@ -123,10 +132,10 @@ def _await_person(part: Part) -> None:
 
 
 def _record(
-    tape: Tape,
+    tape: MountingTape,
     source: FrameSource,
     eye: Eye,
-    sensors: Sensors,
+    sensors: VehicleSensors,
     page: LivePage | None,
     now: Callable[[], float],
 ) -> None:
@@ -148,7 +157,7 @@ def _record(
         raise Interrupted("Ctrl-C: nothing was measured")
 
 
-def _keep(tapes: Sequence[Tape], setup: LiveSetup) -> None:
+def _keep(tapes: Sequence[MountingTape], setup: LiveSetup) -> None:
     """Never raises: where the recording cannot be kept, it is measured from all the same."""
     if not any(tapes):
         return

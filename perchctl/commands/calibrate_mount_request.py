@@ -8,18 +8,15 @@ import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from perchctl.calibration.files import camera_of
-from perchctl.calibration.mounting.recording import Part
-from perchctl.camera.credentials import without_password
-from perchctl.camera.open import is_live, source_spec
+from perchctl.calibration import MountingPart, profile_camera
+from perchctl.camera import is_live, source_spec, without_password
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_output, check_place
-from perchctl.link.uri import check_uri
-from perchctl.profile import Profile, find_profile, load_profile
-from perchctl.profile.edit import writable_profile
-from perchctl.vision.types import CameraModel
+from perchctl.link import check_uri
+from perchctl.profile import Profile, find_profile, load_profile, writable_profile
+from perchctl.vision import CameraModel
 
-PARTS: dict[str, tuple[Part, ...]] = {
+PARTS: dict[str, tuple[MountingPart, ...]] = {
     "carry": ("carry",),
     "pivot": ("pivot",),
     "both": ("carry", "pivot"),
@@ -68,7 +65,7 @@ class MountOptions:
     name: str
     profile: Profile
     camera: CameraModel
-    parts: tuple[Part, ...]
+    parts: tuple[MountingPart, ...]
     into: Path | None
     report: Path
     log: Path
@@ -117,7 +114,7 @@ def resolve(request: MountRequest, output: Path | None, force: bool, page: bool)
     live = not (request.logs or request.truth)
     source, uri = _live(request, profile, parts) if live else ("", None)
     report, log = _places(output, find_profile(name).stem, force, live)
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     return MountOptions(request, name, profile, camera, parts, into, report, log, source, uri)
 
 
@@ -145,7 +142,7 @@ def _check_together(request: MountRequest, page: bool) -> None:
 
 
 def _live(
-    request: MountRequest, profile: Profile, parts: tuple[Part, ...]
+    request: MountRequest, profile: Profile, parts: tuple[MountingPart, ...]
 ) -> tuple[str, str | None]:
     """The camera, and the vehicle where the carry needs it (or it was named)."""
     given = profile.camera.source if request.source is None else request.source

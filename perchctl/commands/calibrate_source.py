@@ -9,18 +9,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from perchctl.calibration.types import Grey
-from perchctl.camera.credentials import without_password
-from perchctl.camera.files import (
+from perchctl.calibration import Grey
+from perchctl.camera import (
     IMAGE_SUFFIXES,
     BrokenPicture,
+    FrameSource,
     ImagesSource,
     VideoSource,
     image_files,
+    open_source,
     read_grey,
+    source_spec,
+    without_password,
 )
-from perchctl.camera.open import open_source, source_spec
-from perchctl.camera.source import FrameSource
 from perchctl.errors import InvalidValue, NotFound, UsageError
 
 _SAMPLES = 4

@@ -6,17 +6,16 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from perchctl.camera.computer import Camera, cameras
-from perchctl.camera.v4l2 import Control
+from perchctl.camera import CameraControl, ConnectedCamera, find_cameras
 from perchctl.errors import NotFound
 
 NONE = "this computer has no camera: plug in the receiver or camera (Linux lists /dev/videoN)"
 
 
-def list_cameras(as_json: bool, known: Sequence[Camera] | None = None) -> int:
+def list_cameras(as_json: bool, known: Sequence[ConnectedCamera] | None = None) -> int:
     """Print them; returns the exit code. Nothing is set, and no picture taken. `known` takes the
     place of this computer's. Errors: NotFound where there are none."""
-    known = cameras(asked=True) if known is None else known
+    known = find_cameras(asked=True) if known is None else known
     if not known:
         raise NotFound(NONE)
     if as_json:
@@ -26,7 +25,7 @@ def list_cameras(as_json: bool, known: Sequence[Camera] | None = None) -> int:
     return 0
 
 
-def camera_record(camera: Camera) -> dict[str, Any]:
+def camera_record(camera: ConnectedCamera) -> dict[str, Any]:
     """For JSON."""
     return {
         "source": camera.source,
@@ -41,7 +40,7 @@ def camera_record(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _control_record(control: Control, value: int | None) -> dict[str, Any]:
+def _control_record(control: CameraControl, value: int | None) -> dict[str, Any]:
     record: dict[str, Any] = {
         "name": control.name, "kind": control.kind, "value": value, "default": control.default,
         "min": control.low, "max": control.high, "step": control.step,
@@ -52,7 +51,7 @@ def _control_record(control: Control, value: int | None) -> dict[str, Any]:
     return record
 
 
-def camera_lines(camera: Camera) -> list[str]:
+def camera_lines(camera: ConnectedCamera) -> list[str]:
     """For people."""
     lines = [f"{camera.source}  {camera.name or '(no name)'}"]
     if camera.stable_path:
@@ -70,7 +69,7 @@ def camera_lines(camera: Camera) -> list[str]:
     return lines
 
 
-def _allowed(control: Control) -> str:
+def _allowed(control: CameraControl) -> str:
     if control.menu:
         return ", ".join(f"{index}: {text}" for index, text in control.menu)
     if control.kind == "boolean":

@@ -7,10 +7,9 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from perchctl.camera.computer import camera_numbers
-from perchctl.camera.files import IMAGE_SUFFIXES
+from perchctl.camera import IMAGE_SUFFIXES, camera_numbers
 from perchctl.commands.positioning import POSITIONINGS
-from perchctl.profile.places import listing
+from perchctl.profile import file_names
 
 _DEVICES = Path("/dev")
 _SCHEMES = ("video:", "images:", "http://", "rtsp://", "aideck://", "sim:")
@@ -21,7 +20,7 @@ _PICTURES = (*IMAGE_SUFFIXES, ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 
 def profiles(begun: str) -> list[str]:
     """Names that go on from what was typed, then profile files and folders."""
-    return [*_that_begin(begun, listing("profiles")), *_files(begun, _YAML)]
+    return [*_that_begin(begun, file_names("profiles")), *_files(begun, _YAML)]
 
 
 def logs(begun: str) -> list[str]:

@@ -11,15 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.open import open_source
+from perchctl.calibration import profile_camera
+from perchctl.camera import open_source
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.commands.output import say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import InvalidValue, UsageError, no_simulator
-from perchctl.profile import Profile, load_profile
-from perchctl.profile.positioning import PositioningConfig
-from perchctl.vision.types import CameraModel
+from perchctl.profile import PositioningConfig, Profile, load_profile
+from perchctl.vision import CameraModel
 from perchctl.weights import (
     EstimateTruth,
     Experiment,
@@ -49,7 +48,7 @@ def collect(request: CollectRequest, path: Path) -> None:
         if not 0.0 <= getattr(request, name) <= 50.0:
             raise InvalidValue(f"--{name} {getattr(request, name):g} must be between 0 and 50")
     profile = load_profile(request.profile, with_weights=False)
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     if request.truth == "sim":
         _collect_simulated(request, path, profile, camera)
     else:
@@ -131,7 +130,7 @@ def _truth(
         own = profile.positioning if profile.positioning.by == "mocap" else None
         mocap, (body, target) = _capture_of(request, own)
         return MocapTruth.open(mocap, body, target if given is None else given, gear, own)
-    from perchctl.link.estimate import EstimateLink
+    from perchctl.link import EstimateLink
 
     link = EstimateLink(profile.link.uri if request.uri is None else request.uri, profile.link, now)
     link.connect()

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from perchctl.commands.output import say
-from perchctl.log.place import beside
-from perchctl.log.read import read_log
+from perchctl.log import path_beside, read_log
 from perchctl.profile import Profile
 
 
@@ -14,9 +13,9 @@ def plot_of(log_path: Path, profile: Profile) -> Path | None:
     """Draws it where the profile asks for it; one that fails is a warning, the flight is over."""
     if not profile.log.plot:
         return None
-    from perchctl.log.plot import plot_flight
+    from perchctl.log import plot_flight
 
-    picture = beside(log_path, ".png")
+    picture = path_beside(log_path, ".png")
     try:
         plot_flight(read_log(log_path), picture)
     except Exception as error:

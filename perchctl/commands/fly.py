@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.check import warnings_before_flight
 from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.fly_plan import plan, plan_text, weights_text
@@ -36,19 +36,17 @@ from perchctl.errors import (
     TargetNotFound,
     UsageError,
 )
-from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.positions import check_compared
-from perchctl.flight.session import (
+from perchctl.flight import (
     PLAIN_SEED,
     FlyOptions,
+    OperatorSwitch,
     SessionResult,
     check_options,
     fly_session,
+    require_comparison,
 )
-from perchctl.log.summary import FlightSummary, summary_text
-from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.watch import Event, EventKind, Watcher
+from perchctl.log import FlightSummary, LogWatcher, summary_text
+from perchctl.mission import Event, EventKind, Outcome, Phase, Watcher
 from perchctl.profile import find_profile, load_profile
 
 EXIT_CODE_OF: dict[Outcome, int] = {
@@ -93,7 +91,7 @@ def run(request: FlyRequest) -> int:
         return 0
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
-    check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
+    require_comparison(options.profile.positioning, options.uri, simulated=options.simulated)
     asks = not (request.yes or options.simulated)
     if asks and not sys.stdin.isatty():
         raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")
@@ -217,7 +215,7 @@ def live_page(
     if port is None:
         return contextlib.nullcontext()
     return flight_page(
-        camera_of(options.profile.camera),
+        profile_camera(options.profile.camera),
         f"perchctl fly {options.uri}",
         options.profile.target.large.side_m,
         port,

@@ -6,16 +6,19 @@ import dataclasses
 import textwrap
 from typing import Any
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.credentials import profile_record, without_password
+from perchctl.calibration import profile_camera
+from perchctl.camera import profile_record, without_password
 from perchctl.check import Row, Verdict, comparison_rows, profile_rows
-from perchctl.flight.clock import wall_date
-from perchctl.flight.session import FlyOptions
-from perchctl.profile import Profile, find_calibration, find_weights, read_weights
-from perchctl.profile.mask import find_mask
-from perchctl.profile.picture import edges_of
-from perchctl.target.lengths import millimetres
-from perchctl.target.overhead import overhead
+from perchctl.flight import FlyOptions, wall_date
+from perchctl.profile import (
+    Profile,
+    find_calibration,
+    find_mask,
+    find_weights,
+    picture_edges,
+    read_weights,
+)
+from perchctl.target import mm_text, overhead_view
 
 _COLUMN, _WIDTH = 13, 80
 
@@ -110,7 +113,7 @@ def _positioning_line(options: FlyOptions) -> str:
 
 def _overhead(profile: Profile) -> str:
     """Where it has to be."""
-    return overhead(profile.target, camera_of(profile.camera), profile.camera.mount).words
+    return overhead_view(profile.target, profile_camera(profile.camera), profile.camera.mount).words
 
 
 def _compared_lines(options: FlyOptions) -> list[str]:
@@ -138,7 +141,7 @@ def _place_lines(profile: Profile) -> list[str]:
 def _vehicle_lines(profile: Profile) -> list[str]:
     """Where gear and camera are, and how late the picture is."""
     camera = profile.camera
-    edges = edges_of(camera.mount, camera.mirrored)
+    edges = picture_edges(camera.mount, camera.mirrored)
     seen = [] if edges is None else [f"picture's {edges[0]} is the front, {edges[1]} the left side"]
     latency = camera.latency_s
     late = f"{latency * 1e3:g} ms" if isinstance(latency, (int, float)) else str(latency)
@@ -153,7 +156,7 @@ def _vehicle_lines(profile: Profile) -> list[str]:
 
 
 def _mm(place_m: tuple[float, float, float]) -> str:
-    return f"{' '.join(millimetres(part) for part in place_m)} mm"
+    return f"{' '.join(mm_text(part) for part in place_m)} mm"
 
 
 def _limit_lines(profile: Profile) -> list[str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from perchctl.commands.output import say
-from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight import OperatorSwitch
 
 Handler = Callable[[int, FrameType | None], None]
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

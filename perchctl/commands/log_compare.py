@@ -9,7 +9,7 @@ from perchctl.commands.log_file import opened
 from perchctl.commands.log_plot import DRAWN_IN, FORMATS
 from perchctl.commands.output import print_record
 from perchctl.files import check_output
-from perchctl.log.compare.table import compared, comparison_record, comparison_text
+from perchctl.log import compare_flights, comparison_record, comparison_text
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ def run(request: CompareRequest) -> int:
     if picture is not None:
         check_output(picture, FORMATS, request.force, DRAWN_IN)
     with opened(request.one) as one, opened(request.other) as other:
-        found = compared(one, other)
+        found = compare_flights(one, other)
         record, text = comparison_record(found), comparison_text(found)
     if picture is not None:
-        from perchctl.log.compare.plot import plot_comparison
+        from perchctl.log import plot_comparison
 
         plot_comparison(one, other, picture)
     if request.as_json:

@@ -11,12 +11,15 @@ from perchctl.commands.log_file import log_file, opened
 from perchctl.commands.output import print_record, say
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_output, same_file, write_files
-from perchctl.log.export.as_csv import csv_text
-from perchctl.log.export.as_parquet import check_parquet, parquet_bytes
-from perchctl.log.export.table import columns_of
-from perchctl.log.place import beside
-from perchctl.log.recording import export_mcap
-from perchctl.log.recording.place import recording_of
+from perchctl.log import (
+    check_parquet,
+    csv_text,
+    export_mcap,
+    log_columns,
+    parquet_bytes,
+    path_beside,
+    recording_path,
+)
 
 STDOUT = Path("-")
 ENDINGS = {"csv": ".csv", "parquet": ".parquet", "mcap": ".mcap"}
@@ -50,10 +53,12 @@ def run(request: ExportRequest) -> int:
     path = log_file(request.file, request.profile, request.log_dir)
     if request.output == STDOUT:
         with opened(path) as log:
-            text = csv_text(columns_of(log))
+            text = csv_text(log_columns(log))
         sys.stdout.write(text)
         return 0
-    place = request.output or beside(path, ("_export" if form == "mcap" else "") + ENDINGS[form])
+    place = request.output or path_beside(
+        path, ("_export" if form == "mcap" else "") + ENDINGS[form]
+    )
     check_output(place, (ENDINGS[form],), request.force, f"what --{form} writes")
     write = _write_mcap if form == "mcap" else _write_table
     done = write(path, place, request.force)
@@ -87,7 +92,7 @@ def _form(request: ExportRequest) -> str:
 
 def _write_table(path: Path, place: Path, _force: bool) -> dict[str, Any]:
     with opened(path) as log:
-        columns = columns_of(log)
+        columns = log_columns(log)
         if place.suffix.lower() == ENDINGS["csv"]:
             content = csv_text(columns).encode("utf-8", errors="backslashreplace")
         else:
@@ -97,7 +102,7 @@ def _write_table(path: Path, place: Path, _force: bool) -> dict[str, Any]:
 
 
 def _write_mcap(path: Path, place: Path, force: bool) -> dict[str, Any]:
-    own = recording_of(path)
+    own = recording_path(path)
     if same_file(place, own):
         raise InvalidValue(
             f"{own} is the flight's own recording, with its pictures: open that, or name another "

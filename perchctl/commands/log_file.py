@@ -8,8 +8,7 @@ from pathlib import Path
 
 from perchctl.commands.output import say
 from perchctl.errors import UsageError
-from perchctl.log.newest import newest_logs
-from perchctl.log.read import FlightLog, read_log, values_of
+from perchctl.log import FlightLog, log_values, newest_logs, read_log
 from perchctl.profile import Profile, load_profile
 
 
@@ -46,5 +45,5 @@ def opened(path: Path) -> Iterator[FlightLog]:
     Errors: NotFound, InvalidValue.
     """
     log = read_log(path)
-    with values_of(path):
+    with log_values(path):
         yield log

@@ -8,8 +8,7 @@ from pathlib import Path
 from perchctl.commands.log_file import log_file, opened
 from perchctl.commands.output import print_record
 from perchctl.files import check_output
-from perchctl.log.place import beside
-from perchctl.log.summary import summary_of
+from perchctl.log import path_beside, summarise_flight
 
 FORMATS = (".png", ".pdf", ".svg")
 DRAWN_IN = "what plots are drawn in"
@@ -30,11 +29,11 @@ class PlotRequest:
 def run(request: PlotRequest) -> int:
     """Draw; returns the exit code. Errors: NotFound, InvalidValue, UsageError."""
     path = log_file(request.file, request.profile, request.log_dir)
-    picture = request.output or beside(path, ".png")
+    picture = request.output or path_beside(path, ".png")
     with opened(path) as log:
         check_output(picture, FORMATS, request.force, DRAWN_IN)
-        outcome = summary_of(log).outcome
-    from perchctl.log.plot import plot_flight
+        outcome = summarise_flight(log).outcome
+    from perchctl.log import plot_flight
 
     plot_flight(log, picture)
     if request.as_json:

@@ -11,11 +11,8 @@ from perchctl.commands.log_plot import DRAWN_IN, FORMATS
 from perchctl.commands.output import print_record, say
 from perchctl.errors import ReplayDiffers
 from perchctl.files import check_output
-from perchctl.log.read import FlightLog
-from perchctl.log.recording import pictures_of, recording_of
-from perchctl.log.setup import profile_of
-from perchctl.profile import Profile, load_profile
-from perchctl.profile.changed import changed
+from perchctl.log import FlightLog, flown_profile, recorded_pictures, recording_path
+from perchctl.profile import Profile, changed_profile, load_profile
 from perchctl.replay import (
     Picture,
     changed_gates,
@@ -74,11 +71,11 @@ def _profile(request: ReplayRequest, log: FlightLog) -> Profile | None:
     """What it is to be replayed by; None: as it was flown."""
     if request.profile is None and not request.settings:
         return None
-    base = profile_of(log.header) if request.profile is None else load_profile(request.profile)
-    return changed(base, request.settings)
+    base = flown_profile(log.header) if request.profile is None else load_profile(request.profile)
+    return changed_profile(base, request.settings)
 
 
 def _pictures(request: ReplayRequest, log: Path) -> Iterator[Picture] | None:
     """Those of the recording that lies beside the log; None without one."""
-    recording = recording_of(log)
-    return pictures_of(recording) if request.pictures and recording.is_file() else None
+    recording = recording_path(log)
+    return recorded_pictures(recording) if request.pictures and recording.is_file() else None

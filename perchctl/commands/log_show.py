@@ -8,8 +8,7 @@ from pathlib import Path
 from perchctl.commands.log_file import log_file, log_folder, opened
 from perchctl.commands.output import print_record
 from perchctl.errors import UsageError
-from perchctl.log.newest import listed, newest_logs
-from perchctl.log.shown import list_lines, list_record, show_record, show_text
+from perchctl.log import list_lines, list_log, list_record, newest_logs, show_record, show_text
 
 MOST_LISTED = 10
 
@@ -48,7 +47,7 @@ def _list(request: ShowRequest) -> int:
             f"folder with --log-dir"
         )
     folder = log_folder(request.profile, request.log_dir)
-    logs = [listed(path) for path in newest_logs(folder, request.count or MOST_LISTED)]
+    logs = [list_log(path) for path in newest_logs(folder, request.count or MOST_LISTED)]
     if request.as_json:
         print_record({"folder": str(folder), "logs": [list_record(each) for each in logs]})
     else:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perchctl.calibration.files import camera_of, load_calibration
+from perchctl.calibration import load_calibration, profile_camera
 from perchctl.commands.make_target_measured import write_measured
 from perchctl.commands.make_target_request import (
     TargetOutcome,
@@ -20,20 +20,27 @@ from perchctl.commands.output import print_record
 from perchctl.errors import PerchError, UsageError
 from perchctl.files import check_output, check_place, write_files
 from perchctl.profile import Profile, TargetConfig, find_calibration, load_profile
-from perchctl.target.blind import blind_lines, mounted
-from perchctl.target.boards import parse_board
-from perchctl.target.checks import check_target
-from perchctl.target.compare import comparison
-from perchctl.target.design import error_curve, make_design
-from perchctl.target.design_text import design_record, design_text
-from perchctl.target.lengths import millimetres
-from perchctl.target.limits import Optics
-from perchctl.target.page import Page, parse_page
-from perchctl.target.png import png_bytes
-from perchctl.target.sheets import board_page, target_pages
-from perchctl.target.suggest import suggest
-from perchctl.target.svg import svg_bytes
-from perchctl.target.tiles import tiles
+from perchctl.target import (
+    Optics,
+    Page,
+    blind_lines,
+    board_page,
+    check_target,
+    compare_designs,
+    describe_design,
+    design_record,
+    error_curve,
+    make_design,
+    mm_text,
+    mounted_camera,
+    parse_board,
+    parse_page,
+    png_bytes,
+    suggest_target,
+    svg_bytes,
+    target_pages,
+    tile_page,
+)
 
 __all__ = ["TargetRequest", "run"]
 
@@ -78,7 +85,7 @@ def _target(request: TargetRequest, profile: Profile, target: TargetConfig) -> T
     date = profile.date if own else None
     origin = f"profile {profile.name}" if own else "sizes from the command line"
     pages = target_pages(target, page, request.magnet_m, origin, date)
-    title = f"perchctl target, {millimetres(target.large.side_m)} mm"
+    title = f"perchctl target, {mm_text(target.large.side_m)} mm"
     files = _sheet_files(request, "target.pdf", pages, title, date)
     lines = [
         *(f"wrote {path}" for path in files),
@@ -98,11 +105,11 @@ def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
     """What the profile's camera sees of that target to the end; nothing without a
     calibration, as a sheet needs none."""
     try:
-        camera = camera_of(profile.camera)
+        camera = profile_camera(profile.camera)
     except PerchError:
         return []
     name = profile.camera.calibration
-    return [f"{name}: {text}" for text in blind_lines(mounted(target, camera, profile))]
+    return [f"{name}: {text}" for text in blind_lines(mounted_camera(target, camera, profile))]
 
 
 def _board(request: TargetRequest, notation: str) -> TargetOutcome:
@@ -128,7 +135,7 @@ def _sheet_files(
     date: datetime.date | None = None,
 ) -> dict[Path, bytes]:
     """The PDF, and the pictures that were requested beside it."""
-    from perchctl.target.pdf import pdf_bytes
+    from perchctl.target import pdf_bytes
 
     pdf = request.output or Path(default)
     if pdf.suffix.lower() != ".pdf":
@@ -138,7 +145,7 @@ def _sheet_files(
     printed = list(pages)
     if request.tile is not None:
         sheet = parse_page(request.tile)
-        printed = [tile for page in pages for tile in tiles(page, sheet)]
+        printed = [tile for page in pages for tile in tile_page(page, sheet)]
     files = {pdf: pdf_bytes(printed, title, date)}
     for number, page in enumerate(pages):
         side = "" if number == 0 else "_back"
@@ -151,7 +158,7 @@ def _sheet_files(
 
 def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
     """The ranges of a target for a camera, with its picture, and its sheet with `-o`."""
-    from perchctl.target.plot import draw_design
+    from perchctl.target import draw_design
 
     if request.suggest and request.output is not None:
         raise UsageError("--suggest prints a command to run; give -o to that command")
@@ -168,13 +175,13 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
     lines: list[str] = []
     record: dict[str, Any] = {}
     if request.suggest:
-        found, design = suggest(
+        found, design = suggest_target(
             camera, optics, profile, request.magnet_m, request.ceiling_m, request.page
         )
         present = make_design(profile.target, camera, optics, profile, request.ceiling_m)
         lines += [f"note: {note}" for note in found.notes] + [found.command(), ""]
         lines += [f"why: {reason}" for reason in found.reasons]
-        lines += [*comparison(design, present, f"profile {profile.name}"), ""]
+        lines += [*compare_designs(design, present, f"profile {profile.name}"), ""]
         record = {
             "command": found.command(),
             "reasons": list(found.reasons),
@@ -184,7 +191,7 @@ def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
         target = requested_target(request, profile)
         design = make_design(target, camera, optics, profile, request.ceiling_m)
     curve = error_curve(design)
-    lines.append(design_text(design, curve, str(path)))
+    lines.append(describe_design(design, curve, str(path)))
     record |= design_record(design) | {"target": design.target.model_dump(mode="json")}
     files: dict[Path, bytes] = {}
     if request.output is not None:

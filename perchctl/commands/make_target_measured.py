@@ -8,10 +8,10 @@ from perchctl.commands.make_target_request import TargetOutcome, TargetRequest, 
 from perchctl.errors import InvalidValue, UsageError
 from perchctl.files import check_place
 from perchctl.profile import load_profile
-from perchctl.target.lengths import parse_length
-from perchctl.target.measured import (
+from perchctl.target import (
     measured_target,
     new_profile_text,
+    parse_length,
     updated_profile_text,
     write_profile,
 )

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.profile import MarkerConfig, Profile, TargetConfig
-from perchctl.profile.dictionaries import check_marker_id
-from perchctl.target.lengths import millimetres, parse_length
+from perchctl.profile import MarkerConfig, Profile, TargetConfig, check_marker_id
+from perchctl.target import mm_text, parse_length
 
 SIDE_LIMITS_M = (0.004, 2.0)
 
@@ -152,14 +151,14 @@ def requested_target(request: TargetRequest, profile: Profile) -> TargetConfig:
         side_m = old.side_m if side is None else parse_length(side, f"--{name}")
         if not SIDE_LIMITS_M[0] <= side_m <= SIDE_LIMITS_M[1]:
             raise InvalidValue(
-                f"--{name}: {millimetres(side_m)} mm is outside of {SIDE_LIMITS_M[0] * 1e3:g} mm "
+                f"--{name}: {mm_text(side_m)} mm is outside of {SIDE_LIMITS_M[0] * 1e3:g} mm "
                 f"to {SIDE_LIMITS_M[1]:g} m"
             )
         markers[name] = MarkerConfig(dictionary=chosen, id=number, side_m=side_m)
     if markers["small"].side_m >= markers["large"].side_m / 2:
         raise InvalidValue(
-            f"the small marker ({millimetres(markers['small'].side_m)} mm) must be less than half "
-            f"of the large one ({millimetres(markers['large'].side_m)} mm)"
+            f"the small marker ({mm_text(markers['small'].side_m)} mm) must be less than half "
+            f"of the large one ({mm_text(markers['large'].side_m)} mm)"
         )
     return profile.target.model_copy(update=markers)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from perchctl.camera.credentials import profile_record
+from perchctl.camera import profile_record
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands.new_profile_answers import (
     NONE_YET,
@@ -24,9 +24,7 @@ from perchctl.commands.new_profile_answers import (
 from perchctl.commands.output import print_record, say, tell
 from perchctl.errors import Interrupted, PerchError, UsageError
 from perchctl.files import check_output, write_files
-from perchctl.profile import Profile, load_profile
-from perchctl.profile.picture import edges_of
-from perchctl.profile.written import profile_text
+from perchctl.profile import Profile, load_profile, picture_edges, profile_text
 
 HEAD = """\
 # A profile of perchctl, made by perchctl new-profile. Above each key stands what
@@ -184,7 +182,7 @@ def _report(request: NewProfileRequest, profile: Profile, answers: Mapping[str, 
             )
         )
     if profile.camera.mirrored:
-        front, left = edges_of(profile.camera.mount, mirrored=True) or ("", "")
+        front, left = picture_edges(profile.camera.mount, mirrored=True) or ("", "")
         say(
             f"camera: with the front at its {front} and the left side at its {left} edge the "
             f"picture is mirrored: wrote camera.mirrored: true, which turns each picture right "

@@ -13,17 +13,28 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from perchctl.calibration.files import load_calibration
-from perchctl.camera.aideck import aideck_address
-from perchctl.camera.credentials import without_password
-from perchctl.camera.open import ALLOWED, SCHEMES, is_live, scheme_of
+from perchctl.calibration import load_calibration
+from perchctl.camera import (
+    ALLOWED_SOURCES,
+    SCHEMES,
+    aideck_address,
+    is_live,
+    scheme_of,
+    without_password,
+)
 from perchctl.check import OVERDUE
 from perchctl.errors import InvalidValue
-from perchctl.link.uri import check_uri
-from perchctl.profile import Profile, find_calibration, load_profile
-from perchctl.profile.base import FARTHEST_ON_BODY_M
-from perchctl.profile.load import first_fault
-from perchctl.profile.picture import EDGES, edges_beside, mount_from_edges
+from perchctl.link import check_uri
+from perchctl.profile import (
+    FARTHEST_ON_BODY_M,
+    PICTURE_EDGES,
+    Profile,
+    edges_beside,
+    find_calibration,
+    first_invalid_key,
+    load_profile,
+    mount_from_edges,
+)
 
 EXAMPLE = "example_640x480.yaml"
 AIDECKS_EXAMPLE = "example_aideck_324x244.yaml"
@@ -54,7 +65,7 @@ def _simulated(answers: Texts) -> bool:
 
 def _source(text: str, answers: Texts) -> str:
     if scheme_of(text) not in SCHEMES or re.fullmatch(r"camera:\W*(-\d*)?", text):
-        raise InvalidValue(f"{text!r} is no camera; allowed are {ALLOWED}")
+        raise InvalidValue(f"{text!r} is no camera; allowed are {ALLOWED_SOURCES}")
     if scheme_of(text) == "aideck":
         aideck_address(text)
     if not _simulated(answers) and (text.startswith("sim:") or not is_live(text)):
@@ -76,7 +87,7 @@ def _calibration(text: str, _answers: Texts) -> Path | None:
 
 
 def _edge(text: str, _answers: Texts) -> str:
-    return _one_of(text, tuple(EDGES))
+    return _one_of(text, tuple(PICTURE_EDGES))
 
 
 def _edge_beside(text: str, answers: Texts) -> str:
@@ -269,7 +280,7 @@ def made(texts: Texts, output: Path) -> Profile:
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
-        key, said = first_fault(error)
+        key, said = first_invalid_key(error)
         raise InvalidValue(f"{key}: {said}" if key else said) from None
 
 

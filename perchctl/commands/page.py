@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from perchctl.commands.output import say
 from perchctl.display import LivePage
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 
 def page_port(view: bool, port: int) -> int | None:

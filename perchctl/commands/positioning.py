@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import get_args
 
 from perchctl.errors import InvalidValue
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, Profile
 
 POSITIONINGS: tuple[str, ...] = get_args(PositioningConfig.model_fields["by"].annotation)
 

@@ -6,12 +6,11 @@ import dataclasses
 import json
 from dataclasses import dataclass
 
-from perchctl.camera.credentials import profile_record, without_passwords
+from perchctl.camera import profile_record, without_passwords
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands.output import print_record, say
 from perchctl.errors import UsageError
-from perchctl.profile import find_profile, load_profile
-from perchctl.profile.written import editor_schema, profile_text
+from perchctl.profile import editor_schema, find_profile, load_profile, profile_text
 
 DEFAULT_PROFILE = "sim"
 

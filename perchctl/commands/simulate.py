@@ -16,9 +16,14 @@ from perchctl.commands.simulate_request import (
     tell_logs,
 )
 from perchctl.errors import PerchError, no_simulator
-from perchctl.flight.results import FlightResult, campaign_summary, campaign_table, none_took_off
-from perchctl.flight.uninterrupted import uninterrupted
-from perchctl.log.place import make_log_folder
+from perchctl.flight import (
+    FlightResult,
+    campaign_summary,
+    campaign_table,
+    defer_interrupts,
+    none_took_off_text,
+)
+from perchctl.log import make_log_folder
 from perchctl.startup import leave_at_ctrl_c, loaded
 
 __all__ = ["SimulateRequest", "run"]
@@ -56,7 +61,7 @@ def run(request: SimulateRequest) -> int:
 
 def _answer(request: SimulateRequest) -> Callable[[SimulateRequest], int] | None:
     """What answers the question that was asked; None: it is a plain campaign."""
-    with uninterrupted():
+    with defer_interrupts():
         if request.compare is not None:
             from perchctl.commands.simulate_compare import run_compare
 
@@ -77,7 +82,7 @@ def _answer(request: SimulateRequest) -> Callable[[SimulateRequest], int] | None
 
 
 def _campaign(request: SimulateRequest) -> int:
-    from perchctl.flight.campaign import run_campaign
+    from perchctl.flight import run_campaign
 
     profile = request.loaded()
 
@@ -97,5 +102,5 @@ def _campaign(request: SimulateRequest) -> int:
             report,
             kept,
             profiles=[profile],
-            objection=none_took_off,
+            objection=none_took_off_text,
         )

@@ -6,9 +6,15 @@ from perchctl.commands.output import print_record
 from perchctl.commands.positioning import positioned
 from perchctl.commands.simulate_request import SimulateRequest, and_problem, fly_each
 from perchctl.errors import PerchError
-from perchctl.flight.compared import compared, comparison_record, comparison_text
-from perchctl.flight.variants import VariantResult, fly_variants, whole_seeds
-from perchctl.log.compare.table import profile_differences
+from perchctl.flight import (
+    VariantResult,
+    compare_variants,
+    fly_variants,
+    variants_record,
+    variants_text,
+    whole_seeds,
+)
+from perchctl.log import profile_differences
 from perchctl.profile import load_profile
 
 _NO_DIFFERENCE = ("name", "description", "date")
@@ -25,17 +31,17 @@ def run_compare(request: SimulateRequest) -> int:
 
     def report(results: list[VariantResult], problem: PerchError | None) -> None:
         pairs = [(a, b) for a, b in whole_seeds(results, len(profiles))]
-        found = compared(names, pairs)
+        found = compare_variants(names, pairs)
         if request.as_json:
             record = {
                 "a": names[0],
                 "b": names[1],
-                **comparison_record(found),
+                **variants_record(found),
                 "profile": {key: {"a": a, "b": b} for key, (a, b) in keys.items()},
             }
             print_record(and_problem(record, problem))
             return
-        print(comparison_text(found))
+        print(variants_text(found))
         for key, (a, b) in keys.items():
             print(f"differs: {key} is {a} in A, {b} in B")
         if not keys:

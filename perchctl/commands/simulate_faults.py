@@ -17,8 +17,8 @@ from perchctl.faults import (
     run_fault_campaign,
     select_faults,
 )
-from perchctl.flight.results import aligned
-from perchctl.log.jsonl import to_plain
+from perchctl.flight import align_columns
+from perchctl.log import to_plain
 from perchctl.profile import Profile
 
 
@@ -64,7 +64,7 @@ def _list(as_json: bool) -> None:
     if as_json:
         print_record({"faults": {fault.name: fault.what for fault in FAULTS}})
     else:
-        print("\n".join(aligned([(fault.name, fault.what) for fault in FAULTS])))
+        print("\n".join(align_columns([(fault.name, fault.what) for fault in FAULTS])))
 
 
 def _tell(result: FaultResult, profile: Profile, as_json: bool) -> None:

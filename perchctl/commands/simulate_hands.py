@@ -11,8 +11,7 @@ from pathlib import Path
 from perchctl.cluster import parse_address
 from perchctl.commands.output import say
 from perchctl.errors import no_cluster
-from perchctl.flight.hands import job_processes
-from perchctl.flight.uninterrupted import uninterrupted
+from perchctl.flight import defer_interrupts, flight_processes
 from perchctl.profile import Profile
 
 
@@ -24,13 +23,13 @@ def hands_of(
     `profiles`: with the files that flights read; `log_dir`: where they write. Errors: UsageError,
     ConnectionFailed, InvalidValue."""
     if cluster is None:
-        with job_processes(jobs) as executor:
+        with flight_processes(jobs) as executor:
             yield executor, jobs
         return
     if find_spec("distributed") is None:
         raise no_cluster()
     try:
-        with uninterrupted():
+        with defer_interrupts():
             from perchctl.cluster import cluster_hands
     except ImportError as error:
         raise no_cluster(str(error)) from error

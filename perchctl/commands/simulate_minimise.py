@@ -15,12 +15,17 @@ from perchctl.commands.simulate_hands import hands_of
 from perchctl.commands.simulate_request import SimulateRequest
 from perchctl.errors import Interrupted, InvalidValue, PerchError
 from perchctl.files import write_files
-from perchctl.flight.campaign import fly_all
-from perchctl.flight.conditions import Condition, Conditions, conditions_of
-from perchctl.flight.failure import Ended, fly_to_its_end, minimised_failure
-from perchctl.log.jsonl import to_plain
-from perchctl.profile.load import is_path
-from perchctl.profile.written import scalar_text
+from perchctl.flight import (
+    EndedFlight,
+    ScenarioCondition,
+    ScenarioConditions,
+    fly_all,
+    fly_to_its_end,
+    minimised_failure,
+    scenario_conditions,
+)
+from perchctl.log import to_plain
+from perchctl.profile import is_profile_path, scalar_text
 
 
 @dataclass
@@ -28,7 +33,7 @@ class Minimised:
     """What is known so far. `ended`: how the flight ends at these levels."""
 
     levels: Mapping[str, float]
-    ended: Ended
+    ended: EndedFlight
     flights: int = 0
     whole: bool = False
 
@@ -40,7 +45,7 @@ def run_minimise(request: SimulateRequest) -> int:
     """
     assert request.minimise is not None
     seed, profile = request.minimise, request.loaded()
-    conditions = conditions_of(profile, seed)
+    conditions = scenario_conditions(profile, seed)
     found: Minimised | None = None
     problem: PerchError | None = None
     with (
@@ -58,11 +63,11 @@ def run_minimise(request: SimulateRequest) -> int:
         found = Minimised(dict.fromkeys(conditions.names, 1.0), whole, 1)
         so_far = found
 
-        def flown(_ended: Ended) -> None:
+        def flown(_ended: EndedFlight) -> None:
             so_far.flights += 1
             advance()
 
-        def less(levels: Mapping[str, float], ended: Ended) -> None:
+        def less(levels: Mapping[str, float], ended: EndedFlight) -> None:
             so_far.levels, so_far.ended = levels, ended
 
         try:
@@ -79,7 +84,7 @@ def run_minimise(request: SimulateRequest) -> int:
     return (problem or Interrupted()).exit_code
 
 
-def _report(request: SimulateRequest, conditions: Conditions, found: Minimised) -> None:
+def _report(request: SimulateRequest, conditions: ScenarioConditions, found: Minimised) -> None:
     text = profile_of(request, conditions, found)
     if request.output is not None:
         write_files({request.output: text.encode()})
@@ -107,11 +112,13 @@ def _report(request: SimulateRequest, conditions: Conditions, found: Minimised) 
     print(f"profile:   {request.output}", flush=True)
 
 
-def _left(conditions: Conditions, found: Minimised) -> list[Condition]:
+def _left(conditions: ScenarioConditions, found: Minimised) -> list[ScenarioCondition]:
     return [condition for condition in conditions.off if found.levels[condition.name]]
 
 
-def _record(conditions: Conditions, condition: Condition, found: Minimised) -> dict[str, Any]:
+def _record(
+    conditions: ScenarioConditions, condition: ScenarioCondition, found: Minimised
+) -> dict[str, Any]:
     values = conditions.values(found.levels)
     return {
         "name": condition.name,
@@ -123,7 +130,7 @@ def _record(conditions: Conditions, condition: Condition, found: Minimised) -> d
     }
 
 
-def _words(request: SimulateRequest, conditions: Conditions, found: Minimised) -> list[str]:
+def _words(request: SimulateRequest, conditions: ScenarioConditions, found: Minimised) -> list[str]:
     left = _left(conditions, found)
     flights = f"{found.flights} flights" + ("" if found.whole else ", stopped before its end")
     lines = [f"seed {conditions.seed} of {request.profile} ends {found.ended.told}"]
@@ -137,9 +144,13 @@ def _words(request: SimulateRequest, conditions: Conditions, found: Minimised) -
     return [*lines, "all else is nominal"]
 
 
-def profile_of(request: SimulateRequest, conditions: Conditions, found: Minimised) -> str:
+def profile_of(request: SimulateRequest, conditions: ScenarioConditions, found: Minimised) -> str:
     """The profile's file: the seed with it flies just what was found."""
-    base = str(Path(request.profile).resolve()) if is_path(request.profile) else request.profile
+    base = (
+        str(Path(request.profile).resolve())
+        if is_profile_path(request.profile)
+        else request.profile
+    )
     file = str(request.output) if request.output is not None else "FILE"
     lines = [f"# {line}" for line in _words(request, conditions, found)]
     lines += [f"# again: perchctl simulate --only {conditions.seed} -p {file}"]

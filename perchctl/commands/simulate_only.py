@@ -10,8 +10,8 @@ from perchctl.commands.output import print_record
 from perchctl.commands.simulate_request import SimulateRequest, fly_each
 from perchctl.display import timed_event_text
 from perchctl.errors import PerchError
-from perchctl.flight.campaign import LoggedFlight, fly_all, fly_logged
-from perchctl.log.summary import summary_text
+from perchctl.flight import LoggedFlight, fly_all, fly_logged
+from perchctl.log import summary_text
 from perchctl.profile import Profile
 
 

@@ -19,9 +19,14 @@ from perchctl.commands.progress import Ended, progress_bar
 from perchctl.commands.simulate_modes import MOST_UNTIL, check_modes
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output
-from perchctl.flight.kept import Judged, Kept, log_keeper
-from perchctl.flight.results_file import campaign_header, open_results
-from perchctl.flight.uninterrupted import uninterrupted
+from perchctl.flight import (
+    CampaignResults,
+    JudgedFlight,
+    campaign_header,
+    defer_interrupts,
+    log_keeper,
+    open_results,
+)
 from perchctl.profile import Profile, load_profile
 
 AGAIN_S = 0.5
@@ -32,7 +37,7 @@ class EnoughFlown(Exception):
     """Raised where a result is noted: the flights that are left are not needed."""
 
 
-class Seeded(Ended, Judged, Protocol):
+class Seeded(Ended, JudgedFlight, Protocol):
     """A flight's result, of whatever campaign."""
 
     @property
@@ -151,20 +156,22 @@ class SimulateRequest:
     @contextlib.contextmanager
     def results(
         self, profile: Profile, kind: type[R], faults: Sequence[str] | None = None
-    ) -> Iterator[Kept[R]]:
+    ) -> Iterator[CampaignResults[R]]:
         """What becomes of each result: `--out`, `--resume`, `--keep`. Errors: InvalidValue."""
         keep = log_keeper(self.keep or "all")
         with contextlib.ExitStack() as stack:
-            kept: Kept[R] = Kept(self.seeds, {}, keep)
+            kept: CampaignResults[R] = CampaignResults(self.seeds, {}, keep)
             if self.out is not None:
                 header = campaign_header(profile, faults)
                 file = open_results(self.out, header, kind, self.resume, self.force)
                 stack.callback(file.close)
-                kept = Kept(self.seeds, file.earlier, keep, file.append, self.log_dir)
+                kept = CampaignResults(self.seeds, file.earlier, keep, file.append, self.log_dir)
             if self.log_dir is not None and self.keep not in (None, "all"):
-                from perchctl.flight.campaign import log_of
+                from perchctl.flight import seed_log_path
 
-                stack.enter_context(kept.without_torn([log_of(s, self.log_dir) for s in kept.left]))
+                stack.enter_context(
+                    kept.without_torn([seed_log_path(s, self.log_dir) for s in kept.left])
+                )
             yield kept
 
 
@@ -181,7 +188,7 @@ def fly_each(
     campaign: Callable[[Executor, Callable[[R], None]], object],
     request: SimulateRequest,
     report: Callable[[list[R], PerchError | None], None],
-    kept: Kept[R] | None = None,
+    kept: CampaignResults[R] | None = None,
     flights: int | None = None,
     profiles: Sequence[Profile] = (),
     expected: Callable[[], int] | None = None,
@@ -199,7 +206,7 @@ def fly_each(
     from perchctl.commands.simulate_hands import hands_of
 
     total = len(request.seeds) if flights is None else flights
-    kept = kept or Kept(request.seeds, {}, lambda result: None)
+    kept = kept or CampaignResults(request.seeds, {}, lambda result: None)
     results: list[R] = list(kept.earlier)
     left = total - len(results)
     jobs = max(1, min(request.jobs or 1, left))
@@ -246,7 +253,7 @@ def noting(results: list[R], *others: Callable[[R], None]) -> Callable[[R], None
     """Keeps each result as it comes, and tells the others; a signal waits meanwhile."""
 
     def note(result: R) -> None:
-        with uninterrupted():
+        with defer_interrupts():
             results.append(result)
             for tell in others:
                 tell(result)

@@ -15,9 +15,14 @@ from perchctl.commands.simulate_request import (
     tell_logs,
 )
 from perchctl.errors import PerchError
-from perchctl.flight.campaign import run_campaign
-from perchctl.flight.results import FlightResult, campaign_summary, campaign_table, none_took_off
-from perchctl.flight.until import Enough
+from perchctl.flight import (
+    FlightResult,
+    StopRule,
+    campaign_summary,
+    campaign_table,
+    none_took_off_text,
+    run_campaign,
+)
 
 
 def run_until(request: SimulateRequest) -> int:
@@ -25,7 +30,7 @@ def run_until(request: SimulateRequest) -> int:
     assert request.until is not None
     width = width_of(request.until)
     profile = request.loaded()
-    enough = Enough(request.seeds, width)
+    enough = StopRule(request.seeds, width)
 
     def count(result: FlightResult) -> None:
         if enough.note(result):
@@ -58,11 +63,11 @@ def run_until(request: SimulateRequest) -> int:
     with request.results(profile, FlightResult) as kept:
         return fly_each(
             campaign, request, report, kept, profiles=[profile], expected=enough.expected,
-            objection=none_took_off,
+            objection=none_took_off_text,
         )  # fmt: skip
 
 
-def verdict(enough: Enough, width: float) -> str:
+def verdict(enough: StopRule, width: float) -> str:
     low, high = (100.0 * bound for bound in enough.interval)
     known = f"the success rate is {low:.2f} to {high:.2f} % (95 %), {high - low:.2f} % wide"
     flights = len(enough.counted)

@@ -12,12 +12,19 @@ from functools import partial
 from pathlib import Path
 from typing import TextIO
 
-from perchctl.calibration.files import assumed_size, load_calibration, load_sized
-from perchctl.camera.credentials import without_password
-from perchctl.camera.files import DEFAULT_RATE_HZ, ImagesSource, Recording
-from perchctl.camera.mirror import UnmirroredSource
-from perchctl.camera.open import of_pictures, open_source, source_spec
-from perchctl.camera.source import FrameSource, check_size
+from perchctl.calibration import assumed_size_warning, load_calibration, load_sized
+from perchctl.camera import (
+    DEFAULT_RATE_HZ,
+    FrameSource,
+    ImagesSource,
+    Recording,
+    UnmirroredSource,
+    check_size,
+    is_pictures,
+    open_source,
+    source_spec,
+    without_password,
+)
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
 from perchctl.commands.page import live_page, page_port
@@ -26,7 +33,7 @@ from perchctl.display import AXES_OF_SIDE, LivePage, Sketch
 from perchctl.errors import Interrupted, NotFound, UsageError
 from perchctl.files import check_output, same_file
 from perchctl.profile import Profile, find_calibration, load_profile
-from perchctl.target.print_check import PrintCheck
+from perchctl.target import PrintCheck
 from perchctl.track import (
     Notes,
     OutputOptions,
@@ -38,7 +45,7 @@ from perchctl.track import (
     sketch_of,
     track_state,
 )
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 STILLS_HZ = 1.0
 """Of files of pictures that do not belong together: so each can be looked at, in the video too."""
@@ -117,11 +124,11 @@ def _are_stills(request: TrackRequest, source: str) -> bool:
     """Files of pictures need not belong together, unless the user says so."""
     if request.video and request.stills:
         raise UsageError("--stills and --video contradict each other: give one of them")
-    if request.video and not of_pictures(source):
+    if request.video and not is_pictures(source):
         raise UsageError(
             f"--video is for files of pictures, and {source} gives a video anyway: leave it out"
         )
-    return request.stills or (of_pictures(source) and not request.video)
+    return request.stills or (is_pictures(source) and not request.video)
 
 
 def track(
@@ -231,7 +238,7 @@ class _Run:
         stack.callback(source.close)
         if camera is None:
             camera = load_calibration(options.calibration, source.size_px, options.cam)
-            say(assumed_size(options.calibration, camera.size_px))
+            say(assumed_size_warning(options.calibration, camera.size_px))
         self.camera = camera
         check_size(source.size_px, camera, self.input.file_name(0))
         setup = camera_pipeline(options.profile, camera, options.stills)

@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from perchctl.display.status import FlightStatus, event_text, status_rows
-from perchctl.mission.watch import Event, EventKind
+from perchctl.mission import Event, EventKind
 
 PERIOD_S = 0.1
 CLOSE_TIMEOUT_S = 1.0

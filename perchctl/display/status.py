@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from perchctl.mission.state import BatteryOutlook
-from perchctl.mission.turn import Outside
-from perchctl.mission.watch import Event, EventKind
+from perchctl.mission import BatteryOutlook, Event, EventKind, ExternalPositions
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
@@ -45,7 +43,7 @@ class FlightStatus:
     attempts: int
     reason: str
     hold: str = ""
-    outside: Outside | None = None
+    outside: ExternalPositions | None = None
     battery: BatteryOutlook | None = None
 
 
@@ -91,7 +89,7 @@ def _whole(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 100.0 else f"{seconds / 60.0:.0f} min"
 
 
-def _outside_text(outside: Outside) -> str:
+def _outside_text(outside: ExternalPositions) -> str:
     if outside.problem is not None:
         return outside.problem
     return f"position {outside.rate_hz:.0f} Hz   {_age(outside.age_s)}"

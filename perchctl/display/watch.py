@@ -6,8 +6,7 @@ import math
 
 from perchctl.display.panel import Reporter
 from perchctl.display.status import FlightStatus
-from perchctl.mission.safety import BEFORE_CONTACT
-from perchctl.mission.watch import Event, Tick
+from perchctl.mission import BEFORE_CONTACT, Event, Tick
 
 
 class DisplayWatcher:

@@ -25,9 +25,9 @@ from perchctl.faults.effects import (
     TelemetryDelayed,
 )
 from perchctl.geometry import rot_z
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase
 from perchctl.profile import Profile
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario
 
 Place = tuple[float, float]
 """On the floor, world axes, m."""

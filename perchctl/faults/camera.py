@@ -8,9 +8,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from perchctl.camera.source import FrameSource
+from perchctl.camera import FrameSource
 from perchctl.faults.effects import CameraFault
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 SNOW_STREAM = 512
 SNOW_SIGMA = 60.0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.faults.result import FaultResult
-from perchctl.flight.campaign import fly_all, log_of
+from perchctl.flight import fly_all, seed_log_path
 from perchctl.profile import Profile
 
 
@@ -31,5 +31,5 @@ def run_fault_campaign(
 def _fly_logged(
     profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
 ) -> FaultResult:
-    log = None if log_dir is None else log_of(seed, log_dir)
+    log = None if log_dir is None else seed_log_path(seed, log_dir)
     return fly_fault_seed(profile, seed, faults, log, record)

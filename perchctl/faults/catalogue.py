@@ -26,8 +26,8 @@ from perchctl.faults.expected_outcomes import (
     TOO_LOW,
     ExpectedOutcome,
 )
-from perchctl.mission.state import Phase
-from perchctl.sim.scenario import Scenario
+from perchctl.mission import Phase
+from perchctl.sim import Scenario
 
 P = Phase
 STREAM = 510

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from perchctl.flight.loop import RESCUED
-from perchctl.mission.lander import Finding
-from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
+from perchctl.flight import RESCUED
+from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
 
 Claim = Literal[
     "hangs on the target", "held off the target", "hangs", "stands", "hangs or stands",

@@ -9,7 +9,7 @@ import numpy as np
 
 from perchctl.faults import effects as e
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario
 
 Rng = np.random.Generator
 Draw = Callable[[Rng, Scenario], tuple[e.Effect, ...]]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from perchctl.faults.effects import Killed, Push
 from perchctl.faults.facts import Facts
 from perchctl.faults.oracle import Flag
-from perchctl.mission.guards import CATCHABLE_M
+from perchctl.mission import CATCHABLE_M
 
 NOTICED_S, DOWN_MPS = 1.5, 0.4
 """How long a low battery takes to be believed, and how fast a landing goes at best."""

@@ -10,8 +10,7 @@ from perchctl.faults.oracle import Sample
 from perchctl.faults.truth import WatchedVehicle
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.profile import Profile
-from perchctl.sim.powertrain import most_thrust_n
-from perchctl.sim.thrust_curve import MOTOR_FORCE_N
+from perchctl.sim import MOTOR_FORCE_N, most_thrust_n
 
 LEAST_LIFT = 1.02
 """Over the weight: with less nothing is held in the air."""

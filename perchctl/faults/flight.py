@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.errors import PerchError
 from perchctl.faults.bounds import DescentBound, PlaceBound, UnfeltDrift
 from perchctl.faults.camera import FaultyCamera
@@ -33,24 +33,23 @@ from perchctl.faults.program import FaultyClock, PlantedError, ProgramKilled
 from perchctl.faults.radio import FaultyRadio
 from perchctl.faults.result import End, FaultResult
 from perchctl.faults.truth import WatchedVehicle, sample_of
-from perchctl.flight.lockstep import lockstep_source
-from perchctl.flight.lockstep_positions import feed_lockstep, measured_by
-from perchctl.flight.loop import FlightParts, fly
-from perchctl.flight.memory import give_back_memory, peak_memory_mb
-from perchctl.flight.operator import OperatorSwitch
+from perchctl.flight import (
+    FlightParts,
+    OperatorSwitch,
+    feed_lockstep,
+    fly,
+    give_back_memory,
+    lockstep_source,
+    peak_memory_mb,
+    with_positioning,
+)
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.link.assemble import FAST_BLOCKS
-from perchctl.link.bursty import radio_of
-from perchctl.link.mock import MockLink
-from perchctl.log.exact import to_exact
-from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, FlightReport, Tick, Watcher
+from perchctl.link import FAST_BLOCKS, MockLink, simulated_radio
+from perchctl.log import LogWatcher, to_exact
+from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
-from perchctl.sim.crtp.codec import Packet, Port
-from perchctl.sim.draw import draw_capture, draw_scenario
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Packet, Port, Scenario, draw_capture, draw_scenario
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
 END_OF: dict[Phase, End] = {
@@ -85,10 +84,10 @@ class FaultyFlight:
         profile, sooner_s = _flown_by(profile, case), _sooner_s(case.effects)
         self._profile, self._case, self._log = profile, case, log
         self._scenario = scenario = _scenario_of(case, scenario)
-        camera = camera_of(profile.camera)
+        camera = profile_camera(profile.camera)
         capture = draw_capture(profile, scenario.seed)
         self._vehicle = vehicle = WatchedVehicle(scenario, camera, profile.target, capture)
-        self._radio = radio = FaultyRadio(radio_of(scenario))
+        self._radio = radio = FaultyRadio(simulated_radio(scenario))
         radio.serves(vehicle.firmware)
         self._link = MockLink(vehicle, profile.link.telemetry_period_s, radio)
         source = FaultyCamera(lockstep_source(vehicle, profile), scenario.seed)
@@ -322,9 +321,9 @@ def _sooner_s(effects: Sequence[Effect]) -> float:
 def _flown_by(profile: Profile, case: Case) -> Profile:
     """The profile as the case needs it."""
     if any(isinstance(effect, ExternalPositions) for effect in case.effects):
-        profile = measured_by("mocap", profile)
+        profile = with_positioning("mocap", profile)
     if any(isinstance(effect, DeckSilent) for effect in case.effects):
-        profile = measured_by("deck", profile)
+        profile = with_positioning("deck", profile)
     more_s = _sooner_s(case.effects)
     if more_s == 0.0:
         return profile

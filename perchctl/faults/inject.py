@@ -45,11 +45,8 @@ from perchctl.faults.program import FaultyClock
 from perchctl.faults.radio import FaultyRadio
 from perchctl.faults.truth import SAMPLE_S, WatchedVehicle
 from perchctl.geometry import GRAVITY_MPS2, rot_z
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, Tick
-from perchctl.sim.capture.settings import MILLIMETRES, CaptureFault
-from perchctl.sim.firmware.controller import Estimate
-from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.mission import Event, Phase, Tick
+from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, Estimate, Neighbour, Scenario
 
 LIGHTHOUSE = "deck.bcLighthouse4"
 CAPTURE_FAULTS = {
@@ -57,7 +54,7 @@ CAPTURE_FAULTS = {
     "silent": CaptureFault(gone=True),
     "occluded": CaptureFault(occluded=True),
     "swapped": CaptureFault(swapped=True),
-    "millimetres": CaptureFault(scale=MILLIMETRES),
+    "millimetres": CaptureFault(scale=MILLIMETRES_PER_M),
     "mirrored": CaptureFault(mirrored=True),
     "late": CaptureFault(),
 }

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from perchctl.faults.effects import FOR_EVER, Hung, Killed, Raises, Slow, Suspended
-from perchctl.link.mock import MockLink
+from perchctl.link import MockLink
 
 LONGEST_S = 60.0
 """`FOR_EVER` of a program that hangs: then somebody kills it."""

@@ -10,12 +10,8 @@ from perchctl.faults.effects import (
     Silence,
     TelemetryDelayed,
 )
-from perchctl.link.log_blocks import FORGOTTEN_S, RESUME_PERIOD_S
-from perchctl.link.mock import Radio
-from perchctl.sim.crtp.codec import Packet, Port
-from perchctl.sim.crtp.commands import CommandService
-from perchctl.sim.crtp.server import PROTOCOL_VERSION
-from perchctl.sim.firmware import Firmware
+from perchctl.link import BLOCKS_DELETED_AFTER_S, RESUME_PERIOD_S, Radio
+from perchctl.sim import PROTOCOL_VERSION, CommandService, Firmware, Packet, Port
 
 ORDERS = ("setpoint", "raw", "land", "notify", "stop", "emergency-stop")
 """The packets that faults can name."""
@@ -66,7 +62,7 @@ class FaultyRadio(Radio):
                 self._twice.add(order)
             case Reboots(boots_s):
                 self._begun.append((Silence(boots_s, up=True, down=True), now_s))
-                unasked_s = boots_s + FORGOTTEN_S + RESUME_PERIOD_S
+                unasked_s = boots_s + BLOCKS_DELETED_AFTER_S + RESUME_PERIOD_S
                 self._begun.append((Silence(unasked_s, up=False, down=True), now_s))
             case Silence() | BlockDead() | TelemetryDelayed():
                 self._begun.append((effect, now_s))

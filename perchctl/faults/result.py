@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from perchctl.faults.oracle import FLAGS, Flag
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario
 
 End = Literal["perched", "landed", "aborted", "refused", "failed", "gone"]
 """`refused`: never took off; `failed`: an exception ended the flight, behind its rescue; `gone`:

@@ -12,8 +12,7 @@ from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES
 from perchctl.faults.oracle import FLAGS
 from perchctl.faults.result import End, FaultResult
-from perchctl.flight.rates import rate_record, rate_text
-from perchctl.flight.results import aligned, peak_mb
+from perchctl.flight import align_columns, peak_mb, rate_record, rate_text
 
 ENDS: tuple[End, ...] = get_args(End)
 WORST = 20
@@ -98,7 +97,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
         for fault in FAULTS
         if fault.name in flown
     ]
-    lines = aligned(cells)
+    lines = align_columns(cells)
     lines += ["", "a cell: flights, !k of them wrong, u: unavoidable among them", ""]
     ends = ", ".join(f"{figures[end]} {end}" for end in ENDS if figures[end])
     lines.append(f"flights            {figures['flights']}" + (f": {ends}" if ends else ""))
@@ -125,7 +124,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     worst = worst_first(results)[:WORST]
     if worst:
         lines += ["", "worst flights"]
-        lines += aligned([("seed", "fault", "phase", "what", "end"), *map(_line, worst)])
+        lines += align_columns([("seed", "fault", "phase", "what", "end"), *map(_line, worst)])
     return "\n".join(lines)
 
 

@@ -8,12 +8,15 @@ from collections.abc import Callable
 from perchctl.faults.oracle import Sample
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.profile import TargetConfig
-from perchctl.sim.body import REST_HEIGHT_M
-from perchctl.sim.capture.settings import CaptureSettings
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import (
+    CONTROL_PERIOD_S,
+    REST_HEIGHT_M,
+    CaptureSettings,
+    Scenario,
+    SimulatedVehicle,
+)
 from perchctl.vehicle import LOCKED
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 SAMPLE_S = 0.01
 FULL_THRUST = 60000.0

@@ -1,0 +1,5 @@
+"""One flight, real or in lockstep, and campaigns of simulated flights."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -19,13 +19,11 @@ from perchctl.errors import PerchError, SafetyAbort, TimedOut
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.flight.memory import give_back_memory, peak_memory_mb
 from perchctl.flight.results import FlightEnd, FlightResult
-from perchctl.flight.uninterrupted import uninterrupted
-from perchctl.log.summary import FlightSummary
-from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, EventKeeper, Watcher
+from perchctl.flight.uninterrupted import defer_interrupts
+from perchctl.log import FlightSummary, LogWatcher
+from perchctl.mission import Event, EventKeeper, Phase, Watcher
 from perchctl.profile import Profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 
 R = TypeVar("R")
 K = TypeVar("K", bound=Hashable)
@@ -109,7 +107,7 @@ def fly_seed(
 
 def fly_logged(profile: Profile, folder: Path, seed: int, record: bool = False) -> LoggedFlight:
     """Fly one seed to look at it closely. Errors: NotFound, InvalidValue (calibration, log)."""
-    log = LogWatcher.lockstep(log_of(seed, folder), profile, seed, record)
+    log = LogWatcher.lockstep(seed_log_path(seed, folder), profile, seed, record)
     events = EventKeeper()
     flight, summary = _flown(profile, seed, log, events)
     assert summary is not None
@@ -144,10 +142,12 @@ def run_campaign(
 
 
 def _fly_logged(profile: Profile, log_dir: Path | None, record: bool, seed: int) -> FlightResult:
-    return fly_seed(profile, seed, None if log_dir is None else log_of(seed, log_dir), record)
+    return fly_seed(
+        profile, seed, None if log_dir is None else seed_log_path(seed, log_dir), record
+    )
 
 
-def log_of(seed: int, log_dir: Path) -> Path:
+def seed_log_path(seed: int, log_dir: Path) -> Path:
     """The file for a seed's log."""
     return log_dir / f"flight_seed{seed}.jsonl"
 
@@ -174,7 +174,7 @@ def fly_all(
     ended: SimpleQueue[tuple[K, Future[R]]] = SimpleQueue()
 
     def hand_over(*some: K) -> None:
-        with uninterrupted():  # the executor may start processes as flights are handed to it
+        with defer_interrupts():  # the executor may start processes as flights are handed to it
             for seed in some:
                 _submitted(executor, fly, seed).add_done_callback(partial(_put, ended, seed))
 

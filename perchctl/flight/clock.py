@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from datetime import datetime
 from typing import Protocol
 
-from perchctl.sim.process.shared import MARGIN_S, SharedTime
+from perchctl.sim import CLOCK_MARGIN_S, SharedTime
 
 SIM_PATIENCE_S = 5.0
 """The clock waits so long, on the wall's clock, for a simulator that does not go on: longer than
@@ -25,6 +25,8 @@ _POLL_S = 0.001
 
 
 class Clock(Protocol):
+    """Time and waiting, in seconds: the one clock of a flight, real or simulated."""
+
     def now(self) -> float:
         """Seconds, monotonic."""
 
@@ -80,14 +82,14 @@ class SimulatedClock:
 
     def wait_until(self, t_s: float) -> None:
         if self._began_s is not None:
-            self._shared.limit_s = t_s - self.zero_s + MARGIN_S
+            self._shared.limit_s = t_s - self.zero_s + CLOCK_MARGIN_S
         while (left_s := t_s - self.now()) > 0:
             self._sleep(max(left_s, _POLL_S))
 
     @contextlib.contextmanager
     def waiting_for_loop(self) -> Iterator[None]:
         """Within it each `wait_until` is the loop's sign of life, and without one simulated time
-        goes on for `MARGIN_S` only."""
+        goes on for `CLOCK_MARGIN_S` only."""
         self._began_s = self._wall(), self.now()
         try:
             yield

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import binomtest, bootstrap
 
 from perchctl.flight.rates import LEVEL, rate_record, rate_text
-from perchctl.flight.results import FlightResult, aligned
+from perchctl.flight.results import FlightResult, align_columns
 
 FEWEST_PAIRS = 20
 """An interval of fewer would promise too much: of 8 pairs a bootstrap's is wrong five times as
@@ -138,7 +138,7 @@ class Comparison:
         return {which for which in found if which is not None}
 
 
-def compared(
+def compare_variants(
     names: tuple[str, str],
     pairs: Sequence[tuple[FlightResult, FlightResult]],
     figures: Sequence[Figure] = FIGURES,
@@ -201,7 +201,8 @@ def _ending(r: FlightResult) -> tuple[Any, ...]:
     return r.outcome, r.reason, r.miss_m, r.time_s, r.attempts, r.locked, r.fell
 
 
-def comparison_text(found: Comparison) -> str:
+def variants_text(found: Comparison) -> str:
+    """The comparison of two profiles as a table, for people."""
     return "\n".join(_lines(found))
 
 
@@ -211,7 +212,7 @@ def _lines(found: Comparison) -> Iterator[str]:
     n = success.flights
     alone = f"only A {success.alone[0]}, only B {success.alone[1]}"
     rate_a, rate_b = (rate_text(k, n) for k in success.good)
-    yield from aligned(
+    yield from align_columns(
         [
             ("", f"A: {a}", f"B: {b}", "B less A", ""),
             ("success", rate_a, rate_b, alone, success_verdict(success)),
@@ -265,7 +266,7 @@ def difference_verdict(each: Difference) -> str:
     return f"{'AB'[each.better]} is better by {each.figure.scale * abs(each.mean):.2f}{unit}"
 
 
-def comparison_record(found: Comparison) -> dict[str, Any]:
+def variants_record(found: Comparison) -> dict[str, Any]:
     """For programs: SI; a difference is B's less A's, `better` "A", "B" or None."""
     success = found.success
     return {

@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, invert_T
-from perchctl.profile import Profile, SimulationConfig
-from perchctl.profile.keys import unit_of
-from perchctl.sim.draw import draw_points, draw_scenario
-from perchctl.sim.scenario import Scenario
+from perchctl.profile import Profile, SimulationConfig, key_unit
+from perchctl.sim import Scenario, draw_points, draw_scenario
 
 NO_CONDITION = frozenset(
     {"set", "camera_burst_start_s", "first_contact_share", "draught_towards_deg",
@@ -27,7 +25,7 @@ Told = Callable[[Profile, Scenario], str]
 
 
 @dataclass(frozen=True)
-class Condition:
+class ScenarioCondition:
     """`keys`: of `simulation`. `told`: what it is, in words; None: the keys and their values.
     `gradual`: there is less and more of it, beside being there and not."""
 
@@ -58,47 +56,57 @@ def _frames(drawn: Scenario) -> str:
 
 
 CONDITIONS = (
-    Condition("mass", ("mass_kg",), lambda _, s: f"{1e3 * s.mass_kg:.1f} g"),
-    Condition("battery", ("battery_rest_v",), lambda _, s: f"{s.battery_rest_v:.2f} V at rest"),
-    Condition(
+    ScenarioCondition("mass", ("mass_kg",), lambda _, s: f"{1e3 * s.mass_kg:.1f} g"),
+    ScenarioCondition(
+        "battery", ("battery_rest_v",), lambda _, s: f"{s.battery_rest_v:.2f} V at rest"
+    ),
+    ScenarioCondition(
         "start",
         ("start_offset_m", "target_xy_m"),
         lambda _, s: f"{math.hypot(*s.target_xy_m):.2f} m aside",
     ),
-    Condition(
+    ScenarioCondition(
         "heading", ("target_yaw_deg",), lambda _, s: f"{math.degrees(s.target_yaw_rad):.0f} deg"
     ),
-    Condition("ceiling", ("ceiling_z_m",), lambda _, s: f"at {s.ceiling_z_m:.2f} m"),
-    Condition("latency", ("camera_latency_s",), lambda _, s: f"{1e3 * s.camera_latency_s:.0f} ms"),
-    Condition("jitter", ("camera_jitter_s",), lambda _, s: f"{1e3 * s.camera_jitter_s:.0f} ms"),
-    Condition("frame rate", ("camera_rate_hz",), lambda _, s: f"{s.camera_rate_hz:.0f} Hz"),
-    Condition(
+    ScenarioCondition("ceiling", ("ceiling_z_m",), lambda _, s: f"at {s.ceiling_z_m:.2f} m"),
+    ScenarioCondition(
+        "latency", ("camera_latency_s",), lambda _, s: f"{1e3 * s.camera_latency_s:.0f} ms"
+    ),
+    ScenarioCondition(
+        "jitter", ("camera_jitter_s",), lambda _, s: f"{1e3 * s.camera_jitter_s:.0f} ms"
+    ),
+    ScenarioCondition("frame rate", ("camera_rate_hz",), lambda _, s: f"{s.camera_rate_hz:.0f} Hz"),
+    ScenarioCondition(
         "lost frames", ("camera_drop_rate",), lambda _, s: f"{100 * s.camera_drop_rate:.0f} %"
     ),
-    Condition("frames lost in one go", ("camera_burst_frames",), lambda _, s: _frames(s)),
-    Condition("noise", ("camera_noise_sigma",), lambda _, s: f"{s.camera_noise_sigma:.1f} of 255"),
-    Condition(
+    ScenarioCondition("frames lost in one go", ("camera_burst_frames",), lambda _, s: _frames(s)),
+    ScenarioCondition(
+        "noise", ("camera_noise_sigma",), lambda _, s: f"{s.camera_noise_sigma:.1f} of 255"
+    ),
+    ScenarioCondition(
         "mounting error",
         ("mount_error_deg", "mount_error_m", "mount_error_rpy_deg", "mount_error_xyz_m"),
         _mounting,
     ),
-    Condition(
+    ScenarioCondition(
         "tilt bias",
         ("estimate_tilt_bias_deg", "estimate_tilt_bias_xy_deg"),
         lambda _, s: _tilt(s),
     ),
-    Condition(
+    ScenarioCondition(
         "drift",
         ("drift_mps", "drift_xyz_mps"),
         lambda _, s: f"{1e3 * float(np.linalg.norm(s.drift_mps)):.0f} mm/s",
     ),
-    Condition("draught", ("draught_mps",), lambda _, s: f"{math.hypot(*s.draught_mps):.2f} m/s"),
-    Condition("first contact", ("first_contact_fails",), _contact, gradual=False),
-    Condition("magnet", ("magnet_force_n",), lambda _, s: f"{s.magnet_force_n:.2f} N"),
-    Condition("target", ("no_target",), lambda _, s: "none" if s.no_target else "there"),
-    Condition("interlacing", ("camera_fields", "camera_blended")),
-    Condition("receiver", ("camera_receiver_hz", "camera_receiver_noise"), gradual=False),
-    Condition("neighbours", ("neighbours", "neighbour_ids"), gradual=False),
+    ScenarioCondition(
+        "draught", ("draught_mps",), lambda _, s: f"{math.hypot(*s.draught_mps):.2f} m/s"
+    ),
+    ScenarioCondition("first contact", ("first_contact_fails",), _contact, gradual=False),
+    ScenarioCondition("magnet", ("magnet_force_n",), lambda _, s: f"{s.magnet_force_n:.2f} N"),
+    ScenarioCondition("target", ("no_target",), lambda _, s: "none" if s.no_target else "there"),
+    ScenarioCondition("interlacing", ("camera_fields", "camera_blended")),
+    ScenarioCondition("receiver", ("camera_receiver_hz", "camera_receiver_noise"), gradual=False),
+    ScenarioCondition("neighbours", ("neighbours", "neighbour_ids"), gradual=False),
 )
 """With words of their own, or of several keys; each other key is a condition by itself."""
 
@@ -107,21 +115,21 @@ def _tilt(drawn: Scenario) -> str:
     return f"{math.degrees(math.hypot(*drawn.estimate_tilt_bias_rad)):.2f} deg"
 
 
-def _of_the_section() -> tuple[Condition, ...]:
+def _of_the_section() -> tuple[ScenarioCondition, ...]:
     known = {key for condition in CONDITIONS for key in condition.keys}
     others = (key for key in SimulationConfig.model_fields if key not in known | NO_CONDITION)
-    return (*CONDITIONS, *(Condition(key, (key,)) for key in others))
+    return (*CONDITIONS, *(ScenarioCondition(key, (key,)) for key in others))
 
 
 @dataclass(frozen=True)
-class Conditions:
+class ScenarioConditions:
     """Of one seed of a profile; `off` are those in which it is not nominal."""
 
     profile: Profile
     seed: int
     nominal: Mapping[str, Any]
     drawn: Mapping[str, Any]
-    off: tuple[Condition, ...]
+    off: tuple[ScenarioCondition, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -156,7 +164,7 @@ class Conditions:
         simulation = SimulationConfig.model_validate(plain)
         return self.profile.model_copy(update={"simulation": simulation})
 
-    def told(self, condition: Condition, levels: Mapping[str, float]) -> str:
+    def told(self, condition: ScenarioCondition, levels: Mapping[str, float]) -> str:
         """What it is at these levels, in words."""
         profile = self.toned(levels)
         if condition.told is not None:
@@ -165,7 +173,7 @@ class Conditions:
         return ", ".join(f"{key} {_plain(key, values[key])}" for key in condition.keys)
 
 
-def conditions_of(profile: Profile, seed: int) -> Conditions:
+def scenario_conditions(profile: Profile, seed: int) -> ScenarioConditions:
     """Of what that seed draws."""
     drawn = profile.simulation.model_dump() | draw_points(profile, seed)
     nominal = _nominal(profile)
@@ -174,7 +182,7 @@ def conditions_of(profile: Profile, seed: int) -> Conditions:
         for condition in _of_the_section()
         if any(drawn[key] != nominal[key] for key in condition.keys)
     )
-    return Conditions(profile, seed, nominal, drawn, off)
+    return ScenarioConditions(profile, seed, nominal, drawn, off)
 
 
 def _nominal(profile: Profile) -> dict[str, Any]:
@@ -231,4 +239,4 @@ def _plain(key: str, value: Any) -> str:
     if isinstance(value, tuple) and len(set(value)) == 1:
         value = value[0]
     text = f"{value:.4g}" if isinstance(value, float) else str(value)
-    return f"{text} {unit_of(key)}".strip()
+    return f"{text} {key_unit(key)}".strip()

@@ -22,7 +22,7 @@ from perchctl.vehicle import (
     MeasuredBy,
     Telemetry,
 )
-from perchctl.vision.types import TargetEstimate
+from perchctl.vision import TargetEstimate
 
 KNOWN_SUPERVISOR_BITS = 0x0FFF
 REST_ACC_G = 0.15
@@ -51,7 +51,7 @@ class Problem:
         return f"{self.found}: {self.advice}"
 
 
-def forbidden(telemetry: Telemetry) -> Problem | None:
+def forbidden_problem(telemetry: Telemetry) -> Problem | None:
     """What the supervisor reports that waiting will not mend."""
     raw = f"0x{telemetry.supervisor:04X}"
     for bit, what, advice in _FORBIDDEN:
@@ -65,7 +65,7 @@ def forbidden(telemetry: Telemetry) -> Problem | None:
     return None
 
 
-def battery_low(telemetry: Telemetry, profile: Profile) -> Problem | None:
+def battery_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
     """A reading below `NO_BATTERY_READING_V` is none, and no problem here."""
     needed_v = profile.safety.min_rest_v
     if not NO_BATTERY_READING_V <= telemetry.battery_v < needed_v:
@@ -77,7 +77,7 @@ def battery_low(telemetry: Telemetry, profile: Profile) -> Problem | None:
     )
 
 
-def unsettled(telemetry: Telemetry, profile: Profile) -> Problem | None:
+def unsettled_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
     """The estimate's variance; one that is no number is not settled either."""
     variance, most = telemetry.position_variance_m2, profile.safety.estimator_variance_m2
     if variance is None or variance <= most:
@@ -89,7 +89,7 @@ def unsettled(telemetry: Telemetry, profile: Profile) -> Problem | None:
     return Problem(f"variance {found} m^2, at most {allowed} allowed", advice)
 
 
-def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
+def unmeasured_problem(by: MeasuredBy, profile: Profile) -> Problem | None:
     """Nothing tells the vehicle where it is: it would fly by a sum of accelerations."""
     config = profile.positioning
     if config.by != "deck" or by.placed_by(config.decks) or by.external:
@@ -108,7 +108,7 @@ def unmeasured(by: MeasuredBy, profile: Profile) -> Problem | None:
     return Problem(found, advice)
 
 
-def off_the_ground(telemetry: Telemetry, profile: Profile) -> Problem | None:
+def height_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
     """A vehicle that hangs, or is held, by the settled estimate."""
     safety, z_m = profile.safety, telemetry.position_m[2]
     if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:
@@ -127,7 +127,8 @@ def tilt_deg(telemetry: Telemetry) -> float:
     return math.degrees(max(roll_rad, pitch_rad) + 0.0 * (roll_rad + pitch_rad))
 
 
-def tilted(telemetry: Telemetry, profile: Profile) -> Problem | None:
+def tilt_problem(telemetry: Telemetry, profile: Profile) -> Problem | None:
+    """The vehicle does not stand level enough to take off."""
     found_deg, most_deg = tilt_deg(telemetry), profile.safety.start_tilt_deg
     if found_deg <= most_deg:
         return None
@@ -135,20 +136,21 @@ def tilted(telemetry: Telemetry, profile: Profile) -> Problem | None:
     return Problem(f"tilted by {found} deg, at most {allowed} allowed", "put it on level ground")
 
 
-def moving(telemetry: Telemetry) -> Problem | None:
+def motion_problem(telemetry: Telemetry) -> Problem | None:
+    """The vehicle is moved or vibrates: its accelerometer does not read one g."""
     if abs(telemetry.acc_z_g - 1.0) <= REST_ACC_G:
         return None
     return Problem(f"its accelerometer reads {telemetry.acc_z_g:.2f} g", "let it stand still")
 
 
-def not_allowed(telemetry: Telemetry) -> Problem | None:
+def not_allowed_problem(telemetry: Telemetry) -> Problem | None:
     """The supervisor does not let it fly (yet)."""
     if telemetry.has(CAN_FLY):
         return None
     return Problem(f"0x{telemetry.supervisor:04X}", "wait, or restart it")
 
 
-def within_reach(target: TargetEstimate | None) -> Problem | None:
+def too_near_problem(target: TargetEstimate | None) -> Problem | None:
     """A target that is too near to be seen from the ground."""
     if target is None or not target.tracked:
         return None

@@ -12,12 +12,12 @@ import cv2
 
 from perchctl.errors import PerchError
 from perchctl.flight.campaign import OUTCOMES, fly_all
-from perchctl.flight.conditions import Conditions
+from perchctl.flight.conditions import ScenarioConditions
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
 from perchctl.flight.memory import give_back_memory
 from perchctl.flight.minimise import Levels, minimised
 from perchctl.flight.results import FlightEnd
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase
 from perchctl.profile import Profile
 
 
@@ -31,7 +31,7 @@ class Kind(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Ended:
+class EndedFlight:
     """One flight's end, and why."""
 
     seed: int
@@ -53,14 +53,14 @@ class Ended:
         return f"{', '.join([self.outcome, *flags])}: {self.reason}"
 
 
-def fly_to_its_end(profile: Profile, seed: int) -> Ended:
+def fly_to_its_end(profile: Profile, seed: int) -> EndedFlight:
     """One flight; what the program refuses to fly has ended, too."""
     cv2.setNumThreads(1)
     try:
         flight = fly_lockstep(profile, seed)
     except PerchError as error:
-        return Ended(seed, Kind("refused", "", False, False), str(error))
-    ended = Ended(seed, kind_of(flight), flight.report.reason)
+        return EndedFlight(seed, Kind("refused", "", False, False), str(error))
+    ended = EndedFlight(seed, kind_of(flight), flight.report.reason)
     del flight
     give_back_memory()
     return ended
@@ -74,13 +74,13 @@ def kind_of(flight: LockstepFlight) -> Kind:
 
 
 def minimised_failure(
-    conditions: Conditions,
-    failure: Ended,
+    conditions: ScenarioConditions,
+    failure: EndedFlight,
     executor: Executor | None = None,
     jobs: int = 1,
-    on_result: Callable[[Ended], None] = lambda ended: None,
-    on_less: Callable[[Levels, Ended], None] = lambda levels, ended: None,
-    fly: Callable[[Profile, int], Ended] = fly_to_its_end,
+    on_result: Callable[[EndedFlight], None] = lambda ended: None,
+    on_less: Callable[[Levels, EndedFlight], None] = lambda levels, ended: None,
+    fly: Callable[[Profile, int], EndedFlight] = fly_to_its_end,
 ) -> dict[str, float]:
     """The levels of `perchctl.flight.minimise`, of a seed that ended in `failure`, by flights; the
     same failure is one of the same kind.
@@ -88,7 +88,7 @@ def minimised_failure(
     `jobs` fly at a time. What is found is the same however many do. `on_less`: each smaller
     failure as it is found.
     """
-    ends: list[Ended] = []
+    ends: list[EndedFlight] = []
 
     def first_failing(several: Sequence[Levels]) -> int | None:
         for start in range(0, len(several), jobs):
@@ -110,6 +110,6 @@ def minimised_failure(
 
 
 def _fly_toned(
-    fly: Callable[[Profile, int], Ended], profiles: Sequence[Profile], seed: int, number: int
-) -> Ended:
+    fly: Callable[[Profile, int], EndedFlight], profiles: Sequence[Profile], seed: int, number: int
+) -> EndedFlight:
     return fly(profiles[number], seed)

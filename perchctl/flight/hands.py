@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from perchctl.children import end_with_parent
-from perchctl.flight.uninterrupted import uninterrupted
+from perchctl.flight.uninterrupted import defer_interrupts
 
 R = TypeVar("R")
 
@@ -45,7 +45,7 @@ class Hands(Executor):
             for i in range(count)
         ]
         resource_tracker.ensure_running()  # it lifts the mask of the thread that starts it
-        with uninterrupted():  # threads and processes have the mask of who starts them
+        with defer_interrupts():  # threads and processes have the mask of who starts them
             for thread in self._threads:
                 thread.start()
 
@@ -93,7 +93,7 @@ class Hands(Executor):
                 continue
             try:
                 hand = hand or self._started()
-                hand[1].send_bytes(order_of(fn, args))
+                hand[1].send_bytes(flight_order(fn, args))
                 good, answer = pickle.loads(hand[1].recv_bytes())
             except (EOFError, OSError):
                 self._let_go(hand)
@@ -134,15 +134,15 @@ def _serve(connection: Connection) -> None:
     end_with_parent()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            connection.send_bytes(answered(connection.recv_bytes()))
+            connection.send_bytes(run_order(connection.recv_bytes()))
 
 
-def order_of(fn: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
+def flight_order(fn: Callable[..., Any], args: tuple[Any, ...]) -> bytes:
     """A flight in the form in which it is sent."""
     return pickle.dumps((fn, args))
 
 
-def answered(order: bytes) -> bytes:
+def run_order(order: bytes) -> bytes:
     """What became of it, as sent back: whether it is good, and its result or its error."""
     answer = _answer(order)
     try:
@@ -161,7 +161,7 @@ def _answer(order: bytes) -> tuple[bool, Any]:
 
 
 @contextlib.contextmanager
-def job_processes(jobs: int) -> Iterator[Executor]:
+def flight_processes(jobs: int) -> Iterator[Executor]:
     """So many processes that fly; left by an exception, they are ended where they are."""
     hands = Hands(jobs)
     try:

@@ -7,11 +7,11 @@ import math
 from dataclasses import dataclass, field
 
 from perchctl.geometry import wrap_rad
-from perchctl.mission.imu import ImuMotion, moved
+from perchctl.mission import ImuMotion, integrate_imu
 from perchctl.profile import SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry, is_battery_reading
-from perchctl.vision.types import Attitude
+from perchctl.vision import Attitude
 
 KEEP_S = 2.0
 SMEARED_S = 0.15
@@ -40,7 +40,7 @@ class History:
         return self.samples[-1] if self.samples else None
 
 
-def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> History:
+def add_samples(history: History, new: list[Telemetry], safety: SafetyConfig) -> History:
     """The history with new samples; `jumped` and `turned_rad`, the largest step of the
     heading, are about these samples only.
 
@@ -64,7 +64,7 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
             changed_s = sample.t_s
         if is_battery_reading(sample.battery_v) and sample.battery_v != battery_v:
             changed_s, battery_v = sample.t_s, sample.battery_v
-        imu = moved(imu, samples[-1] if samples else None, sample)
+        imu = integrate_imu(imu, samples[-1] if samples else None, sample)
         samples.append(sample)
     if samples:
         oldest = samples[-1].t_s - KEEP_S
@@ -73,9 +73,9 @@ def extended(history: History, new: list[Telemetry], safety: SafetyConfig) -> Hi
     return History(tuple(samples), jumped, turned_rad, changed_s, battery_v, imu)
 
 
-def belated(history: History, late: list[Telemetry], safety: SafetyConfig) -> History:
+def add_late_samples(history: History, late: list[Telemetry], safety: SafetyConfig) -> History:
     """With what has come since in the same turn: what `history` says of its own samples stays."""
-    after = extended(history, late, safety)
+    after = add_samples(history, late, safety)
     turned_rad = max(history.turned_rad, after.turned_rad)
     return replace(after, jumped=history.jumped or after.jumped, turned_rad=turned_rad)
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 from perchctl.errors import UsageError
-from perchctl.log.recording.place import recording_of
+from perchctl.log import recording_path
 
 
-class Judged(Protocol):
+class JudgedFlight(Protocol):
     """A flight's result, of whatever campaign."""
 
     @property
@@ -28,10 +28,10 @@ class Judged(Protocol):
         ...
 
 
-R = TypeVar("R", bound=Judged)
+R = TypeVar("R", bound=JudgedFlight)
 
 
-def log_keeper(keep: str) -> Callable[[Judged], None]:
+def log_keeper(keep: str) -> Callable[[JudgedFlight], None]:
     """To be called with each flight as it ends: removes the logs, with the recordings beside them,
     that `keep` does not want: ``all``, ``failed``, or ``worst:N``. Errors: UsageError."""
     if keep == "all":
@@ -49,7 +49,7 @@ class _Worst:
         self._count = count
         self._kept: list[tuple[tuple[Any, ...], int, str]] = []
 
-    def __call__(self, result: Judged) -> None:
+    def __call__(self, result: JudgedFlight) -> None:
         if result.log is None:
             return
         heapq.heappush(self._kept, (result.badness, -result.seed, str(result.log)))
@@ -59,12 +59,12 @@ class _Worst:
 
 def _remove(log: Path | None) -> None:
     if log is not None:
-        for path in (log, recording_of(log)):
+        for path in (log, recording_path(log)):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
 
 
-class Kept(Generic[R]):
+class CampaignResults(Generic[R]):
     """A campaign's results: those of a file of results, and those that come. Of earlier ones only
     logs in `folder` are judged: others may be another campaign's by now."""
 

@@ -6,29 +6,28 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.mirror import as_profiled
-from perchctl.camera.slot import NewestSlot
-from perchctl.camera.source import FrameSource
+from perchctl.calibration import profile_camera
+from perchctl.camera import FrameSource, NewestSlot, mirrored_as_profiled
 from perchctl.flight.lockstep_positions import feed_lockstep
 from perchctl.flight.loop import FlightParts, fly
-from perchctl.link.bursty import radio_of
-from perchctl.link.mock import MockLink
-from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import Operator, Phase
-from perchctl.mission.watch import Event, FlightReport, Tick, Watcher
+from perchctl.link import MockLink, simulated_radio
+from perchctl.log import LogWatcher
+from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
 from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
-from perchctl.sim.camera import SimCamera
-from perchctl.sim.capture.settings import CaptureSettings
-from perchctl.sim.draw import draw_capture, draw_scenario
-from perchctl.sim.receiver import DeliveredFrame
-from perchctl.sim.scenario import Scenario
-from perchctl.sim.told import Teller
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import (
+    CaptureSettings,
+    DeliveredFrame,
+    EventExplainer,
+    Scenario,
+    SimCamera,
+    SimulatedVehicle,
+    draw_capture,
+    draw_scenario,
+)
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2
@@ -98,7 +97,7 @@ def lockstep_source(vehicle: SimulatedVehicle, profile: Profile) -> FrameSource:
     """The vehicle's camera as the flight sees it by its profile."""
     assert vehicle.camera is not None
     source = LockstepSource(vehicle.camera, profile.camera.start_latency_s)
-    return as_profiled(source, profile.camera)
+    return mirrored_as_profiled(source, profile.camera)
 
 
 class Truth:
@@ -181,10 +180,10 @@ def fly_lockstep(
         )  # fmt: skip
         watcher.close(flight.report, flight.perched_miss_m, flight.fell)
         return flight
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     capture = capture or draw_capture(profile, scenario.seed)
     vehicle = SimulatedVehicle(scenario, camera, profile.target, capture)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, radio_of(scenario))
+    link = MockLink(vehicle, profile.link.telemetry_period_s, simulated_radio(scenario))
     positions = feed_lockstep(link, profile)
     source = lockstep_source(vehicle, profile)
     truth = Truth(vehicle)
@@ -194,7 +193,7 @@ def fly_lockstep(
         watchers = (*watchers, log)
         source = log.watched(source)
     operator = _OperatorAt(operator_at or {})
-    tell = Teller(scenario)
+    tell = EventExplainer(scenario)
     pipeline = _pipeline_of(profile, camera)
     parts = FlightParts(
         link, source, LockstepClock(link), profile, pipeline, (*watchers, operator), operator.read,

@@ -7,18 +7,15 @@ from typing import Literal
 
 from perchctl.errors import ConnectionFailed
 from perchctl.geometry import yaw_of
-from perchctl.link.mock import MockLink
-from perchctl.link.outside import RESET, parameters_of
+from perchctl.link import RESET_PARAMETER, MockLink, estimator_parameters
 from perchctl.positioning import FeedThread, PositionFeed
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
-from perchctl.sim.capture.server import SYSTEM
-from perchctl.sim.capture.system import LockstepCapture
+from perchctl.profile import PositioningConfig, Profile
+from perchctl.sim import SIMULATED_SYSTEM, LockstepCapture
 
 FIRST_FRAME_S = 1.0
 
 
-def measured_by(by: Literal["deck", "mocap"], profile: Profile) -> Profile:
+def with_positioning(by: Literal["deck", "mocap"], profile: Profile) -> Profile:
     """The same with its position by decks, or from outside."""
     config = profile.positioning.model_copy(update={"by": by})
     return profile.model_copy(update={"positioning": config})
@@ -37,7 +34,7 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
         return None
     if capture is None or config.by != "mocap":
         return None
-    config = config.model_copy(update={"system": SYSTEM, "host": "sim"})
+    config = config.model_copy(update={"system": SIMULATED_SYSTEM, "host": "sim"})
     feed = PositionFeed(LockstepCapture(capture), link.external, config)
     link.each(FeedThread.PERIOD_S, feed.turn)
     end_s = link.now_s + FIRST_FRAME_S
@@ -56,6 +53,6 @@ def _start_at(
 ) -> None:
     start = {"X": x_m, "Y": y_m, "Z": z_m, "Yaw": yaw_rad}
     initial = {f"kalman.initial{name}": value for name, value in start.items()}
-    for name, value in (parameters_of(config) | initial | {RESET: 1}).items():
+    for name, value in (estimator_parameters(config) | initial | {RESET_PARAMETER: 1}).items():
         link.vehicle.firmware.set_parameter(name, value)
-    link.vehicle.firmware.set_parameter(RESET, 0)
+    link.vehicle.firmware.set_parameter(RESET_PARAMETER, 0)

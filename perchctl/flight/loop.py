@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from perchctl.camera.source import FrameSource
+from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
 from perchctl.flight.outside import AtRest
@@ -27,34 +27,34 @@ from perchctl.flight.senses import Senses
 from perchctl.flight.told import events_of, report_of
 from perchctl.flight.turns import Turns
 from perchctl.flight.watchdog import Watchdog
-from perchctl.link.protocol import Link
-from perchctl.mission import planner
-from perchctl.mission.felt import begun_anew
-from perchctl.mission.lander import Finding
-from perchctl.mission.sent import Sent
-from perchctl.mission.state import (
+from perchctl.link import Link
+from perchctl.mission import (
     FLYING_PHASES,
+    RESCUE,
+    Event,
+    EventKind,
+    Finding,
+    FlightReport,
     Observation,
     Operator,
     Phase,
     PlannerState,
-)
-from perchctl.mission.turn import Turn
-from perchctl.mission.watch import (
-    RESCUE,
-    Event,
-    EventKind,
-    FlightReport,
+    SentCommand,
     SentWatcher,
     Tick,
+    Turn,
     Watcher,
+    drop_sights,
+    is_mission_over,
+    start_mission,
+    step_mission,
 )
 from perchctl.pipeline import Pipeline
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, Idle
-from perchctl.vision.consistency import Consistency
+from perchctl.vision import Consistency
 
 HUNG_S = 0.25
 """A turn that takes longer was hung up somewhere: what it knew of the vehicle is old."""
@@ -128,11 +128,11 @@ def fly(parts: FlightParts) -> FlightReport:
         raise
 
 
-def _teller(parts: FlightParts) -> Callable[[Sent], None]:
+def _teller(parts: FlightParts) -> Callable[[SentCommand], None]:
     """What is sent in the loop's place is told to those who want it."""
     told = [watcher for watcher in parts.watchers if isinstance(watcher, SentWatcher)]
 
-    def tell(sent: Sent) -> None:
+    def tell(sent: SentCommand) -> None:
         for watcher in told:
             with contextlib.suppress(Exception):
                 watcher.sent(sent)
@@ -209,7 +209,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         turns.lap()
         turns.observed(obs)
         before = state
-        new, command = planner.step(before or planner.start(obs), obs, parts.profile)
+        new, command = step_mission(before or start_mission(obs), obs, parts.profile)
         turns.decided(obs, new, command, outside)
         turns.lap()
         overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
@@ -225,7 +225,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         senses.sends_sights = state.blind_s is None
         if state.astray and parts.positions is not None and not (before and before.astray):
             parts.positions.stop()
-            senses.felt = begun_anew(senses.felt)
+            senses.felt = drop_sights(senses.felt)
         events = events_of(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True
@@ -244,7 +244,7 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         told = senses.noticed.newest
         for watcher in parts.watchers:
             watcher.tick(tick)
-        if planner.is_over(state):
+        if is_mission_over(state):
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
             return report_of(state, obs, tuple(passed), senses)
         due_s += period_s

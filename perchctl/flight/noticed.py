@@ -12,20 +12,19 @@ from dataclasses import dataclass, field
 
 from perchctl.flight.history import History, attitude_at, velocity_at
 from perchctl.geometry import finite
-from perchctl.profile import CameraConfig
-from perchctl.profile.vision import USED_LATENCY_S
+from perchctl.profile import USED_LATENCY_S, CameraConfig
 from perchctl.values import replace
-from perchctl.vision.consistency import (
-    LEAST_RANGE_M,
-    STEP_S,
+from perchctl.vision import (
+    ATTITUDE_STEP_S,
+    LEAST_CONSISTENCY_RANGE_M,
     Consistency,
-    Sums,
-    added,
-    moment_of,
-    solved,
+    ConsistencySums,
+    MarkerPose,
+    PoseSetup,
+    add_moment,
+    consistency_moment,
+    solve_consistency,
 )
-from perchctl.vision.pose import PoseSetup
-from perchctl.vision.types import MarkerPose
 
 SOLVE_EVERY_S = 1.0
 LIKELY_S = 0.02
@@ -43,7 +42,7 @@ class Noticed:
     """`newest` is what `sums` said at `solved_s`, and `used_s` what is taken off the pictures'
     times beyond the profile's latency, since the picture of `seen_s`."""
 
-    sums: Sums = field(default_factory=Sums)
+    sums: ConsistencySums = field(default_factory=ConsistencySums)
     newest: Consistency | None = None
     solved_s: float = -math.inf
     used_s: float = 0.0
@@ -74,20 +73,24 @@ def _learned(
     setup: PoseSetup,
     attitude_sigma_rad: float,
 ) -> Noticed:
-    if pose.cov is None or not finite(pose.cov) or float(pose.tvec_m[2]) < LEAST_RANGE_M:
+    if (
+        pose.cov is None
+        or not finite(pose.cov)
+        or float(pose.tvec_m[2]) < LEAST_CONSISTENCY_RANGE_M
+    ):
         return old
     likely = old.newest is not None and old.newest.delay_sigma_s < LIKELY_S
     delay_s = old.newest.delay_s if old.newest is not None and likely else 0.0
     delay_s = max(-USED_LATENCY_S[1], min(USED_LATENCY_S[1], delay_s))
-    before = attitude_at(history, t_s - delay_s - STEP_S)
-    after = attitude_at(history, t_s - delay_s + STEP_S)
+    before = attitude_at(history, t_s - delay_s - ATTITUDE_STEP_S)
+    after = attitude_at(history, t_s - delay_s + ATTITUDE_STEP_S)
     if before is None or after is None:
         return old
     velocity_mps = velocity_at(history, t_s - delay_s)
-    moment = moment_of(t_s, pose, before, after, velocity_mps, delay_s, setup)
-    new = replace(old, sums=added(old.sums, moment))
+    moment = consistency_moment(t_s, pose, before, after, velocity_mps, delay_s, setup)
+    new = replace(old, sums=add_moment(old.sums, moment))
     if t_s - old.solved_s >= SOLVE_EVERY_S:
-        newest = solved(new.sums, attitude_sigma_rad)
+        newest = solve_consistency(new.sums, attitude_sigma_rad)
         new = replace(new, newest=newest, solved_s=t_s)
     return new
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from perchctl.errors import Interrupted
-from perchctl.mission.state import Operator
+from perchctl.mission import Operator
 
 AGAIN_S = 0.5
 """A second press counts this long after the first."""

@@ -46,15 +46,17 @@ def measurer(profile: Profile) -> str:
     return "the sight of the target" if by_sight else "the motion capture"
 
 
-def strange(place: ExternalPosition, telemetry: Telemetry, profile: Profile) -> Problem | None:
+def world_problem(
+    place: ExternalPosition, telemetry: Telemetry, profile: Profile
+) -> Problem | None:
     """What waiting will not mend: another unit, another axis up, another place. The world that
     the target measures in is the vehicle's own, from where it stands: there is no other."""
     if profile.positioning.by == "target":
         return unreachable(place, profile)
     return (
-        in_millimetres(place, profile)
+        millimetres_problem(place, profile)
         or with_another_up(place, telemetry)
-        or off_the_ground(place, profile)
+        or external_height_problem(place, profile)
         or unreachable(place, profile)
     )
 
@@ -83,7 +85,8 @@ def unreachable(place: ExternalPosition, profile: Profile) -> Problem | None:
     )
 
 
-def in_millimetres(place: ExternalPosition, profile: Profile) -> Problem | None:
+def millimetres_problem(place: ExternalPosition, profile: Profile) -> Problem | None:
+    """The external position seems to be in millimetres: off by a factor of a thousand."""
     safety, (x, y, z) = profile.safety, place.position_m
     far_m = max(abs(v) for v in place.position_m)
     on_ground = abs(z / 1000.0 - safety.ground_z_m) <= safety.ground_tolerance_m
@@ -133,7 +136,7 @@ def nearest_axis(direction: Array) -> str | None:
     return f"{'-' if direction[i] < 0 else ''}{'xyz'[i]}"
 
 
-def off_the_ground(place: ExternalPosition, profile: Profile) -> Problem | None:
+def external_height_problem(place: ExternalPosition, profile: Profile) -> Problem | None:
     """Elsewhere than where it takes off."""
     safety, z_m = profile.safety, place.position_m[2]
     if abs(z_m - safety.ground_z_m) <= safety.ground_tolerance_m:

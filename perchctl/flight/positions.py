@@ -9,9 +9,7 @@ from perchctl.errors import SafetyAbort, no_motion_capture
 from perchctl.flight.clock import Clock, wall_date
 from perchctl.flight.outside import AtRest
 from perchctl.flight.preflight import refuse_strange
-from perchctl.link.cflib_link import CflibLink
-from perchctl.link.claim import vehicle_of
-from perchctl.link.outside import check_parameters
+from perchctl.link import CflibLink, check_estimator_parameters, vehicle_uri
 from perchctl.positioning import (
     CaptureSource,
     FeedThread,
@@ -21,8 +19,7 @@ from perchctl.positioning import (
     load_comparison,
     open_capture,
 )
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, Profile
 
 STRANGE_S = 0.5
 """For so long it is looked whether positions are of another world, before they are used."""
@@ -31,7 +28,7 @@ STRANGE_S = 0.5
 def check_positioning(profile: Profile, *, simulated: bool) -> None:
     """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
     config = profile.positioning
-    check_parameters(profile.link.parameters, config)
+    check_estimator_parameters(profile.link.parameters, config)
     if config.by != "mocap":
         return
     if not simulated:
@@ -40,13 +37,13 @@ def check_positioning(profile: Profile, *, simulated: bool) -> None:
         raise no_motion_capture()
 
 
-def check_compared(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
+def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
     """Raises SafetyAbort for a capture that no hand has compared of late with this vehicle:
     that its axes are swapped does not show at rest. The simulator's own room is right as it is
     built."""
     if config.by != "mocap" or simulated:
         return
-    objected = load_comparison(config, vehicle_of(uri)).objection(wall_date())
+    objected = load_comparison(config, vehicle_uri(uri)).objection(wall_date())
     if objected is not None:
         raise SafetyAbort(": ".join(objected))
 
@@ -62,7 +59,9 @@ def opened_capture(
     return capture
 
 
-def at_hand(config: PositioningConfig, simulated: tuple[str, str] | None) -> PositioningConfig:
+def capture_for_vehicle(
+    config: PositioningConfig, simulated: tuple[str, str] | None
+) -> PositioningConfig:
     """With the capture that measures this vehicle: a simulated one's is at `simulated`, its kind
     and address, and in no lab."""
     if simulated is None:

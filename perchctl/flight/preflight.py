@@ -5,39 +5,39 @@ from __future__ import annotations
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight.criteria import (
     Problem,
-    battery_low,
-    forbidden,
-    moving,
-    not_allowed,
-    off_the_ground,
-    tilted,
-    unmeasured,
-    unsettled,
-    within_reach,
+    battery_problem,
+    forbidden_problem,
+    height_problem,
+    motion_problem,
+    not_allowed_problem,
+    tilt_problem,
+    too_near_problem,
+    unmeasured_problem,
+    unsettled_problem,
 )
-from perchctl.flight.outside import AtRest, apart, measurer, missing, strange
+from perchctl.flight.outside import AtRest, apart, measurer, missing, world_problem
 from perchctl.flight.view import not_in_view, out_of_view
 from perchctl.geometry import Place
-from perchctl.link.protocol import Link
+from perchctl.link import Link
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision.types import CameraModel, TargetEstimate
+from perchctl.vision import CameraModel, TargetEstimate
 
 
 def refuse(telemetry: Telemetry | None, profile: Profile) -> None:
     """Raises SafetyAbort for what waiting will not mend."""
     if telemetry is None:
         return
-    _refuse(forbidden(telemetry))
-    _refuse(battery_low(telemetry, profile))
+    _refuse(forbidden_problem(telemetry))
+    _refuse(battery_problem(telemetry, profile))
 
 
 def refuse_unmeasured(link: Link, profile: Profile, *, positions: bool) -> None:
     """Raises SafetyAbort where nothing would tell the vehicle its position. `positions`: those
     of the profile's motion capture are being sent."""
     if profile.positioning.by == "deck":
-        _refuse(unmeasured(link.measured_by(), profile))
+        _refuse(unmeasured_problem(link.measured_by(), profile))
     elif profile.positioning.by == "mocap" and not positions:
         raise SafetyAbort("the profile says positioning: mocap, and nothing sends positions")
 
@@ -56,14 +56,14 @@ def refuse_strange(
         return
     if now_s - telemetry.t_s + telemetry.behind_s > profile.safety.proof_age_s:
         return  # unknown: neither judged, nor is what was seen so far forgotten
-    stands = tilted(telemetry, profile) is None and moving(telemetry) is None
+    stands = tilt_problem(telemetry, profile) is None and motion_problem(telemetry) is None
     # What was sent last before a problem may have been elsewhere.
     told = status.problem is None and status.age_s <= profile.positioning.hold_s
     if stands and not told:
         return
     place = status.measured if stands else None
     if place is not None:
-        _refuse(strange(place, telemetry, profile))
+        _refuse(world_problem(place, telemetry, profile))
     if at_rest is not None:
         _refuse(at_rest.strange(place, profile))
 
@@ -98,19 +98,19 @@ def still_waiting_for(
         return _bounded(f"telemetry (the newest is {age_s:.1f} s old)", waited_s, limit_s)
     if outside is not None and not by_sight and (problem := missing(outside, profile)):
         return _bounded(f"positions of the motion capture ({problem.sentence})", waited_s, limit_s)
-    if problem := unsettled(telemetry, profile):
+    if problem := unsettled_problem(telemetry, profile):
         what = f"the state estimate to settle ({problem.found}; {problem.advice})"
         return _bounded(what, waited_s, limit_s)
     seen = None if outside is None else outside.measured
     if seen is not None and (problem := apart(seen, telemetry)):
         what = f"the state estimate to agree with {measurer(profile)} ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)
-    _refuse(off_the_ground(telemetry, profile))
-    if problem := tilted(telemetry, profile):
+    _refuse(height_problem(telemetry, profile))
+    if problem := tilt_problem(telemetry, profile):
         return _bounded(f"the vehicle to stand level (it is {problem.found})", waited_s, limit_s)
-    if problem := moving(telemetry):
+    if problem := motion_problem(telemetry):
         return _bounded(f"the vehicle to stand still ({problem.found})", waited_s, limit_s)
-    if problem := not_allowed(telemetry):
+    if problem := not_allowed_problem(telemetry):
         return _bounded(f"the supervisor to allow flight ({problem.found})", waited_s, limit_s)
     if not has_frame:
         what = f"a good picture ({camera_problem or 'none has come'})"
@@ -120,7 +120,7 @@ def still_waiting_for(
             problem = not_in_view(target, camera_problem, telemetry, profile, camera)
         what = f"a sight of the target, which measures the position ({problem.sentence})"
         return _bounded(what, waited_s, limit_s)
-    _refuse(within_reach(target))
+    _refuse(too_near_problem(target))
     return ""
 
 

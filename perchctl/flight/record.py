@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from perchctl.flight.results import FlightResult
-from perchctl.log.exact import from_exact, to_exact
+from perchctl.log import from_exact, to_exact
 
 R = TypeVar("R")
 

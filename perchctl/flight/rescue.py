@@ -8,15 +8,22 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from perchctl.flight.clock import Clock
-from perchctl.flight.history import History, extended
-from perchctl.link.protocol import Link, ToldSent, tell_nobody
-from perchctl.mission import lander
-from perchctl.mission.context import Context
-from perchctl.mission.ending import Touchdown, touchdown_of
-from perchctl.mission.felt import FeltMotion
-from perchctl.mission.lander import Finding
-from perchctl.mission.sent import Sent
-from perchctl.mission.state import Condition, Observation, Operator, PlannerState
+from perchctl.flight.history import History, add_samples
+from perchctl.link import Link, SentCallback, ignore_sent
+from perchctl.mission import (
+    Condition,
+    Context,
+    Finding,
+    Observation,
+    Operator,
+    PlannerState,
+    SentCommand,
+    Touchdown,
+    VisualInertialMotion,
+    rest_finding,
+    step_landing,
+    touchdown_of,
+)
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, EmergencyStop, Idle
 
@@ -40,8 +47,8 @@ def rescue(
     state: PlannerState | None,
     history: History,
     position_age_s: Callable[[float], float] = lambda now_s: 0.0,
-    told: ToldSent = tell_nobody,
-    felt: FeltMotion | None = None,
+    told: SentCallback = ignore_sent,
+    felt: VisualInertialMotion | None = None,
 ) -> Rescued:
     """Fly the way down without the planner, the camera and the log, bounded by the landing's
     time. Returns where the vehicle is, once its motors have been seen off.
@@ -54,7 +61,7 @@ def rescue(
     def send(command: Command) -> None:
         with suppress(Exception):  # the link may be what failed: the next one goes out all the same
             link.send(command)
-            told(Sent(clock.now(), "rescue", command))
+            told(SentCommand(clock.now(), "rescue", command))
 
     start_s, period_s = clock.now(), 1.0 / profile.link.loop_hz
     while (now_s := clock.now()) < start_s + profile.planner.landing.timeout_s:
@@ -62,7 +69,7 @@ def rescue(
             send(EmergencyStop())  # the link's guard repeats it
             return Rescued()
         with suppress(Exception):
-            history = extended(history, link.telemetry(), profile.safety)
+            history = add_samples(history, link.telemetry(), profile.safety)
         newest = history.newest
         if newest is not None:
             obs = Observation(
@@ -77,12 +84,12 @@ def rescue(
                 imu=history.imu,
                 felt=felt,
             )
-            state, command = lander.step(state or _before_take_off(obs), obs, profile)
+            state, command = step_landing(state or _before_take_off(obs), obs, profile)
             if not isinstance(command, Idle):
                 send(command)
             c = Context(state, obs, profile)
             if c.held(Condition.DOWN) >= LOOK_S:
-                found = lander.finding(c)
+                found = rest_finding(c)
                 hangs = found in (Finding.HANGS, Finding.HELD)
                 return Rescued(found, None if hangs else touchdown_of(c))
         clock.wait_until(now_s + period_s)

@@ -12,7 +12,7 @@ import numpy as np
 from perchctl.errors import SafetyAbort
 from perchctl.flight.memory import peak_memory_mb
 from perchctl.flight.rates import rate_record, rate_text
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario
 
 FlightEnd = Literal["perched", "landed", "aborted", "refused"]
 ENDS: tuple[FlightEnd, ...] = get_args(FlightEnd)
@@ -118,7 +118,7 @@ def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
     return sorted(bad, key=lambda r: (-_SEVERITY.index(r.outcome), r.seed))
 
 
-def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
+def none_took_off_text(results: Sequence[FlightResult]) -> SafetyAbort | None:
     """What a campaign says of which every flight was refused: that is no seed's doing."""
     if not results or any(r.outcome != "refused" for r in results):
         return None
@@ -144,7 +144,7 @@ def campaign_table(
     if bad:
         shown = "" if len(bad) <= worst else f", {worst} of {len(bad)}"
         lines += ["", f"worst flights{shown}"]
-        lines += aligned(
+        lines += align_columns(
             [("seed", "outcome", "miss [mm]", "time [s]", "attempts", "reason")]
             + [_cells(r) for r in bad[:worst]]
         )
@@ -153,7 +153,7 @@ def campaign_table(
     return "\n".join(lines)
 
 
-def aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+def align_columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
     """Rows of cells as lines of columns; the first row is the head."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [

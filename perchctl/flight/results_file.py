@@ -23,9 +23,7 @@ import perchctl
 from perchctl.errors import InvalidValue
 from perchctl.files import cannot_be_written, check_place
 from perchctl.flight.record import result_from, result_record
-from perchctl.log.exact import from_exact
-from perchctl.log.jsonl import decode, line_of
-from perchctl.log.setup import camera_record
+from perchctl.log import camera_record, decode_line, from_exact, json_line
 from perchctl.profile import Profile
 
 R = TypeVar("R")
@@ -115,7 +113,7 @@ class ResultsFile(Generic[R]):
         self._write({"kind": "flight", **result_record(result)})
 
     def _write(self, record: dict[str, Any]) -> None:
-        line, done = line_of(record), 0
+        line, done = json_line(record), 0
         good = os.fstat(self._fd).st_size
         try:
             while done < len(line):
@@ -183,7 +181,7 @@ def _read(
     """The newest header, the flights, and how many bytes are whole lines. `check` is asked about
     the headers before a flight is read."""
     good = data.rfind(b"\n") + 1
-    begin = line_of({"kind": "header", "format": FORMAT})[:-2]
+    begin = json_line({"kind": "header", "format": FORMAT})[:-2]
     if not data.startswith(begin[: len(data)]) or (good and not data.startswith(begin)):
         raise InvalidValue(
             f"{path} holds no campaign's results: name the file of one, or a new one"
@@ -192,7 +190,7 @@ def _read(
     flights: dict[int, R] = {}
     for number, line in enumerate(data[:good].splitlines(), start=1):
         try:
-            record = decode(line)
+            record = decode_line(line)
             what = record.pop("kind", None)
             if what == "header":
                 header = _header(record)

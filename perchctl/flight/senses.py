@@ -7,37 +7,55 @@ import zlib
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from perchctl.camera.health import MEANING, HealthState, assess
-from perchctl.camera.mirror import mirrored_note
-from perchctl.camera.source import FrameSource, check_size
+from perchctl.camera import (
+    VERDICT_TEXTS,
+    FrameSource,
+    HealthState,
+    assess_frame,
+    check_size,
+    mirrored_note,
+)
 from perchctl.flight.history import (
     History,
+    add_late_samples,
+    add_samples,
     attitude_at,
     attitude_of,
     battery_age_s,
-    belated,
-    extended,
 )
 from perchctl.flight.noticed import Noticed, noticed
 from perchctl.flight.sights import Sights
-from perchctl.mission.felt import FeltWatch, felt
-from perchctl.mission.state import Observation
-from perchctl.mission.turn import FrameSeen, PoseSeen, Taken
+from perchctl.mission import (
+    FrameSeen,
+    Observation,
+    PoseSeen,
+    TurnInputs,
+    VisualInertialWindow,
+    estimate_motion,
+)
 from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile, SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import SendPosition, Telemetry
-from perchctl.vision.consistency import Consistency, solved
-from perchctl.vision.fields import BLENDED, INTERLACED
-from perchctl.vision.own import ANOTHERS
-from perchctl.vision.tracks import surest_of
-from perchctl.vision.types import Detections, Frame, PipelineOutput, PipelineState, TargetEstimate
+from perchctl.vision import (
+    BLENDED,
+    INTERLACED,
+    OTHER_TARGET_TEXT,
+    Consistency,
+    Detections,
+    Frame,
+    PipelineOutput,
+    PipelineState,
+    TargetEstimate,
+    solve_consistency,
+    surest_pose,
+)
 
 MIRRORED_FRAMES = 5
 REMARK_PICTURES = 3
 HEARD_S = 0.15
 """A sight that is carried on by an older estimate swings the vehicle that flies by it."""
-ENDED = " has ended"
+ENDED_TEXT = " has ended"
 SENSED = (
     "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
     "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
@@ -68,7 +86,7 @@ class Senses:
     history: History = field(default_factory=History)
     state: PipelineState = field(default_factory=PipelineState)
     output: PipelineOutput | None = None
-    taken: Taken = field(default_factory=Taken)  # in this turn
+    taken: TurnInputs = field(default_factory=TurnInputs)  # in this turn
     blind: bool = False
     repeated: bool = False
     last_good_frame_s: float = -math.inf
@@ -76,7 +94,7 @@ class Senses:
     frames: int = 0
     ground_z_m: float = 0.0  # of the estimate, where the flight begins
     noticed: Noticed = field(default_factory=Noticed)
-    felt: FeltWatch = field(default_factory=FeltWatch)
+    felt: VisualInertialWindow = field(default_factory=VisualInertialWindow)
     send: SendPosition = lambda place: True
     recorded: bool = False  # the turns are: with the pictures' checksums and the present's spread
     sights: Sights | None = field(init=False, default=None)
@@ -97,13 +115,13 @@ class Senses:
         """Telemetry and at most one frame. Without `look`, at the ceiling, the frame only counts
         as a sign of the camera's life."""
         samples = self.link.telemetry()
-        self.history = extended(self.history, samples, self.profile.safety)
+        self.history = add_samples(self.history, samples, self.profile.safety)
         if self.sights is not None and self.sends_sights:
             self.sights.begin(self.history, now_s, touches=not look)
         self.output, self.blind, self.repeated = None, not look, False
         frame = self.source.poll(now_s)
         problem = self.source.problem(now_s)
-        self.taken = Taken(
+        self.taken = TurnInputs(
             tuple(samples), frame=_seen(frame), problem=problem, ended=self.source.finished,
             live=self.source.live, look=look,
         )  # fmt: skip
@@ -112,14 +130,14 @@ class Senses:
             frame = replace(frame, t_s=frame.t_s - used_s)
         if frame is None:
             if problem is None and self.source.finished:
-                problem = f"{self.source.describe()}{ENDED}"
+                problem = f"{self.source.describe()}{ENDED_TEXT}"
             if problem is not None:
                 self.camera_problem = problem
             return
         if self.frames == 0:
             check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
         rejection = problem or self._rejection(frame, now_s)
-        self.repeated = rejection == MEANING["repeated"]
+        self.repeated = rejection == VERDICT_TEXTS["repeated"]
         if rejection is not None:
             if not self.repeated:  # which says nothing new, of the camera's troubles neither
                 self.camera_problem = rejection
@@ -147,7 +165,7 @@ class Senses:
     def present(self, began_s: float, now_s: float) -> None:
         """What has arrived while camera or vision hung, since the turn of `began_s`."""
         late = self.link.telemetry()
-        self.history = belated(self.history, late, self.profile.safety)
+        self.history = add_late_samples(self.history, late, self.profile.safety)
         self.taken = replace(self.taken, late=tuple(late))
         if self.last_good_frame_s == began_s:
             self.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
@@ -182,12 +200,12 @@ class Senses:
 
     def _notice(self, output: PipelineOutput, used_s: float) -> None:
         """Latency and mounting, from a picture whose pose was taken for the target's."""
-        pose = surest_of(self.state.measured)
+        pose = surest_pose(self.state.measured)
         if pose is not None and pose.t_s == output.detections.t_s:
             T_body_cam = self.pipeline.pose.T_body_cam
             x_m, y_m, z_m = (T_body_cam[:3, :3] @ pose.tvec_m + T_body_cam[:3, 3]).tolist()
             history = self.history
-            self.felt = felt(
+            self.felt = estimate_motion(
                 self.felt, pose.t_s, (x_m, y_m, z_m), history.samples, history.imu.offset_g
             )
         if pose is None or output.target is None or not output.target.measured:
@@ -204,7 +222,7 @@ class Senses:
 
     def noticed_at_last(self) -> Consistency | None:
         """Of the whole flight; None of one that saw too little."""
-        return solved(self.noticed.sums, self._attitude_sigma_rad)
+        return solve_consistency(self.noticed.sums, self._attitude_sigma_rad)
 
     @property
     def _attitude_sigma_rad(self) -> float:
@@ -222,7 +240,7 @@ class Senses:
         for text, shown in (
             (INTERLACED, output.fields != "whole"),
             (BLENDED, output.detections.ghost_px > 0.0),
-            (ANOTHERS, output.refused),
+            (OTHER_TARGET_TEXT, output.refused),
         ):
             before = self._shown.get(text, 0)
             if before < REMARK_PICTURES:
@@ -250,7 +268,7 @@ class Senses:
         if (width, height) != (size_px := self.pipeline.camera.size_px):
             return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
         live = self.source.live
-        self._health, verdict = assess(self._health, frame, live)
+        self._health, verdict = assess_frame(self._health, frame, live)
         if self.recorded and self.taken.frame is not None:
             seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
             self.taken = replace(self.taken, frame=seen)
@@ -259,10 +277,10 @@ class Senses:
         self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
         if not verdict.usable and self._note is None:
             return verdict.text
-        return lateness(now_s - frame.t_s, self.profile.safety) if live else None
+        return lateness_text(now_s - frame.t_s, self.profile.safety) if live else None
 
 
-def lateness(age_s: float, safety: SafetyConfig) -> str | None:
+def lateness_text(age_s: float, safety: SafetyConfig) -> str | None:
     """Why a live picture of this age is no measurement."""
     return f"the picture is {age_s:.1f} s late" if age_s > safety.max_frame_age_s else None
 

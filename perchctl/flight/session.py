@@ -9,31 +9,36 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.credentials import without_password
-from perchctl.camera.open import ALLOWED, SCHEMES, is_live, open_source, scheme_of
-from perchctl.camera.source import FrameSource
+from perchctl.calibration import profile_camera
+from perchctl.camera import (
+    ALLOWED_SOURCES,
+    SCHEMES,
+    FrameSource,
+    is_live,
+    open_source,
+    scheme_of,
+    without_password,
+)
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError, no_simulator
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.loop import FlightParts, fly
 from perchctl.flight.operator import OperatorSwitch
 from perchctl.flight.positions import (
-    at_hand,
-    check_compared,
+    capture_for_vehicle,
     check_positioning,
     opened_capture,
+    require_comparison,
     started_feed,
 )
-from perchctl.link.cflib_link import CflibLink
-from perchctl.link.uri import check_uri
-from perchctl.mission.watch import Event, FlightReport, Watcher
+from perchctl.link import CflibLink, check_uri
+from perchctl.mission import Event, FlightReport, Watcher
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 if TYPE_CHECKING:
-    from perchctl.sim.process.handle import SimProcess
+    from perchctl.sim import SimProcess
 
 
 PLAIN_SEED = 11
@@ -71,7 +76,7 @@ def check_options(options: FlyOptions) -> None:
     check_positioning(options.profile, simulated=options.simulated)
     shown = without_password(options.source)
     if scheme_of(options.source) not in SCHEMES:
-        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED}")
+        raise InvalidValue(f"camera source {shown!r} is unknown; allowed are {ALLOWED_SOURCES}")
     if options.source.startswith("sim:") and not options.simulated:
         raise UsageError(
             f"source {shown} belongs to the simulated vehicle, but the URI is "
@@ -101,9 +106,9 @@ def fly_session(
     called once vehicle and camera have answered; what it raises ends the session on the ground.
     """
     check_options(options)
-    check_compared(options.profile.positioning, options.uri, simulated=options.simulated)
+    require_comparison(options.profile.positioning, options.uri, simulated=options.simulated)
     profile, switch = options.profile, switch or OperatorSwitch()
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     pipeline = make_pipeline(profile, camera)
     with contextlib.ExitStack() as stack:
         uri, spec, simulated = options.uri, options.source, None
@@ -119,7 +124,9 @@ def fly_session(
         )  # fmt: skip
         stack.callback(source.close)
         source = watch_source(source)
-        positioning = at_hand(profile.positioning, simulated.capture if simulated else None)
+        positioning = capture_for_vehicle(
+            profile.positioning, simulated.capture if simulated else None
+        )
         capture = opened_capture(stack, positioning, clock)
         link = CflibLink(uri, profile.link, clock.now, positioning=positioning)
         try:
@@ -148,10 +155,9 @@ def _teller(options: FlyOptions, clock: Clock) -> Callable[[Event], str]:
     """What the simulated scenario did, by the time at which the simulation was then."""
     if not isinstance(clock, SimulatedClock):
         return lambda event: ""
-    from perchctl.sim.draw import draw_scenario
-    from perchctl.sim.told import Teller
+    from perchctl.sim import EventExplainer, draw_scenario
 
-    tell = Teller(draw_scenario(options.profile, options.seed))
+    tell = EventExplainer(draw_scenario(options.profile, options.seed))
     return lambda event: tell(event, event.t_s - clock.zero_s)
 
 
@@ -168,8 +174,7 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
     """Started, with its camera's stream. Errors: UsageError without the simulator."""
     if find_spec("mujoco") is None:
         raise no_simulator()
-    from perchctl.sim.draw import draw_capture, draw_scenario
-    from perchctl.sim.process.handle import SimProcess
+    from perchctl.sim import SimProcess, draw_capture, draw_scenario
 
     return SimProcess.start(
         draw_scenario(options.profile, options.seed),

@@ -12,8 +12,7 @@ from perchctl.pipeline import Pipeline
 from perchctl.positioning import FeedStatus, SightFeed
 from perchctl.profile import Profile
 from perchctl.vehicle import SendPosition
-from perchctl.vision.tracks import surest_of
-from perchctl.vision.types import Measured, TargetEstimate
+from perchctl.vision import MeasuredMarkers, TargetEstimate, surest_pose
 
 CARRIED_FOR_S = 0.1
 CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06
@@ -49,9 +48,9 @@ class Sights:
         elif touches:
             self.feed.known(touching_m, now_s)
 
-    def see(self, measured: Measured, history: History, now_s: float) -> None:
+    def see(self, measured: MeasuredMarkers, history: History, now_s: float) -> None:
         """A picture. What is pressed or hangs needs none, and the last ones were of before."""
-        pose = surest_of(measured)
+        pose = surest_pose(measured)
         if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
             return
         then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)

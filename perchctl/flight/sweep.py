@@ -15,17 +15,21 @@ from perchctl.flight.compared import (
     MISS,
     NOT_PROVEN,
     Comparison,
-    compared,
-    comparison_record,
+    compare_variants,
     difference_verdict,
     success_verdict,
+    variants_record,
 )
 from perchctl.flight.rates import rate_record, rate_text
-from perchctl.flight.results import FlightResult, aligned
-from perchctl.profile import Profile
-from perchctl.profile.changed import changed, value_of
-from perchctl.profile.plain_yaml import clipped, parts_of
-from perchctl.profile.written import scalar_text
+from perchctl.flight.results import FlightResult, align_columns
+from perchctl.profile import (
+    Profile,
+    changed_profile,
+    clip_text,
+    profile_value,
+    scalar_text,
+    split_values,
+)
 
 MOST_KEYS = 2
 
@@ -57,7 +61,7 @@ class Grid:
         return ", ".join(f"{key}={text}" for key, text in texts)
 
 
-def grid_of(profile: Profile, sweeps: Sequence[str]) -> Grid:
+def sweep_grid(profile: Profile, sweeps: Sequence[str]) -> Grid:
     """Of each ``key=value,value``; the values as in a profile's file. Errors: UsageError,
     InvalidValue."""
     if len(sweeps) > MOST_KEYS:
@@ -71,10 +75,10 @@ def grid_of(profile: Profile, sweeps: Sequence[str]) -> Grid:
     cells = []
     for row in itertools.product(*texts):
         settings = [f"{key}={text}" for key, text in zip(keys, row, strict=True)]
-        swept = changed(profile, settings, "--sweep")
-        cells.append(Cell(row, swept, swept == changed(profile, ())))
+        swept = changed_profile(profile, settings, "--sweep")
+        cells.append(Cell(row, swept, swept == changed_profile(profile, ())))
     if not any(cell.own for cell in cells):
-        own = tuple(scalar_text(value_of(profile, key)) for key in keys)
+        own = tuple(scalar_text(profile_value(profile, key)) for key in keys)
         cells.append(Cell(own, profile, True))
     for one, other in itertools.combinations(cells, 2):
         if one.profile == other.profile:
@@ -85,12 +89,12 @@ def grid_of(profile: Profile, sweeps: Sequence[str]) -> Grid:
 def _split(sweep: str) -> tuple[str, tuple[str, ...]]:
     key, equals, text = sweep.partition("=")
     try:
-        parts = parts_of(text)
+        parts = split_values(text)
     except ValueError as error:
-        raise InvalidValue(f"--sweep {clipped(sweep)}: {error}") from None
+        raise InvalidValue(f"--sweep {clip_text(sweep)}: {error}") from None
     if not equals or not key.strip() or not parts:
         raise UsageError(
-            f"--sweep {clipped(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
+            f"--sweep {clip_text(sweep)} must be KEY=VALUE,VALUE with a key of the profile, as in "
             f"--sweep planner.align.xy_m=0.02,0.04"
         )
     return key.strip(), tuple(parts)
@@ -122,7 +126,7 @@ class Swept:
     against_own: Comparison | None
 
 
-def swept(grid: Grid, seeds: Sequence[tuple[FlightResult, ...]]) -> Swept:
+def sweep_results(grid: Grid, seeds: Sequence[tuple[FlightResult, ...]]) -> Swept:
     """Of each seed's flights, one a cell."""
     by_cell = list(zip(*seeds, strict=True)) or [()] * len(grid.cells)
     figures = tuple(map(_figures, by_cell))
@@ -131,7 +135,7 @@ def swept(grid: Grid, seeds: Sequence[tuple[FlightResult, ...]]) -> Swept:
     if best != grid.own:
         pairs = list(zip(by_cell[grid.own], by_cell[best], strict=True))
         names = (grid.name(grid.own), grid.name(best))
-        against = compared(names, pairs, (MISS,), times_asked=len(figures) - 1)
+        against = compare_variants(names, pairs, (MISS,), times_asked=len(figures) - 1)
     return Swept(grid, figures, best, against)
 
 
@@ -149,6 +153,7 @@ def _rank(figures: Figures) -> tuple[float, float]:
 
 
 def sweep_text(found: Swept) -> str:
+    """The table of a sweep, and the best of its values, for people."""
     return "\n".join(_lines(found))
 
 
@@ -166,7 +171,7 @@ def _lines(found: Swept) -> Iterator[str]:
                 ", ".join(notes),
             )
         )
-    yield from aligned(rows)
+    yield from align_columns(rows)
     yield ""
     yield f"best:  {grid.name(found.best)}"
     yield f"own:   {grid.name(grid.own)}"
@@ -207,7 +212,7 @@ def sweep_record(found: Swept) -> dict[str, Any]:
     grid = found.grid
     cells = [
         {
-            "values": {key: value_of(cell.profile, key) for key in grid.keys},
+            "values": {key: profile_value(cell.profile, key) for key in grid.keys},
             "own": cell.own,
             "flights": figures.flights,
             "good": figures.good,
@@ -216,7 +221,7 @@ def sweep_record(found: Swept) -> dict[str, Any]:
         }
         for cell, figures in zip(grid.cells, found.figures, strict=True)
     ]
-    against = None if found.against_own is None else comparison_record(found.against_own)
+    against = None if found.against_own is None else variants_record(found.against_own)
     return {"cells": cells, "best": cells[found.best]["values"], "best_against_own": against}
 
 

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from perchctl.flight.senses import Senses
-from perchctl.link.evidence import FRESH_S
-from perchctl.mission import planner
-from perchctl.mission.context import Context
-from perchctl.mission.ending import contact_error_of, touchdown_of
-from perchctl.mission.findings import findings_of
-from perchctl.mission.hold import unplaced
-from perchctl.mission.state import Observation, Outcome, Phase, PlannerState, Severity
-from perchctl.mission.watch import Event, EventKind, FlightReport
+from perchctl.link import FRESH_S
+from perchctl.mission import (
+    Context,
+    Event,
+    EventKind,
+    FlightReport,
+    Observation,
+    Outcome,
+    Phase,
+    PlannerState,
+    Severity,
+    contact_error_of,
+    flight_findings,
+    start_mission,
+    touchdown_of,
+    unplaced_text,
+)
 from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, is_battery_reading
 
@@ -21,7 +30,7 @@ def events_of(
     """What happened in this turn; `before` is None in the first."""
     events: list[Event] = []
     if before is None:
-        start = planner.start(obs)
+        start = start_mission(obs)
         events.append(Event(obs.t_s, EventKind.PHASE, start.reason, start.phase))
         if not is_battery_reading(obs.telemetry.battery_v):
             grace_s = profile.safety.battery_stale_s
@@ -39,7 +48,7 @@ def events_of(
         )
     elif state.stale_s == obs.t_s and before.stale_s != before.t_s and not state.hold:
         # Where it is not held for it the pilot is told all the same.
-        text = unplaced(Context(state, obs, profile))
+        text = unplaced_text(Context(state, obs, profile))
         events.append(Event(obs.t_s, EventKind.NOTE, text, state.phase))
     return events
 
@@ -58,7 +67,7 @@ def report_of(
         # The telemetry at hand is older than an emergency stop, which always locks.
         locked=obs.telemetry.has(LOCKED) or state.outcome is Outcome.EMERGENCY,
         history=passed,
-        findings=None if seen is None else findings_of(seen, camera),
+        findings=None if seen is None else flight_findings(seen, camera),
         contact=contact_error_of(c),
         touchdown=touchdown_of(c),
     )

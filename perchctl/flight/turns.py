@@ -7,9 +7,16 @@ from collections.abc import Callable, Iterable
 
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.senses import Senses
-from perchctl.mission.state import Observation, PlannerState
-from perchctl.mission.turn import Outside, Turn, TurnRole, TurnTiming
-from perchctl.mission.watch import TurnWatcher, Watcher
+from perchctl.mission import (
+    ExternalPositions,
+    Observation,
+    PlannerState,
+    Turn,
+    TurnRole,
+    TurnTiming,
+    TurnWatcher,
+    Watcher,
+)
 from perchctl.positioning import FeedStatus
 from perchctl.values import replace
 from perchctl.vehicle import Command
@@ -104,7 +111,7 @@ class Turns:
         obs: Observation,
         new: PlannerState,
         command: Command,
-        outside: Outside | None,
+        outside: ExternalPositions | None,
     ) -> Turn:
         self._undecided = self._untold = None
         return Turn(
@@ -145,7 +152,7 @@ class Turns:
             watcher.turn(turn)
 
 
-def told_of(status: FeedStatus | None) -> Outside | None:
+def told_of(status: FeedStatus | None) -> ExternalPositions | None:
     if status is None:
         return None
-    return Outside(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)
+    return ExternalPositions(status.age_s, status.problem, status.sent, status.rate_hz, status.pose)

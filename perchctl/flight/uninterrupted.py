@@ -11,7 +11,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextlib.contextmanager
-def uninterrupted() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Ctrl-C and SIGTERM wait until after the block; what is started within, processes and
     threads, never sees them."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)

@@ -9,7 +9,7 @@ from perchctl.flight.rates import rate_interval
 from perchctl.flight.results import FlightResult
 
 
-class Enough:
+class StopRule:
     """Judges flights in the order of their seeds, whichever ends first: the same seeds count
     however many fly at a time.
 

@@ -14,17 +14,17 @@ from perchctl.errors import distinct_figures
 from perchctl.flight.criteria import Problem
 from perchctl.geometry import Place, rot_z
 from perchctl.profile import Profile
-from perchctl.target.overhead import (
-    Sight,
-    aside_words,
-    overhead,
+from perchctl.target import (
+    FieldOfView,
+    TargetFromBody,
+    offset_text,
+    overhead_view,
     reach_at,
     sight_from,
 )
-from perchctl.target.visible import FieldOfView
 from perchctl.values import replace
 from perchctl.vehicle import Telemetry
-from perchctl.vision.types import CameraModel, TargetEstimate
+from perchctl.vision import CameraModel, TargetEstimate
 
 LEAN_DEG = 5.0
 """On its way up, and against a draught: nearer to the picture's edge, the target would leave it."""
@@ -45,7 +45,7 @@ def out_of_view(
             f"the target is the positioning system, and would leave the picture as the vehicle "
             f"takes off: {_too_far(over, profile, camera)} at {planner.takeoff_height_m:g} m of "
             f"height",
-            f"put the vehicle {aside_words(over.aside_m)} from where it stands, or lower "
+            f"put the vehicle {offset_text(over.aside_m)} from where it stands, or lower "
             f"planner.takeoff_height_m",
         )
     if planner.approach_xy_m is None:
@@ -64,9 +64,9 @@ def out_of_view(
     )
 
 
-def seen_at(
+def target_from(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
-) -> Sight:
+) -> TargetFromBody:
     """The target from a place in its world, the vehicle level."""
     return sight_from(
         np.array(body_m), yaw_rad, target.position_m, target.yaw_rad,
@@ -76,20 +76,20 @@ def seen_at(
 
 def _seen_leaning(
     body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
-) -> Sight:
-    """`seen_at` of a vehicle that leans so that the target goes towards the picture's edge: as if
-    it stood farther away."""
-    level = seen_at(body_m, yaw_rad, target, profile, camera)
+) -> TargetFromBody:
+    """`target_from` of a vehicle that leans so that the target goes towards the picture's edge: as
+    if it stood farther away."""
+    level = target_from(body_m, yaw_rad, target, profile, camera)
     aside_m = math.hypot(*level.aside_m)
     if not (level.whole and aside_m > 1e-9):
         return level
     away = -rot_z(yaw_rad)[:2, :2] @ np.array(level.aside_m) / aside_m
     x, y = np.array(body_m[:2]) + _leant_m(level) * away
-    leaning = seen_at((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
+    leaning = target_from((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
     return replace(level, whole=leaning.whole)
 
 
-def _leant_m(sight: Sight) -> float:
+def _leant_m(sight: TargetFromBody) -> float:
     return sight.height_m * math.tan(math.radians(LEAN_DEG))
 
 
@@ -100,7 +100,7 @@ def place_seen(target: TargetEstimate, profile: Profile) -> Place:
     return Place(feet_m + target.e_m + np.asarray(profile.vehicle.gear_body_m), target.e_yaw_rad)
 
 
-def _too_far(sight: Sight, profile: Profile, camera: CameraModel) -> str:
+def _too_far(sight: TargetFromBody, profile: Profile, camera: CameraModel) -> str:
     """How far aside it would be, and how far it might be."""
     if not sight.height_m > 0.0:
         return "it would be no higher than the camera"
@@ -133,5 +133,5 @@ def not_in_view(
     found = "it is not in view" if note is None else f"it is not in view; {note}"
     if camera is None:
         return Problem(found, "put the vehicle under it")
-    where = overhead(profile.target, camera, profile.camera.mount)
+    where = overhead_view(profile.target, camera, profile.camera.mount)
     return Problem(found, f"put the vehicle under it: {where.words}")

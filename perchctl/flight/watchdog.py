@@ -13,10 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from perchctl.flight.history import History, extended
-from perchctl.link.evidence import is_cut, is_placed
-from perchctl.mission import lander
-from perchctl.mission.state import Observation, Operator, Phase, PlannerState
+from perchctl.flight.history import History, add_samples
+from perchctl.link import is_cut, knows_its_position
+from perchctl.mission import Observation, Operator, Phase, PlannerState, step_landing
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import (
@@ -151,7 +150,7 @@ class Watchdog:
         if self._history is None:
             self._history = History((last.obs.telemetry,), imu=last.obs.imu)
         new = [*waiting, *([] if newest is None else [newest])]
-        self._history = history = extended(self._history, new, self._profile.safety)
+        self._history = history = add_samples(self._history, new, self._profile.safety)
         age_s = self._position_age_s(now_s)
         if self._profile.positioning.by == "target":  # no sight is sent without the loop
             age_s = last.obs.position_age_s + now_s - last.obs.t_s
@@ -170,12 +169,12 @@ class Watchdog:
     def _land(self, obs: Observation, last: LastTick) -> Command | None:
         """The way down, from the loop's own state on."""
         state = self._way_down or last.state
-        self._way_down, command = lander.step(state, obs, self._profile)
+        self._way_down, command = step_landing(state, obs, self._profile)
         return None if isinstance(command, Idle) else command
 
     def _hold(self, now_s: float, last: LastTick, newest: Telemetry | None) -> Command | None:
         """The last safe setpoint."""
-        known = newest if is_placed(newest, now_s) else None
+        known = newest if knows_its_position(newest, now_s) else None
         if self._held is None and known is not None:
             match last.command:
                 case RawThrust(thrust) if abs(known.velocity_mps[2]) < STILL_MPS:

@@ -1,1 +1,5 @@
 """The link to a vehicle: what a flight needs of it, by cflib or in lockstep."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

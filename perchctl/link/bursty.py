@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from perchctl.link.mock import Radio
-from perchctl.sim.bursts import Bursts, bursts_of
-from perchctl.sim.crtp.codec import Packet
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Bursts, Packet, Scenario, radio_bursts
 
 
 class BurstyRadio(Radio):
@@ -21,7 +19,7 @@ class BurstyRadio(Radio):
         return None if self._bursts.lost(now_s) else super().down(block, now_s)
 
 
-def radio_of(scenario: Scenario) -> Radio:
+def simulated_radio(scenario: Scenario) -> Radio:
     """As the scenario has it."""
-    bursts = bursts_of(scenario)
+    bursts = radio_bursts(scenario)
     return Radio() if bursts is None else BurstyRadio(bursts)

@@ -25,16 +25,15 @@ from perchctl.link.encode import (
 )
 from perchctl.link.evidence import is_known, may_fly
 from perchctl.link.log_blocks import LogBlocks
-from perchctl.link.outside import Feed, Settling, parameters_of
+from perchctl.link.outside import Feed, Settling, estimator_parameters
 from perchctl.link.prepare import check_firmware, set_parameters
-from perchctl.link.protocol import Guard, ToldSent, tell_nobody
+from perchctl.link.protocol import Guard, SentCallback, ignore_sent
 from perchctl.link.sender import HANGS_S, Sender
 from perchctl.link.uri import check_uri
 from perchctl.link.variables import measured_by
-from perchctl.mission.sent import Sent
-from perchctl.profile import LinkConfig
-from perchctl.profile.positioning import PositioningConfig
-from perchctl.sim.crtp.codec import Packet
+from perchctl.mission import SentCommand
+from perchctl.profile import LinkConfig, PositioningConfig
+from perchctl.sim import Packet
 from perchctl.vehicle import (
     ARMED,
     FLYING,
@@ -80,7 +79,7 @@ class CflibLink:
         self._blocks = LogBlocks(clock)
         self._sender: Sender | None = None
         self._guard: Guard | None = None
-        self._told: ToldSent = tell_nobody
+        self._told: SentCallback = ignore_sent
         self._lost_since_s: float | None = None  # last heard, while the link is lost
         self.connection: Connection | None = None
 
@@ -122,7 +121,7 @@ class CflibLink:
             self._clock,
         ).settle(feed)
 
-    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         self._guard, self._told = guard, told
 
     def problem(self, now_s: float) -> str | None:
@@ -166,7 +165,7 @@ class CflibLink:
         set_parameters(
             connection.cf,
             self._uri,
-            parameters_of(self._positioning),
+            estimator_parameters(self._positioning),
             needed_by="positioning from outside",
         )
         self._sender = Sender(
@@ -253,6 +252,6 @@ class CflibLink:
             connection.close()
             if linked:
                 with contextlib.suppress(Exception):  # whatever looks on
-                    self._told(Sent(at_s, "farewell", FAREWELL))
+                    self._told(SentCommand(at_s, "farewell", FAREWELL))
         else:
             connection.abandon()

@@ -13,9 +13,9 @@ import re
 import sys
 from pathlib import Path
 
-from perchctl.camera.credentials import without_password
+from perchctl.camera import without_password
 from perchctl.errors import ConnectionFailed
-from perchctl.profile.places import user_runtime_folder
+from perchctl.profile import user_runtime_folder
 
 _USUAL = ("2", "2M", "E7E7E7E7E7")  # channel, rate and address of a radio's URI that names none
 _LOCKED_BYTE = 1 << 30  # beyond the text, which others read (Windows)
@@ -38,7 +38,7 @@ class Claim:
             os.close(fd)
 
 
-def vehicle_of(uri: str) -> str:
+def vehicle_uri(uri: str) -> str:
     """The URI without what does not tell vehicles apart: a radio's dongle, case, options."""
     scheme, _, rest = uri.partition("?")[0].partition("://")
     scheme = scheme.lower()
@@ -58,7 +58,7 @@ def claim(uri: str) -> Claim | None:
     Raises ConnectionFailed, which names the program that has it.
     """
     folder = user_runtime_folder()
-    path = folder / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_of(uri)) + ".lock")
+    path = folder / (re.sub(r"[^A-Za-z0-9.]+", "_", vehicle_uri(uri)) + ".lock")
     for _ in range(_TRIES):
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -16,8 +16,8 @@ from perchctl.errors import ConnectionFailed
 from perchctl.files import cannot_be_written
 from perchctl.link.claim import Claim, claim
 from perchctl.link.uri import UDEV_HELP
-from perchctl.profile.places import user_cache_folder
-from perchctl.sim.crtp.codec import Packet
+from perchctl.profile import user_cache_folder
+from perchctl.sim import Packet
 
 CONNECT_TRIES = 2
 CLOSE_TIMEOUT_S = 3.0

@@ -12,7 +12,7 @@ import math
 import struct
 
 from perchctl.errors import InvalidValue
-from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.sim import Packet, Port
 from perchctl.vehicle import (
     Command,
     EmergencyStop,

@@ -16,7 +16,7 @@ def is_known(newest: Telemetry | None, now_s: float) -> bool:
     return newest is not None and now_s - newest.t_s <= FRESH_S
 
 
-def is_placed(newest: Telemetry | None, now_s: float) -> bool:
+def knows_its_position(newest: Telemetry | None, now_s: float) -> bool:
     """Whether its place and speed are known too: they come by a packet of their own."""
     if newest is None or now_s - newest.t_s + newest.behind_s > FRESH_S:
         return False

@@ -12,13 +12,13 @@ from typing import Any
 from perchctl.errors import NotFound, TimedOut
 from perchctl.link.assemble import BLOCKS, FAST_BLOCKS, SLOW_PERIOD_S, Assembler
 from perchctl.link.timebase import Timebase
-from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.sim import Packet, Port
 from perchctl.vehicle import Telemetry
 
 FIRST_SAMPLE_TIMEOUT_S = 3.0
 AWAIT_SLOW_S = 1.0
 """The first sample waits that long for the slow blocks."""
-FORGOTTEN_S = 1.0
+BLOCKS_DELETED_AFTER_S = 1.0
 """A vehicle that hears no radio for so long deletes its log blocks (docs/firmware.md, "Radio
 silence")."""
 RESUME_PERIOD_S = 0.25
@@ -93,7 +93,7 @@ class LogBlocks:
         now_s = self._clock()
         if not self._resuming and now_s - self._resumed_s > RESUME_PERIOD_S:
             for name, packets in self._starting.items():
-                if now_s - self._arrived_s.get(name, self._started_s) > FORGOTTEN_S:
+                if now_s - self._arrived_s.get(name, self._started_s) > BLOCKS_DELETED_AFTER_S:
                     self._resuming.extend(packets)
         if not self._resuming or not send(self._resuming[0]):
             return False

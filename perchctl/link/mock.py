@@ -22,17 +22,15 @@ from perchctl.link.encode import (
     encode,
     encode_external,
 )
-from perchctl.link.protocol import Guard, ToldSent, tell_nobody
-from perchctl.link.variables import EXTERNAL, LISTEN_S, decks_of
-from perchctl.mission.sent import Sent
-from perchctl.sim.crtp.codec import Packet
-from perchctl.sim.crtp.commands import CommandService
-from perchctl.sim.crtp.server import PROTOCOL_VERSION
+from perchctl.link.protocol import Guard, SentCallback, ignore_sent
+from perchctl.link.variables import EXTERNAL_POSITION_TICK, LISTEN_S, decks_found
+from perchctl.mission import SentCommand
+from perchctl.sim import PROTOCOL_VERSION, CommandService, Packet
 from perchctl.values import replace
 from perchctl.vehicle import FLYING, Command, ExternalPosition, MeasuredBy, Telemetry
 
 if TYPE_CHECKING:
-    from perchctl.sim.vehicle import SimulatedVehicle
+    from perchctl.sim import SimulatedVehicle
 
 TELEMETRY_DELAY_S = 0.01
 SETTLE_S = 1.0
@@ -78,7 +76,7 @@ class MockLink:
         self._arrived: list[Telemetry] = []
         self._newest: Telemetry | None = None
         self._guard: Guard | None = None
-        self._told: ToldSent = tell_nobody
+        self._told: SentCallback = ignore_sent
         self._watched_s = -math.inf
         self._turn: Callable[[float], object] = lambda now_s: None
         self._turn_due_s = self._turn_period_s = math.inf
@@ -114,19 +112,19 @@ class MockLink:
     def measured_by(self) -> MeasuredBy:
         firmware = self.vehicle.firmware
         told = {n: firmware.get_parameter(n) for n in firmware.PARAMETERS if n.startswith("deck.")}
-        by = MeasuredBy(decks_of(told))
+        by = MeasuredBy(decks_found(told))
         if by.position_decks:
             return by
-        before = firmware.log_value(EXTERNAL)
+        before = firmware.log_value(EXTERNAL_POSITION_TICK)
         self.advance_to(self.now_s + LISTEN_S)
-        return replace(by, external=firmware.log_value(EXTERNAL) != before)
+        return replace(by, external=firmware.log_value(EXTERNAL_POSITION_TICK) != before)
 
     def telemetry(self) -> list[Telemetry]:
         self._collect()
         samples, self._arrived = self._arrived, []
         return samples
 
-    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         self._guard, self._told = guard, told
 
     def _ask_guard(self) -> None:
@@ -137,7 +135,7 @@ class MockLink:
         command = self._guard.poll(self.now_s, self._newest, self._arrived)
         if command is not None:
             self.send(command)
-            self._told(Sent(self.now_s, "watchdog", command))
+            self._told(SentCommand(self.now_s, "watchdog", command))
 
     def _collect(self) -> None:
         while self._under_way and self._under_way[0][0] <= self.now_s + 1e-9:
@@ -221,7 +219,7 @@ class ScriptedLink:
         self.places.append((self.now_s, place))
         return True
 
-    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         self.watchdog, self.told = guard, told
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.calibration.mounting.recording import AttitudeSample
+from perchctl.calibration import AttitudeSample
 from perchctl.errors import NotFound, TimedOut
 from perchctl.geometry import Array
 from perchctl.link.cflib_link import SILENCE_S

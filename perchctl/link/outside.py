@@ -15,15 +15,15 @@ from typing import Any, Protocol
 
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut
 from perchctl.geometry import wrap_rad, yaw_of
-from perchctl.link.evidence import is_placed, may_fly
+from perchctl.link.evidence import knows_its_position, may_fly
 from perchctl.link.prepare import order_parameter, set_parameters
 from perchctl.positioning import FeedStatus, Placed
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.vehicle import Telemetry
 
 ESTIMATOR = "stabilizer.estimator"
 KALMAN = 2
-RESET = "kalman.resetEstimation"
+RESET_PARAMETER = "kalman.resetEstimation"
 RESETS = 3
 RESET_PULSE_S = 0.1
 AGREE_WITHIN_S, AGREE_FOR_S = 3.0, 0.5
@@ -43,7 +43,7 @@ class Feed(Protocol):
     def place(self) -> Placed | None: ...
 
 
-def parameters_of(config: PositioningConfig) -> dict[str, float]:
+def estimator_parameters(config: PositioningConfig) -> dict[str, float]:
     """What the firmware has to be set to for positions from outside; none with decks."""
     if config.by == "deck":
         return {}
@@ -54,10 +54,10 @@ def parameters_of(config: PositioningConfig) -> dict[str, float]:
     }
 
 
-def check_parameters(own: Mapping[str, float], config: PositioningConfig) -> None:
+def check_estimator_parameters(own: Mapping[str, float], config: PositioningConfig) -> None:
     """One thing is said in one place. Errors: InvalidValue where `link.parameters` says another
     than `positioning`."""
-    for name, wanted in parameters_of(config).items():
+    for name, wanted in estimator_parameters(config).items():
         if name in own and not math.isclose(own[name], wanted, rel_tol=1e-6):
             raise InvalidValue(
                 f"link.parameters sets {name} to {own[name]:g}, but with positioning: {config.by} "
@@ -134,9 +134,13 @@ class Settling:
             needed_by="positioning from outside",
         )
         # Whether it was heard shows in the estimate: the firmware may clear it by itself.
-        order_parameter(self._cf, self._uri, RESET, 1, needed_by="positioning from outside")
+        order_parameter(
+            self._cf, self._uri, RESET_PARAMETER, 1, needed_by="positioning from outside"
+        )
         self._wait(RESET_PULSE_S)
-        order_parameter(self._cf, self._uri, RESET, 0, needed_by="positioning from outside")
+        order_parameter(
+            self._cf, self._uri, RESET_PARAMETER, 0, needed_by="positioning from outside"
+        )
 
     def _agreement(self, feed: Feed, start: Placed) -> str:
         """Empty once capture and estimate agree over fresh samples of both for a while;
@@ -148,7 +152,7 @@ class Settling:
             status, placed, newest = feed.status(now_s), feed.place(), self._newest()
             if status.problem is not None or placed is None:
                 found, since_s = str(status.problem), None
-            elif newest is None or not is_placed(newest, now_s):
+            elif newest is None or not knows_its_position(newest, now_s):
                 since_s = None
             else:
                 found = _difference(placed, newest)

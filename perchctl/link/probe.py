@@ -20,7 +20,7 @@ from perchctl.link.estimate import EstimateLink
 from perchctl.link.prepare import missing_variables
 from perchctl.link.variables import has_variable, parameters, variables
 from perchctl.profile import LinkConfig
-from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.sim import Packet, Port
 from perchctl.vehicle import Telemetry
 
 ANSWER_S = 0.5

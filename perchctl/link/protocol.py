@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from perchctl.mission.sent import Sent
+from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
 
-ToldSent = Callable[[Sent], None]
+SentCallback = Callable[[SentCommand], None]
 """Given what a link sends of itself; neither waits nor raises."""
 
 
-def tell_nobody(sent: Sent) -> None:
-    return None
+def ignore_sent(sent: SentCommand) -> None:
+    """A `SentCallback` that does nothing with what was sent."""
+    return
 
 
 class Guard(Protocol):
@@ -57,7 +58,7 @@ class Link(Protocol):
     def problem(self, now_s: float) -> str | None:
         """None while the link works, otherwise one sentence with the cause."""
 
-    def guard(self, guard: Guard, told: ToldSent = tell_nobody) -> None:
+    def guard(self, guard: Guard, told: SentCallback = ignore_sent) -> None:
         """From now on ask `guard` regularly, until the link is closed. `told` is given, once it
         is on its way, each command that the link sends of itself: its guard's, an order once more
         over a link that was lost, and the farewell; from the link's own thread where it has one.

@@ -15,7 +15,7 @@ USUAL_ADDRESS = 0xE7E7E7E7E7
 
 
 @dataclass(frozen=True)
-class Answering:
+class ScanResult:
     """The URIs that answered; `radio` is why no radio was asked, empty where one was."""
 
     uris: tuple[str, ...]
@@ -31,7 +31,9 @@ def address_of(uri: str) -> int | None:
     return None if address == USUAL_ADDRESS else address
 
 
-def scan(addresses: Iterable[int | None] = (), timeout_s: float = SCAN_TIMEOUT_S) -> Answering:
+def find_vehicles(
+    addresses: Iterable[int | None] = (), timeout_s: float = SCAN_TIMEOUT_S
+) -> ScanResult:
     """What answers now at the usual address and at these; sends null packets only.
 
     A radio's driver may hang: it gets a thread, and what came by then counts.
@@ -55,7 +57,7 @@ def scan(addresses: Iterable[int | None] = (), timeout_s: float = SCAN_TIMEOUT_S
     worker.start()
     worker.join(timeout_s)
     uris = (uri for uri in dict.fromkeys(found) if uri.partition("://")[0] in FORMS)
-    return Answering(tuple(map(with_whole_address, uris)), why[0])
+    return ScanResult(tuple(map(with_whole_address, uris)), why[0])
 
 
 def _radio_problem() -> str:

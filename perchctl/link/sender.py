@@ -20,8 +20,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from perchctl.link.protocol import ToldSent, tell_nobody
-from perchctl.mission.sent import Sent, SentBy
+from perchctl.link.protocol import SentCallback, ignore_sent
+from perchctl.mission import SentBy, SentCommand
 from perchctl.vehicle import Command, EmergencyStop, PositionSetpoint, RawThrust
 
 _STREAMED = (PositionSetpoint, RawThrust)
@@ -73,7 +73,7 @@ class Sender:
         hand_over: Callable[[Any], bool | None],
         guard: Callable[[], Command | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
-        told: ToldSent = tell_nobody,
+        told: SentCallback = ignore_sent,
         *,
         pieces: Callable[[Command], Sequence[Any]] = _whole,
         tend: Callable[[float, bool], None] = lambda stuck_s, hangs: None,
@@ -230,7 +230,7 @@ class Sender:
             self._remove(waiting)
         if waiting.by is not None:
             with suppress(Exception):  # whatever looks on: the next one goes out all the same
-                self._told(Sent(at_s, waiting.by, waiting.command))
+                self._told(SentCommand(at_s, waiting.by, waiting.command))
         return 0.0
 
     def _remove(self, waiting: _Waiting) -> None:

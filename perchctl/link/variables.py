@@ -13,7 +13,7 @@ from perchctl.vehicle import MeasuredBy
 ANSWER_S = 1.5
 LISTEN_S = 1.0
 """Positions from outside that come less than once a second are none to fly by."""
-EXTERNAL = "locSrvZ.tick"
+EXTERNAL_POSITION_TICK = "locSrvZ.tick"
 """When the newest position from outside came, ms (source): steps with each of them."""
 _BLOCK_BYTES = 26
 
@@ -27,7 +27,7 @@ def parameters(cf: Any) -> dict[str, float]:
     }
 
 
-def decks_of(parameters: Mapping[str, float]) -> tuple[str, ...]:
+def decks_found(parameters: Mapping[str, float]) -> tuple[str, ...]:
     """The decks that were found at boot, by the firmware's names, sorted."""
     names = (n.removeprefix("deck.") for n, v in parameters.items() if v and n.startswith("deck."))
     return tuple(sorted(names))
@@ -35,12 +35,12 @@ def decks_of(parameters: Mapping[str, float]) -> tuple[str, ...]:
 
 def measured_by(cf: Any, wait: Callable[[float], None] = time.sleep) -> MeasuredBy:
     """What tells the vehicle where it is. Only one without a positioning deck is listened to."""
-    by = MeasuredBy(decks_of(parameters(cf)))
+    by = MeasuredBy(decks_found(parameters(cf)))
     if by.position_decks:
         return by
-    before = variables(cf, [EXTERNAL]).get(EXTERNAL)
+    before = variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
     wait(LISTEN_S)
-    after = variables(cf, [EXTERNAL]).get(EXTERNAL)
+    after = variables(cf, [EXTERNAL_POSITION_TICK]).get(EXTERNAL_POSITION_TICK)
     external = None if before is None or after is None else after != before
     return replace(by, external=external)
 

@@ -1,0 +1,5 @@
+"""The flight log and its recording: written, read, compared, drawn and exported."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

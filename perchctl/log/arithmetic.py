@@ -19,7 +19,7 @@ _SIDES = (2, 3, 4, 6, 8, 12)
 
 
 @cache
-def arithmetic() -> str:
+def arithmetic_fingerprint() -> str:
     """Eight hexadecimal digits. Where they are the same, with the same libraries, single-threaded
     results are the same to the bit: they stand for the kernels that may be chosen, and for what
     came of some small calculations."""

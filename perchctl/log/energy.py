@@ -11,12 +11,12 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.log.read import FlightLog
-from perchctl.mission.energy import (
+from perchctl.mission import (
     BatteryFit,
     EnergyState,
     charge_at,
-    fitted,
-    updated,
+    fit_battery,
+    update_energy,
     used_mah,
 )
 from perchctl.vehicle import NO_BATTERY_READING_V
@@ -39,7 +39,7 @@ class PhaseEnergy:
 
 
 @dataclass(frozen=True, eq=False)
-class EnergyStory:
+class EnergyHistory:
     """Voltages as they were read, charge by the count of the thrust.
 
     Attributes:
@@ -70,7 +70,7 @@ class EnergyStory:
         return sum(phase.duration_s for phase in self.phases)
 
 
-def energy_of(log: FlightLog) -> EnergyStory:
+def energy_history(log: FlightLog) -> EnergyHistory:
     """Fits the model to the whole flight; a log without ticks gives one without phases."""
     battery_mah, assumed = _battery_mah(log.header)
     t_s, volts = log.column("t_s"), log.column("battery_v")
@@ -82,14 +82,16 @@ def energy_of(log: FlightLog) -> EnergyStory:
     for i, record in enumerate(log.records):
         after_s = float(t_s[i + 1] - t_s[i]) if i + 1 < t_s.size else 0.0
         step_s[i] = min(max(after_s, 0.0), LONGEST_STEP_S)
-        state = updated(state, float(step_s[i]), float(volts[i]), float(thrust[i]), battery_mah)
+        state = update_energy(
+            state, float(step_s[i]), float(volts[i]), float(thrust[i]), battery_mah
+        )
         now_mah = used_mah(state, battery_mah)
         step_mah[i], before_mah = now_mah - before_mah, now_mah
         rest_v[i] = math.nan if state.rest_v is None else state.rest_v
         spent.setdefault(str(record.get("phase") or ""), []).append(i)
     known = volts[volts >= NO_BATTERY_READING_V]
     loaded = state.loaded_s > 0
-    return EnergyStory(
+    return EnergyHistory(
         battery_mah,
         assumed,
         tuple(_phase(name, at, step_s, step_mah, thrust, volts) for name, at in spent.items()),
@@ -97,7 +99,7 @@ def energy_of(log: FlightLog) -> EnergyStory:
         float(known[0]) if known.size else math.nan,
         float(known[-1]) if known.size else math.nan,
         float(known.min()) if known.size else math.nan,
-        fitted(state) if loaded else None,
+        fit_battery(state) if loaded else None,
         charge_at(state.rest_v) if loaded and state.rest_v is not None else None,
     )
 

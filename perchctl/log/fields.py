@@ -12,9 +12,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from perchctl.mission.state import BatteryOutlook
-from perchctl.mission.turn import Outside
-from perchctl.mission.watch import Event
+from perchctl.mission import BatteryOutlook, Event, ExternalPositions
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -25,8 +23,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision.consistency import Consistency
-from perchctl.vision.types import MARKERS, MarkerPose, PipelineOutput, TargetEstimate
+from perchctl.vision import MARKERS, Consistency, MarkerPose, PipelineOutput, TargetEstimate
 
 _POSE_SOURCES = {"l": "large", "s": "small", "j": "joint"}
 
@@ -181,7 +178,7 @@ def tick_record(
     telemetry_age_s: float | None = None,
     consistency: Consistency | None = None,
     delay_used_s: float = 0.0,
-    outside: Outside | None = None,
+    outside: ExternalPositions | None = None,
     battery: BatteryOutlook | None = None,
     true_position_m: tuple[float, float, float] | None = None,
     true_miss_m: float | None = None,
@@ -231,7 +228,7 @@ def _consistency_values(seen: Consistency | None) -> dict[str, Any]:
     }
 
 
-def _outside_values(outside: Outside | None) -> dict[str, Any]:
+def _outside_values(outside: ExternalPositions | None) -> dict[str, Any]:
     if outside is None:
         return {}
     values: dict[str, Any] = {

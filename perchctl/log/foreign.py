@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from perchctl.log.place import beside
+from perchctl.log.place import path_beside
 
 SUFFIX = ".jsonl"
 KINDS = ("tick", "turn", "sent", "event", "summary", "recording")
@@ -69,7 +69,7 @@ def _is_binary(data: bytes) -> bool:
 
 def _remedy(path: Path) -> str:
     """The log that lies beside a plot or a table of it, where there is one."""
-    log = beside(path, SUFFIX)
+    log = path_beside(path, SUFFIX)
     if log != path and log.is_file():
         return f"its flight's log is {log}"
     return f"logs are the {SUFFIX} files in the profile's log.directory"

@@ -28,7 +28,7 @@ class Frames:
     gaps_s: Array
 
 
-def frames_of(log: FlightLog) -> Frames:
+def log_frames(log: FlightLog) -> Frames:
     """The frames of a flight; what is a gap, the median period says."""
     taken = [record for record in log.records if record.get("frame_t_s") is not None]
     times_s = log.since(np.array([record["frame_t_s"] for record in taken], dtype=np.float64))

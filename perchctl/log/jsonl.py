@@ -49,16 +49,16 @@ def encode(record: Mapping[str, Any]) -> bytes:
 
     Top-level keys whose value is None are left out.
     """
-    return line_of({k: v for k, v in to_plain(record).items() if v is not None})
+    return json_line({k: v for k, v in to_plain(record).items() if v is not None})
 
 
-def line_of(plain: Mapping[str, Any]) -> bytes:
+def json_line(plain: Mapping[str, Any]) -> bytes:
     """JSON's own types as one line; no number is rounded."""
     text = json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return text.encode("utf-8", errors="backslashreplace") + b"\n"
 
 
-def decode(line: bytes) -> dict[str, Any]:
+def decode_line(line: bytes) -> dict[str, Any]:
     """Inverse of `encode`; ValueError for anything that is not one JSON object."""
     try:
         record = json.loads(line.decode("utf-8"), parse_constant=_refuse_constant)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.log.frames import frames_of
+from perchctl.log.frames import log_frames
 from perchctl.log.read import FlightLog, PhaseSpan
-from perchctl.log.summary import summary_of
+from perchctl.log.summary import summarise_flight
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 SETTLED_S = 1.0
@@ -70,7 +70,7 @@ class Held:
 
 def measures_of(log: FlightLog) -> Measures:
     """Errors: InvalidValue for a field that is not a number."""
-    end = summary_of(log)
+    end = summarise_flight(log)
     battery_v = log.column("battery_v")
     battery_v = battery_v[battery_v >= NO_BATTERY_READING_V]
     found = end.findings
@@ -142,7 +142,7 @@ def _settled(log: FlightLog) -> dict[str, Any]:
 
 
 def _frames(log: FlightLog) -> dict[str, Any]:
-    frames = frames_of(log)
+    frames = log_frames(log)
     times_s = np.sort(np.concatenate([frames.seen_s, frames.unseen_s]))
     periods_s = np.diff(times_s)
     misfits_px = log.column("j_rms_px")

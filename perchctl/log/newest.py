@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.errors import NotFound, PerchError
-from perchctl.log.jsonl import decode
+from perchctl.log.jsonl import decode_line
 from perchctl.log.read import READABLE_VERSIONS, FlightLog, read_log
-from perchctl.log.summary import FlightSummary, summary_of
+from perchctl.log.summary import FlightSummary, summarise_flight
 
 SUFFIXES = (".jsonl", ".jsonl.gz")
 _BEGIN = b'{"kind":"header","format":"perchctl-flight-log"'
@@ -60,14 +60,14 @@ def newest_logs(folder: Path, most: int | None = None) -> list[Path]:
     return logs
 
 
-def listed(path: Path) -> Listed:
+def list_log(path: Path) -> Listed:
     """A log's header and end. Never raises for a file that is bad."""
     try:
         quick = _from_both_ends(path)
         if quick is not None:
             return quick
         log = read_log(path)
-        return Listed(path, log.header, summary_of(log))
+        return Listed(path, log.header, summarise_flight(log))
     except PerchError as error:
         return Listed(path, {}, None, str(error).removeprefix(f"{path}: "))
     except (TypeError, ValueError) as error:
@@ -81,16 +81,16 @@ def _from_both_ends(path: Path) -> Listed | None:
             first = stream.readline()
             stream.seek(max(len(first), os.fstat(stream.fileno()).st_size - _TAIL_BYTES))
             last = stream.read().splitlines()[-2:]
-        header, end = decode(first), decode(last[-1])
+        header, end = decode_line(first), decode_line(last[-1])
         if end.get("kind") == "recording":
-            end = decode(last[0]) | {k: v for k, v in end.items() if k != "kind"}
+            end = decode_line(last[0]) | {k: v for k, v in end.items() if k != "kind"}
     except (OSError, ValueError, IndexError):
         return None
     if end.get("kind") != "summary" or not first.startswith(_BEGIN):
         return None
     if header.get("version") not in READABLE_VERSIONS:
         return None
-    return Listed(path, header, summary_of(FlightLog(path, header, [], [], end, False)))
+    return Listed(path, header, summarise_flight(FlightLog(path, header, [], [], end, False)))
 
 
 def _is_log(path: Path) -> bool:

@@ -15,7 +15,7 @@ PACKED = ".gz"
 _ELSEWHERE = "name another folder with --log-dir, or in the profile (log.directory)"
 
 
-def beside(log: Path | str, suffix: str) -> Path:
+def path_beside(log: Path | str, suffix: str) -> Path:
     """The file of a log's name with another ending, such as ``.png``; of a packed log, too."""
     path = Path(log)
     whole = path.with_suffix("") if path.suffix == PACKED else path
@@ -46,7 +46,7 @@ def new_file(path: Path, none_beside: tuple[str, ...] = ()) -> tuple[Path, int]:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_BINARY", 0)
     for number in count(1):
         free = path if number == 1 else path.with_stem(f"{path.stem}_{number}")
-        if any(beside(free, suffix).exists() for suffix in none_beside):
+        if any(path_beside(free, suffix).exists() for suffix in none_beside):
             continue
         with suppress(FileExistsError):
             return free, os.open(free, flags, 0o644)

@@ -15,9 +15,9 @@ from matplotlib.patches import Rectangle
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.log.frames import Frames, frames_of
+from perchctl.log.frames import Frames, log_frames
 from perchctl.log.read import FlightLog
-from perchctl.log.summary import FlightSummary, summary_of
+from perchctl.log.summary import FlightSummary, summarise_flight
 from perchctl.plot import (
     BLACK,
     BLUE,
@@ -61,7 +61,7 @@ def plot_flight(log: FlightLog, path: Path | str) -> None:
     for ax, (name, unit, scale, label) in zip(axes[1:5], (*AXES, YAW), strict=True):
         _plot_raw_and_filtered(ax, log, t_s, f"{name}_{unit}", scale, label)
     axes[1].legend(handles=_track_legend(), loc="best", ncols=5, fontsize=8)
-    frames = frames_of(log)
+    frames = log_frames(log)
     _plot_frames(axes[5], frames)
     _plot_height(axes[6], log, t_s)
     _plot_power(axes[7], log, t_s)
@@ -78,7 +78,7 @@ def plot_flight(log: FlightLog, path: Path | str) -> None:
     for ax in (axes[-1], last_ax):
         ax.set_xlabel("time [s]")
     figure.align_ylabels([*axes, last_ax])
-    figure.suptitle(fill(title_of(log, summary_of(log)), TITLE_COLUMNS), fontsize=12)
+    figure.suptitle(fill(title_of(log, summarise_flight(log)), TITLE_COLUMNS), fontsize=12)
     save_figure(figure, Path(path))
 
 

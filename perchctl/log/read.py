@@ -19,12 +19,11 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
 from perchctl.log.fields import FIELDS
 from perchctl.log.foreign import KINDS, why_no_log
-from perchctl.log.jsonl import decode
+from perchctl.log.jsonl import decode_line
 from perchctl.log.sent import Takeover, sent_of, takeovers_of
 from perchctl.log.turn import turn_of
 from perchctl.log.write import FORMAT, SCHEMA_VERSION
-from perchctl.mission.sent import Sent
-from perchctl.mission.turn import Turn
+from perchctl.mission import SentCommand, Turn
 
 READABLE_VERSIONS = (1, 2, 3, SCHEMA_VERSION)
 """1 knew no `tracked` and no events of several fields; its missing values read None. 2 knew no
@@ -77,7 +76,7 @@ class FlightLog:
         return [turn_of(record) for record in self.turn_records]
 
     @cached_property
-    def sent(self) -> list[Sent]:
+    def sent(self) -> list[SentCommand]:
         """What was sent in the loop's place; empty before version 4. Errors: InvalidValue."""
         return [sent_of(record) for record in self.sent_records]
 
@@ -139,7 +138,7 @@ def read_log(path: Path | str) -> FlightLog:
     ignored = 0
     for number, line in enumerate(lines[1:], start=2):
         try:
-            record = _checked(decode(line))
+            record = _checked(decode_line(line))
         except ValueError as error:
             bad = bad or (number, str(error))
             ignored += len(line)
@@ -167,7 +166,7 @@ def read_log(path: Path | str) -> FlightLog:
 
 
 @contextlib.contextmanager
-def values_of(path: Path) -> Iterator[None]:
+def log_values(path: Path) -> Iterator[None]:
     """Around what works with the values of a log: one that is of no flight raises InvalidValue."""
     try:
         yield
@@ -223,7 +222,7 @@ def _header(path: Path, lines: list[bytes]) -> dict[str, Any]:
             f"{path}: line 1: the file is empty: nothing was recorded, or it was lost in copying"
         )
     try:
-        header = decode(lines[0])
+        header = decode_line(lines[0])
     except ValueError:
         header = {}
     if header.get("kind") != "header" or header.get("format") != FORMAT:

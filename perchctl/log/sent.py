@@ -9,8 +9,8 @@ from typing import Any
 from perchctl.errors import InvalidValue
 from perchctl.log.exact import from_exact, to_exact
 from perchctl.log.fields import command_values
-from perchctl.log.jsonl import line_of
-from perchctl.mission.sent import Sent, SentBy
+from perchctl.log.jsonl import json_line
+from perchctl.mission import SentBy, SentCommand
 
 SENT_NOTE = (
     "records of kind sent: a command that went to the vehicle in the loop's place, not rounded: "
@@ -28,15 +28,15 @@ _TELLS = {
 }
 
 
-def sent_line(sent: Sent) -> bytes:
+def sent_line(sent: SentCommand) -> bytes:
     """One line of the log."""
-    return line_of({"kind": "sent", **to_exact(sent)})
+    return json_line({"kind": "sent", **to_exact(sent)})
 
 
-def sent_of(record: Mapping[str, Any]) -> Sent:
+def sent_of(record: Mapping[str, Any]) -> SentCommand:
     """Back to the same bits. Errors: InvalidValue."""
     try:
-        return from_exact(Sent, {k: v for k, v in record.items() if k != "kind"})
+        return from_exact(SentCommand, {k: v for k, v in record.items() if k != "kind"})
     except ValueError as error:
         raise InvalidValue(
             f"the log's record of what was sent at {record.get('t_s', '?')} s cannot be read "
@@ -44,7 +44,7 @@ def sent_of(record: Mapping[str, Any]) -> Sent:
         ) from None
 
 
-def sent_values(sent: Sent) -> dict[str, Any]:
+def sent_values(sent: SentCommand) -> dict[str, Any]:
     """By the names of a tick's fields (`perchctl.log.fields.FIELDS`), and ``by``."""
     return {"t_s": sent.t_s, "by": sent.by, **command_values(sent.command)}
 
@@ -65,9 +65,9 @@ class Takeover:
         return ", ".join(f"{_TELLS[name]} ({count})" for name, count in self.sent)
 
 
-def takeovers_of(sent: Sequence[Sent]) -> tuple[Takeover, ...]:
+def takeovers_of(sent: Sequence[SentCommand]) -> tuple[Takeover, ...]:
     """In order."""
-    goes: list[list[Sent]] = []
+    goes: list[list[SentCommand]] = []
     for each in sorted(sent, key=lambda one: one.t_s):
         last = goes[-1][-1] if goes else None
         if last is None or last.by != each.by or each.t_s - last.t_s > APART_S:
@@ -76,7 +76,7 @@ def takeovers_of(sent: Sequence[Sent]) -> tuple[Takeover, ...]:
     return tuple(_takeover(go) for go in goes)
 
 
-def _takeover(go: Sequence[Sent]) -> Takeover:
+def _takeover(go: Sequence[SentCommand]) -> Takeover:
     names = [str(command_values(each.command)["cmd"]) for each in go]
     counted = tuple((name, names.count(name)) for name in dict.fromkeys(names))
     return Takeover(go[0].by, go[0].t_s, go[-1].t_s, counted)

@@ -18,21 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, PerchError
-from perchctl.log.arithmetic import arithmetic
+from perchctl.log.arithmetic import arithmetic_fingerprint
 from perchctl.log.exact import from_exact, to_exact
-from perchctl.profile import Profile
-from perchctl.profile.load import first_fault
-from perchctl.profile.mask import read_mask
-from perchctl.vision.types import CameraModel
+from perchctl.profile import Profile, first_invalid_key, read_mask
+from perchctl.vision import CameraModel
 
 
 def camera_record(profile: Profile) -> dict[str, Any]:
     """``camera``, the calibration, and ``mask``, what the gear covers in it; of a file that
     cannot be read, nothing: that is the flight's to say."""
     with contextlib.suppress(PerchError):
-        camera = camera_of(profile.camera)
+        camera = profile_camera(profile.camera)
         record = {"camera": to_exact(camera)}
         if profile.camera.mask is not None:
             record["mask"] = _packed(read_mask(profile.camera.mask, camera.size_px))
@@ -49,12 +47,12 @@ def computer_record() -> dict[str, Any]:
             "python": platform.python_version(),
             "numpy": np.__version__,
             "opencv": cv2.__version__,
-            "arithmetic": arithmetic(),
+            "arithmetic": arithmetic_fingerprint(),
         }
     }
 
 
-def other_computer(header: Mapping[str, Any]) -> str:
+def computer_differences(header: Mapping[str, Any]) -> str:
     """In what the flight's differed from this one, in words; empty where it did not, or where
     the log does not say."""
     was, here = header.get("computer"), computer_record()["computer"]
@@ -67,19 +65,19 @@ def other_computer(header: Mapping[str, Any]) -> str:
     )
 
 
-def profile_of(header: Mapping[str, Any]) -> Profile:
+def flown_profile(header: Mapping[str, Any]) -> Profile:
     """The profile that was flown, but for passwords. Errors: InvalidValue."""
     try:
         return Profile.model_validate(header.get("profile"))
     except ValidationError as error:
-        key, text = first_fault(error)
+        key, text = first_invalid_key(error)
         raise InvalidValue(
             f"the log's profile cannot be used by this version of perchctl: {key or 'profile'}: "
             f"{text}"
         ) from None
 
 
-def camera_in(header: Mapping[str, Any]) -> CameraModel | None:
+def flown_camera(header: Mapping[str, Any]) -> CameraModel | None:
     """The calibration that was flown; None in a log that has none. Errors: InvalidValue."""
     if header.get("camera") is None:
         return None
@@ -89,7 +87,7 @@ def camera_in(header: Mapping[str, Any]) -> CameraModel | None:
         raise InvalidValue(f"the log's header holds no calibration: camera: {error}") from None
 
 
-def mask_in(header: Mapping[str, Any], camera: CameraModel) -> NDArray[np.bool_] | None:
+def flown_mask(header: Mapping[str, Any], camera: CameraModel) -> NDArray[np.bool_] | None:
     """(height, width), True where the gear covers; None without a mask. Errors: InvalidValue."""
     text = header.get("mask")
     if text is None:

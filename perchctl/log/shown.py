@@ -11,7 +11,7 @@ from typing import Any
 from perchctl.log.measures import Held, Measures, holds_of, measures_of, shown
 from perchctl.log.newest import Listed
 from perchctl.log.read import FlightLog, PhaseSpan
-from perchctl.log.summary import summary_of, summary_text
+from perchctl.log.summary import summarise_flight, summary_text
 
 COLUMNS = 79
 _HANG = 11
@@ -71,7 +71,7 @@ def show_record(log: FlightLog) -> dict[str, Any]:
 
 
 def _end_record(log: FlightLog) -> dict[str, Any]:
-    end = summary_of(log)
+    end = summarise_flight(log)
     record = end.as_record()
     return {
         key: record.get(key)
@@ -121,6 +121,7 @@ def list_lines(logs: Sequence[Listed]) -> Iterator[str]:
 
 
 def list_record(each: Listed) -> dict[str, Any]:
+    """The heading of a log as JSON's own types."""
     end = each.summary
     return {
         "log": str(each.path),
@@ -157,7 +158,7 @@ def row_of(log: FlightLog, span: PhaseSpan) -> str | None:
 
 def _head(log: FlightLog) -> Iterator[str]:
     """The lines that `fly` ends with, but for the phases, which come as a table."""
-    end = replace(summary_of(log), phases=(), battery_min_v=None)
+    end = replace(summarise_flight(log), phases=(), battery_min_v=None)
     first, *others = summary_text(end).splitlines()
     yield from wrap(plain(first), COLUMNS, subsequent_indent="  ")
     for line in others:

@@ -11,8 +11,7 @@ import numpy as np
 
 from perchctl.log.read import FlightLog, PhaseSpan
 from perchctl.log.recording.end import RecordingEnd
-from perchctl.mission.ending import ContactError, Touchdown
-from perchctl.mission.findings import Findings, latency_text, turn_text
+from perchctl.mission import ContactError, Findings, Touchdown, latency_text, turn_text
 from perchctl.vehicle import NO_BATTERY_READING_V
 
 
@@ -144,7 +143,7 @@ def findings_lines(found: Findings) -> list[str]:
     ]
 
 
-def summary_of(log: FlightLog) -> FlightSummary:
+def summarise_flight(log: FlightLog) -> FlightSummary:
     """From the log's summary record; from its ticks where that is missing."""
     phases = log.phases
     battery_v = log.column("battery_v")
@@ -188,7 +187,7 @@ def summary_text(flight: FlightSummary | FlightLog, log_path: Path | None = None
     if isinstance(flight, FlightLog):
         if flight.ignored_bytes:
             faults.append(f"log lost:  its tail, {flight.ignored_bytes} unreadable bytes")
-        flight = summary_of(flight)
+        flight = summarise_flight(flight)
     if flight.lost_records:
         faults.insert(0, f"log lost:  {flight.lost_records} records ({flight.log_problem})")
     elif flight.log_problem is not None:

@@ -9,8 +9,8 @@ from typing import Any
 
 from perchctl.errors import InvalidValue
 from perchctl.log.exact import from_exact, to_exact
-from perchctl.log.jsonl import line_of
-from perchctl.mission.turn import Turn
+from perchctl.log.jsonl import json_line
+from perchctl.mission import Turn
 
 TURN_NOTE = (
     "records of kind turn: all that a turn of the loop took in, knew and decided, not rounded; "
@@ -24,7 +24,7 @@ def turn_line(turn: Turn) -> bytes:
     obs, samples = turn.observation, turn.taken.late or turn.taken.samples
     if obs is not None and samples and obs.telemetry is samples[-1]:
         del record["observation"]["telemetry"]  # it stands in the same line already
-    return line_of(record)
+    return json_line(record)
 
 
 def turn_of(record: dict[str, Any]) -> Turn:

@@ -9,17 +9,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from perchctl.camera.source import FrameSource, WatchedSource
+from perchctl.camera import FrameSource, WatchedSource
 from perchctl.log.fields import event_record, tick_record
 from perchctl.log.place import log_path
 from perchctl.log.read import PhaseSpan
-from perchctl.log.recording.place import SUFFIX, recording_of
+from perchctl.log.recording.place import SUFFIX, recording_path
 from perchctl.log.sent import sent_values
 from perchctl.log.summary import FlightSummary, recording_values
 from perchctl.log.write import FlightLogWriter, make_header
-from perchctl.mission.sent import Sent
-from perchctl.mission.turn import Turn
-from perchctl.mission.watch import Event, FlightReport, Tick
+from perchctl.mission import Event, FlightReport, SentCommand, Tick, Turn
 from perchctl.profile import Profile
 from perchctl.vehicle import NO_BATTERY_READING_V
 
@@ -82,7 +80,7 @@ class LogWatcher:
         from perchctl.log.recording.recorder import Recorder
 
         try:
-            return cls(writer, Recorder.open(recording_of(writer.path), header, profile, live))
+            return cls(writer, Recorder.open(recording_path(writer.path), header, profile, live))
         except BaseException:
             writer.close()
             writer.path.unlink(missing_ok=True)
@@ -126,7 +124,7 @@ class LogWatcher:
         """One without a tick."""
         self.writer.turn(turn)
 
-    def sent(self, sent: Sent) -> None:
+    def sent(self, sent: SentCommand) -> None:
         """From any thread: it goes to those that write, and waits for none of them."""
         self.writer.sent(sent)
         if self._recorder is not None:

@@ -22,19 +22,17 @@ from pathlib import Path
 from typing import Any
 
 import perchctl
-from perchctl.camera.credentials import profile_record, without_password
+from perchctl.camera import profile_record, without_password
 from perchctl.errors import InvalidValue
 from perchctl.log.behind import Behind
 from perchctl.log.exact import to_exact
 from perchctl.log.fields import EVENT_FIELDS, FIELDS, event_record
-from perchctl.log.jsonl import encode, line_of
+from perchctl.log.jsonl import encode, json_line
 from perchctl.log.place import cannot_start, make_log_folder, new_file
 from perchctl.log.sent import SENT_NOTE, sent_line
 from perchctl.log.setup import camera_record, computer_record
 from perchctl.log.turn import TURN_NOTE, turn_line
-from perchctl.mission.sent import Sent
-from perchctl.mission.turn import Turn
-from perchctl.mission.watch import Event
+from perchctl.mission import Event, SentCommand, Turn
 from perchctl.profile import Profile
 
 FORMAT = "perchctl-flight-log"
@@ -49,7 +47,7 @@ TURNS_SHARE = 0.8
 """Of the queue, beyond which turns are dropped: what is left is for ticks and events."""
 DEFAULT_LOOP_HZ = 50.0
 NO_ANSWER = "the disk does not answer: the flight log lacks its end"
-_Record = Mapping[str, Any] | Turn | Sent
+_Record = Mapping[str, Any] | Turn | SentCommand
 
 
 def make_header(
@@ -165,7 +163,7 @@ class FlightLogWriter:
         """Append a whole turn, exactly (`perchctl.log.turn`). Never raises."""
         self._put(turn, turn.t_s)
 
-    def sent(self, sent: Sent) -> None:
+    def sent(self, sent: SentCommand) -> None:
         """Append what was sent in the loop's place, exactly (`perchctl.log.sent`); from any
         thread. Never raises."""
         self._put(sent, sent.t_s)
@@ -308,14 +306,14 @@ class FlightLogWriter:
 
 def _header_line(header: Mapping[str, Any]) -> bytes:
     """A replay flies by the profile in it: its numbers are not rounded."""
-    return line_of(to_exact({k: v for k, v in header.items() if v is not None}))
+    return json_line(to_exact({k: v for k, v in header.items() if v is not None}))
 
 
 def _line_of(record: _Record) -> bytes:
     match record:
         case Turn():
             return turn_line(record)
-        case Sent():
+        case SentCommand():
             return sent_line(record)
         case _:
             return encode(record)

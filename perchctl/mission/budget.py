@@ -18,7 +18,7 @@ from perchctl.mission.energy import (
     Floor,
     left_s,
     loaded_v,
-    updated,
+    update_energy,
     used_mah,
 )
 from perchctl.mission.state import BatteryOutlook, Phase
@@ -52,7 +52,7 @@ def watched(c: Context) -> EnergyState:
     tel = c.obs.telemetry
     reading_v = tel.battery_v if c.obs.battery_age_s <= FRESH_S else math.nan
     dt_s = max(0.0, c.obs.t_s - c.state.t_s)
-    return updated(c.state.energy, dt_s, reading_v, tel.thrust, c.profile.vehicle.battery_mah)
+    return update_energy(c.state.energy, dt_s, reading_v, tel.thrust, c.profile.vehicle.battery_mah)
 
 
 def outlook(c: Context) -> BatteryOutlook:

@@ -94,7 +94,7 @@ class Floor:
     press_load: float = 1.0
 
 
-def updated(
+def update_energy(
     state: EnergyState, dt_s: float, battery_v: float, thrust: float, battery_mah: float
 ) -> EnergyState:
     """The state after `dt_s` under a commanded thrust 0..65535.
@@ -124,12 +124,12 @@ def updated(
             fit=_summed(state, dt_s, battery_v),
             loaded_s=state.loaded_s + dt_s,
         )
-    now_v = battery_v + fitted(state).sag_v * state.load
+    now_v = battery_v + fit_battery(state).sag_v * state.load
     rest_v = now_v if state.rest_v is None else _towards(state.rest_v, now_v, dt_s / SMOOTH_S)
     return replace(state, rest_v=rest_v)
 
 
-def fitted(state: EnergyState) -> BatteryFit:
+def fit_battery(state: EnergyState) -> BatteryFit:
     """What the readings say, around what is usual, within what can be."""
     a, b, c, p, q = state.fit
     a += SAG_WITHIN_V**-2
@@ -149,7 +149,7 @@ def left_s(
     load = hover_load or state.mean_load
     if state.rest_v is None or state.loaded_s < LEAST_LOADED_S or not load > 0.0:
         return None
-    fit = fitted(state)
+    fit = fit_battery(state)
     press_load = max(load, floor.press_load)
     end_v = max(floor.hover_v + fit.sag_v * load, floor.press_v + fit.sag_v * press_load)
     share = charge_at(state.rest_v) - charge_at(end_v)
@@ -160,7 +160,7 @@ def loaded_v(state: EnergyState, load: float) -> float | None:
     """The voltage under a share of the full thrust, now; None where nothing tells it."""
     if state.rest_v is None:
         return None
-    return state.rest_v - fitted(state).sag_v * load
+    return state.rest_v - fit_battery(state).sag_v * load
 
 
 def used_mah(state: EnergyState, battery_mah: float) -> float:
@@ -187,7 +187,10 @@ def _counted(state: EnergyState, dt_s: float, battery_mah: float) -> EnergyState
     state = replace(state, unknown_s=state.unknown_s + dt_s)
     if state.rest_v is None:
         return state
-    share = charge_at(state.rest_v) - fitted(state).hunger * state.load * _per_s(battery_mah) * dt_s
+    share = (
+        charge_at(state.rest_v)
+        - fit_battery(state).hunger * state.load * _per_s(battery_mah) * dt_s
+    )
     return replace(state, rest_v=resting_v(share))
 
 

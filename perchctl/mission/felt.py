@@ -49,7 +49,7 @@ class Mismatch:
 
 
 @dataclass(frozen=True)
-class FeltMotion:
+class VisualInertialMotion:
     """The vehicle's motion by pictures and accelerometer, world axes: its speed sideways at `t_s`,
     by how much the accelerometer and the attitude give too much there, and its vertical speed; None
     where the delay that it rests on may be over, which a place that hardly changes does not tell.
@@ -62,7 +62,7 @@ class FeltMotion:
 
 
 @dataclass(frozen=True)
-class FeltWatch:
+class VisualInertialWindow:
     """`sights` of the last `WINDOW_S`, each its time and the way from body to target in body
     axes, m. `found`: the newest judgement, made at `found_s`, and `agreed`: how many in a row say
     the same. Once enough agree, it stays. `motion`: the newest in which the sum wandered by at most
@@ -73,7 +73,7 @@ class FeltWatch:
     found: Mismatch | None = None
     found_s: float = -math.inf
     agreed: int = 0
-    motion: FeltMotion | None = None
+    motion: VisualInertialMotion | None = None
     motion_within_m: float = WANDERS_M
 
     @property
@@ -81,15 +81,19 @@ class FeltWatch:
         return self.found if self.agreed >= AGREED else None
 
 
-def begun_anew(old: FeltWatch) -> FeltWatch:
+def drop_sights(old: VisualInertialWindow) -> VisualInertialWindow:
     """The watch after wrong positions have turned the attitude: the sights from before go, and what
     they leave turned is better felt roughly than not at all."""
     return replace(old, sights=(), motion_within_m=ROUGH_M)
 
 
-def felt(
-    old: FeltWatch, t_s: float, way_m: Vector, samples: tuple[Telemetry, ...], offset_g: Vector
-) -> FeltWatch:
+def estimate_motion(
+    old: VisualInertialWindow,
+    t_s: float,
+    way_m: Vector,
+    samples: tuple[Telemetry, ...],
+    offset_g: Vector,
+) -> VisualInertialWindow:
     """With one more sight. `samples`: the telemetry of the last 2 s, oldest first; `offset_g`: what
     the accelerometer reads too much."""
     kept = tuple(s for s in old.sights if t_s - WINDOW_S <= s[0] < t_s)
@@ -107,7 +111,9 @@ def felt(
     if wanders_m[i] <= new.motion_within_m:
         (vx, vy, vz), (bx, by, _) = velocity_mps[:, i].tolist(), bias_mps2[:, i].tolist()
         climb_mps = vz if t_s - new.found_s <= WINDOW_S else None
-        new = replace(new, motion=FeltMotion(samples[-1].t_s, (vx, vy), (bx, by), climb_mps))
+        new = replace(
+            new, motion=VisualInertialMotion(samples[-1].t_s, (vx, vy), (bx, by), climb_mps)
+        )
     return replace(new, judged_s=t_s)
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from perchctl.profile import CameraConfig
-from perchctl.profile.vision import USED_LATENCY_S
+from perchctl.profile import USED_LATENCY_S, CameraConfig
 from perchctl.values import replace
-from perchctl.vision.consistency import Consistency
+from perchctl.vision import Consistency
 
 SURE = 1.96
 """Standard deviations on both sides of a 95 % interval."""
@@ -32,7 +31,7 @@ class Findings:
     advice: tuple[str, ...] = ()
 
 
-def findings_of(seen: Consistency, camera: CameraConfig) -> Findings:
+def flight_findings(seen: Consistency, camera: CameraConfig) -> Findings:
     """The flight's findings against the profile that was flown."""
     x, y, z = (math.degrees(turn) for turn in seen.turn_rad)
     sx, sy, sz = (math.degrees(sigma) for sigma in seen.turn_sigma_rad)

@@ -14,7 +14,7 @@ from perchctl.mission.conditions import (
     touched_aside_m,
 )
 from perchctl.mission.context import HANGING_S, Context
-from perchctl.mission.hold import unplaced
+from perchctl.mission.hold import unplaced_text
 from perchctl.mission.imu import PUSHED_S
 from perchctl.mission.mounting import explained
 from perchctl.mission.state import Condition, Phase
@@ -280,7 +280,7 @@ def why_contact(c: Context) -> str:
     aside_m, sigma_m = contact_aside_m(c)
     by = "position, acceleration and thrust"
     if not c.placed:
-        by = f"acceleration and thrust, {unplaced(c)}"
+        by = f"acceleration and thrust, {unplaced_text(c)}"
     text = f"contact proven by {by}; {1e3 * aside_m:.1f} +- {1e3 * sigma_m:.1f} mm off centre"
     if c.height_m >= CATCHABLE_M:
         return text
@@ -305,7 +305,7 @@ def why_pressed_blindly(c: Context) -> str:
 
 
 def why_unplaced(c: Context) -> str:
-    return f"{unplaced(c)}; down level, by thrust alone"
+    return f"{unplaced_text(c)}; down level, by thrust alone"
 
 
 def why_astray(c: Context) -> str:

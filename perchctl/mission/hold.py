@@ -9,7 +9,7 @@ from perchctl.mission.state import Phase
 from perchctl.values import replace
 from perchctl.vehicle import PositionSetpoint
 
-NO_PICTURE = "no picture for"
+NO_PICTURE_TEXT = "no picture for"
 UNCORRECTED = "the estimate's variance only grows; is the positioning system gone?"
 BLIND_VARIANCE_M2 = 0.02
 """Passed about 3 s after the last sight (docs/firmware.md, "Target as position")."""
@@ -21,7 +21,7 @@ def hold_reason(c: Context) -> str:
     safety = c.profile.safety
     # A take-off goes on, on what is known; without a position nothing is.
     if c.state.phase in _HOLDABLE | {Phase.APPROACH} and is_unplaced(c):
-        return unplaced(c)
+        return unplaced_text(c)
     if c.state.phase not in _HOLDABLE:
         return ""
     if c.telemetry_age_s > safety.telemetry_hold_s:
@@ -33,7 +33,7 @@ def hold_reason(c: Context) -> str:
     if c.obs.loop_late_s > safety.loop_late_hold_s:
         return f"the control loop is {c.obs.loop_late_s:.1f} s late"
     if c.state.phase in _CAMERA_PHASES and c.obs.camera_age_s > safety.camera_hold_s:
-        return c.obs.camera_problem or f"{NO_PICTURE} {c.obs.camera_age_s:.1f} s"
+        return c.obs.camera_problem or f"{NO_PICTURE_TEXT} {c.obs.camera_age_s:.1f} s"
     return ""
 
 
@@ -61,7 +61,7 @@ def sinking(c: Context, setpoint: PositionSetpoint) -> PositionSetpoint:
     return replace(setpoint, z_m=max(lowest_m, z_m))
 
 
-def unplaced(c: Context) -> str:
+def unplaced_text(c: Context) -> str:
     """For how long none was sent, and why."""
     if c.is_blown:
         return "pushed aside while the target was not seen"

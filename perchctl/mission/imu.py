@@ -208,7 +208,7 @@ class ImuMotion:
         return max(0.0, self.place_frozen_s - self.frozen_s)
 
 
-def moved(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
+def integrate_imu(motion: ImuMotion, last: Telemetry | None, new: Telemetry) -> ImuMotion:
     """The motion with one more sample; `last` is the one before, None at the first."""
     dt_s = math.inf if last is None else new.t_s - last.t_s
     off_s = min(motion.off_s, new.t_s) if new.thrust < 1 else math.inf

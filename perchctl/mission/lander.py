@@ -192,7 +192,9 @@ what is in the air falls with it."""
 LEVEL_SPARE_S, UNHEARD_SPARE_S, LEVEL_MEAN_MPS = 2.0, 0.8, 0.35
 
 
-def step(state: PlannerState, obs: Observation, profile: Profile) -> tuple[PlannerState, Command]:
+def step_landing(
+    state: PlannerState, obs: Observation, profile: Profile
+) -> tuple[PlannerState, Command]:
     """One tick of the way down without the mission's table: for who lands in the loop's place."""
     state = observed(begun(state, obs, profile), obs, profile)
     state = replace(state, since=conditions_since(Context(state, obs, profile)))
@@ -298,7 +300,7 @@ def stage_of(c: Context) -> Stage:
     return Stage.ORDERED if c.state.orders else Stage.DOWN
 
 
-def finding(c: Context) -> Finding:
+def rest_finding(c: Context) -> Finding:
     """Where the vehicle is, once its motors are off.
 
     What was within the magnet's reach and has not fallen since hangs, as long as no silence of

@@ -44,7 +44,7 @@ HOVER_WITHIN = 0.2
 _LEARNING = (Phase.ESTIMATE, Phase.ALIGN, Phase.ASCEND)
 
 
-def start(obs: Observation) -> PlannerState:
+def start_mission(obs: Observation) -> PlannerState:
     """A planner on the ground, before take-off."""
     tel = obs.telemetry
     return PlannerState(
@@ -58,7 +58,7 @@ def start(obs: Observation) -> PlannerState:
     )
 
 
-def step(
+def step_mission(
     state: PlannerState, obs: Observation, profile: Profile, table: tuple[Row, ...] = TABLE
 ) -> tuple[PlannerState, Command]:
     """One tick of the mission."""
@@ -71,7 +71,8 @@ def step(
     return replace(lander.ordered(new, command), t_s=obs.t_s), command
 
 
-def is_over(state: PlannerState) -> bool:
+def is_mission_over(state: PlannerState) -> bool:
+    """True once the mission is in a phase that it never leaves."""
     return state.phase in TERMINALS
 
 

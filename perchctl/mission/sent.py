@@ -11,7 +11,7 @@ SentBy = Literal["watchdog", "rescue", "reconnect", "farewell"]
 
 
 @dataclass(frozen=True)
-class Sent:
+class SentCommand:
     """One that no turn of the loop decided. Handed to the link at `t_s`, on the loop's clock: as
     of any packet, whether it arrives is not known.
 

@@ -8,11 +8,11 @@ from enum import Enum, IntEnum
 
 from perchctl.geometry import Array
 from perchctl.mission.energy import EnergyState
-from perchctl.mission.felt import FeltMotion, Mismatch
+from perchctl.mission.felt import Mismatch, VisualInertialMotion
 from perchctl.mission.imu import ImuMotion, Reckoning
 from perchctl.mission.mounting import MountWatch
 from perchctl.vehicle import PositionSetpoint, Telemetry
-from perchctl.vision.types import TargetEstimate
+from perchctl.vision import TargetEstimate
 
 
 class Phase(Enum):
@@ -34,7 +34,7 @@ class Phase(Enum):
     ABORTED = "ABORTED"
 
 
-SEVEN = (
+SEVEN_PHASES = (
     Phase.APPROACH,
     Phase.SEARCH,
     Phase.ESTIMATE,
@@ -43,7 +43,7 @@ SEVEN = (
     Phase.PERCH,
     Phase.COMPLETE,
 )
-FLYING_PHASES = frozenset({*SEVEN, Phase.RECOVER})
+FLYING_PHASES = frozenset({*SEVEN_PHASES, Phase.RECOVER})
 TERMINALS = frozenset({Phase.PERCHED, Phase.LANDED, Phase.ABORTED})
 
 
@@ -158,7 +158,7 @@ class Observation:
     position_age_s: float = 0.0
     position_problem: str | None = None
     imu: ImuMotion = field(default_factory=ImuMotion)
-    felt: FeltMotion | None = None
+    felt: VisualInertialMotion | None = None
     mismatch: Mismatch | None = None
 
 

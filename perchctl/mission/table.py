@@ -37,8 +37,8 @@ from perchctl.mission.lander import (
     HELD,
     LOOKED_S,
     Finding,
-    finding,
     hangs_where_it_did,
+    rest_finding,
     why_fell_unseen,
     why_landed,
     why_unknown,
@@ -224,16 +224,16 @@ TABLE: tuple[Row, ...] = (
     # --- landing ---------------------------------------------------------------
     Row(
         "hung", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.HANGS, P.PERCHED,
+        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.HANGS, P.PERCHED,
         "hanging with the motors off",
     ),
     Row(
         "landed", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.STANDS, P.LANDED, why_landed,
+        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.STANDS, P.LANDED, why_landed,
     ),
     Row(
         "held-elsewhere", only(P.LANDING),
-        lambda c: c.held(C.DOWN) >= 0.1 and finding(c) is Finding.HELD, P.ABORTED,
+        lambda c: c.held(C.DOWN) >= 0.1 and rest_finding(c) is Finding.HELD, P.ABORTED,
         "motors off; something holds it where its estimate has no target: look before you touch it",
         S.LAND, O.SAFETY,
     ),

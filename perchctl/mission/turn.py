@@ -11,13 +11,13 @@ from typing import Literal
 from perchctl.geometry import Array
 from perchctl.mission.state import Observation, Outcome, Phase
 from perchctl.vehicle import Command, ExternalPosition, Telemetry
-from perchctl.vision.types import PictureKind
+from perchctl.vision import PictureKind
 
 TurnRole = Literal["waiting", "redone", "flown", "failed"]
 
 
 @dataclass(frozen=True)
-class Outside:
+class ExternalPositions:
     """Positions from outside, as the vehicle is handed them: how old the newest is, why none is
     sent now (None while they are), how many were sent, and how many a second, and the newest."""
 
@@ -42,7 +42,7 @@ class FrameSeen:
 
 
 @dataclass(frozen=True)
-class Taken:
+class TurnInputs:
     """What link and camera gave in one turn.
 
     Attributes:
@@ -105,7 +105,7 @@ class Turn:
     role: TurnRole
     began_s: float
     t_s: float
-    taken: Taken
+    taken: TurnInputs
     poses: dict[str, PoseSeen] = field(default_factory=dict)
     observation: Observation | None = None
     command: Command | None = None
@@ -113,7 +113,7 @@ class Turn:
     row: str = ""
     held: bool = False
     attempts: int = 0
-    outside: Outside | None = None
+    outside: ExternalPositions | None = None
     timing: TurnTiming | None = None
     outcome: Outcome | None = None
     reason: str | None = None

@@ -8,15 +8,16 @@ from typing import Protocol, runtime_checkable
 
 from perchctl.mission.ending import ContactError, Touchdown
 from perchctl.mission.findings import Findings
-from perchctl.mission.sent import Sent
+from perchctl.mission.sent import SentCommand
 from perchctl.mission.state import Outcome, Phase, PlannerState, Severity
-from perchctl.mission.turn import Outside, Turn
+from perchctl.mission.turn import ExternalPositions, Turn
 from perchctl.vehicle import Command, Telemetry
-from perchctl.vision.consistency import Consistency
-from perchctl.vision.types import PipelineOutput, TargetEstimate
+from perchctl.vision import Consistency, PipelineOutput, TargetEstimate
 
 
 class EventKind(Enum):
+    """What happened: a phase was entered, the vehicle is held, or something to note."""
+
     PHASE = "phase"  # a phase was entered
     HOLD = "hold"  # the vehicle is held in place
     NOTE = "note"  # something worth a line
@@ -69,7 +70,7 @@ class Tick:
     telemetry_age_s: float
     consistency: Consistency | None = None
     delay_used_s: float = 0.0
-    outside: Outside | None = None
+    outside: ExternalPositions | None = None
     turn: Turn | None = None
 
 
@@ -96,7 +97,7 @@ class TurnWatcher(Watcher, Protocol):
 class SentWatcher(Watcher, Protocol):
     """One that is told of what was sent in the loop's place, too."""
 
-    def sent(self, sent: Sent) -> None:
+    def sent(self, sent: SentCommand) -> None:
         """Called by whoever sent it, in its own thread: must neither wait nor raise."""
 
 

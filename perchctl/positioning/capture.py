@@ -24,7 +24,7 @@ from perchctl.errors import (
 )
 from perchctl.positioning.child import Arrived, CaptureSetup, Connected, Failed, NotLoaded
 from perchctl.positioning.types import BodyPose, CaptureFrame
-from perchctl.profile.positioning import CAPTURE_SYSTEMS, PositioningConfig, host_fault
+from perchctl.profile import CAPTURE_SYSTEMS, PositioningConfig, host_fault
 
 SILENT_S = 0.3
 KEPT = 64

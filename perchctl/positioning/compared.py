@@ -19,8 +19,7 @@ from pathlib import Path
 
 from perchctl.errors import InvalidValue
 from perchctl.files import write_files
-from perchctl.profile.places import user_state_folder
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, user_state_folder
 
 VALID_S = 24 * 3600.0
 AHEAD_S = 60.0
@@ -34,7 +33,7 @@ AGAIN = "run perchctl check --lift, lift the vehicle and turn it by hand"
 @dataclass(frozen=True)
 class SetUp:
     """What a comparison is true of: another vehicle, capture, body or turn of its axes is another
-    one. `vehicle`: as `perchctl.link.claim.vehicle_of` has it."""
+    one. `vehicle`: as `perchctl.link.claim.vehicle_uri` has it."""
 
     vehicle: str
     system: str

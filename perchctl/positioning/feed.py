@@ -18,7 +18,7 @@ import numpy as np
 
 from perchctl.positioning.judge import Judge, Placed
 from perchctl.positioning.types import CaptureSource
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition, SendPosition
 
 QUIET_S = 0.1

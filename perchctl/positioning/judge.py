@@ -20,7 +20,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.positioning.types import BodyPose, CaptureFrame
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 
 STALE_S = 0.05

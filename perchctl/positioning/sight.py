@@ -24,9 +24,15 @@ from perchctl.positioning.feed import RATE_OVER_S, UNSEEN, FeedStatus
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import ExternalPosition, SendPosition
-from perchctl.vision.places import to_level, to_world
-from perchctl.vision.pose import PoseSetup, level_rotation
-from perchctl.vision.types import Attitude, MarkerPose, TargetEstimate
+from perchctl.vision import (
+    Attitude,
+    MarkerPose,
+    PoseSetup,
+    TargetEstimate,
+    level_rotation,
+    to_level,
+    to_world,
+)
 
 GROUND_FRAMES = 15
 """From rest, half a second of a camera of 30 Hz: their median is where the target is."""

@@ -8,13 +8,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.profile.load import first_fault
-from perchctl.profile.plain_yaml import clipped, parse_yaml
+from perchctl.profile.load import first_invalid_key
+from perchctl.profile.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.schema import Profile
 from perchctl.profile.simulation import in_world
 
 
-def changed(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
+def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--set") -> Profile:
     """With each ``key=value``, such as ``planner.align.xy_m=0.03``; the value as in a profile's
     file. `option` is where they were given. Errors: UsageError (of another form), InvalidValue."""
     settings = sorted(settings, key=_is_world, reverse=True)  # keys win over a world, whatever
@@ -23,7 +23,7 @@ def changed(profile: Profile, settings: Iterable[str], option: str = "--set") ->
         key, equals, text = setting.partition("=")
         if not equals or not key.strip():
             raise UsageError(
-                f"{option} {clipped(setting)} must be KEY=VALUE with a key of the profile, as in "
+                f"{option} {clip_text(setting)} must be KEY=VALUE with a key of the profile, as in "
                 f"{option} planner.align.xy_m=0.03"
             )
         try:
@@ -32,13 +32,15 @@ def changed(profile: Profile, settings: Iterable[str], option: str = "--set") ->
                 world = in_world(profile.simulation, str(parse_yaml(text)))
                 values["simulation"] = world.model_dump(mode="json")
         except ValidationError as error:
-            raise InvalidValue(f"{option} {clipped(setting)}: {first_fault(error)[1]}") from None
+            raise InvalidValue(
+                f"{option} {clip_text(setting)}: {first_invalid_key(error)[1]}"
+            ) from None
         except ValueError as error:
-            raise InvalidValue(f"{option} {clipped(setting)}: {error}") from None
+            raise InvalidValue(f"{option} {clip_text(setting)}: {error}") from None
     try:
         return Profile.model_validate(values)
     except ValidationError as error:
-        key, text = first_fault(error)
+        key, text = first_invalid_key(error)
         raise InvalidValue(f"{option}: {key or 'profile'}: {text}") from None
 
 
@@ -46,7 +48,7 @@ def _is_world(setting: str) -> bool:
     return setting.partition("=")[0].strip() == "simulation.set"
 
 
-def value_of(profile: Profile, dotted: str) -> Any:
+def profile_value(profile: Profile, dotted: str) -> Any:
     """What the profile has at that key, in JSON's types; None where it has none."""
     value: Any = profile.model_dump(mode="json")
     for name in dotted.split("."):

@@ -16,7 +16,7 @@ def dictionary_names() -> tuple[str, ...]:
 
 
 @cache
-def predefined(name: str) -> Any:
+def aruco_dictionary(name: str) -> Any:
     """The cv2.aruco dictionary of that name; ValueError names the choices."""
     if name not in dictionary_names():
         raise ValueError(
@@ -25,15 +25,15 @@ def predefined(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def id_count(name: str) -> int:
+def dictionary_size(name: str) -> int:
     """How many ids the dictionary holds (0 .. count - 1)."""
-    return int(predefined(name).bytesList.shape[0])
+    return int(aruco_dictionary(name).bytesList.shape[0])
 
 
 def is_one_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool:
     """Whether both are the same black and white cells, at any turn: ``DICT_4X4_50`` holds the
     first ids of ``DICT_4X4_1000``."""
-    one, two = predefined(name), predefined(other)
+    one, two = aruco_dictionary(name), aruco_dictionary(other)
     if one.markerSize != two.markerSize:
         return False
     turns = two.bytesList[other_id].reshape(4, -1)  # a row for each quarter turn
@@ -43,14 +43,14 @@ def is_one_pattern(name: str, marker_id: int, other: str, other_id: int) -> bool
 
 def check_marker_id(name: str, marker_id: int) -> None:
     """Raises ValueError when the id is outside its dictionary, with what would hold it."""
-    count = id_count(name)
+    count = dictionary_size(name)
     if marker_id < count:
         return
     hint = ""
     match = re.fullmatch(r"(DICT_\d+X\d+)_\d+", name)
     if match:
         family = [n for n in dictionary_names() if n.startswith(match.group(1) + "_")]
-        larger = sorted((id_count(n), n) for n in family if id_count(n) > marker_id)
+        larger = sorted((dictionary_size(n), n) for n in family if dictionary_size(n) > marker_id)
         if larger:
             hint = f"; {larger[0][1]} holds it"
     raise ValueError(f"id {marker_id} is outside {name}, which holds 0..{count - 1}{hint}")

@@ -47,7 +47,7 @@ def writable_profile(name: str) -> Path:
     return path
 
 
-def write_values(path: Path, values: Mapping[str, Value]) -> Path:
+def write_profile_values(path: Path, values: Mapping[str, Value]) -> Path:
     """Put the values into the file, by their dotted keys; returns the file that keeps the old
     text, beside it, for the same eyes only.
 

@@ -63,7 +63,7 @@ class Key:
 
     @property
     def unit(self) -> str:
-        return unit_of(self.path)
+        return key_unit(self.path)
 
     @property
     def meaning(self) -> str:
@@ -71,7 +71,7 @@ class Key:
         return str(self.field.description or "")
 
 
-def unit_of(path: str) -> str:
+def key_unit(path: str) -> str:
     """By the last of a key's words; empty where it has no unit."""
     name = path.rpartition(".")[2]
     endings = (name.split("_", n)[-1] for n in range(1, name.count("_") + 1))

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
-from perchctl.profile.keys import unit_of
+from perchctl.profile.keys import key_unit
 
-REACHED = 0.8
+REACHED_SHARE = 0.8
 """Of the take-off height: from here on it counts as reached (`Condition.AT_TAKEOFF_HEIGHT`)."""
 
 
@@ -66,7 +66,7 @@ class Limit:
             return named
         if not self.words:
             return f"{named}, together {values[0]:.3g},"
-        unit = unit_of(self.right) if isinstance(self.right, str) else ""
+        unit = key_unit(self.right) if isinstance(self.right, str) else ""
         return f"{named} is {f'{values[0]:.3g} {unit}'.strip()}, and"
 
     def _values(self, profile: Any) -> tuple[float, float] | None:
@@ -85,7 +85,7 @@ def _value(profile: Any, side: str | float) -> Any:
 def _named(profile: Any, side: str | float, units: bool = False) -> str:
     if not isinstance(side, str):
         return f"{side:g}"
-    unit = unit_of(side) if units else ""
+    unit = key_unit(side) if units else ""
     return f"{side} ({f'{_value(profile, side):g} {unit}'.strip()})"
 
 
@@ -101,8 +101,8 @@ IMPOSSIBLE: tuple[Limit, ...] = (
     Limit(
         ("planner.takeoff_height_m", "planner.takeoff_speed_mps"), "planner.approach_timeout_s",
         "the take-off takes longer than it is waited for",
-        of=lambda height_m, speed_mps: REACHED * height_m / speed_mps,
-        words=f"the climb to {REACHED:g} of {{0}} at {{1}}",
+        of=lambda height_m, speed_mps: REACHED_SHARE * height_m / speed_mps,
+        words=f"the climb to {REACHED_SHARE:g} of {{0}} at {{1}}",
     ),
     Limit(
         ("camera.latency_s",), "safety.max_frame_age_s",

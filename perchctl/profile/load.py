@@ -15,8 +15,8 @@ from pydantic import BaseModel, ValidationError
 from perchctl.errors import InvalidValue, NotFound, ProfileNote
 from perchctl.profile.merge import FittedWeights
 from perchctl.profile.old_keys import with_present_keys
-from perchctl.profile.places import data_file, data_folder, listing
-from perchctl.profile.plain_yaml import clipped, parse_yaml
+from perchctl.profile.places import data_file, data_folder, file_names
+from perchctl.profile.plain_yaml import clip_text, parse_yaml
 from perchctl.profile.schema import Profile
 
 _NAMED_FILES = (
@@ -27,14 +27,14 @@ _NAMED_FILES = (
 """Section and key of what names a file, and the data folder that may hold it by its name."""
 
 
-def is_path(name: str) -> bool:
+def is_profile_path(name: str) -> bool:
     """Whether a profile is named by its file, not by its name alone."""
     return "/" in name or name.endswith((".yaml", ".yml"))
 
 
 def find_profile(name: str) -> Path:
     """The file of a profile given by path or by name; NotFound names the choices."""
-    if is_path(name):
+    if is_profile_path(name):
         path = Path(name).expanduser()
         if path.is_file():
             return path
@@ -109,13 +109,13 @@ def find_calibration(name: str) -> Path:
     if found is None:
         raise NotFound(
             f"calibration file {name} not found; give a path, or one of "
-            f"{', '.join(listing('calib')) or 'none (' + str(data_folder('calib')) + ' is empty)'}"
+            + (", ".join(file_names("calib")) or f"none ({data_folder('calib')} is empty)")
         )
     return found
 
 
 def _choices() -> str:
-    return ", ".join(listing("profiles"))
+    return ", ".join(file_names("profiles"))
 
 
 def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
     if not isinstance(base_name, str):
         raise InvalidValue(f"{path}: extends: must be the name or path of a profile")
     beside = path.parent / Path(base_name).expanduser()
-    by_path = beside.is_file() or is_path(base_name)
+    by_path = beside.is_file() or is_profile_path(base_name)
     try:
         base = find_profile(str(beside.absolute()) if by_path else base_name)
     except NotFound as error:
@@ -207,31 +207,31 @@ _COUNTS = ("tuple_type", "too_long", "missing")
 
 
 def _one_sentence(path: Path, error: ValidationError, model: type[BaseModel] = Profile) -> str:
-    key, text = first_fault(error, model)
+    key, text = first_invalid_key(error, model)
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return f"{path}: {key or 'profile'}: {text}{more}"
 
 
-def first_fault(error: ValidationError, model: type[BaseModel] = Profile) -> tuple[str, str]:
+def first_invalid_key(error: ValidationError, model: type[BaseModel] = Profile) -> tuple[str, str]:
     """The key of the first fault that was found in values of `model`, empty where it is of no
     single one, and what is wrong."""
     first = error.errors(include_url=False)[0]
-    key = clipped(".".join(str(part) for part in first["loc"]))
+    key = clip_text(".".join(str(part) for part in first["loc"]))
     count = _numbers_at(model, first["loc"]) if first["type"] in _COUNTS else 0
     if first["type"] == "extra_forbidden":
         above = first["loc"][:-1]
         keys = _keys_at(above) if above else ["extends", *_keys_at(above)]
         text = f"this key is unknown; allowed here are {', '.join(keys)}"
     elif first["type"] == "value_error":
-        text = clipped(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
+        text = clip_text(str(first["ctx"]["error"]), _MOST_OF_A_FAULT)
     elif first["type"] == "model_type":
-        found = clipped(repr(first["input"]))
+        found = clip_text(repr(first["input"]))
         text = f"must hold keys and values, found {found}; give some, or remove it"
     elif count:
-        key = clipped(".".join(part for part in first["loc"] if isinstance(part, str)))
-        text = f"needed are {count} numbers, found {clipped(repr(first['input']))}"
+        key = clip_text(".".join(part for part in first["loc"] if isinstance(part, str)))
+        text = f"needed are {count} numbers, found {clip_text(repr(first['input']))}"
     else:
-        found = clipped(repr(first["input"]))
+        found = clip_text(repr(first["input"]))
         text = f"{first['msg'][:1].lower()}{first['msg'][1:]}, found {found}"
         names = [part for part in first["loc"] if isinstance(part, str)]
         if names and names[-1].endswith("_m") and first["type"] in _BOUNDS:

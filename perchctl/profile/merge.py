@@ -10,6 +10,8 @@ from perchctl.profile.base import Section
 
 
 class WeightsConfig(Section):
+    """The paper's weights: the large marker's share in each axis and in yaw."""
+
     x: float = Field(
         0.275, ge=0, le=1, description="the large marker's share; the small one has the rest"
     )
@@ -19,6 +21,8 @@ class WeightsConfig(Section):
 
 
 class MergeConfig(Section):
+    """The profile's `merge`: how the two markers become one estimate."""
+
     method: Literal["weights", "joint"] = Field(
         "joint", description="the paper's weights, or both markers solved as one"
     )
@@ -53,7 +57,7 @@ class FittedData(BaseModel):
 
 
 class FittedWeights(BaseModel):
-    """A weights file, as far as a flight needs it (`perchctl.weights.write_weights` writes more)."""
+    """A weights file, as far as a flight needs it (`perchctl.weights` writes more)."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 

@@ -12,7 +12,7 @@ import math
 from perchctl.geometry import Array
 from perchctl.profile.vision import Mounting
 
-EDGES: dict[str, tuple[int, int]] = {
+PICTURE_EDGES: dict[str, tuple[int, int]] = {
     "top": (0, -1),
     "right": (1, 0),
     "bottom": (0, 1),
@@ -24,16 +24,16 @@ UPRIGHT = math.cos(math.radians(30.0))
 
 def edges_beside(front: str) -> tuple[str, str]:
     """Where the vehicle's left side can be: first in a picture that is not mirrored."""
-    x, y = EDGES[front]
-    plain = next(edge for edge, place in EDGES.items() if place == (-y, x))
-    mirrored = next(edge for edge, place in EDGES.items() if place == (y, -x))
+    x, y = PICTURE_EDGES[front]
+    plain = next(edge for edge, place in PICTURE_EDGES.items() if place == (-y, x))
+    mirrored = next(edge for edge, place in PICTURE_EDGES.items() if place == (y, -x))
     return plain, mirrored
 
 
 def mount_from_edges(front: str, left: str) -> tuple[float, bool]:
     """The last of `camera.mount.rpy_deg` for a camera that looks up, and whether its picture is
     mirrored. `left` is one of `edges_beside(front)`."""
-    x, y = EDGES[front]
+    x, y = PICTURE_EDGES[front]
     mirrored = left == edges_beside(front)[1]
     if mirrored:
         x = -x  # of the picture as it is flipped before use
@@ -42,7 +42,7 @@ def mount_from_edges(front: str, left: str) -> tuple[float, bool]:
     return (180.0 if turn_deg == -180.0 else turn_deg + 0.0), mirrored
 
 
-def edges_of(mount: Mounting, mirrored: bool) -> tuple[str, str] | None:
+def picture_edges(mount: Mounting, mirrored: bool) -> tuple[str, str] | None:
     """Front and left side in the picture as the camera gives it; None for a camera that does not
     look up, or is turned by about an eighth of a circle."""
     R_cam_body = mount.T_body_cam[:3, :3].T
@@ -54,4 +54,6 @@ def edges_of(mount: Mounting, mirrored: bool) -> tuple[str, str] | None:
 
 def _edge(direction: Array, mirrored: bool) -> str | None:
     x, y = (-direction[0] if mirrored else direction[0]), direction[1]
-    return next((e for e, place in EDGES.items() if x * place[0] + y * place[1] >= UPRIGHT), None)
+    return next(
+        (e for e, place in PICTURE_EDGES.items() if x * place[0] + y * place[1] >= UPRIGHT), None
+    )

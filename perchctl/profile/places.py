@@ -25,13 +25,14 @@ def data_file(kind: str, name: str) -> Path | None:
     return None
 
 
-def listing(kind: str) -> list[str]:
+def file_names(kind: str) -> list[str]:
     """Names of the files of that kind that can be named without a path."""
     folders = (data_folder(kind), user_config_folder() / kind)
     return sorted({p.stem for f in folders if f.is_dir() for p in f.glob("*.yaml")})
 
 
 def user_config_folder() -> Path:
+    """For the user's own profiles and calibrations, by the XDG rules."""
     return Path(platformdirs.user_config_dir("perchctl", appauthor=False))
 
 
@@ -43,6 +44,7 @@ def user_runtime_folder() -> Path:
 
 
 def user_cache_folder() -> Path:
+    """For what can be made anew, by the XDG rules."""
     return Path(platformdirs.user_cache_dir("perchctl", appauthor=False))
 
 

@@ -30,16 +30,16 @@ def parse_yaml(text: str) -> Any:
         return loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise ValueError(f"line {line}: not YAML: {clipped(str(error.problem))}") from None
+        raise ValueError(f"line {line}: not YAML: {clip_text(str(error.problem))}") from None
     except yaml.YAMLError as error:
         raise ValueError(f"not a text file in YAML ({error.__class__.__name__})") from None
     except RecursionError:
         raise ValueError("values are nested too deeply to be read") from None
     except (ValueError, OverflowError) as error:
-        raise ValueError(clipped(str(error), 200)) from None
+        raise ValueError(clip_text(str(error), 200)) from None
 
 
-def parts_of(text: str) -> list[str]:
+def split_values(text: str) -> list[str]:
     """The texts of values that commas stand between, as in a list: a value may be a list itself.
     Raises ValueError as `parse_yaml` does."""
     row = f"[{text}]"
@@ -49,7 +49,7 @@ def parts_of(text: str) -> list[str]:
     return [row[part.start_mark.index : part.end_mark.index].strip() for part in node.value]
 
 
-def clipped(text: str, most: int = _MOST_SHOWN) -> str:
+def clip_text(text: str, most: int = _MOST_SHOWN) -> str:
     """The text, or its beginning where it is longer than anybody reads."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
@@ -88,7 +88,7 @@ def _refuse_twice(node: yaml.MappingNode) -> None:
         name = (key.tag, key.value)
         if name in first:
             raise ValueError(
-                f"line {_line(key)}: key {clipped(key.value)} is there twice, first in line "
+                f"line {_line(key)}: key {clip_text(key.value)} is there twice, first in line "
                 f"{first[name]}: keep one"
             )
         first[name] = _line(key)

@@ -31,6 +31,8 @@ from perchctl.profile.vision import (
 
 
 class LinkConfig(Section):
+    """The profile's `link`: URI, telemetry and firmware parameters."""
+
     uri: str = Field("sim://", description="`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
     connect_timeout_s: float = Field(15.0, gt=0, le=120, description="for both tries together")
     parameters: dict[str, int | float] = Field(

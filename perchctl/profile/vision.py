@@ -13,7 +13,7 @@ from pydantic import Field, field_validator, model_validator
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile.base import BodyVector3, Section, Vector3
 from perchctl.profile.dictionaries import check_marker_id, is_one_pattern
-from perchctl.profile.plain_yaml import clipped
+from perchctl.profile.plain_yaml import clip_text
 
 _FORMAT = "^[A-Z0-9]{3,4}$"
 
@@ -71,6 +71,8 @@ picture is so late that the target is not to be steered by."""
 
 
 class CameraConfig(Section):
+    """The profile's `camera`: source, calibration, latency, mounting."""
+
     source: str = Field(
         "sim:",
         description="`camera:N` or its name, `rtsp://...`, `http://...`, `aideck://HOST`, "
@@ -131,8 +133,8 @@ class CameraConfig(Section):
         if name is None or (isinstance(name, str) and re.fullmatch(_FORMAT, name)):
             return name
         raise ValueError(
-            f"found {clipped(repr(name))}; allowed is a format's name of three or four capitals or "
-            f"digits, as in MJPG or YUYV; perchctl check --cameras lists what each camera has"
+            f"found {clip_text(repr(name))}; allowed is a format's name of three or four capitals "
+            f"or digits, as in MJPG or YUYV; perchctl check --cameras lists what each camera has"
         )
 
     @field_validator("controls", mode="before")
@@ -146,13 +148,13 @@ class CameraConfig(Section):
             "perchctl check --cameras lists them"
         )
         if not isinstance(controls, Mapping):
-            raise ValueError(f"found {clipped(repr(controls))}; {needed}")
+            raise ValueError(f"found {clip_text(repr(controls))}; {needed}")
         for name, value in controls.items():
             whole = isinstance(value, str) or (
                 isinstance(value, (int, float)) and float(value).is_integer()
             )
             if not isinstance(name, str) or isinstance(value, bool) or not whole:
-                found = f"{clipped(str(name))}: {clipped(repr(value))}"
+                found = f"{clip_text(str(name))}: {clip_text(repr(value))}"
                 hint = "; write 1 for on and 0 for off" if isinstance(value, bool) else ""
                 raise ValueError(f"found {found}; {needed}{hint}")
         return controls
@@ -173,6 +175,8 @@ class VehicleConfig(Section):
 
 
 class MarkerConfig(Section):
+    """One marker of the profile's `target`: dictionary, id and side."""
+
     dictionary: str = Field(description="an OpenCV dictionary")
     id: int = Field(ge=0, description="within the dictionary")
     side_m: float = Field(
@@ -255,6 +259,8 @@ class TargetConfig(Section):
 
 
 class DetectorConfig(Section):
+    """The profile's `detector`: how markers are searched and measured."""
+
     refinement: Literal["none", "subpix", "line"] = Field(
         "line", description="of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
     )
@@ -275,6 +281,8 @@ class DetectorConfig(Section):
 
 
 class PoseConfig(Section):
+    """The profile's `pose`: how a pose is solved from corners."""
+
     solver: Literal["sqpnp", "iterative", "epnp", "ippe", "ippe_square"] = Field(
         "sqpnp", description="OpenCV's solver for the first guess"
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from perchctl.profile.keys import Key, allowed, keys, unit_of
+from perchctl.profile.keys import Key, allowed, key_unit, keys
 from perchctl.profile.schema import Profile
 
 _WIDTH = 80
@@ -66,7 +66,7 @@ def editor_schema() -> dict[str, Any]:
         section.pop("required", None)  # a profile that extends another gives some keys only
         for name, field in section["properties"].items():
             field.pop("title", None)
-            unit = unit_of(name)
+            unit = key_unit(name)
             if unit and "description" in field:
                 field["description"] += f" ({unit})"
     extends = {"type": "string", "description": "name or path of the profile that has the rest"}

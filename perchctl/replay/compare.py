@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.log.exact import to_exact
+from perchctl.log import to_exact
 
 
 @dataclass(frozen=True)

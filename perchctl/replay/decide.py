@@ -12,10 +12,8 @@ from functools import cached_property
 from typing import Any
 
 from perchctl.errors import InvalidValue
-from perchctl.log.read import FlightLog
-from perchctl.mission import planner
-from perchctl.mission.state import Observation, PlannerState
-from perchctl.mission.turn import Turn
+from perchctl.log import FlightLog
+from perchctl.mission import Observation, PlannerState, Turn, start_mission, step_mission
 from perchctl.profile import Profile
 from perchctl.replay.compare import Difference, first_differing
 from perchctl.vehicle import Command
@@ -111,7 +109,7 @@ def decide(
             yield _failed_again(tick, turn, obs, state, profile)
             continue
         try:
-            new, command = planner.step(state or planner.start(obs), obs, profile)
+            new, command = step_mission(state or start_mission(obs), obs, profile)
         except Exception as error:  # what came after it cannot be decided
             yield Decided(tick, turn, obs, state, None, type(error).__name__)
             return
@@ -124,8 +122,8 @@ def _failed_again(
     tick: int, turn: Turn, obs: Observation, state: PlannerState | None, profile: Profile
 ) -> Decided:
     try:
-        before = state or planner.start(obs)
-        new, command = planner.step(before, obs, profile)
+        before = state or start_mission(obs)
+        new, command = step_mission(before, obs, profile)
     except Exception as error:
         return Decided(tick, turn, obs, state, None, type(error).__name__)
     return Decided(tick, turn, obs, new, command)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import perchctl
-from perchctl.log.read import FlightLog
-from perchctl.log.setup import other_computer
+from perchctl.log import FlightLog, computer_differences
 
 ON_PICTURES = ("camera", "detector", "pose", "kalman", "merge", "target", "vehicle")
 ON_NEITHER = ("link", "simulation", "log")
@@ -30,7 +29,7 @@ def notes_of(
             f"perchctl {made_by} flew it, and this is {perchctl.__version__}: what differs may be "
             f"what has been changed on purpose since"
         )
-    elsewhere = other_computer(log.header)
+    elsewhere = computer_differences(log.header)
     if elsewhere:
         yield f"it was flown with {elsewhere}: the last bits of a number may differ for that alone"
     if log.truncated:

@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from perchctl.geometry import Array
-from perchctl.mission.state import Observation
-from perchctl.mission.turn import Turn
+from perchctl.mission import Observation, Turn
 from perchctl.plot import BLACK, BLUE, GREY, GRID, VERMILLION, new_figure, save_figure
 from perchctl.replay.decide import Decided
 from perchctl.replay.run import Replay

@@ -6,13 +6,11 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
-from perchctl.flight.senses import SENSED
-from perchctl.log.read import FlightLog
-from perchctl.log.setup import camera_in, mask_in, profile_of
-from perchctl.mission.state import Observation
-from perchctl.mission.turn import Turn
+from perchctl.flight import SENSED
+from perchctl.log import FlightLog, flown_camera, flown_mask, flown_profile
+from perchctl.mission import Observation, Turn
 from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.replay.compare import Difference, first_differing, same
@@ -115,7 +113,7 @@ def replay(
     the same goes for what telemetry and times alone give.
     Errors: InvalidValue, NotFound (a calibration or mask that another profile names).
     """
-    flown = profile_of(log.header)
+    flown = flown_profile(log.header)
     whole = whole_turns(log)
     turns, used = whole.turns, profile or flown
     changed = changed_keys(flown, used)
@@ -160,10 +158,10 @@ def check_readable(log: FlightLog) -> None:
     """Decode all that a replay takes from the log. Errors: InvalidValue, and those of a value that
     no flight writes."""
     whole_turns(log)
-    profile_of(log.header)
-    camera = camera_in(log.header)
+    flown_profile(log.header)
+    camera = flown_camera(log.header)
     if camera is not None:
-        mask_in(log.header, camera)
+        flown_mask(log.header, camera)
     if not math.isfinite(log.start_s):
         raise ValueError("the first turn has no time")
 
@@ -186,13 +184,13 @@ def changed_keys(one: Profile, other: Profile) -> tuple[str, ...]:
 def pipeline_of(log: FlightLog, profile: Profile, changed: Sequence[str] = ()) -> Pipeline:
     """The flown calibration and mask, unless others are named by now. Errors: InvalidValue,
     NotFound."""
-    camera = camera_in(log.header)
+    camera = flown_camera(log.header)
     if camera is None or {"camera.calibration", "camera.cam"} & {*changed}:
-        camera = camera_of(profile.camera)
+        camera = profile_camera(profile.camera)
     if profile.camera.mask is None or "camera.mask" in changed:
         return make_pipeline(profile, camera)
     try:
-        return make_pipeline(profile, camera, mask_in(log.header, camera))
+        return make_pipeline(profile, camera, flown_mask(log.header, camera))
     except ValueError as error:
         raise InvalidValue(f"{log.path}: its mask does not fit its calibration: {error}") from None
 

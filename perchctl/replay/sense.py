@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.flight.senses import ENDED, SENSED, Senses
-from perchctl.mission.state import Observation
-from perchctl.mission.turn import FrameSeen, PoseSeen, Taken, Turn
+from perchctl.flight import ENDED_TEXT, SENSED, Senses
+from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
 from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 Picture = tuple[int, float, NDArray[np.uint8]]
 """Of a frame: its number, its time as the source gave it, and the picture that was looked at."""
@@ -60,15 +59,15 @@ class _Given:
         self._pictures = _readable(pictures)
         self._name = "the recording"
         self._shown: tuple[int | None, NDArray[np.uint8]] | None = None
-        self._taken = Taken()
+        self._taken = TurnInputs()
         self._samples: list[tuple[Telemetry, ...]] = []
 
     def turn(self, turn: Turn) -> None:
         taken, obs = turn.taken, turn.observation
         self._taken, self._samples = taken, [taken.samples, taken.late]
         told = None if obs is None else obs.camera_problem
-        if taken.ended and told is not None and told.endswith(ENDED):
-            self._name = told.removesuffix(ENDED)  # no other record has the flown source's
+        if taken.ended and told is not None and told.endswith(ENDED_TEXT):
+            self._name = told.removesuffix(ENDED_TEXT)  # no other record has the flown source's
 
     # As a link.
 

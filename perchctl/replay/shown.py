@@ -11,13 +11,11 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from perchctl.flight.history import History, battery_age_s, belated, extended
-from perchctl.flight.senses import lateness
-from perchctl.mission.state import Observation
-from perchctl.mission.turn import Turn
+from perchctl.flight import History, add_late_samples, add_samples, battery_age_s, lateness_text
+from perchctl.mission import Observation, Turn
 from perchctl.profile import Profile
 from perchctl.replay.sense import Sensed
-from perchctl.vision.types import TargetEstimate
+from perchctl.vision import TargetEstimate
 
 
 @dataclass
@@ -42,9 +40,9 @@ def shown(turns: Sequence[Turn], flown: Profile, profile: Profile) -> Iterator[S
     history, camera = History(), _Camera()
     later_s = placed_later_s(turns, flown, profile)
     for turn in turns:
-        history = extended(history, list(turn.taken.samples), profile.safety)
+        history = add_samples(history, list(turn.taken.samples), profile.safety)
         if turn.t_s != turn.began_s:
-            history = belated(history, list(turn.taken.late), profile.safety)
+            history = add_late_samples(history, list(turn.taken.late), profile.safety)
         obs, newest = turn.observation, history.newest
         if obs is None or newest is None:
             if _is_judged(turn) and _late(turn, 0.0, profile) is None:
@@ -134,7 +132,7 @@ def _late(turn: Turn, used_s: float, profile: Profile) -> str | None:
     frame = turn.taken.frame
     if frame is None or not (_is_judged(turn) and turn.taken.live):
         return None
-    return lateness(turn.began_s - (frame.t_s - used_s), profile.safety)
+    return lateness_text(turn.began_s - (frame.t_s - used_s), profile.safety)
 
 
 def _good_before(obs: Observation, young_s: Iterable[float]) -> float:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.log.setup import profile_of
-from perchctl.mission.state import Condition
+from perchctl.log import flown_profile
+from perchctl.mission import Condition
 from perchctl.replay.decide import Decided, decide
 from perchctl.replay.run import Replay
 from perchctl.replay.sense import Sensed
@@ -52,7 +52,7 @@ def changed_gates(replay: Replay) -> list[Gate]:
     """Those that would have fallen at other times. The other side is decided anew, too, by the
     flown profile: what a log does not hold is compared as well."""
     turns = [each.turn for each in replay.decided]
-    flown = list(decide(turns, profile_of(replay.log.header)))
+    flown = list(decide(turns, flown_profile(replay.log.header)))
     one, other = _falls(flown, replay.log.start_s), _falls(replay.decided, replay.log.start_s)
     names = [*one, *(name for name in other if name not in one)]
     gates = [Gate(n, tuple(one.get(n, ())), tuple(other.get(n, ()))) for n in names]

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.log.energy import EnergyStory
-from perchctl.log.frames import shows_target
+from perchctl.log import EnergyHistory, shows_target
 from perchctl.report.edges import LinkHealth, OutsideHealth
 from perchctl.report.findings import findings_in
 from perchctl.report.sight import Sight, part_of
@@ -42,7 +41,11 @@ class Advice:
 
 
 def advice_of(
-    track: Track, sight: Sight, link: LinkHealth, energy: EnergyStory, outside: OutsideHealth | None
+    track: Track,
+    sight: Sight,
+    link: LinkHealth,
+    energy: EnergyHistory,
+    outside: OutsideHealth | None,
 ) -> tuple[Advice, ...]:
     """In the order in which to heed it."""
     found = [
@@ -241,7 +244,7 @@ def _computer(track: Track) -> Iterator[Advice]:
         )
 
 
-def _battery(track: Track, energy: EnergyStory) -> Iterator[Advice]:
+def _battery(track: Track, energy: EnergyHistory) -> Iterator[Advice]:
     safety = _section(_section(track.log.header, "profile"), "safety")
     least_v = _number(safety.get("min_load_v"))
     if least_v is not None and energy.lowest_v < least_v + SPARE_V:

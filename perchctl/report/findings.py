@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pydantic import ValidationError
 
-from perchctl.log.read import FlightLog
-from perchctl.log.summary import summary_of
-from perchctl.mission.findings import Findings, findings_of
+from perchctl.log import FlightLog, summarise_flight
+from perchctl.mission import Findings, flight_findings
 from perchctl.profile import CameraConfig
-from perchctl.vision.consistency import Consistency
+from perchctl.vision import Consistency
 
 WORKED_OUT = (
     "delay_s",
@@ -20,7 +19,7 @@ WORKED_OUT = (
 def findings_in(log: FlightLog) -> Findings | None:
     """The summary's; else what the last ticks had worked out. None where neither is there."""
     if log.summary is not None:
-        return summary_of(log).findings
+        return summarise_flight(log).findings
     newest = next(
         (r for r in reversed(log.records) if all(r.get(k) is not None for k in WORKED_OUT)), None
     )
@@ -37,4 +36,4 @@ def findings_in(log: FlightLog) -> Findings | None:
         turn_rad=tuple(newest[f"turn_{axis}_rad"] for axis in "xyz"),
         turn_sigma_rad=tuple(newest[f"turn_{axis}_sigma_rad"] for axis in "xyz"),
     )
-    return findings_of(seen, camera)
+    return flight_findings(seen, camera)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.log.frames import shows_target
+from perchctl.log import shows_target
 from perchctl.report.track import Track
 
 LEAST_S = 0.3

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.log.read import FlightLog
+from perchctl.log import FlightLog
 
 LOOKS_UP_DEG = 20.0
 """A camera that is tilted more has another geometry than this one."""

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from importlib.resources import files
 
 import perchctl
-from perchctl.log.read import values_of
+from perchctl.log import log_values
 from perchctl.report import sections
 from perchctl.report.markup import Markup, table, tag
 from perchctl.report.plot import trend
@@ -56,7 +56,7 @@ def page_of(flights: Sequence[ReportedFlight]) -> str:
 
 
 def _flight(told: ReportedFlight, number: int, back: str) -> Markup:
-    with values_of(told.log.path):
+    with log_values(told.log.path):
         parts = [sections.headline(told, back)]
         for title, make in PARTS:
             made = make(told)

@@ -20,7 +20,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure, SubFigure
 
 from perchctl.geometry import Array
-from perchctl.log.frames import frames_of
+from perchctl.log import log_frames
 from perchctl.report.markup import Markup, tag
 from perchctl.report.track import Track
 
@@ -149,7 +149,7 @@ def _errors(track: Track) -> Markup | None:
 
 def _last_seconds(track: Track) -> Markup | None:
     """What the contact was made with: single frames and the estimate, up to the last sight."""
-    frames = frames_of(track.log)
+    frames = log_frames(track.log)
     if not frames.seen_s.size:
         return None
     end_s = float(frames.seen_s[-1])
@@ -270,7 +270,7 @@ def _over_time(
 
 def _mark_unseen(ax: Axes, track: Track) -> None:
     """At the bottom: frames without the target, and when no picture came."""
-    frames = frames_of(track.log)
+    frames = log_frames(track.log)
     upright = ax.get_xaxis_transform()
     if frames.unseen_s.size:
         ax.vlines(frames.unseen_s, 0.0, 0.05, transform=upright, color=INK, linewidth=0.6,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from perchctl.mission.findings import latency_text, turn_text
+from perchctl.mission import latency_text, turn_text
 from perchctl.report.edges import timings_of
 from perchctl.report.markup import Markup, pairs, table, tag, text
 from perchctl.report.plot import battery_plot, flight_plots, histogram

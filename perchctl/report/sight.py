@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.log.frames import frames_of, shows_target
+from perchctl.log import log_frames, shows_target
 from perchctl.report.track import Track
 
 PHASES = ("SEARCH", "ESTIMATE", "ALIGN", "ASCEND", "PERCH", "RECOVER")
@@ -65,7 +65,7 @@ def sight_of(track: Track) -> Sight:
         _seen(track, phase, [(i, r) for i, r in leading if r.get("phase") == phase])
         for phase in PHASES
     )
-    gaps = frames_of(track.log).gaps_s
+    gaps = log_frames(track.log).gaps_s
     return Sight(
         _seen(track, "in these phases", leading),
         tuple(seen for seen in each if seen.frames),

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.log.summary import summary_of
-from perchctl.mission.state import FLYING_PHASES, SEVEN
+from perchctl.log import summarise_flight
+from perchctl.mission import FLYING_PHASES, SEVEN_PHASES
 from perchctl.report.losses import Loss, losses_of
 from perchctl.report.track import SAME_S, Step, Track
 from perchctl.report.words import count, length
@@ -30,7 +30,7 @@ ACTS = {
     "stop": "it stopped the motors",
     "emergency": "it cut the motors",
 }
-PAPERS = tuple(phase.value for phase in SEVEN)
+PAPERS = tuple(phase.value for phase in SEVEN_PHASES)
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ def _motors(track: Track) -> Iterator[Sentence]:
 def _end(track: Track) -> Iterator[Sentence]:
     """Where a log stops without saying how the flight ended."""
     if track.log.summary is not None:
-        flight = summary_of(track.log)
+        flight = summarise_flight(track.log)
         if flight.locked:
             text = "The supervisor locked the vehicle: inspect and restart it"
             yield Sentence(track.end_s, text, "bad")

@@ -7,10 +7,8 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from perchctl.log.energy import EnergyStory, energy_of
-from perchctl.log.read import FlightLog
-from perchctl.log.summary import FlightSummary, summary_of
-from perchctl.mission.findings import Findings
+from perchctl.log import EnergyHistory, FlightLog, FlightSummary, energy_history, summarise_flight
+from perchctl.mission import Findings
 from perchctl.report.advice import Advice, advice_of
 from perchctl.report.edges import LinkHealth, OutsideHealth, link_of, outside_of
 from perchctl.report.findings import findings_in
@@ -33,7 +31,7 @@ class ReportedFlight:
     sight: Sight
     link: LinkHealth
     outside: OutsideHealth | None
-    energy: EnergyStory
+    energy: EnergyHistory
     findings: Findings | None
     advice: tuple[Advice, ...]
     pictures: tuple[Shown, ...] | None
@@ -77,7 +75,7 @@ def tell(log: FlightLog, recorded: Recorded | None = None) -> ReportedFlight:
     """Works it all out. `recorded`: the pictures beside the log, None where there are none."""
     track = Track(log)
     sight, link, outside = sight_of(track), link_of(track), outside_of(track)
-    energy = energy_of(log)
+    energy = energy_history(log)
     shown: tuple[Shown, ...] | None = None
     problem = ""
     if recorded is not None:
@@ -85,7 +83,7 @@ def tell(log: FlightLog, recorded: Recorded | None = None) -> ReportedFlight:
         problem = problem.replace(f"{log.path.parent}{os.sep}", "")
     return ReportedFlight(
         track,
-        summary_of(log),
+        summarise_flight(log),
         story_of(track),
         sight,
         link,

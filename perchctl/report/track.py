@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.log.read import FlightLog, PhaseSpan
+from perchctl.log import FlightLog, PhaseSpan
 from perchctl.report.motion import Motion, motion_of
 
 SAME_S = 1e-3

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from perchctl.files import write_files
-from perchctl.log.place import beside
-from perchctl.log.read import read_log, values_of
-from perchctl.log.recording import pictures_of, recording_of
+from perchctl.log import log_values, path_beside, read_log, recorded_pictures, recording_path
 from perchctl.report.page import page_of
 from perchctl.report.told import ReportedFlight, tell
 
@@ -18,7 +16,7 @@ SESSION_NAME = "session.html"
 
 def report_path_of(log_path: Path) -> Path:
     """Where a flight's report stands: beside its log, by its name."""
-    return beside(log_path, REPORT_SUFFIXES[0])
+    return path_beside(log_path, REPORT_SUFFIXES[0])
 
 
 def session_path_of(log_paths: Sequence[Path]) -> Path:
@@ -32,11 +30,11 @@ def told_of(log_path: Path) -> ReportedFlight:
 
     Raises NotFound and InvalidValue for the log, as `read_log`.
     """
-    log, recording = read_log(log_path), recording_of(log_path)
-    with values_of(log_path):
+    log, recording = read_log(log_path), recording_path(log_path)
+    with log_values(log_path):
         if not recording.is_file():
             return tell(log)
-        return tell(log, lambda numbers: pictures_of(recording, exact=False, numbers=numbers))
+        return tell(log, lambda numbers: recorded_pictures(recording, exact=False, numbers=numbers))
 
 
 def write_report(log_paths: Sequence[Path], output: Path) -> tuple[ReportedFlight, ...]:

@@ -52,7 +52,7 @@ class Bursts:
         return self._bad
 
 
-def bursts_of(scenario: Scenario) -> Bursts | None:
+def radio_bursts(scenario: Scenario) -> Bursts | None:
     """Those of a flight; None where its radio loses nothing."""
     if not scenario.radio_loss:
         return None

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2, Array, make_T, rotation_from_rpy
-from perchctl.profile import Profile
-from perchctl.profile.simulation import SimulationConfig
+from perchctl.profile import Profile, SimulationConfig
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.draw_more import beyond
 from perchctl.sim.scenario import Neighbour, Scenario

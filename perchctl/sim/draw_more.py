@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.profile.simulation import SimulationConfig
+from perchctl.profile import SimulationConfig
 from perchctl.sim.gusts import Gust
 
 _STREAM = 21

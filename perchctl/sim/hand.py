@@ -13,10 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from perchctl.calibration.mounting.recording import AttitudeSample, Part, Recording
-from perchctl.calibration.mounting.seen import seeing, seen_by, seen_mirrored, seen_pose
-from perchctl.calibration.mounting.turns import turn, turn_vector
-from perchctl.camera.mirror import unmirrored
+from perchctl.calibration import (
+    AttitudeSample,
+    MountingPart,
+    MountingRecording,
+    best_pose,
+    camera_only_profile,
+    is_seen_mirrored,
+    pose_basis,
+    rotation_matrices,
+    rotation_vectors,
+)
+from perchctl.camera import unmirror_frame
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy, rpy_from_rotation
 from perchctl.pipeline import PipelineState, make_pipeline, step
 from perchctl.profile import Profile
@@ -24,10 +32,10 @@ from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame
 
 HAND_STREAM = 430
-SECONDS: dict[Part, float] = {"carry": 30.0, "pivot": 20.0}
+SECONDS: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
 LATENCY_S = (0.02, 0.15)
 MOVED_M, MOVED_UP_M = 0.06, (-0.02, 0.01)
 MOUNT_TILT_DEG, TARGET_TILT_DEG = 5.0, 5.0
@@ -76,7 +84,7 @@ class Hand:
     """
 
     seed: int
-    part: Part
+    part: MountingPart
     scenario: Scenario
     R_world_target: Array
     seconds: float
@@ -110,7 +118,9 @@ class Hand:
         return np.asarray(T[:3, :3].T @ (np.array(self.scenario.gear_body_m) - T[:3, 3]))
 
 
-def draw_hand(profile: Profile, part: Part, seed: int, seconds: float | None = None) -> Hand:
+def draw_hand(
+    profile: Profile, part: MountingPart, seed: int, seconds: float | None = None
+) -> Hand:
     """Of one seed both parts have the same vehicle."""
     rng = np.random.default_rng([seed, HAND_STREAM])
     yaw, *tilt = np.radians(rng.uniform(-1.0, 1.0, 3) * (180.0, MOUNT_TILT_DEG, MOUNT_TILT_DEG))
@@ -158,7 +168,7 @@ def draw_hand(profile: Profile, part: Part, seed: int, seconds: float | None = N
     return replace(hand, point_target_m=point - (0.0, 0.0, high_m))
 
 
-def _turns(rng: np.random.Generator, part: Part) -> Waves:
+def _turns(rng: np.random.Generator, part: MountingPart) -> Waves:
     """Tilts about the camera's x and y, and its heading, in rad."""
     slow_deg, round_deg, quick_deg = (27.0, 200.0, 6.0) if part == "carry" else (25.0, 40.0, 2.0)
     slow = _waves(rng, np.radians([slow_deg, slow_deg, 0.0]), (0.12, 0.3))
@@ -201,7 +211,7 @@ def _together(*waves: Waves) -> Waves:
 
 
 def _rot_z(angles: Array) -> Array:
-    return turn(np.stack([0.0 * angles, 0.0 * angles, angles], axis=1))
+    return rotation_matrices(np.stack([0.0 * angles, 0.0 * angles, angles], axis=1))
 
 
 # --- the true motion ---------------------------------------------------------------------
@@ -210,7 +220,9 @@ def _rot_z(angles: Array) -> Array:
 def R_target_cam(hand: Hand, t_s: Array) -> Array:
     """The camera's turn at times (n,), (n, 3, 3)."""
     turns = hand.turns(t_s)
-    return np.asarray(_rot_z(hand.heading_rad + turns[:, 2]) @ turn(turns * (1.0, 1.0, 0.0)))
+    return np.asarray(
+        _rot_z(hand.heading_rad + turns[:, 2]) @ rotation_matrices(turns * (1.0, 1.0, 0.0))
+    )
 
 
 def cam_target_m(hand: Hand, t_s: Array) -> Array:
@@ -254,7 +266,7 @@ def attitudes(
     now = R_world_body(t_s)
     h = _RATE_STEP_S
     before, after = R_world_body(t_s - h), R_world_body(t_s + h)
-    rate = turn_vector(before.transpose(0, 2, 1) @ after) / (2.0 * h)
+    rate = rotation_vectors(before.transpose(0, 2, 1) @ after) / (2.0 * h)
     rpy = np.array([rpy_from_rotation(R) for R in now])
     place = cam_target_m(hand, t_s) @ hand.R_world_target.T - now @ hand.T_body_cam[:3, 3]
     sigma_m = max(hand.scenario.estimate_noise_m, 1e-4)
@@ -322,25 +334,25 @@ def pictures(hand: Hand, profile: Profile, camera: CameraModel) -> Iterator[Deli
         yield from source.take()
 
 
-def record(
+def record_hand(
     hand: Hand,
     profile: Profile,
     camera: CameraModel,
     positioned: bool = False,
     told: Callable[[], None] = lambda: None,
-) -> Recording:
+) -> MountingRecording:
     """The whole part, through renderer and pipeline; `told` is called with each picture."""
-    pipeline = make_pipeline(seeing(profile), camera)
+    pipeline = make_pipeline(camera_only_profile(profile), camera)
     state = PipelineState()
     poses, mirrored = [], 0
     for frame in pictures(hand, profile, camera):
         picture = Frame(frame.index, frame.t_arrival_s, frame.image, frame.t_arrival_s, "whole")
         if profile.camera.mirrored:
-            picture = unmirrored(picture)
+            picture = unmirror_frame(picture)
         state, output = step(state, picture, None, pipeline)
-        mirrored += seen_mirrored(output)
-        if (pose := seen_pose(output, frame.t_arrival_s)) is not None:
+        mirrored += is_seen_mirrored(output)
+        if (pose := best_pose(output, frame.t_arrival_s)) is not None:
             poses.append(pose)
         told()
-    felt, by = attitudes(hand, positioned), seen_by(profile, camera)
-    return Recording(hand.part, felt, tuple(poses), mirrored, by)
+    felt, by = attitudes(hand, positioned), pose_basis(profile, camera)
+    return MountingRecording(hand.part, felt, tuple(poses), mirrored, by)

@@ -12,7 +12,7 @@ from perchctl.sim.pixels import vignetting
 from perchctl.sim.rays import COARSE_PX, FINE_PX, RayGrid, ray_grid
 from perchctl.sim.surfaces import Picture
 from perchctl.sim.tiles import TileRays, tile_rays
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from perchctl.sim.rays import COARSE_PX, local_px_per_m
 from perchctl.sim.scenario import Neighbour
 from perchctl.sim.surfaces import Sheet, SheetTexture
 from perchctl.sim.tiles import Box, Tiles, box_of, reach_of, tiles_of
-from perchctl.target.drawing import draw_target
+from perchctl.target import draw_target
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 FINE_PX, COARSE_PX = 2, 8
 """Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks."""

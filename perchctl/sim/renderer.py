@@ -46,7 +46,7 @@ from perchctl.sim.surfaces import (
     Picture,
 )
 from perchctl.sim.tiles import Box, box_around, by_tile, fill
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 """Numbers of this part's random streams."""

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.target.drawing import TargetDrawing, ink_coverage, sheet_coverage
+from perchctl.target import TargetDrawing, ink_coverage, sheet_coverage
 
 Picture = NDArray[np.uint8]
 

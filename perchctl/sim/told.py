@@ -6,8 +6,7 @@ from __future__ import annotations
 import math
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission.hold import NO_PICTURE
-from perchctl.mission.watch import Event, EventKind
+from perchctl.mission import NO_PICTURE_TEXT, Event, EventKind
 from perchctl.sim.bursts import Bursts
 from perchctl.sim.cell import RESISTANCE_OHM
 from perchctl.sim.scenario import Scenario
@@ -29,7 +28,7 @@ _OLD_CHARGE, _OLD_OHM = 0.9, 1.1 * RESISTANCE_OHM
 _TELEMETRY = "telemetry is"
 
 
-class Teller:
+class EventExplainer:
     """Asked for each event of one flight, in order."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -65,7 +64,7 @@ class Teller:
 
     @staticmethod
     def _lacks_pictures(event: Event) -> bool:
-        held = event.kind is EventKind.HOLD and event.reason.startswith(NO_PICTURE)
+        held = event.kind is EventKind.HOLD and event.reason.startswith(NO_PICTURE_TEXT)
         return held or event.row in LOSSES
 
     def _why_no_pictures(self, t_s: float) -> str:

@@ -17,7 +17,7 @@ from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.world import World
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 _TICK_S = 1e-6  # less than a control period: an exposure is never passed over
 

@@ -17,10 +17,7 @@ import numpy as np
 from perchctl.geometry import R_MARKER_TARGET, Array, rot_z, rpy_from_rotation
 from perchctl.profile import DetectorConfig, Profile, TargetConfig
 from perchctl.target.visible import FieldOfView, square_outline
-from perchctl.vision.markers.cut import shows_enough
-from perchctl.vision.markers.detector import make_detector
-from perchctl.vision.markers.visible import RigidPose
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, RigidPose, make_aruco_detector, shows_enough_of_target
 
 FROM_M = 0.10
 """The last stretch that is looked at, from gear to target."""
@@ -49,7 +46,7 @@ class Mounted:
     turned_rpy_deg: tuple[float, float, float] | None = None
 
 
-def mounted(target: TargetConfig, camera: CameraModel, profile: Profile) -> Mounted:
+def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) -> Mounted:
     """Of the profile's `camera.mount` and `vehicle.gear_body_m`."""
     T_body_cam = profile.camera.mount.T_body_cam
     gear_m = np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3]
@@ -62,7 +59,7 @@ def mounted(target: TargetConfig, camera: CameraModel, profile: Profile) -> Moun
     return Mounted(here, turned, (roll, pitch, yaw))
 
 
-def sees_small(camera: CameraModel, profile: Profile, range_m: float) -> bool:
+def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
     """Whether the whole small marker is in the picture with the gear's tip so far under it."""
     T_body_cam = profile.camera.mount.T_body_cam
     R = T_body_cam[:3, :3].T
@@ -97,7 +94,7 @@ def blind_record(mount: Mounted) -> dict[str, object]:
 def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array) -> Blind:
     """`gear_m` is the gear from the camera, body axes."""
     R, offset = R_body_cam.T, R_body_cam.T @ gear_m
-    view, patterns = FieldOfView(camera), make_detector(DetectorConfig(), target).patterns
+    view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
     outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
     half_m = target.large.side_m / 2.0
 
@@ -110,7 +107,7 @@ def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m:
 
     def left(range_m: float) -> bool:
         pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre(range_m) / half_m)
-        return whole(range_m) or shows_enough(pose, patterns, camera)
+        return whole(range_m) or shows_enough_of_target(pose, patterns, camera)
 
     return Blind(*(_nearest_m(seen) for seen in (whole, left)))
 

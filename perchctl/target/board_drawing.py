@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.profile import MarkerConfig
-from perchctl.profile.dictionaries import predefined
+from perchctl.profile import MarkerConfig, aruco_dictionary
 from perchctl.target.boards import TAG_DICTIONARY, Board
 from perchctl.target.drawing import Rectangle, marker_cells, merged_rectangles
 
@@ -58,7 +57,7 @@ def _aprilgrid_rectangles(board: Board) -> list[Rectangle]:
 
 def tag_cells(tag: int) -> NDArray[np.bool_]:
     """Black cells of an aprilgrid's tag as Kalibr prints it, (10, 10), row 0 at the top."""
-    dictionary = predefined(TAG_DICTIONARY)
+    dictionary = aruco_dictionary(TAG_DICTIONARY)
     n = int(dictionary.markerSize) + 2 * TAG_BORDER_CELLS
     picture = dictionary.generateImageMarker(tag, n, borderBits=TAG_BORDER_CELLS)
     return np.asarray(picture)[::-1, ::-1] < 128  # half a turn: see `Board.tag_corners`

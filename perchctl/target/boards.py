@@ -28,11 +28,11 @@ import numpy as np
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.profile.dictionaries import id_count
+from perchctl.profile import dictionary_size
 from perchctl.target.kalibr import kalibr_notation
-from perchctl.target.lengths import millimetres, parse_length
+from perchctl.target.lengths import mm_text, parse_length
 
-Kind = Literal["chessboard", "charuco", "aprilgrid"]
+BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 EXAMPLES = "chessboard:9x6:25mm, charuco:10x7:25mm:18mm:DICT_5X5_100 or aprilgrid:6x6:22mm:0.3"
 MAX_COUNT = 100
 APRILGRID_DEFAULTS = ("6x6", "22mm", "0.3")
@@ -55,7 +55,7 @@ class Board:
         scale: of the print as measured to the print as meant, along width and height.
     """
 
-    kind: Kind
+    kind: BoardKind
     columns: int
     rows: int
     square_m: float
@@ -120,16 +120,16 @@ class Board:
         """The text that `parse_board` reads back to this very board."""
         text = f"{self.kind}:{self.columns}x{self.rows}"
         if self.kind == "aprilgrid" and self.marker_m is not None:
-            text += f":{millimetres(self.marker_m)}mm:{self.square_m / self.marker_m:.6g}"
+            text += f":{mm_text(self.marker_m)}mm:{self.square_m / self.marker_m:.6g}"
         else:
-            text += f":{millimetres(self.square_m)}mm"
+            text += f":{mm_text(self.square_m)}mm"
             if self.marker_m is not None:
-                text += f":{millimetres(self.marker_m)}mm:{self.dictionary}"
+                text += f":{mm_text(self.marker_m)}mm:{self.dictionary}"
         text += ":legacy" if self.legacy else ""
         if self.scale == (1.0, 1.0):
             return text
         width, height = (m * s for m, s in zip(self.size_m, self.scale, strict=True))
-        return f"{text}{_MEASURED}{millimetres(width)}x{millimetres(height)}mm"
+        return f"{text}{_MEASURED}{mm_text(width)}x{mm_text(height)}mm"
 
     def measured(self, width_m: float, height_m: float) -> Board:
         """The same board, printed so large. Raises InvalidValue where that cannot be."""
@@ -140,8 +140,8 @@ class Board:
             off = is_m / meant_m - 1.0
             if abs(off) > MAX_SCALE_ERROR:
                 raise InvalidValue(
-                    f"the board's {name} of {millimetres(is_m)} mm is {100 * off:+.0f} % off the "
-                    f"{millimetres(meant_m)} mm of {self.notation()}: measure its black area, in mm"
+                    f"the board's {name} of {mm_text(is_m)} mm is {100 * off:+.0f} % off the "
+                    f"{mm_text(meant_m)} mm of {self.notation()}: measure its black area, in mm"
                 )
             scale.append(is_m / meant_m)
         return replace(self, scale=(scale[0], scale[1]))
@@ -202,11 +202,11 @@ def _parsed(text: str) -> Board:
     if marker > 0.95 * square:
         raise _wrong(
             text,
-            f"the marker ({millimetres(marker)} mm) needs white around it: at most "
-            f"{millimetres(0.95 * square)} mm in a square of {millimetres(square)} mm",
+            f"the marker ({mm_text(marker)} mm) needs white around it: at most "
+            f"{mm_text(0.95 * square)} mm in a square of {mm_text(square)} mm",
         )
     try:
-        held = id_count(parts[3])
+        held = dictionary_size(parts[3])
     except ValueError as error:
         raise _wrong(text, str(error)) from None
     needed = columns * rows // 2
@@ -232,7 +232,7 @@ def _aprilgrid(text: str, parts: list[str]) -> Board:
             f"spacing {spacing!r}: the gap is given as a share of the tag's side, {low:g} to "
             f"{high:g}",
         )
-    held = id_count(TAG_DICTIONARY)
+    held = dictionary_size(TAG_DICTIONARY)
     if columns * rows > held:
         raise _wrong(text, f"{columns * rows} tags are needed, and tag36h11 holds {held}")
     return Board("aprilgrid", columns, rows, float(f"{share * tag:.12g}"), tag, TAG_DICTIONARY)

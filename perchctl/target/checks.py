@@ -11,17 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
-from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.profile.dictionaries import id_count, predefined
+from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary, dictionary_size
 from perchctl.target.drawing import (
     RING_MIN_PER_LARGE_SIDE,
     draw_bitmap,
     draw_target,
     marker_cells,
 )
-from perchctl.target.lengths import millimetres
+from perchctl.target.lengths import mm_text
 from perchctl.target.reading import PlainReader
-from perchctl.vision.types import MARKERS
+from perchctl.vision import MARKERS
 
 RING_RANGE_PER_LARGE_SIDE = (RING_MIN_PER_LARGE_SIDE, 9.0 / 150.0)
 """White ring around the small marker, per side of the large one, where the large one's
@@ -81,7 +80,7 @@ def check_target(target: TargetConfig, magnet_m: float, *, search: bool = True) 
 def white_centre_ids(dictionary: str, ratio: float) -> tuple[int, ...]:
     """Ids whose cells under a small marker of `ratio` times the side, with the least ring
     of white around it, are all white."""
-    source = predefined(dictionary)
+    source = aruco_dictionary(dictionary)
     n = int(source.markerSize)
     reach = (ratio / 2.0 + RING_MIN_PER_LARGE_SIDE) * (n + 2)  # cells from the centre
     edges = np.arange(-n / 2.0, n / 2.0 + 0.5)
@@ -94,13 +93,13 @@ def white_centre_ids(dictionary: str, ratio: float) -> tuple[int, ...]:
 
 def all_bits(dictionary: str) -> NDArray[np.bool_]:
     """Inner bits of every id, True is white, (ids, n, n)."""
-    source = predefined(dictionary)
+    source = aruco_dictionary(dictionary)
     n = int(source.markerSize)
     rows = [
         cv2.aruco.Dictionary.getBitsFromByteList(
             np.ascontiguousarray(source.bytesList[i : i + 1]), n
         )
-        for i in range(id_count(dictionary))
+        for i in range(dictionary_size(dictionary))
     ]
     return np.array(rows, dtype=np.uint8) > 0
 
@@ -108,14 +107,14 @@ def all_bits(dictionary: str) -> NDArray[np.bool_]:
 def _check_magnet(target: TargetConfig, magnet_m: float) -> None:
     if magnet_m > target.large.side_m:
         raise InvalidValue(
-            f"the magnet ({millimetres(magnet_m)} mm) does not fit behind the large marker "
-            f"({millimetres(target.large.side_m)} mm): take a smaller one (--magnet)"
+            f"the magnet ({mm_text(magnet_m)} mm) does not fit behind the large marker "
+            f"({mm_text(target.large.side_m)} mm): take a smaller one (--magnet)"
         )
     diagonal = math.sqrt(2.0) * target.small.side_m
     if diagonal > magnet_m:
         raise InvalidValue(
             f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) is not inside the magnet "
-            f"({millimetres(magnet_m)} mm), so the gear could touch where no magnet is: at most "
+            f"({mm_text(magnet_m)} mm), so the gear could touch where no magnet is: at most "
             f"--small {math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g}mm, or a larger --magnet"
         )
 
@@ -143,10 +142,13 @@ def _check_reading(target: TargetConfig, white_ids: tuple[int, ...], search: boo
                 f"the {name} marker cannot be read from this drawing: "
                 f"{_white_hint(target, white_ids, search)}"
             )
-    same_size = predefined(large.dictionary).markerSize == predefined(small.dictionary).markerSize
+    same_size = (
+        aruco_dictionary(large.dictionary).markerSize
+        == aruco_dictionary(small.dictionary).markerSize
+    )
     for marker, other in ((large, small), (small, large)):
         ids = {marker.id, other.id} if same_size else {marker.id}
-        extra = _ids_read(image, predefined(marker.dictionary)) - ids
+        extra = _ids_read(image, aruco_dictionary(marker.dictionary)) - ids
         if extra:
             raise InvalidValue(
                 f"{marker.dictionary} also reads id {min(extra)} from this drawing, so the two "
@@ -189,7 +191,7 @@ def _white_hint(target: TargetConfig, white_ids: tuple[int, ...], search: bool) 
     if not search:
         return "take a smaller small marker, or another id"
     fits = largest_small_m(target)
-    small = "take a smaller --small" + ("" if fits is None else f" (up to {millimetres(fits)}mm)")
+    small = "take a smaller --small" + ("" if fits is None else f" (up to {mm_text(fits)}mm)")
     if target.large.id in white_ids:
         return small
     readable = [i for i in white_ids[:MOST_TRIED] if _reads_with(target, i)]

@@ -6,19 +6,19 @@ import math
 
 import numpy as np
 
-from perchctl.target.design import Design, ErrorCurve, cm, error_curve
-from perchctl.target.lengths import millimetres
+from perchctl.target.design import ErrorCurve, TargetDesign, cm_text, error_curve
+from perchctl.target.lengths import mm_text
 
 _RANGES_M = (1.0, 0.5, 0.2, 0.1)
 """At which the errors are compared."""
 
 
-def comparison(proposed: Design, present: Design, name: str) -> list[str]:
+def compare_designs(proposed: TargetDesign, present: TargetDesign, name: str) -> list[str]:
     """A table of sizes, ranges and errors; `name` is the present target's."""
     rows: list[tuple[str, ...]] = [("", "proposed", name)]
     pair = (proposed, present)
-    rows.append(("large marker, mm", *(millimetres(d.target.large.side_m) for d in pair)))
-    rows.append(("small marker, mm", *(millimetres(d.target.small.side_m) for d in pair)))
+    rows.append(("large marker, mm", *(mm_text(d.target.large.side_m) for d in pair)))
+    rows.append(("small marker, mm", *(mm_text(d.target.small.side_m) for d in pair)))
     for key, what in (
         ("z1_m", "large one read up to, cm"),
         ("z2_m", "small one read up to, cm"),
@@ -45,4 +45,4 @@ def _height_error(curve: ErrorCurve, z_m: float) -> str:
 
 
 def _cm(length_m: float | None) -> str:
-    return "never" if length_m is None else cm(length_m)
+    return "never" if length_m is None else cm_text(length_m)

@@ -15,12 +15,12 @@ import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.profile import Profile, TargetConfig
-from perchctl.target.blind import Mounted, mounted
+from perchctl.target.blind import Mounted, mounted_camera
 from perchctl.target.bound import PoseBound, pose_bound
 from perchctl.target.limits import TRIALS, Optics, smallest_side_px
 from perchctl.target.overhead import least_side_px
 from perchctl.target.visible import FieldOfView, square_outline, turned_outline
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 CORNER_SIGMA_PX = 0.2
 """Spread of a corner that the error bound is drawn for: a plainly refined one."""
@@ -62,7 +62,7 @@ class GearRanges:
 
 
 @dataclass(frozen=True)
-class Design:
+class TargetDesign:
     target: TargetConfig
     camera: CameraModel
     optics: Optics
@@ -144,7 +144,7 @@ def make_design(
     profile: Profile,
     ceiling_m: float | None = None,
     ranges: Ranges | None = None,
-) -> Design:
+) -> TargetDesign:
     """Ranges and what is wrong with them for a flight by that profile under a ceiling of
     that height over the floor (None: unknown)."""
     ranges = ranges or design_ranges(target, camera, optics)
@@ -155,13 +155,13 @@ def make_design(
     if ceiling_m is not None:
         search = ceiling_m - height - profile.camera.mount.position_m[2]
     warnings = _warnings(target, ranges, gear, standoff, height, ceiling_m, search)
-    return Design(
+    return TargetDesign(
         target=target,
         camera=camera,
         optics=optics,
         ranges=ranges,
         gear=gear,
-        mount=mounted(target, camera, profile),
+        mount=mounted_camera(target, camera, profile),
         standoff_m=standoff,
         search_range_m=search,
         search_height_m=height,
@@ -200,23 +200,25 @@ def _warnings(
         )
     if ranges.z2_m <= ranges.z3_m:
         found.append(
-            f"gap between the markers: the small one is read up to {cm(ranges.z2_m)} cm, and the "
-            f"large one is whole at any turn only from {cm(ranges.z3_m)} cm on"
+            f"gap between the markers: the small one is read up to {cm_text(ranges.z2_m)} cm, and "
+            f"the large one is whole at any turn only from {cm_text(ranges.z3_m)} cm on"
         )
     elif ranges.z2_m < 1.15 * ranges.z3_m:
         found.append("the overlap is short: less than 15 % of the range")
     if gear.small_nearest_m is None or gear.small_nearest_m > standoff_m:
         at = (
-            "" if gear.small_nearest_m is None else f" (only from {cm(gear.small_nearest_m)} cm on)"
+            ""
+            if gear.small_nearest_m is None
+            else f" (only from {cm_text(gear.small_nearest_m)} cm on)"
         )
         found.append(
-            f"gap before contact: with the gear {cm(standoff_m)} cm under the target the small "
-            f"marker is not wholly in the picture{at}; mount the camera nearer to the gear"
+            f"gap before contact: with the gear {cm_text(standoff_m)} cm under the target the "
+            f"small marker is not wholly in the picture{at}; mount the camera nearer to the gear"
         )
     return found
 
 
-def error_curve(design: Design, sigma_px: float = CORNER_SIGMA_PX) -> ErrorCurve:
+def error_curve(design: TargetDesign, sigma_px: float = CORNER_SIGMA_PX) -> ErrorCurve:
     """The Cramer-Rao bound over the range from contact to z1."""
     r = design.ranges
     spans = {"large": (r.z3_m, r.z1_m), "small": (r.z4_m, r.z2_m)}
@@ -244,5 +246,6 @@ def _row(bound: PoseBound) -> tuple[float, float, float]:
     return bound.x_m, bound.z_m, bound.yaw_rad
 
 
-def cm(length_m: float) -> str:
+def cm_text(length_m: float) -> str:
+    """A length in centimetres, without its unit, for a sentence."""
     return f"{100.0 * length_m:.3g}"

@@ -11,25 +11,25 @@ from perchctl.target.design import (
     PAPER_CM,
     PAPER_FOCAL_PX,
     PAPER_SIZE_PX,
-    Design,
     ErrorCurve,
-    cm,
+    TargetDesign,
+    cm_text,
 )
-from perchctl.target.lengths import millimetres
+from perchctl.target.lengths import mm_text
 
 _NEVER = "never"
 _TABLE_CM = (3, 5, 7, 10, 15, 20, 25, 30, 50, 75, 100, 150, 200, 300, 500)
 
 
-def design_text(design: Design, curve: ErrorCurve, camera_name: str) -> str:
+def describe_design(design: TargetDesign, curve: ErrorCurve, camera_name: str) -> str:
     """Ranges, overlap, error over the range, warnings; several lines."""
     r, optics, target = design.ranges, design.optics, design.target
     width, height = design.camera.size_px
     lines = [
         f"camera    {camera_name}, {width}x{height}, f {r.focal_px:.0f} px",
         f"optics    blur sigma {optics.blur_px:g} px, noise sigma {optics.noise:g}",
-        f"target    {millimetres(target.large.side_m)} mm {target.large.dictionary}/"
-        f"{target.large.id} around {millimetres(target.small.side_m)} mm "
+        f"target    {mm_text(target.large.side_m)} mm {target.large.dictionary}/"
+        f"{target.large.id} around {mm_text(target.small.side_m)} mm "
         f"{target.small.dictionary}/{target.small.id}",
         f"z1        {_cm(r.z1_m):<9} large marker from here on inwards (side {_px(r.large_px)})",
         f"z2        {_cm(r.z2_m):<9} small marker from here on inwards (side {_px(r.small_px)})",
@@ -53,7 +53,7 @@ def design_text(design: Design, curve: ErrorCurve, camera_name: str) -> str:
     return "\n".join(lines)
 
 
-def design_record(design: Design) -> dict[str, object]:
+def design_record(design: TargetDesign) -> dict[str, object]:
     """The same for machines; metres."""
     r = design.ranges
     return {
@@ -72,7 +72,7 @@ def design_record(design: Design) -> dict[str, object]:
     }
 
 
-def _overlap(design: Design) -> str:
+def _overlap(design: TargetDesign) -> str:
     r = design.ranges
     if r.z2_m is None or r.z3_m is None or r.z2_m <= r.z3_m:
         return "none: the two markers are never seen together at every turn"
@@ -98,7 +98,7 @@ def _table(curve: ErrorCurve) -> list[str]:
     return lines
 
 
-def _against_paper(design: Design) -> list[str]:
+def _against_paper(design: TargetDesign) -> list[str]:
     """Where the paper's own camera and target differ from what it reports."""
     r, target = design.ranges, design.target
     same = (
@@ -121,7 +121,7 @@ def _against_paper(design: Design) -> list[str]:
     return lines
 
 
-def _needed_blur(design: Design, here_m: float, name: str) -> str:
+def _needed_blur(design: TargetDesign, here_m: float, name: str) -> str:
     """In strong blur the readable side grows in proportion to it."""
     blur = design.optics.blur_px
     if blur < 1.5:
@@ -130,7 +130,7 @@ def _needed_blur(design: Design, here_m: float, name: str) -> str:
 
 
 def _cm(length_m: float | None) -> str:
-    return _NEVER if length_m is None else f"{cm(length_m)} cm"
+    return _NEVER if length_m is None else f"{cm_text(length_m)} cm"
 
 
 def _px(side_px: float | None) -> str:

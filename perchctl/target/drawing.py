@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.profile.dictionaries import predefined
+from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
 
 BORDER_BITS = 1
 """Width of a marker's black border in cells."""
@@ -79,7 +78,7 @@ class Bitmap:
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
     """Black cells of a marker with its border, shape (n, n), row 0 at the top."""
-    dictionary = predefined(marker.dictionary)
+    dictionary = aruco_dictionary(marker.dictionary)
     n = int(dictionary.markerSize) + 2 * BORDER_BITS
     picture = cv2.aruco.generateImageMarker(dictionary, marker.id, n, borderBits=BORDER_BITS)
     return np.asarray(picture) < 128

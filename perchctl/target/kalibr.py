@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.profile.plain_yaml import parse_yaml
+from perchctl.profile import parse_yaml
 
 KEYS = {
     "aprilgrid": ("tagCols", "tagRows", "tagSize", "tagSpacing"),

@@ -34,6 +34,6 @@ def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float
     return float(f"{value:.12g}")
 
 
-def millimetres(length_m: float) -> str:
+def mm_text(length_m: float) -> str:
     """``150`` or ``149.6``: a length in millimetres, without a unit, to 1 um."""
     return f"{round(length_m * 1e3, 3):g}"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from perchctl.profile import TargetConfig
 from perchctl.target.drawing import TargetDrawing, draw_target, ink_coverage, sheet_coverage
 from perchctl.target.reading import PlainReader
-from perchctl.vision.types import MarkerName
+from perchctl.vision import MarkerName
 
 FOUND_RATE = 0.9
 TRIALS = 24

@@ -11,7 +11,7 @@ import yaml
 from perchctl.errors import InvalidValue, PerchError
 from perchctl.files import PartFile, cannot_be_written
 from perchctl.profile import MarkerConfig, Profile, TargetConfig, load_profile
-from perchctl.target.lengths import millimetres
+from perchctl.target.lengths import mm_text
 
 MAX_SCALE_ERROR = 0.1
 """A print off by more than this was not measured in the unit that was meant."""
@@ -45,13 +45,12 @@ def measured_target(
         off = side_m / marker.side_m - 1.0
         if abs(off) > MAX_SCALE_ERROR:
             raise InvalidValue(
-                f"--measured-{name}: {millimetres(side_m)} mm is {100 * off:+.0f} % off the "
-                f"{millimetres(marker.side_m)} mm of the profile: measure the black square, in mm"
+                f"--measured-{name}: {mm_text(side_m)} mm is {100 * off:+.0f} % off the "
+                f"{mm_text(marker.side_m)} mm of the profile: measure the black square, in mm"
             )
         sides[name], scales[name] = side_m, off
         notes.append(
-            f"{name}: {millimetres(side_m)} mm, {100 * off:+.2f} % against "
-            f"{millimetres(marker.side_m)} mm"
+            f"{name}: {mm_text(side_m)} mm, {100 * off:+.2f} % against {mm_text(marker.side_m)} mm"
         )
         if abs(off) > NOTABLE_SCALE_ERROR:
             notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
@@ -64,8 +63,8 @@ def measured_target(
     )
     if small.side_m >= large.side_m / 2:
         raise InvalidValue(
-            f"the small marker ({millimetres(small.side_m)} mm) must be less than half of the "
-            f"large one ({millimetres(large.side_m)} mm): measure both black squares"
+            f"the small marker ({mm_text(small.side_m)} mm) must be less than half of the "
+            f"large one ({mm_text(large.side_m)} mm): measure both black squares"
         )
     size_sigma = min(nominal.size_sigma, MEASURED_SIGMA) if len(sides) == 2 else nominal.size_sigma
     if size_sigma > MEASURED_SIGMA:

@@ -13,10 +13,9 @@ import numpy as np
 
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import Mounting, TargetConfig
-from perchctl.target.lengths import millimetres
+from perchctl.target.lengths import mm_text
 from perchctl.target.visible import FieldOfView, turned_outline
-from perchctl.vision.pose import square
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, square_corners
 
 SURE_PX = 18.0
 """A search finds sides of 13 px in 7 of 8 pictures, those of 15 px and more in all, at a blur of
@@ -69,7 +68,7 @@ def least_side_px(plain_px: float | None = None) -> float:
     return SURE_PX if plain_px is None else max(SURE_PX, BLURRED * plain_px)
 
 
-def overhead(
+def overhead_view(
     target: TargetConfig, camera: CameraModel, mount: Mounting, plain_px: float | None = None
 ) -> Overhead:
     """Of the large marker."""
@@ -108,7 +107,7 @@ def reach_at(side_m: float, field: FieldOfView, mount: Mounting, height_m: float
 
 
 @dataclass(frozen=True)
-class Sight:
+class TargetFromBody:
     """A target as a level body at some place has it.
 
     Attributes:
@@ -130,19 +129,19 @@ def sight_from(
     target: TargetConfig,
     camera: CameraModel,
     mount: Mounting,
-) -> Sight:
+) -> TargetFromBody:
     """Positions (3,) and headings in one world, z up; the body level, the target too."""
     T, field = mount.T_body_cam, FieldOfView(camera)
     R, camera_m = T[:3, :3], T[:3, 3]
     centre = rot_z(body_yaw_rad).T @ (target_m - body_m) - camera_m
     turn = rot_z(target_yaw_rad - body_yaw_rad)
     large, small = (
-        (square(side_m) @ turn.T + centre) @ R
+        (square_corners(side_m) @ turn.T + centre) @ R
         for side_m in (target.large.side_m, target.small.side_m)
     )
     view = R[:, 2]
     aside = centre - centre[2] / view[2] * view if view[2] >= LEAST_UP else np.full(3, math.nan)
-    return Sight(
+    return TargetFromBody(
         whole=field.holds(large) or (field.holds(small) and _is_readable(target, camera, centre)),
         height_m=float(centre[2]),
         aside_m=(float(aside[0]), float(aside[1])),
@@ -154,14 +153,14 @@ def _is_readable(target: TargetConfig, camera: CameraModel, centre: Array) -> bo
     return float(camera.K[0, 0]) * target.small.side_m >= SURE_PX * float(centre[2])
 
 
-def edge_room(points_px: Array, size_px: tuple[int, int]) -> float:
+def edge_margin(points_px: Array, size_px: tuple[int, int]) -> float:
     """The least way of points (n, 2) px to the picture's edge, a share of its larger side."""
     size = np.array(size_px, dtype=np.float64)
     least_px = np.minimum(points_px + 0.5, size - 0.5 - points_px).min()
     return float(least_px) / max(size_px)
 
 
-def aside_words(aside_m: tuple[float, float]) -> str:
+def offset_text(aside_m: tuple[float, float]) -> str:
     """``0.31 m forward and 0.12 m to the right``."""
     forward_m, left_m = aside_m
     parts = [
@@ -189,4 +188,4 @@ def _lean(lean_deg: tuple[float, float]) -> str:
 
 def marker_words(target: TargetConfig) -> str:
     """``the target's large marker of 150 mm``."""
-    return f"the target's large marker of {millimetres(target.large.side_m)} mm"
+    return f"the target's large marker of {mm_text(target.large.side_m)} mm"

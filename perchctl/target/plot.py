@@ -14,14 +14,14 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, new_figure, save_png
 
 if TYPE_CHECKING:
-    from perchctl.target.design import Design, ErrorCurve
+    from perchctl.target.design import ErrorCurve, TargetDesign
 
 SIZE_IN = (9.0, 7.5)
 STYLES = {"large": (BLUE, "-", 1.4), "small": (ORANGE, "-", 1.4), "both": (BLACK, "--", 2.0)}
 PANELS = (("x, y [mm]", 1e3), ("z [mm]", 1e3), ("turn [deg]", 180.0 / math.pi))
 
 
-def draw_design(design: Design, curve: ErrorCurve) -> bytes:
+def draw_design(design: TargetDesign, curve: ErrorCurve) -> bytes:
     """A PNG: bars from the nearest to the farthest range, and the error bound below them."""
     figure = new_figure(*SIZE_IN)
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(0.8, 1, 1, 1))
@@ -61,7 +61,7 @@ def _plain_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _plot_spans(ax: Axes, design: Design) -> None:
+def _plot_spans(ax: Axes, design: TargetDesign) -> None:
     r = design.ranges
     rows = (("large", r.z3_m, r.z1_m, ("z3", "z1")), ("small", r.z4_m, r.z2_m, ("z4", "z2")))
     for row, (name, near, far, labels) in enumerate(rows):

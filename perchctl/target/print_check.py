@@ -16,8 +16,7 @@ import numpy as np
 from perchctl.geometry import Array
 from perchctl.profile import TargetConfig
 from perchctl.target.drawing import marker_corners_m
-from perchctl.vision.camera_model import undistort_px
-from perchctl.vision.types import CameraModel, PipelineOutput
+from perchctl.vision import CameraModel, PipelineOutput, undistort_px
 
 CORNER_BIAS_PX = 0.02
 """What a refined corner errs inwards or outwards in all frames alike; no number of frames

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.profile.dictionaries import predefined
-from perchctl.vision.types import MARKERS, MarkerName
+from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.vision import MARKERS, MarkerName
 
 
 class PlainReader:
@@ -34,7 +33,7 @@ class PlainReader:
 
 
 def _own(marker: MarkerConfig) -> Any:
-    source = predefined(marker.dictionary)
+    source = aruco_dictionary(marker.dictionary)
     return cv2.aruco.Dictionary(
         np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1]), source.markerSize, 0
     )

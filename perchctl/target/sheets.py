@@ -15,7 +15,7 @@ from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target.board_drawing import board_rectangles
 from perchctl.target.boards import Board
 from perchctl.target.drawing import black_rectangles, draw_target, marker_cells
-from perchctl.target.lengths import millimetres
+from perchctl.target.lengths import mm_text
 from perchctl.target.page import (
     PAGES_MM,
     Circle,
@@ -182,7 +182,7 @@ def _page_for(needed: tuple[float, float]) -> str:
 
 def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> tuple[str, ...]:
     def named(marker: MarkerConfig) -> str:
-        return f"{millimetres(marker.side_m)} mm {marker.dictionary} id {marker.id}"
+        return f"{mm_text(marker.side_m)} mm {marker.dictionary} id {marker.id}"
 
     dated = f", {date.isoformat()}" if date else ""
     return (
@@ -226,7 +226,7 @@ def _back(target: TargetConfig, place: Place, magnet_m: float) -> Page:
         Line(cx, cy - reach, cx, cy + reach, 0.2),
     ]
     texts = (
-        f"BACK: glue the magnet ({millimetres(magnet_m)} mm across) into the circle.",
+        f"BACK: glue the magnet ({mm_text(magnet_m)} mm across) into the circle.",
         "The cross lies over the centre of both markers.",
     )
     base = cy + half + _MARK_GAP + _MARK + 2.0 + _TEXT

@@ -13,14 +13,14 @@ from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, Profile, TargetConfig
 from perchctl.target.checks import check_target
-from perchctl.target.design import Design, focal_px, is_seen_from_ground, make_design
-from perchctl.target.lengths import millimetres
+from perchctl.target.design import TargetDesign, focal_px, is_seen_from_ground, make_design
+from perchctl.target.lengths import mm_text
 from perchctl.target.limits import Optics, smallest_side_px
 from perchctl.target.overhead import least_side_px
 from perchctl.target.page import PAGES_MM, parse_page
 from perchctl.target.sheets import fits, fitting_page
 from perchctl.target.visible import FieldOfView, turned_outline
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 DEFAULT_SEARCH_M = 1.15
 """Range to cover where no ceiling is named: the paper's z1."""
@@ -68,14 +68,14 @@ class _Smalls:
     why: str
 
 
-def suggest(
+def suggest_target(
     camera: CameraModel,
     optics: Optics,
     profile: Profile,
     magnet_m: float,
     ceiling_m: float | None = None,
     page: str = "a4",
-) -> tuple[Suggestion, Design]:
+) -> tuple[Suggestion, TargetDesign]:
     """The largest markers that the page holds and that are seen all the way, as every error
     falls with the size; a larger page only where the search needs it.
 
@@ -112,14 +112,14 @@ def suggest(
     target = _target(round(large_m, 4), round(small_m, 4))
     check_target(target, max(magnet_m, math.sqrt(2.0) * target.small.side_m))
     held = page if fits(target, parse_page(page)) else fitting_page(target)
-    read = f"read from {100 * search_m:.0f} cm away with {millimetres(needed_m)} mm"
+    read = f"read from {100 * search_m:.0f} cm away with {mm_text(needed_m)} mm"
     wider = fits(_target(large_m + _LARGE_STEP_M, small_m), parse_page(page))
     bound = "beside a larger one no small one takes over" if wider else f"{held} holds no larger"
     reasons = (
-        f"large {millimetres(large_m)} mm: {read} and more; the larger, the more exact, and {bound}"
+        f"large {mm_text(large_m)} mm: {read} and more; the larger, the more exact, and {bound}"
         if large_m > needed_m
-        else f"large {millimetres(large_m)} mm: {read} and no less",
-        f"small {millimetres(small_m)} mm: takes over from the large one with "
+        else f"large {mm_text(large_m)} mm: {read} and no less",
+        f"small {mm_text(small_m)} mm: takes over from the large one with "
         f"{1e3 * smalls.least_m:.1f} mm and more; the larger, the more exact, and beyond that "
         f"{smalls.why}",
     )

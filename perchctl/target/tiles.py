@@ -13,7 +13,7 @@ OVERLAP = 10.0
 _MARK = 4.0
 
 
-def tiles(page: Page, sheet: tuple[float, float]) -> list[Page]:
+def tile_page(page: Page, sheet: tuple[float, float]) -> list[Page]:
     """The page on sheets (width, height, mm), upright or across, whichever are fewer; row by row
     from the top left one. A page that fits is one sheet of its own size.
 

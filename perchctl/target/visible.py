@@ -7,8 +7,7 @@ import math
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import undistort
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, undistort
 
 MARGIN_PX = 3.0
 """cv2.aruco drops markers nearer than this to the picture's edge."""

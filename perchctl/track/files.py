@@ -13,7 +13,7 @@ import numpy as np
 from perchctl.display import Sketch, draw_sketch
 from perchctl.files import PartFile, cannot_be_written
 from perchctl.track.result import CSV_COLUMNS, Tracked, csv_row
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 _TICKS_HZ = 90_000  # of the video's times
 _H264 = {"preset": "veryfast", "crf": "20", "bf": "0"}  # no frames out of order: times begin at 0

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import wrap_rad, yaw_of
-from perchctl.vision.types import MarkerPose, PipelineOutput
+from perchctl.vision import MarkerPose, PipelineOutput
 
 JUMPS = (
     "the target jumps from one picture to the next: pictures that do not belong together need "

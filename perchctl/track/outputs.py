@@ -10,7 +10,7 @@ from typing import TextIO
 from perchctl.display import Sketch
 from perchctl.track.files import CsvFile, OverlayFile
 from perchctl.track.result import Tracked, text_line, text_rows, track_record
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 LIVE_RATE_HZ = 30.0
 

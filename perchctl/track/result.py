@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import Array, rot_z, yaw_of
-from perchctl.vision.merge import better
-from perchctl.vision.types import (
+from perchctl.vision import (
     MARKERS,
     Detection,
     MarkerName,
     MarkerPose,
     PipelineOutput,
     Stage,
+    better_conditioned,
 )
 
 
@@ -117,7 +117,7 @@ def _behind(output: PipelineOutput, stage: Stage) -> tuple[MarkerPose | None, bo
         return poses.get(stage.value), True
     if "joint" in poses:
         return poses["joint"], True
-    return better(poses["large"], poses["small"]), False
+    return better_conditioned(poses["large"], poses["small"]), False
 
 
 def _rotation(rvec: Array) -> Array:

@@ -7,8 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from perchctl.camera.health import HealthState, Verdict, assess
-from perchctl.camera.mirror import mirrored_note
+from perchctl.camera import HealthState, HealthVerdict, assess_frame, mirrored_note
 from perchctl.display import PageState, Sketch
 from perchctl.pipeline import (
     FieldState,
@@ -21,8 +20,9 @@ from perchctl.pipeline import (
 from perchctl.profile import CameraConfig, Profile
 from perchctl.track.jumps import JUMPS, jumped, pose_in
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
-from perchctl.vision.fields import BLENDED, INTERLACED
-from perchctl.vision.types import (
+from perchctl.vision import (
+    BLENDED,
+    INTERLACED,
     MARKERS,
     CameraModel,
     Frame,
@@ -116,9 +116,9 @@ class Tracker:
             self.notes += (_DISAGREE,)
         return self._last
 
-    def _assess(self, frame: Frame) -> Verdict:
+    def _assess(self, frame: Frame) -> HealthVerdict:
         alike_is_frozen = self.live or not self.stills
-        self._health, judged = assess(self._health, frame, alike_is_frozen)
+        self._health, judged = assess_frame(self._health, frame, alike_is_frozen)
         return judged
 
 

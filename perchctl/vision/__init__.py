@@ -1,0 +1,5 @@
+"""From a frame to the target's estimate: detection, pose, filter and merge, pure."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

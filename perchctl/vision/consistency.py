@@ -11,7 +11,7 @@ The rest of the place's wandering is no white noise: the vehicle's estimate walk
 each row (`X`, `Y`, `HEADING`) goes through the Kalman filter of a level that walks, the factors
 through the same one as the target's place, and what is summed are the innovations: that is
 the generalized least squares of the whole flight with a few numbers of memory (de Jong 1991, "The
-diffuse Kalman filter"). Nothing is solved until somebody asks (`solved`).
+diffuse Kalman filter"). Nothing is solved until somebody asks (`solve_consistency`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _PRIOR = np.array([0.1, 0.1, 0.1, 1.0, 0.5, 0.02, 0.02])
 mounting's roll and pitch, any turn about the upward axis and with it half of the size, 2 cm/s of
 drift."""
 
-STEP_S = 0.02
+ATTITUDE_STEP_S = 0.02
 """Of the difference that stands for a speed: a shake of 5 Hz keeps 0.94 of its."""
 NOISE_MPS, NOISE_RADPS = 0.01, math.radians(1.0)
 """Of the vehicle's speed and rates of turn, as its estimate has them. It looks like motion, and
@@ -49,7 +49,7 @@ MOST_GAP_S = 0.5
 GATE_SIGMAS = 5.0
 _POSSIBLE = np.array([0.0, 0.2, 0.4, 0.4, 0.4, 0.0, 0.0, 0.0])
 """What the gate takes for possible beyond the noise: 200 ms, and 0.4 rad about each axis."""
-LEAST_RANGE_M = 0.15
+LEAST_CONSISTENCY_RANGE_M = 0.15
 """Nearer, nothing is swept: it is pressed soon, and its estimate may run away."""
 STAMPS_S = 0.003
 """What an average does not take away: of the stamps of telemetry and exposure, and of the
@@ -60,7 +60,7 @@ LEAST_FRAMES = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class ConsistencySums:
     """A flight's memory: `level` (3, 8) and its `variance` (3,) as the newest frame left them,
     None before the first; `information` (8, 8) of the innovations; `rows` that they are of."""
 
@@ -98,7 +98,7 @@ class Moment:
     range_m: float
 
 
-def moment_of(
+def consistency_moment(
     t_s: float,
     pose: MarkerPose,
     before: Attitude,
@@ -107,8 +107,8 @@ def moment_of(
     delay_s: float,
     setup: PoseSetup,
 ) -> Moment:
-    """The frame's target for the vehicle's attitude `STEP_S` before and after the frame's time
-    less `delay_s`, and its velocity then. `delay_s` is the delay that is thought likely: about
+    """The frame's target for the vehicle's attitude `ATTITUDE_STEP_S` before and after the frame's
+    time less `delay_s`, and its velocity then. `delay_s` is the delay that is thought likely: about
     it, the factors are those of small changes."""
     assert pose.cov is not None
     T_body_cam = setup.T_body_cam
@@ -121,7 +121,7 @@ def moment_of(
     turned = wrap_rad(heading1 - heading0)
     rows, noise = [], []
     speeds = [
-        (_dot(q, place) - _dot(p, place)) / (2.0 * STEP_S) + v
+        (_dot(q, place) - _dot(p, place)) / (2.0 * ATTITUDE_STEP_S) + v
         for p, q, v in zip(R0, R1, velocity_mps, strict=False)
     ]
     moves = _above(math.hypot(*speeds), math.hypot(NOISE_MPS, NOISE_RADPS * z))
@@ -134,7 +134,7 @@ def moment_of(
         factors = [speed, v * z - w * y, w * x - u * z, u * y - v * x, u * x + v * y]
         rows.append([0.5 * at + delay_s * speed, *factors, 0.0, 0.0])
         noise.append(aside_m2 + LEAST_SIGMA_M**2 + (JITTER_S * speed) ** 2)
-    rate = turned / (2.0 * STEP_S)
+    rate = turned / (2.0 * ATTITUDE_STEP_S)
     rate *= _above(abs(rate), NOISE_RADPS)
     rows.append([heading0 + 0.5 * turned + delay_s * rate, rate] + 6 * [0.0])
     noise.append(float(pose.cov[3, 3]) + LEAST_SIGMA_RAD**2 + (JITTER_S * rate) ** 2)
@@ -161,7 +161,7 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def added(old: Sums, new: Moment) -> Sums:
+def add_moment(old: ConsistencySums, new: Moment) -> ConsistencySums:
     """The sums with one more frame. After a gap, or where the target or the estimate's world has
     jumped, the level begins anew, and what was learned is kept."""
     if old.level is None:
@@ -182,7 +182,7 @@ def added(old: Sums, new: Moment) -> Sums:
     if gap_s > MOST_GAP_S or beyond.any():
         return replace(old, t_s=new.t_s, level=rows, variance=new.variance)
     gain = predicted / spread
-    return Sums(
+    return ConsistencySums(
         new.t_s,
         old.began_s,
         old.level + gain[:, None] * change,
@@ -192,7 +192,7 @@ def added(old: Sums, new: Moment) -> Sums:
     )
 
 
-def solved(sums: Sums, attitude_sigma_rad: float) -> Consistency | None:
+def solve_consistency(sums: ConsistencySums, attitude_sigma_rad: float) -> Consistency | None:
     """What the flight shows so far; None after less than a second of frames.
 
     `attitude_sigma_rad`: constant error of the estimate's roll and pitch.

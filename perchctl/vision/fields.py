@@ -117,6 +117,7 @@ def combing(image: Grey) -> float:
 
 
 def is_combed(image: Grey) -> bool:
+    """True where the picture, (h, w) grey, holds two fields of different times."""
     return combing(image) > _COMBED
 
 
@@ -142,7 +143,7 @@ def interpolated_sigma_px(blur_px: float) -> float:
     return _ALIAS_PX * math.exp(-_ALIAS_BLURS * blur_px * blur_px)
 
 
-def looked_at(frame: Frame, mode: FieldsMode) -> Frame:
+def classify_fields(frame: Frame, mode: FieldsMode) -> Frame:
     """The frame, with `fields` saying what it is."""
     if frame.fields is not None:
         return frame
@@ -160,7 +161,7 @@ def halves(frame: Frame) -> tuple[Frame, Frame]:
     )
 
 
-def separated(
+def separate_fields(
     state: FieldState, frame: Frame, mode: FieldsMode
 ) -> tuple[FieldState, tuple[Frame, ...]]:
     """The pictures of a stream's frame, in their order of time: one, or two fields.
@@ -172,7 +173,7 @@ def separated(
     """
     skip = frame.fields is None and mode == "auto" and state.kind == "whole"
     skip = skip and state.skipped + 1 < _EVERY
-    frame = replace(frame, fields="whole") if skip else looked_at(frame, mode)
+    frame = replace(frame, fields="whole") if skip else classify_fields(frame, mode)
     skipped = state.skipped + 1 if skip else 0
     # A stream of fields stays one.
     kind = state.kind if state.kind == "woven" else frame.fields

@@ -32,7 +32,7 @@ MEASURED, RATES = slice(YAW, None, 2), slice(YAW_RATE, None, 2)
 POSITION, VELOCITY = slice(X, None, 2), slice(VX, None, 2)
 TILTS, PRINT = slice(0, 2), slice(2, 4)  # of the constant errors
 
-MAX_GAP_S = 1.0
+MAX_TRACK_GAP_S = 1.0
 MAX_PREDICTION_S = 1.0
 """Beyond it the target is taken to stay where it was predicted."""
 
@@ -204,7 +204,7 @@ def step_track(
 
     Returns None when there is nothing (left) to track: never seen, or unseen for more
     than `n_max` frames (equation 3's k_n <= n_max). A frame that is not newer than the
-    track changes nothing. A gap beyond `MAX_GAP_S` in either direction starts afresh.
+    track changes nothing. A gap beyond `MAX_TRACK_GAP_S` in either direction starts afresh.
     """
     if measured is not None and not finite(measured.z):
         measured = None
@@ -213,7 +213,7 @@ def step_track(
     if track is None:
         return None if measured is None else start_track(measured, t_s, setup)
     dt_s = t_s - track.t_s
-    if abs(dt_s) > MAX_GAP_S or not finite(track.x):
+    if abs(dt_s) > MAX_TRACK_GAP_S or not finite(track.x):
         return None if measured is None else start_track(measured, t_s, setup)
     if dt_s <= 0.0:
         return track
@@ -246,7 +246,7 @@ def _updated(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array, Arra
     return x, left.dot(P).dot(left.T) + gain.dot(R).dot(gain.T), gain
 
 
-def predicted(
+def predict_track(
     track: MarkerTrack, t_s: float, setup: FilterSetup, spread: bool = True
 ) -> MarkerTrack:
     """The track at a time after its frame, with no measurement in between. Without `spread` its
@@ -263,7 +263,7 @@ def predicted(
 
 def foreseen(track: MarkerTrack, t_s: float, setup: FilterSetup) -> Measurement:
     """What a measurement at a later time should be, its R being what the track leaves open:
-    of `predicted` the part that is measured."""
+    of `predict_track` the part that is measured."""
     dt_s, x = _ahead(track, t_s, setup)
     P, noise = track.P, setup.process
     R = P[MEASURED, MEASURED] + dt_s * (P[MEASURED, RATES] + P[RATES, MEASURED])

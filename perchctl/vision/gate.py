@@ -31,7 +31,7 @@ import numpy as np
 from perchctl.geometry import Array, wrap_rad
 from perchctl.values import replace
 from perchctl.vision.filter import (
-    MAX_GAP_S,
+    MAX_TRACK_GAP_S,
     FilterSetup,
     Measurement,
     foreseen,
@@ -120,7 +120,7 @@ def remembered(
     lock: Lock | None, stranger: Stranger | None, t_s: float
 ) -> tuple[Lock | None, Stranger | None]:
     """What of both still counts."""
-    if stranger is not None and not 0.0 <= t_s - stranger.track.t_s <= MAX_GAP_S:
+    if stranger is not None and not 0.0 <= t_s - stranger.track.t_s <= MAX_TRACK_GAP_S:
         stranger = None
     if lock is None:
         return None, None
@@ -128,7 +128,7 @@ def remembered(
     # A place in the level frame means nothing for long, but a stranger stays a stranger.
     lasting = lock.in_world or stranger is not None
     # A clock that was set back: nothing that is older than it will be confirmed.
-    if age_s < -MAX_GAP_S or age_s > (FORGET_S if lasting else MAX_GAP_S):
+    if age_s < -MAX_TRACK_GAP_S or age_s > (FORGET_S if lasting else MAX_TRACK_GAP_S):
         return None, None
     return lock, stranger
 

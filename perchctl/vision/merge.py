@@ -65,7 +65,7 @@ def disagree(large: MarkerPose, small: MarkerPose, limit_m: float) -> bool:
     return bool((gap > np.maximum(limit_m, vague)).any())
 
 
-def better(large: MarkerPose, small: MarkerPose) -> MarkerPose:
+def better_conditioned(large: MarkerPose, small: MarkerPose) -> MarkerPose:
     """The better-conditioned of the two, by the spread of its position."""
     spread_large, spread_small = (float(np.linalg.norm(p.sigma_m)) for p in (large, small))
     return small if spread_small < spread_large else large

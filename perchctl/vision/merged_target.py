@@ -15,7 +15,9 @@ from perchctl.vision.strategies import Merged
 from perchctl.vision.types import Attitude
 
 
-def told_in_level(merged: Merged, attitude: Attitude | None, setup: PoseSetup) -> dict[str, Any]:
+def estimate_in_level(
+    merged: Merged, attitude: Attitude | None, setup: PoseSetup
+) -> dict[str, Any]:
     """Place and motion of tracks in the level frame, as a `TargetEstimate` has them."""
     e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
     world_m, world_yaw_rad = None, None
@@ -32,7 +34,7 @@ def told_in_level(merged: Merged, attitude: Attitude | None, setup: PoseSetup) -
     }
 
 
-def told_in_world(merged: Merged, attitude: Attitude, setup: PoseSetup) -> dict[str, Any]:
+def estimate_in_world(merged: Merged, attitude: Attitude, setup: PoseSetup) -> dict[str, Any]:
     """The same of tracks in the world, as seen from the vehicle at `attitude`, but the spread."""
     world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
     e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, setup)

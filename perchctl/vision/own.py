@@ -16,7 +16,7 @@ from perchctl.vision.places import to_world
 from perchctl.vision.pose import PoseSetup, estimate_pose
 from perchctl.vision.types import Attitude, Detection, MarkerName, MarkerPose
 
-ANOTHERS = (
+OTHER_TARGET_TEXT = (
     "a target is in view that is too far from target.expected_xy_m to be the own one: it is not "
     "followed"
 )
@@ -24,7 +24,7 @@ _SIGMA_PX = 1.0  # of corners as a search finds them
 
 
 @dataclass(frozen=True)
-class OwnPlace:
+class OwnTargetPlace:
     """Where the own target is, in the world of the state estimate; `xy_m` None: not known.
     One that is farther than `within_m` from there is another vehicle's."""
 
@@ -32,15 +32,15 @@ class OwnPlace:
     within_m: float = math.inf
 
 
-NOWHERE = OwnPlace()
+NOWHERE = OwnTargetPlace()
 """Nothing is known: the gear's axis decides."""
 
 
 @dataclass(frozen=True, eq=False)
-class Chooser:
+class TargetSelector:
     """How far aside a marker is, for a picture taken at `attitude`."""
 
-    place: OwnPlace
+    place: OwnTargetPlace
     t_s: float
     attitude: Attitude | None
     pose: PoseSetup
@@ -61,7 +61,7 @@ class Chooser:
 
 
 def aside_m(
-    pose: MarkerPose, attitude: Attitude | None, place: OwnPlace, setup: PoseSetup
+    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> float:
     """How far a target is from the own one's place; without that, or without an attitude, from
     the upward axis through the gear."""
@@ -72,7 +72,7 @@ def aside_m(
 
 
 def refusal(
-    pose: MarkerPose, attitude: Attitude | None, place: OwnPlace, setup: PoseSetup
+    pose: MarkerPose, attitude: Attitude | None, place: OwnTargetPlace, setup: PoseSetup
 ) -> str | None:
     """One sentence where the target is another vehicle's. Nothing is refused without an attitude:
     where the vehicle is, is not known then."""

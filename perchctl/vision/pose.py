@@ -26,7 +26,7 @@ from perchctl.vision.camera_model import undistort_px
 from perchctl.vision.curl import lift_of
 from perchctl.vision.points import Points, make_points
 from perchctl.vision.solve import (
-    Candidate,
+    PoseCandidate,
     Scored,
     TiltPrior,
     covariance,
@@ -52,7 +52,7 @@ __all__ = [
     "normal_cam",
     "rotation_matrix",
     "rotation_vector",
-    "square",
+    "square_corners",
 ]
 
 
@@ -93,11 +93,12 @@ def make_pose_setup(
     camera: CameraModel,
     readout_s: float | None = 0.0,
 ) -> PoseSetup:
+    """The constants of pose estimation, from the profile and the calibrated camera."""
     return PoseSetup(
         config=config,
         object_points={
-            "large": square(target.large.side_m),
-            "small": square(target.small.side_m),
+            "large": square_corners(target.large.side_m),
+            "small": square_corners(target.small.side_m),
         },
         T_body_cam=np.asarray(T_body_cam, dtype=np.float64),
         gear_body_m=np.asarray(gear_body_m, dtype=np.float64),
@@ -108,7 +109,7 @@ def make_pose_setup(
     )
 
 
-def square(side_m: float) -> Array:
+def square_corners(side_m: float) -> Array:
     """Corners TL TR BR BL of a marker in its own axes, (4, 3)."""
     h = side_m / 2.0
     return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
@@ -125,7 +126,7 @@ def estimate_pose(
     attitude: Attitude | None,
     setup: PoseSetup,
     previous_normal_cam: Array | None = None,
-    start: Candidate | None = None,
+    start: PoseCandidate | None = None,
 ) -> MarkerPose | None:
     """The pose from one marker's corners, or from both markers' corners at once.
 
@@ -178,7 +179,7 @@ def _points(detections: Sequence[Detection], setup: PoseSetup) -> Points | None:
 
 
 def _continued(
-    points: Points, start: Candidate | None, prior: TiltPrior, config: PoseConfig
+    points: Points, start: PoseCandidate | None, prior: TiltPrior, config: PoseConfig
 ) -> Scored | None:
     """The solution next to a start, None where there is none that fits."""
     if start is None or not config.refine:
@@ -248,6 +249,7 @@ def rotation_matrix(rvec: Array) -> Array:
 
 
 def rotation_vector(R: Array) -> Array:
+    """The rotation vector (3,) rad of a rotation matrix (3, 3)."""
     return flat(cv2.Rodrigues(R)[0])
 
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from perchctl.geometry import Array, finite
 from perchctl.vision.camera_model import project
-from perchctl.vision.filter import MAX_GAP_S
+from perchctl.vision.filter import MAX_TRACK_GAP_S
 from perchctl.vision.markers.overview import lattice_of
 from perchctl.vision.pose import PoseSetup, rotation_matrix, rotation_vector
-from perchctl.vision.solve import Candidate
+from perchctl.vision.solve import PoseCandidate
 from perchctl.vision.types import Attitude, MarkerName, MarkerPose, Sighting
 
 _FORGOTTEN = 0.1  # of what was learned, with each picture
@@ -24,18 +24,18 @@ _FORGOTTEN = 0.1  # of what was learned, with each picture
 
 def expected_corners(
     sight: Sighting | None, t_s: float, attitude: Attitude | None, setup: PoseSetup
-) -> tuple[dict[MarkerName, Array] | None, Candidate | None]:
+) -> tuple[dict[MarkerName, Array] | None, PoseCandidate | None]:
     """Where both markers' corners should be, (4, 2) px each: the last sighting of the target,
     moved by the vehicle's own motion since; and that pose.
 
     Without an attitude at both times there are no corners and the pose is unmoved. Both
     are None where the sighting is too old or the target has gone behind the camera.
     """
-    if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_GAP_S:
+    if sight is None or not 0.0 < t_s - sight.pose.t_s <= MAX_TRACK_GAP_S:
         return None, None
     pose, then = sight.pose, sight.attitude
     if attitude is None or then is None:
-        return None, Candidate(pose.rvec_rad, pose.tvec_m)
+        return None, PoseCandidate(pose.rvec_rad, pose.tvec_m)
     R_then, R_now = _R_world_cam(then, setup), _R_world_cam(attitude, setup)
     by_place, by_speed = sight.off_rad2
     share = by_place / (by_place + by_speed) if by_place + by_speed > 0.0 else 0.5
@@ -47,20 +47,20 @@ def expected_corners(
         return None, None
     rvec = rotation_vector(R.dot(rotation_matrix(pose.rvec_rad)))
     corners = project(setup.all_points, rvec, tvec, setup.camera)
-    moved = Candidate(rvec, tvec)
+    moved = PoseCandidate(rvec, tvec)
     if not finite(corners):
         return None, moved
     return {"large": corners[:4], "small": corners[4:]}, moved
 
 
-def sighted(
+def update_sight(
     before: Sighting | None, pose: MarkerPose, attitude: Attitude | None, setup: PoseSetup
 ) -> Sighting:
     """The target seen once more; with what that says of the vehicle's own account of its way."""
     if before is None:
         return Sighting(pose, attitude)
     then, passed_s = before.attitude, pose.t_s - before.pose.t_s
-    if attitude is None or then is None or not 0.0 < passed_s <= MAX_GAP_S:
+    if attitude is None or then is None or not 0.0 < passed_s <= MAX_TRACK_GAP_S:
         return Sighting(pose, attitude, before.off_rad2)
     R = _R_world_cam(attitude, setup)
     seen_m = _R_world_cam(then, setup).dot(before.pose.tvec_m) - R.dot(pose.tvec_m)

@@ -34,7 +34,7 @@ _SMALL_MOVE_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class PoseCandidate:
     """rvec (3,) rad and tvec (3,) m of the marker in the camera."""
 
     rvec: Array
@@ -42,7 +42,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Scored(Candidate):
+class Scored(PoseCandidate):
     """A candidate with the corners' errors (n, 2) and their Jacobian (2n, 6) with (rvec,
     tvec)."""
 
@@ -63,7 +63,7 @@ class TiltPrior:
     normal_cam: Array | None
     spread_rad: float
 
-    def contradicts(self, candidate: Candidate) -> bool:
+    def contradicts(self, candidate: PoseCandidate) -> bool:
         """Whether it is known and further away than its spread."""
         return (
             self.normal_cam is not None
@@ -92,10 +92,10 @@ def solve(points: Points, solver: Solver, refine: bool, prior: TiltPrior) -> Sco
     return best if settled is None and solver == "sqpnp" else settled
 
 
-def gauss_newton(points: Points, start: Candidate) -> Scored | None:
+def gauss_newton(points: Points, start: PoseCandidate) -> Scored | None:
     """Gauss-Newton with each corner's own spread, from a start that is near (the frame
     before); None where it does not settle within some steps."""
-    candidate: Candidate = start
+    candidate: PoseCandidate = start
     before = math.inf
     W = points.whitening
     for _ in range(_MAX_STEPS):
@@ -124,7 +124,10 @@ def gauss_newton(points: Points, start: Candidate) -> Scored | None:
             return Scored(rvec, tvec, error_px, scored.jacobian)
         if gain < 1e-4 + 1e-6 * cost:
             return scored
-        candidate, before = Candidate(candidate.rvec - step[:3], candidate.tvec - step[3:]), cost
+        candidate, before = (
+            PoseCandidate(candidate.rvec - step[:3], candidate.tvec - step[3:]),
+            cost,
+        )
         if not _usable(candidate):
             return None
     return None
@@ -194,7 +197,7 @@ def tilt_rad(rvec: Array, expected_cam: Array) -> float:
     return math.acos(max(-1.0, min(1.0, float(normal @ expected_cam))))
 
 
-def _closed_form(points: Points, solver: Solver) -> list[Candidate]:
+def _closed_form(points: Points, solver: Solver) -> list[PoseCandidate]:
     if solver == "ippe_square" and len(points.object_m) != 4:
         solver = "ippe"
     try:
@@ -203,25 +206,25 @@ def _closed_form(points: Points, solver: Solver) -> list[Candidate]:
         )
     except cv2.error:
         return []  # degenerate corners: all on one line, or on one point
-    candidates = [Candidate(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
+    candidates = [PoseCandidate(flat(r), flat(t)) for r, t in zip(rvecs, tvecs, strict=True)]
     return [candidate for candidate in candidates if _usable(candidate)]
 
 
-def _usable(candidate: Candidate) -> bool:
+def _usable(candidate: PoseCandidate) -> bool:
     rvec, tvec = candidate.rvec, candidate.tvec
     return bool(finite(rvec) and finite(tvec) and tvec[2] > 0.0)
 
 
-def _refined(points: Points, start: Candidate) -> Candidate:
+def _refined(points: Points, start: PoseCandidate) -> PoseCandidate:
     first = start.rvec.reshape(3, 1).copy(), start.tvec.reshape(3, 1).copy()
     try:
         rvec, tvec = cv2.solvePnPRefineLM(points.object_m, points.image_px, points.K, None, *first)
     except cv2.error:
         return start
-    return Candidate(flat(rvec), flat(tvec))
+    return PoseCandidate(flat(rvec), flat(tvec))
 
 
-def _scored(candidate: Candidate, points: Points) -> Scored:
+def _scored(candidate: PoseCandidate, points: Points) -> Scored:
     rvec, tvec = candidate.rvec, candidate.tvec
     projected, jacobian = cv2.projectPoints(points.object_m, rvec, tvec, points.K, None)
     error: Array = projected.reshape(-1, 2) - points.image_px
@@ -233,7 +236,7 @@ def _other_tilt(scored: Scored, points: Points) -> list[Scored]:
     rvec = mirror_solution(scored.rvec, scored.tvec)
     if rvec is None:
         return []
-    turned = _refined(points, Candidate(rvec, scored.tvec))
+    turned = _refined(points, PoseCandidate(rvec, scored.tvec))
     return [_scored(turned, points)] if _usable(turned) else []
 
 

@@ -17,7 +17,7 @@ from perchctl.geometry import Array
 from perchctl.profile import MergeConfig
 from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
 from perchctl.vision.merge import (
-    better,
+    better_conditioned,
     choose_stage,
     disagree,
     merge_pair,
@@ -25,7 +25,7 @@ from perchctl.vision.merge import (
 )
 from perchctl.vision.pose import PoseSetup, estimate_pose, level_rotation
 from perchctl.vision.rolling import seen_at_once
-from perchctl.vision.solve import Candidate
+from perchctl.vision.solve import PoseCandidate
 from perchctl.vision.types import (
     MARKERS,
     Attitude,
@@ -33,7 +33,7 @@ from perchctl.vision.types import (
     Detections,
     MarkerPose,
     MarkerTrack,
-    Measured,
+    MeasuredMarkers,
     Stage,
 )
 
@@ -59,7 +59,7 @@ class Merged:
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class MergePrior:
     """What is known before a frame is solved.
 
     `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,)
@@ -67,16 +67,18 @@ class Prior:
     """
 
     attitude: Attitude | None
-    near: Candidate | None
+    near: PoseCandidate | None
     normal_cam: Array | None
 
 
 class MergeStrategy(Protocol):
+    """How poses of both markers become one: the paper's weights, or one joint solution."""
+
     @property
     def tracks(self) -> tuple[str, ...]:
         """Names of its filters."""
 
-    def measure(self, detections: Detections, prior: Prior) -> Measured:
+    def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
         """Solve what this frame needs, once, and choose the track that each pose feeds."""
 
     def merge(
@@ -93,13 +95,13 @@ class Weights:
     pose: PoseSetup
     tracks: tuple[str, ...] = MARKERS
 
-    def measure(self, detections: Detections, prior: Prior) -> Measured:
+    def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
         singles = _singles(
             _seen(detections, self.pose), detections.t_s, prior, self.pose, prior.near
         )
         contradicting = _contradict(singles, self.config)
         fed = _usable(singles, contradicting, prior, self.config, self.pose)
-        return Measured(singles, fed, contradicting)
+        return MeasuredMarkers(singles, fed, contradicting)
 
     def merge(
         self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
@@ -137,7 +139,7 @@ class Joint:
     pose: PoseSetup
     tracks: tuple[str, ...] = ("joint",)
 
-    def measure(self, detections: Detections, prior: Prior) -> Measured:
+    def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
         seen, t_s = _seen(detections, self.pose), detections.t_s
         joint = None
         if len(seen) == 2:
@@ -149,20 +151,24 @@ class Joint:
         # The joint tilt is the surest: the single markers of its frame start from it.
         singles = {}
         if not enough or self.pose.config.each_marker:
-            near = prior.near if joint is None else Candidate(joint.rvec_rad, joint.tvec_m)
+            near = prior.near if joint is None else PoseCandidate(joint.rvec_rad, joint.tvec_m)
             singles = _singles(seen, t_s, prior, self.pose, near)
         if joint is None:
             contradicting = _contradict(singles, self.config)
             fed = _usable(singles, contradicting, prior, self.config, self.pose)
             if len(fed) == 2:
-                return Measured(singles, {"joint": better(fed["large"], fed["small"])})
-            return Measured(singles, _as_joint(fed), contradicting)
+                return MeasuredMarkers(
+                    singles, {"joint": better_conditioned(fed["large"], fed["small"])}
+                )
+            return MeasuredMarkers(singles, _as_joint(fed), contradicting)
         poses = {"joint": joint, **singles}
         if enough:
-            return Measured(poses, {"joint": joint})
+            return MeasuredMarkers(poses, {"joint": joint})
         contradicting = not clear and _contradict(singles, self.config)
         fed = _usable(singles, contradicting, prior, self.config, self.pose)
-        return Measured(poses, _as_joint(fed) if len(fed) == 1 else {"joint": joint}, contradicting)
+        return MeasuredMarkers(
+            poses, _as_joint(fed) if len(fed) == 1 else {"joint": joint}, contradicting
+        )
 
     def merge(
         self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
@@ -182,9 +188,9 @@ def _seen(detections: Detections, setup: PoseSetup) -> list[Detection]:
 def _singles(
     seen: list[Detection],
     t_s: float,
-    prior: Prior,
+    prior: MergePrior,
     setup: PoseSetup,
-    start: Candidate | None,
+    start: PoseCandidate | None,
 ) -> dict[str, MarkerPose]:
     found = (estimate_pose([d], t_s, prior.attitude, setup, prior.normal_cam, start) for d in seen)
     return {pose.source: pose for pose in found if pose is not None}
@@ -199,7 +205,7 @@ def _contradict(singles: Mapping[str, MarkerPose], config: MergeConfig) -> bool:
 def _usable(
     singles: Mapping[str, MarkerPose],
     contradicting: bool,
-    prior: Prior,
+    prior: MergePrior,
     config: MergeConfig,
     setup: PoseSetup,
 ) -> dict[str, MarkerPose]:
@@ -207,7 +213,7 @@ def _usable(
     the stage asks for."""
     if len(singles) < 2:
         return dict(singles)
-    use = better(singles["large"], singles["small"])
+    use = better_conditioned(singles["large"], singles["small"])
     if contradicting:
         return {use.source: use}
     offset = setup.gear_body_m - setup.T_body_cam[:3, 3]

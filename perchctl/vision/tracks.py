@@ -11,7 +11,7 @@ from perchctl.profile import KalmanConfig
 from perchctl.values import replace
 from perchctl.vision.filter import POSITION, FilterSetup, Measurement, make_filter, step_track
 from perchctl.vision.gate import Sight, Verdict, judged, locked, remembered
-from perchctl.vision.own import NOWHERE, OwnPlace, refusal
+from perchctl.vision.own import NOWHERE, OwnTargetPlace, refusal
 from perchctl.vision.places import measurement
 from perchctl.vision.pose import PoseSetup
 from perchctl.vision.predict import is_in_view
@@ -20,7 +20,7 @@ from perchctl.vision.types import (
     Lock,
     MarkerPose,
     MarkerTrack,
-    Measured,
+    MeasuredMarkers,
     PipelineState,
     Stranger,
 )
@@ -36,19 +36,19 @@ class TrackSetup:
     names: tuple[str, ...]
     pose: PoseSetup
     gate: bool
-    own: OwnPlace = NOWHERE
+    own: OwnTargetPlace = NOWHERE
 
     def constants(self, in_world: bool) -> FilterSetup:
         return self.world if in_world else self.level
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
+class TrackedFrame:
     """The tracks one frame on. `measured` feeds nothing where its pose was not `taken`; `note`
     is a sentence for people on a pose that was not, or that begins the tracks anew; `refused`, it
     was another vehicle's target."""
 
-    measured: Measured
+    measured: MeasuredMarkers
     tracks: dict[str, MarkerTrack]
     lock: Lock | None = None
     stranger: Stranger | None = None
@@ -58,8 +58,9 @@ class Followed:
 
 
 def make_track_setup(
-    config: KalmanConfig, names: tuple[str, ...], pose: PoseSetup, own: OwnPlace = NOWHERE
+    config: KalmanConfig, names: tuple[str, ...], pose: PoseSetup, own: OwnTargetPlace = NOWHERE
 ) -> TrackSetup:
+    """The constants of the Kalman filters of these tracks, from the profile."""
     return TrackSetup(
         level=make_filter(config, in_world=False),
         world=make_filter(config, in_world=True),
@@ -70,14 +71,14 @@ def make_track_setup(
     )
 
 
-def followed_on(
+def update_tracks(
     state: PipelineState,
-    measured: Measured,
+    measured: MeasuredMarkers,
     t_s: float,
     attitude: Attitude | None,
     in_world: bool,
     setup: TrackSetup,
-) -> Followed:
+) -> TrackedFrame:
     """What the gate lets through goes into the tracks."""
     constants = setup.constants(in_world)
     fed = {
@@ -98,7 +99,7 @@ def followed_on(
         fed = fed if verdict.taken else {}
         measured = measured if verdict.taken else replace(measured, fed={})
         tracks = _stepped(old, fed, t_s, setup.names, constants)
-        return Followed(
+        return TrackedFrame(
             measured, tracks, taken=verdict.taken, note=verdict.text, refused=verdict.refused
         )
     if not verdict.taken:
@@ -110,7 +111,9 @@ def followed_on(
         if len(tracks) > 1:
             surest = min(tracks.values(), key=lambda t: (t.unseen, float(np.trace(t.P))))
         lock = locked(lock, surest, sight, verdict)
-    return Followed(measured, tracks, lock, stranger, verdict.taken, verdict.text, verdict.refused)
+    return TrackedFrame(
+        measured, tracks, lock, stranger, verdict.taken, verdict.text, verdict.refused
+    )
 
 
 def _verdict(
@@ -128,16 +131,18 @@ def _verdict(
     return verdict
 
 
-def _sight(measured: Measured, fed: Mapping[str, Measurement], t_s: float, in_world: bool) -> Sight:
+def _sight(
+    measured: MeasuredMarkers, fed: Mapping[str, Measurement], t_s: float, in_world: bool
+) -> Sight:
     """What the gate has to judge: the surest pose of those that would be fed."""
-    pose = surest_of(measured)
+    pose = surest_pose(measured)
     assert pose is not None
     name = next(n for n, each in measured.fed.items() if each is pose)
     whole = pose.source == "joint" or (len(measured.poses) > 1 and not measured.contradicting)
     return Sight(t_s, pose, fed[name], in_world, whole)
 
 
-def surest_of(measured: Measured) -> MarkerPose | None:
+def surest_pose(measured: MeasuredMarkers) -> MarkerPose | None:
     """Of the poses that are fed, or else of all."""
     poses = measured.fed or measured.poses
     return min(poses.values(), key=lambda p: float(p.sigma_m @ p.sigma_m), default=None)

@@ -298,7 +298,7 @@ class Stranger:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredMarkers:
     """What one frame's corners gave.
 
     Attributes:
@@ -318,7 +318,7 @@ class PipelineState:
 
     tracks: dict[str, MarkerTrack] = field(default_factory=dict)
     in_world: bool = False  # the tracks' frame: world of the state estimate, or level
-    measured: Measured = Measured()  # of the newest frame
+    measured: MeasuredMarkers = MeasuredMarkers()  # of the newest frame
     attitude: Attitude | None = None  # at the newest frame
     target: TargetEstimate | None = None  # at the last frame with a track
     last: Detections | None = None

@@ -19,8 +19,15 @@ from perchctl.files import cannot_be_written
 from perchctl.geometry import Array
 from perchctl.pipeline import Pipeline, make_pipeline, step
 from perchctl.profile import Profile
-from perchctl.vision.pose import estimate_pose
-from perchctl.vision.types import MARKERS, Attitude, CameraModel, Frame, MarkerPose, PipelineState
+from perchctl.vision import (
+    MARKERS,
+    Attitude,
+    CameraModel,
+    Frame,
+    MarkerPose,
+    PipelineState,
+    estimate_pose,
+)
 from perchctl.weights.table import HEADER, row_text
 
 SEEN_SHARE = 0.9

@@ -8,11 +8,11 @@ from contextlib import AbstractContextManager
 
 import numpy as np
 
-from perchctl.camera.source import FrameSource, check_size
+from perchctl.camera import FrameSource, check_size
 from perchctl.errors import Interrupted, InvalidValue, NotFound, TimedOut
 from perchctl.geometry import Array, wrap_rad
 from perchctl.profile import Profile
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame
 from perchctl.weights.collect import (
     MarkerReader,
     MarkerReading,

@@ -18,10 +18,9 @@ from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, rotation_from_rpy
-from perchctl.log.read import FlightLog, read_log
+from perchctl.log import FlightLog, read_log
 from perchctl.profile import Profile
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario, draw_scenario
 from perchctl.weights.types import AXES, UNITS, Measurements, wrap
 
 STRETCH_S = 1.0

@@ -15,11 +15,8 @@ import numpy as np
 from perchctl.errors import InvalidValue
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, wrap_rad
 from perchctl.profile import Profile
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import rotation_vector, square
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.sim import Renderer, Scenario
+from perchctl.vision import CameraModel, Frame, project, rotation_vector, square_corners
 from perchctl.weights.collect import (
     MarkerReader,
     SessionFile,
@@ -64,7 +61,7 @@ class SimulatedStand:
             camera_defocus_px=blur_px,
         )
         self._renderer = Renderer(self._scenario, camera, profile.target, seed)
-        self._corners = square(profile.target.large.side_m)
+        self._corners = square_corners(profile.target.large.side_m)
 
     def fill(
         self, session: SessionFile, positions: int, frames: int, advance: Callable[[], None]

@@ -26,9 +26,9 @@ from perchctl.errors import (
 )
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
 from perchctl.positioning import BodyPose, CaptureFrame, Placed, open_capture
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.vehicle import Telemetry
-from perchctl.vision.types import Attitude
+from perchctl.vision import Attitude
 
 SAMPLES = 30
 WITHIN_S = 5.0

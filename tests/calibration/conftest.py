@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 from tests.helpers.boards import CHARUCO, draw_camera, render_folder
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from typer.testing import Result
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.calibration.lens import parameters_of
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 from tests.helpers.boards import (
     APRILGRID,
     CHARUCO,

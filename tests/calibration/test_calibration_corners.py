@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.calibration import BoardView, Grey
 from perchctl.calibration.detect import find_board
 from perchctl.calibration.saddle import fit_saddles
-from perchctl.calibration.types import Grey, View
 from perchctl.geometry import Array
-from perchctl.target.boards import parse_board
-from perchctl.vision.camera_model import project
+from perchctl.target import parse_board
+from perchctl.vision import project
 from tests.helpers.boards import (
     APRILGRID,
     CHARUCO,
@@ -80,7 +80,7 @@ def _errors(board_pose: Array, chess: bool, refine: bool, seed: int = 0) -> Arra
     rng = np.random.default_rng(seed)
     picture = BoardRenderer(CAMERA, board).render(board_pose, rng, noise=2.0)
     view = find_board(picture, board, refine=refine)
-    assert isinstance(view, View)
+    assert isinstance(view, BoardView)
     there = project(board.corners_m(), board_pose[:3], board_pose[3:], CAMERA)
     if chess and np.linalg.norm(view.corners_px[0] - there[0]) > 20:
         there = there[::-1]  # found from its other end
@@ -110,7 +110,7 @@ def test_a_large_picture_keeps_the_places_of_its_pixels() -> None:
     picture = BoardRenderer(CAMERA, CHARUCO).render(pose, np.random.default_rng(0), noise=1.0)
     large = np.asarray(cv2.resize(picture, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC))
     view = find_board(large, CHARUCO)
-    assert isinstance(view, View)
+    assert isinstance(view, BoardView)
     there = project(CHARUCO.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
     expected = (there + 0.5) * 4 - 0.5
     assert np.abs((view.corners_px - expected).mean(axis=0)).max() < 0.1
@@ -122,7 +122,7 @@ def _tag_errors(
     """Of the corners found of an aprilgrid, which all know where they belong, (n, 2)."""
     picture = renderer.render(pose, np.random.default_rng(0), blur_px, noise=2.0)
     view = find_board(picture, APRILGRID, refine=refine)
-    assert isinstance(view, View)
+    assert isinstance(view, BoardView)
     there = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)
     return np.asarray(view.corners_px - there[view.ids])
 
@@ -154,7 +154,7 @@ def test_a_wide_gap_s_window_leaves_the_tag_s_cells_out() -> None:
     pose = np.array([0.3, -0.2, 0.4, -0.03, -0.08, 0.35])
     picture = BoardRenderer(CAMERA, board).render(pose, np.random.default_rng(0), noise=2.0)
     view = find_board(picture, board)
-    assert isinstance(view, View)
+    assert isinstance(view, BoardView)
     assert len(view) == 64
     errors = view.corners_px - project(board.corners_m(), pose[:3], pose[3:], CAMERA)
     assert np.sqrt((errors**2).sum(axis=1).mean()) < 0.05
@@ -202,7 +202,7 @@ def test_a_corner_on_the_picture_s_rim_is_not_measured(tag_renderer: BoardRender
         pose[3] -= off * pose[5] / CAMERA.K[0, 0]
     picture = tag_renderer.render(pose, np.random.default_rng(0), noise=2.0)
     view = find_board(picture, APRILGRID)
-    assert isinstance(view, View)
+    assert isinstance(view, BoardView)
     assert 130 < len(view) < 144
     there = project(APRILGRID.corners_m(), pose[:3], pose[3:], CAMERA)[view.ids]
     assert np.linalg.norm(view.corners_px - there, axis=1).max() < 0.3
@@ -221,7 +221,7 @@ def test_a_tag_of_something_else_is_none_of_the_board_s(tag_renderer: BoardRende
         stranger[5:45, 5:45] = tags.generateImageMarker(tag, 40, borderBits=2)
         picture[y : y + 50, x : x + 50] = stranger
     view = find_board(picture, APRILGRID)
-    assert isinstance(view, View)
+    assert isinstance(view, BoardView)
     assert len(view) > 100
     assert np.abs(view.corners_px - there[view.ids]).max() < 0.5
     assert not set(APRILGRID.tag_corners(7)) & set(view.ids)

@@ -7,15 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perchctl.calibration.check import check
+from perchctl.calibration import BoardView, Grey, calibrate_camera, check_calibration
 from perchctl.calibration.detect import find_board
 from perchctl.calibration.pictures import _sharpness
-from perchctl.calibration.solve import calibrate
-from perchctl.calibration.types import Grey, View
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project
-from perchctl.vision.fields import is_combed
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, is_combed, project
 from tests.helpers.boards import CHARUCO, BoardRenderer, draw_camera, draw_poses
 
 FIELDS_S = 0.02
@@ -39,7 +35,7 @@ def woven(
 
 
 @pytest.fixture(scope="module")
-def views(camera: CameraModel) -> list[View]:
+def views(camera: CameraModel) -> list[BoardView]:
     """Of a board that is moved while its pictures are taken."""
     rng = np.random.default_rng(3)
     renderer = BoardRenderer(camera, CHARUCO)
@@ -48,7 +44,7 @@ def views(camera: CameraModel) -> list[View]:
         picture, poses = woven(renderer, pose, rng)
         combed += is_combed(picture)
         view = find_board(picture, CHARUCO, f"view {i}")
-        assert isinstance(view, View), view
+        assert isinstance(view, BoardView), view
         there = [project(CHARUCO.corners_m(), p[:3], p[3:], camera)[view.ids] for p in poses]
         # Half way between the fields, or where only one of them shows the board.
         moments = [(there[0] + there[1]) / 2.0, *there]
@@ -59,18 +55,18 @@ def views(camera: CameraModel) -> list[View]:
     return found
 
 
-def test_fields_calibrate_a_camera(views: list[View], camera: CameraModel) -> None:
-    result = calibrate(views, "")
+def test_fields_calibrate_a_camera(views: list[BoardView], camera: CameraModel) -> None:
+    result = calibrate_camera(views, "")
     assert result.solution.rms_px < 0.06
     assert result.camera.K[0, 0] == pytest.approx(camera.K[0, 0], rel=2e-3)
     assert result.camera.K[1, 1] == pytest.approx(camera.K[1, 1], rel=2e-3)
 
 
-def test_fields_judge_a_calibration(views: list[View], camera: CameraModel) -> None:
-    assert check(camera, views).passed
+def test_fields_judge_a_calibration(views: list[BoardView], camera: CameraModel) -> None:
+    assert check_calibration(camera, views).passed
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= 1.01
-    assert not check(dataclasses.replace(camera, K=K), views).passed
+    assert not check_calibration(dataclasses.replace(camera, K=K), views).passed
 
 
 def test_a_comb_is_no_sharpness(camera: CameraModel) -> None:

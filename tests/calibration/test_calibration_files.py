@@ -12,14 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from perchctl.calibration.files import camera_of, load_calibration
-from perchctl.calibration.lens import COEFFICIENTS, MODEL_NAMES, parameters_of
-from perchctl.calibration.solve import calibrate
-from perchctl.calibration.writing import calibration_text, camera_text
+from perchctl.calibration import (
+    MODEL_NAMES,
+    calibrate_camera,
+    calibration_text,
+    camera_text,
+    load_calibration,
+    profile_camera,
+)
+from perchctl.calibration.lens import COEFFICIENTS, parameters_of
 from perchctl.cli import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import CameraConfig
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 from tests.helpers.boards import corner_views, draw_camera
 
 ODD = [1e-05, -0.1, 0.30000000000000004, 1e-17, -123.456, 5e-324, 1 / 3, 0.0]
@@ -67,7 +72,7 @@ def test_any_number_is_written_as_a_number(value: float) -> None:
 def test_a_calibration_s_file_holds_its_quality(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     camera = draw_camera(rng)
-    result = calibrate(corner_views(rng, camera), "charuco:10x7:25mm:18mm:DICT_5X5_100")
+    result = calibrate_camera(corner_views(rng, camera), "charuco:10x7:25mm:18mm:DICT_5X5_100")
     path = tmp_path / "camera.yaml"
     path.write_text(calibration_text(result, "camera", "2026-01-02T03:04:05+00:00"))
     plain = yaml.safe_load(path.read_text())
@@ -131,7 +136,7 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
     chain = _camchain(tmp_path / "camchain.yaml")
     assert load_calibration(chain, cam="cam0").K[0, 0] == 300.0
     assert load_calibration(chain, cam="cam1").K[0, 0] == 400.0
-    assert camera_of(CameraConfig(calibration=str(chain), cam="cam1")).K[0, 0] == 400.0
+    assert profile_camera(CameraConfig(calibration=str(chain), cam="cam1")).K[0, 0] == 400.0
     with pytest.raises(InvalidValue, match=r"2 cameras \(cam0, cam1\): name one with --cam cam0"):
         load_calibration(chain)
     with pytest.raises(InvalidValue, match=r"no camera 'cam2'; its cameras are cam0, cam1"):

@@ -12,13 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration.guided import Moment, capture
+from perchctl.calibration import BoardView, CaptureMoment, capture_views
 from perchctl.calibration.novelty import Capture, Signature, consider, hint, progress, signature
-from perchctl.calibration.types import View
 from perchctl.commands.calibrate_live import captured_views, coverage_bars, page_state
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
@@ -95,8 +94,8 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     for pose in draw_poses(rng, camera, CHESSBOARD, 7):
         image = renderer.render(pose, rng, noise=1.0)
         images += [image, image, image]  # comes in, is still, stays
-    moments: list[Moment] = []
-    views = capture(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
+    moments: list[CaptureMoment] = []
+    views = capture_views(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
     assert 5 <= len(views) <= 7
     assert sum(m.shot for m in moments) == len(views)
     assert [len(m.views) for m in moments] == [m.taken for m in moments]
@@ -105,7 +104,7 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     assert moments[0].advice == "hold still"
     assert 0 < moments[-1].covered["x"] <= 1
     with pytest.raises(TimedOut, match="only 1 views"):
-        capture(_Frames(images[:3]), CHESSBOARD, moments.append, _clock(), lambda s: None)
+        capture_views(_Frames(images[:3]), CHESSBOARD, moments.append, _clock(), lambda s: None)
 
 
 FOLLOWED = {
@@ -211,7 +210,7 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
     assert 15 <= len(state.taken) <= shown <= 40
     again = consider(state, state.taken[-1], CHARUCO)
     assert not again.shot
-    blurred = View(*(getattr(views[-1], n) for n in ("name", "size_px", "ids", "object_m")),
+    blurred = BoardView(*(getattr(views[-1], n) for n in ("name", "size_px", "ids", "object_m")),
                    views[-1].corners_px, 8.0)  # fmt: skip
     before = consider(Capture(), blurred, CHARUCO)
     assert "blurred" in consider(before, blurred, CHARUCO).advice
@@ -220,7 +219,9 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
 def test_the_page_s_bars_are_shares_and_no_characters() -> None:
     image = np.zeros((4, 4), np.uint8)
     covered = {"x": 0.5, "y": 0.0, "size": 1.0, "tilt": 0.25}
-    state = page_state(Moment(0, image, np.empty((0, 2)), covered, 3, "hold still", False), None)
+    state = page_state(
+        CaptureMoment(0, image, np.empty((0, 2)), covered, 3, "hold still", False), None
+    )
     assert state["phase"] == "hold still"
     *bars, views = state["rows"]
     assert [(name, share) for name, _, share in bars] == list(covered.items())

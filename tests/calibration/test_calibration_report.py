@@ -9,12 +9,11 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from perchctl.calibration import BoardView, Calibration, Rejection, calibrate_camera
 from perchctl.calibration.lens import ModelName
 from perchctl.calibration.plot import BANNER, report_figure
 from perchctl.calibration.predict import distortion_curve, ray_errors_px
-from perchctl.calibration.solve import calibrate
-from perchctl.calibration.types import Calibration, Rejection, View
-from perchctl.vision.camera_model import distort
+from perchctl.vision import distort
 from tests.helpers.boards import CHESSBOARD, corner_views, draw_camera
 
 MISSING = [Rejection(f"a_rather_long_name_{i}.jpg", "is cut off") for i in range(6)]
@@ -25,10 +24,10 @@ def calibrated(model: ModelName) -> Calibration:
     rng = np.random.default_rng(3)
     camera = draw_camera(rng)
     views = [_middle(v) for v in corner_views(rng, camera, CHESSBOARD, 8, 0.2)]
-    return calibrate(views, "", model, missing=MISSING)
+    return calibrate_camera(views, "", model, missing=MISSING)
 
 
-def _middle(view: View) -> View:
+def _middle(view: BoardView) -> BoardView:
     away = np.abs(view.corners_px - np.array(view.size_px) / 2) / view.size_px
     return view.keep((away < 0.36).all(axis=1))
 

@@ -11,53 +11,49 @@ import cv2
 import numpy as np
 import pytest
 
+from perchctl.calibration import BoardView, calibrate_camera, check_calibration, views_of_images
 from perchctl.calibration.bundle import start_fit
-from perchctl.calibration.check import check
 from perchctl.calibration.covariance import lens_covariance
 from perchctl.calibration.lens import make_camera, parameters_of, pixel_derivatives, rays_of
-from perchctl.calibration.pictures import views_of_images
 from perchctl.calibration.predict import position_errors_mm, predict_errors, ray_difference_px
-from perchctl.calibration.solve import calibrate
-from perchctl.calibration.types import View
 from perchctl.calibration.verdict import level, limit_mm, sentence
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, project
 from tests.helpers.boards import CHARUCO, CHESSBOARD, corner_views, draw_camera
 
 pytestmark = pytest.mark.long
 
 
-def drawn(seed: int, **options: float) -> tuple[list[View], CameraModel]:
+def drawn(seed: int, **options: float) -> tuple[list[BoardView], CameraModel]:
     rng = np.random.default_rng(seed)
     camera = draw_camera(rng)
     return corner_views(rng, camera, **options), camera  # type: ignore[arg-type]
 
 
-def moved(view: View, which: Array, by: tuple[float, float]) -> View:
+def moved(view: BoardView, which: Array, by: tuple[float, float]) -> BoardView:
     corners = view.corners_px.copy()
     corners[which] += by
     return dataclasses.replace(view, corners_px=corners)
 
 
 @pytest.fixture(scope="module")
-def plain_corners(chessboard_folder: Path) -> list[View]:
+def plain_corners(chessboard_folder: Path) -> list[BoardView]:
     """The photographs' views with OpenCV's own corners."""
     views, missing = views_of_images(str(chessboard_folder), CHESSBOARD, refine=False)
     assert (len(views), missing) == (13, [])
     return views
 
 
-def test_photographs_as_opencv_has_them(plain_corners: list[View]) -> None:
-    result = calibrate(plain_corners, "", "plumb_bob", rejecting=False)
+def test_photographs_as_opencv_has_them(plain_corners: list[BoardView]) -> None:
+    result = calibrate_camera(plain_corners, "", "plumb_bob", rejecting=False)
     assert len(result.views) == 13
     assert result.solution.rms_px == pytest.approx(0.4087, abs=0.005)
 
 
 def test_photographs_with_the_better_corners(chessboard_folder: Path) -> None:
     views, _ = views_of_images(str(chessboard_folder), CHESSBOARD)
-    result = calibrate(views, "")
+    result = calibrate_camera(views, "")
     assert len(result.views) >= 11
     assert result.solution.rms_px <= 0.24
     assert 532 <= result.camera.K[0, 0] <= 537
@@ -69,8 +65,8 @@ def test_photographs_with_the_better_corners(chessboard_folder: Path) -> None:
         assert rms.get(faulty, 1.0) < 0.25 or faulty in named
 
 
-def test_opencv_s_faulty_corners_are_rejected_and_named(plain_corners: list[View]) -> None:
-    result = calibrate(plain_corners, "")
+def test_opencv_s_faulty_corners_are_rejected_and_named(plain_corners: list[BoardView]) -> None:
+    result = calibrate_camera(plain_corners, "")
     named = {r.view: r for r in result.rejections}
     assert {"left02.jpg", "left13.jpg"} <= set(named)
     assert len(result.views) >= 11
@@ -83,7 +79,7 @@ def test_rendered_boards_and_their_truth(scenes_folder: Path) -> None:
     K, dist = np.array(text["camera_matrix"]), np.array(text["dist_coeffs"])
     truth = CameraModel(tuple(text["image_size"]), K, dist)
     views, _ = views_of_images(str(scenes_folder / "calib"), CHARUCO)
-    result = calibrate(views, "")
+    result = calibrate_camera(views, "")
     error = result.solution.parameters - parameters_of(truth)
     assert np.abs(error[:2]).max() < 0.3
     assert np.abs(error[2:4]).max() < 0.6
@@ -100,10 +96,10 @@ def test_rendered_boards_and_their_truth(scenes_folder: Path) -> None:
 RANK = {"stop": 0, "care": 1, "fly": 2}
 
 
-def rank_and_aside(views: Sequence[View]) -> tuple[int, float]:
+def rank_and_aside(views: Sequence[BoardView]) -> tuple[int, float]:
     """How good the verdict is (a refusal is the worst), and the error aside, in limits."""
     try:
-        result = calibrate(views, "")
+        result = calibrate_camera(views, "")
     except InvalidValue:
         return -1, np.inf
     return RANK[level(result)], max(e.mm95 / limit_mm(e.z_m) for e in result.errors)
@@ -128,7 +124,7 @@ def test_what_boards_did_not_cover_is_not_good_to_fly_with() -> None:
     views, camera = drawn(5, views=20, noise_px=0.05)
     right = 0.62 * camera.size_px[0]
     cut = [v.keep(v.corners_px[:, 0] < right) for v in views]
-    result = calibrate([v for v in cut if len(v) >= 8], "")
+    result = calibrate_camera([v for v in cut if len(v) >= 8], "")
     assert max(e.axis_mm95 / limit_mm(e.z_m) for e in result.errors) < 1.0
     assert level(result) == "care"
     assert "% of the picture is uncovered" in sentence(result)
@@ -211,7 +207,7 @@ def test_outliers_are_named_and_the_rest_stays() -> None:
     noise = rng.normal(0, 0.8, views[4].corners_px.shape)
     views[4] = dataclasses.replace(views[4], corners_px=views[4].corners_px + noise)
     views[9] = moved(views[9], np.array([3, 7]), (2.0, -1.0))
-    result = calibrate(views, "", "plumb_bob")
+    result = calibrate_camera(views, "", "plumb_bob")
     whole = [r.view for r in result.rejections if not r.corners]
     corners = {r.view: r.corners for r in result.rejections if r.corners}
     assert whole == [views[4].name]
@@ -223,7 +219,7 @@ def test_outliers_are_named_and_the_rest_stays() -> None:
 def test_good_views_are_all_kept() -> None:
     for seed in range(2):
         views, _ = drawn(20 + seed, noise_px=0.1)
-        assert calibrate(views, "", "plumb_bob").rejections == ()
+        assert calibrate_camera(views, "", "plumb_bob").rejections == ()
 
 
 def test_views_that_fit_no_camera_are_refused() -> None:
@@ -233,19 +229,19 @@ def test_views_that_fit_no_camera_are_refused() -> None:
         noise = rng.normal(0, 4, views[i].corners_px.shape)
         views[i] = dataclasses.replace(views[i], corners_px=views[i].corners_px + noise)
     with pytest.raises(InvalidValue, match="do not fit one camera"):
-        calibrate(views, "", "plumb_bob")
+        calibrate_camera(views, "", "plumb_bob")
 
 
 def test_too_few_views_say_how_many_to_add() -> None:
     views, _ = drawn(0)
     with pytest.raises(InvalidValue, match=r"only 2 pictures show the board.*add 3 or more"):
-        calibrate(views[:2], "")
+        calibrate_camera(views[:2], "")
 
 
 def test_frontal_views_are_refused() -> None:
     views, _ = drawn(1, max_tilt_deg=4.0)
     with pytest.raises(InvalidValue, match=r"tilted by more than.*add .* 20 to 45 deg"):
-        calibrate(views, "")
+        calibrate_camera(views, "")
 
 
 def test_boards_in_one_corner_of_the_picture_are_refused() -> None:
@@ -253,7 +249,7 @@ def test_boards_in_one_corner_of_the_picture_are_refused() -> None:
     near = np.array(camera.size_px) * (0.5, 0.6)
     cut = [v.keep((v.corners_px < near).all(axis=1)) for v in views]
     with pytest.raises(InvalidValue, match=r"cover .* %.*add views with the board at the .*right"):
-        calibrate([v for v in cut if len(v) >= 8], "")
+        calibrate_camera([v for v in cut if len(v) >= 8], "")
 
 
 def test_the_lens_model_is_recommended_by_views_held_out() -> None:
@@ -261,12 +257,12 @@ def test_the_lens_model_is_recommended_by_views_held_out() -> None:
     plain = draw_camera(rng)
     fisheye = CameraModel(plain.size_px, plain.K, np.array([0.25, -0.35, 0.3, -0.2]), "fisheye")
     views = corner_views(rng, fisheye, views=12, noise_px=0.02)
-    result = calibrate(views, "")
+    result = calibrate_camera(views, "")
     scores = {s.model: s.held_out_px for s in result.scores}
     assert set(scores) == {"plumb_bob", "rational_polynomial", "fisheye"}
     assert scores["fisheye"] < 1.2 * min(s for s in scores.values() if s)  # type: ignore[operator]
     views = corner_views(rng, plain, views=12, noise_px=0.05)
-    assert calibrate(views, "").recommended == "plumb_bob"
+    assert calibrate_camera(views, "").recommended == "plumb_bob"
 
 
 def test_a_strong_fisheye_is_not_taken_for_a_pinhole() -> None:
@@ -274,7 +270,7 @@ def test_a_strong_fisheye_is_not_taken_for_a_pinhole() -> None:
     K = np.array([[330.0, 0, 322], [0, 331.0, 238], [0, 0, 1]])
     camera = CameraModel((640, 480), K, np.array([0.05, -0.02, 0.01, -0.003]), "fisheye")
     views = corner_views(rng, camera, views=15, noise_px=0.03)
-    result = calibrate(views, "")
+    result = calibrate_camera(views, "")
     assert result.recommended in ("fisheye", "rational_polynomial")
     if result.recommended == "fisheye":
         assert np.abs(result.camera.K - K).max() < 1.0
@@ -282,21 +278,21 @@ def test_a_strong_fisheye_is_not_taken_for_a_pinhole() -> None:
 
 def test_a_check_passes_the_camera_and_fails_another() -> None:
     views, camera = drawn(12, noise_px=0.05)
-    assert check(camera, views).passed
+    assert check_calibration(camera, views).passed
     longer = CameraModel(camera.size_px, camera.K * [[1.01], [1.01], [1.0]], camera.dist)
-    result = check(longer, views)
+    result = check_calibration(longer, views)
     assert not result.passed
     assert any(d.mm > 0.5 * limit_mm(d.z_m) for d in result.deviations)
     straight = CameraModel(camera.size_px, camera.K, np.zeros(5))
-    assert not check(straight, views).passed
+    assert not check_calibration(straight, views).passed
 
 
 def test_a_check_by_frontal_views_says_that_it_cannot_tell() -> None:
     views, camera = drawn(12, noise_px=0.3, max_tilt_deg=2.0, views=4)
     with pytest.raises(InvalidValue, match=r"too little to judge|do not fit"):
-        check(camera, views)
+        check_calibration(camera, views)
     with pytest.raises(InvalidValue, match="at least 3"):
-        check(camera, views[:2])
+        check_calibration(camera, views[:2])
 
 
 def test_a_print_stretched_along_one_side_is_mended_by_its_measured_sides() -> None:
@@ -308,7 +304,9 @@ def test_a_print_stretched_along_one_side_is_mended_by_its_measured_sides() -> N
     views = corner_views(rng, camera, printed, noise_px=0.03)
     meant = [dataclasses.replace(v, object_m=CHARUCO.corners_m()[v.ids]) for v in views]
     larger = [dataclasses.replace(v, object_m=1.004 * v.object_m) for v in views]
-    known, wrong, scaled = (calibrate(v, "", "plumb_bob", False) for v in (views, meant, larger))
+    known, wrong, scaled = (
+        calibrate_camera(v, "", "plumb_bob", False) for v in (views, meant, larger)
+    )
     assert known.solution.rms_px < 0.06
     assert wrong.solution.rms_px > 2 * known.solution.rms_px
     truth = parameters_of(camera)

@@ -14,18 +14,19 @@ from typer.testing import CliRunner, Result
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.mounting.recording import Recording, read_recordings, write_recordings
-from perchctl.calibration.mounting.report import (
-    KEYS,
-    Comparison,
+from perchctl.calibration import (
+    MountingRecording,
+    MountingReport,
     keys_text,
     mounting_lines,
     mounting_record,
-    turn_between_deg,
-    written_gear_cam_m,
+    read_recordings,
+    solve_carry,
+    solve_pivot,
+    write_recordings,
 )
+from perchctl.calibration.mounting.report import KEYS, turn_between_deg, written_gear_cam_m
 from perchctl.calibration.mounting.result import Carried
-from perchctl.calibration.mounting.solve import solve_carry, solve_pivot
 from perchctl.cli import app
 from perchctl.commands import calibrate_mount
 from perchctl.geometry import Array, rpy_from_rotation
@@ -283,7 +284,7 @@ def test_a_profile_that_was_changed_meanwhile_is_not_written_to(
     text = f"extends: crazyflie\n{changed}\n"
     solved = calibrate_mount.solved
 
-    def long_work(*given: Any) -> Comparison:
+    def long_work(*given: Any) -> MountingReport:
         Path("mine.yaml").write_text(text, encoding="utf-8")
         return solved(*given)
 
@@ -309,7 +310,7 @@ def test_numbers_stand_where_the_profile_is_gone_meanwhile(
 ) -> None:
     solved = calibrate_mount.solved
 
-    def long_work(*given: Any) -> Comparison:
+    def long_work(*given: Any) -> MountingReport:
         Path("mine.yaml").unlink()
         return solved(*given)
 
@@ -323,7 +324,7 @@ def test_numbers_stand_where_the_profile_is_gone_meanwhile(
 def test_the_carry_alone_says_that_the_gear_is_still_to_do() -> None:
     turned = Mounting(rpy_deg=(0.0, 0.0, 90.0)).T_body_cam[:3, :3]
     assert turn_between_deg(turned, np.eye(3)) == pytest.approx(90.0)
-    c = Comparison(load_profile("crazyflie"), carried(turned), None)
+    c = MountingReport(load_profile("crazyflie"), carried(turned), None)
     lines = "\n".join(mounting_lines(c))
     assert "0 0 90 +-" in lines
     assert "you wrote 0 0 0: 90.0 deg away" in lines
@@ -335,7 +336,7 @@ def test_the_carry_alone_says_that_the_gear_is_still_to_do() -> None:
 def test_a_latency_that_flights_measure_stays_so() -> None:
     profile = load_profile("crazyflie")
     camera = profile.camera.model_copy(update={"latency_s": "measured"})
-    c = Comparison(profile.model_copy(update={"camera": camera}), carried(np.eye(3)), None)
+    c = MountingReport(profile.model_copy(update={"camera": camera}), carried(np.eye(3)), None)
     assert "camera.latency_s" not in c.profile_values()
     assert mounting_record(c)["written"]["latency_s"] is None
     assert "you wrote measured: each flight measures it" in "\n".join(mounting_lines(c))
@@ -347,7 +348,7 @@ def test_a_place_is_taken_only_where_it_is_known_better_than_by_a_ruler() -> Non
             carried(np.eye(3)), cam_body_m=np.array([0.031, 0.0, 0.012]),
             cam_body_sigma_m=np.full(3, sigma_m),
         )  # fmt: skip
-        c = Comparison(load_profile("crazyflie"), known, None)
+        c = MountingReport(load_profile("crazyflie"), known, None)
         assert ("camera.mount.position_m" in c.profile_values()) is taken
         assert ("the profile's is kept" in "\n".join(mounting_lines(c))) is not taken
 
@@ -373,10 +374,10 @@ def test_the_simulator_tells_the_truth_beside(
     """Without its pictures, which the solver's own tests render."""
     parts = {r.part: r for r in read_recordings(logs["both"])}
 
-    def quick(held: Any, *_: Any, **__: Any) -> Recording:
+    def quick(held: Any, *_: Any, **__: Any) -> MountingRecording:
         return parts[held.part]
 
-    monkeypatch.setattr("perchctl.sim.hand.record", quick)
+    monkeypatch.setattr("perchctl.sim.hand.record_hand", quick)
     result = mount("--truth", "sim", "--seed", str(SEED), "--part", "pivot", "--json")
     record = json.loads(result.stdout)
     truth = hand("carry", SEED)
@@ -441,7 +442,7 @@ def test_the_report_names_only_what_was_measured(logs: dict[str, Path]) -> None:
     carry, pivot = (read_recordings(logs[part])[0] for part in ("carry", "pivot"))
     carried, pivoted = solve_carry(carry), solve_pivot(pivot)
     sim = load_profile("sim")
-    assert Comparison(sim, None, pivoted).camera_label == ""
-    assert Comparison(sim, carried, None).camera_label == "camera, turn as measured"
+    assert MountingReport(sim, None, pivoted).camera_label == ""
+    assert MountingReport(sim, carried, None).camera_label == "camera, turn as measured"
     placed = replace(carried, cam_body_m=np.zeros(3), cam_body_sigma_m=np.full(3, 1e-4))
-    assert Comparison(sim, placed, None).camera_label == "camera, as measured"
+    assert MountingReport(sim, placed, None).camera_label == "camera, as measured"

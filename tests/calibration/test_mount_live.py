@@ -18,27 +18,28 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import load_calibration
-from perchctl.calibration.mounting.capture import (
+from perchctl.calibration import (
     LEAST_S,
-    MOST_S,
+    AttitudeSample,
+    Eye,
     Moment,
-    Sensors,
-    Tape,
+    MountingTape,
+    VehicleSensors,
     capture,
+    load_calibration,
+    read_recordings,
 )
-from perchctl.calibration.mounting.eye import Eye
-from perchctl.calibration.mounting.recording import AttitudeSample, SeenPose, read_recordings
+from perchctl.calibration.mounting.capture import MOST_S
+from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.cli import app
 from perchctl.commands import calibrate_mount_live
 from perchctl.commands.calibrate_mount_live import guide, page_state
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import R_MARKER_TARGET
-from perchctl.link.motion import MotionLink
+from perchctl.link import MotionLink
 from perchctl.profile import load_profile
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import Frame
+from perchctl.sim import Scenario, SimProcess
+from perchctl.vision import Frame
 from tests.helpers.mounting import hand, seen
 from tests.helpers.relay import relayed
 from tests.helpers.target_picture import CAMERA, pose_of, render
@@ -202,10 +203,10 @@ def feed(attitudes: tuple[AttitudeSample, ...], film: _Film) -> Callable[[], lis
 
 def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
     whole = seen(hand("carry", seconds=LEAST_S["carry"] + 3.0))
-    film, tape, moments = _Film(), Tape("carry"), []
+    film, tape, moments = _Film(), MountingTape("carry"), []
     capture(
-        tape, film, _Looks(whole.poses), Sensors(feed(whole.attitudes, film)), moments.append,
-        film.clock, film.sleep,
+        tape, film, _Looks(whole.poses), VehicleSensors(feed(whole.attitudes, film)),
+        moments.append, film.clock, film.sleep,
     )  # fmt: skip
     assert film.now_s == pytest.approx(LEAST_S["carry"], abs=0.5)
     assert moments[0].missing
@@ -220,13 +221,20 @@ def test_the_advice_names_what_is_in_the_way_first() -> None:
     film, moments = _Film(), []
     ended = lambda: film.now_s > 2.0  # noqa: E731
     capture(
-        Tape("pivot"), film, _Looks(()), Sensors(), moments.append, film.clock, film.sleep, ended
+        MountingTape("pivot"),
+        film,
+        _Looks(()),
+        VehicleSensors(),
+        moments.append,
+        film.clock,
+        film.sleep,
+        ended,
     )
     assert moments[-1].advice == "no target in view"
     film = _Film()
     capture(
-        Tape("pivot"), film, _Looks((), mirrored=True), Sensors(), moments.append, film.clock,
-        film.sleep, ended,
+        MountingTape("pivot"), film, _Looks((), mirrored=True), VehicleSensors(), moments.append,
+        film.clock, film.sleep, ended,
     )  # fmt: skip
     assert "mirrored" in moments[-1].advice
     assert "camera.mirrored" in moments[-1].advice
@@ -252,21 +260,23 @@ class _SeesEachNew(_Looks):
 
 def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
     looks, moments = _SeesEachNew(seen(hand("pivot")).poses), []
-    film, tape = _Receiver(), Tape("pivot")
+    film, tape = _Receiver(), MountingTape("pivot")
     ended = lambda: film.now_s > 4.0  # noqa: E731
-    capture(tape, film, looks, Sensors(), moments.append, film.clock, film.sleep, ended)
+    capture(tape, film, looks, VehicleSensors(), moments.append, film.clock, film.sleep, ended)
     assert {moment.share for moment in moments} == {1.0}
     assert len(moments) == len(tape.poses) == pytest.approx(20, abs=2)
     film = _Receiver(stuck_s=1.0)
-    capture(Tape("pivot"), film, looks, Sensors(), lambda _: None, film.clock, film.sleep)
+    capture(
+        MountingTape("pivot"), film, looks, VehicleSensors(), lambda _: None, film.clock, film.sleep
+    )
     assert film.now_s == pytest.approx(MOST_S, abs=1.0), "and it ends though none is new"
 
 
 def test_a_mirrored_picture_ends_it_soon() -> None:
-    film, tape = _Film(), Tape("carry")
+    film, tape = _Film(), MountingTape("carry")
     with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
         capture(
-            tape, film, _Looks((), mirrored=True), Sensors(), lambda _: None, film.clock,
+            tape, film, _Looks((), mirrored=True), VehicleSensors(), lambda _: None, film.clock,
             film.sleep,
         )  # fmt: skip
     assert film.now_s < 5.0
@@ -292,18 +302,34 @@ def test_pictures_become_poses_or_are_counted_as_mirrored() -> None:
 
 def test_nobody_records_for_ever() -> None:
     film = _Film()
-    capture(Tape("pivot"), film, _Looks(()), Sensors(), lambda _: None, film.clock, film.sleep)
+    capture(
+        MountingTape("pivot"),
+        film,
+        _Looks(()),
+        VehicleSensors(),
+        lambda _: None,
+        film.clock,
+        film.sleep,
+    )
     assert film.now_s == pytest.approx(MOST_S, abs=1.0)
 
 
 def test_a_camera_or_a_vehicle_that_goes_ends_it_and_the_tape_keeps_what_was() -> None:
     whole = seen(hand("pivot"))
-    film, tape = _Film(ends_s=3.0), Tape("pivot")
+    film, tape = _Film(ends_s=3.0), MountingTape("pivot")
     with pytest.raises(TimedOut, match="camera:0 is unplugged"):
-        capture(tape, film, _Looks(whole.poses), Sensors(), lambda _: None, film.clock, film.sleep)
+        capture(
+            tape,
+            film,
+            _Looks(whole.poses),
+            VehicleSensors(),
+            lambda _: None,
+            film.clock,
+            film.sleep,
+        )
     assert len(tape.poses) > 20
-    film, tape = _Film(flooding=True), Tape("pivot")
-    silent = Sensors(problem=lambda now_s: "nothing heard for 2 s" if now_s > 1.0 else None)
+    film, tape = _Film(flooding=True), MountingTape("pivot")
+    silent = VehicleSensors(problem=lambda now_s: "nothing heard for 2 s" if now_s > 1.0 else None)
     with pytest.raises(TimedOut, match="the vehicle is gone: nothing heard for 2 s"):
         capture(tape, film, _Looks(whole.poses), silent, lambda _: None, film.clock, film.sleep)
     assert tape

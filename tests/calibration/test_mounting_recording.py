@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perchctl.calibration.mounting.recording import (
+from perchctl.calibration import (
     AttitudeSample,
-    Recording,
-    SeenPose,
+    MountingRecording,
     read_recordings,
     write_recordings,
 )
+from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import rotation_from_rpy
 
 
-def _recordings() -> tuple[Recording, Recording]:
+def _recordings() -> tuple[MountingRecording, MountingRecording]:
     rng = np.random.default_rng(1)
     attitudes = (
         AttitudeSample(1.25, 0.1, -0.2, 3.0, rng.normal(size=3)),
@@ -27,7 +27,9 @@ def _recordings() -> tuple[Recording, Recording]:
     root = rng.normal(size=(6, 6)) * 1e-4
     R = rotation_from_rpy(3.0, 0.4, -2.0)
     poses = (SeenPose(1.3, R, rng.normal(size=3), root @ root.T), SeenPose(1.33, R.T, np.ones(3)))
-    return Recording("carry", attitudes, poses, 3, "by"), Recording("pivot", (), poses[:1])
+    return MountingRecording("carry", attitudes, poses, 3, "by"), MountingRecording(
+        "pivot", (), poses[:1]
+    )
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
@@ -57,7 +59,7 @@ def test_what_would_not_be_read_is_not_written(tmp_path: Path, number: float) ->
     path, lines = _file(tmp_path)
     broken = AttitudeSample(1.25, number, -0.2, 3.0, np.zeros(3))
     with pytest.raises(InvalidValue, match=r"mount.jsonl is not written: a sample"):
-        write_recordings(path, [Recording("carry", (broken,), ())])
+        write_recordings(path, [MountingRecording("carry", (broken,), ())])
     assert path.read_text().splitlines() == lines
 
 

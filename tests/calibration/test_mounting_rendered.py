@@ -8,23 +8,29 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from perchctl.calibration.files import camera_of
-from perchctl.calibration.mounting.plot import draw_mounting
-from perchctl.calibration.mounting.recording import Part
-from perchctl.calibration.mounting.report import Comparison
-from perchctl.calibration.mounting.seen import seeing, seen_mirrored, seen_pose
-from perchctl.calibration.mounting.solve import solve_carry, solve_pivot
-from perchctl.calibration.mounting.turns import turn_vector
+from perchctl.calibration import (
+    MountingPart,
+    MountingReport,
+    best_pose,
+    camera_only_profile,
+    draw_mounting,
+    is_seen_mirrored,
+    profile_camera,
+    rotation_vectors,
+    solve_carry,
+    solve_pivot,
+)
 from perchctl.pipeline import PipelineState, make_pipeline, step
-from perchctl.sim.hand import Hand, T_target_cam_at, draw_hand, pictures, record
-from perchctl.vision.types import Frame
+from perchctl.sim import draw_hand, record_hand
+from perchctl.sim.hand import Hand, T_target_cam_at, pictures
+from perchctl.vision import Frame
 from tests.helpers.mounting import profile
 
 SEED = 4
-RATE_HZ: dict[Part, float] = {"carry": 7.3, "pivot": 8.2}
+RATE_HZ: dict[MountingPart, float] = {"carry": 7.3, "pivot": 8.2}
 
 
-def _few_pictures(part: Part, seconds: float) -> Hand:
+def _few_pictures(part: MountingPart, seconds: float) -> Hand:
     drawn = draw_hand(profile(), part, SEED, seconds)
     scenario = replace(
         drawn.scenario, camera_rate_hz=RATE_HZ[part], camera_drop_rate=0.0, camera_burst=None
@@ -34,37 +40,37 @@ def _few_pictures(part: Part, seconds: float) -> Hand:
 
 @pytest.mark.long
 def test_a_mounting_is_measured_from_pictures() -> None:
-    camera = camera_of(profile().camera)
+    camera = profile_camera(profile().camera)
     carry, pivot = _few_pictures("carry", 21.5), _few_pictures("pivot", 13.0)
     np.testing.assert_array_equal(carry.T_body_cam, pivot.T_body_cam)
-    carried = solve_carry(record(carry, profile(), camera))
-    turned = turn_vector((carried.R_body_cam @ carry.T_body_cam[:3, :3].T)[None])
+    carried = solve_carry(record_hand(carry, profile(), camera))
+    turned = rotation_vectors((carried.R_body_cam @ carry.T_body_cam[:3, :3].T)[None])
     assert np.degrees(np.linalg.norm(turned)) < 0.15
     assert abs(carried.latency_s - carry.latency_s) < 3e-3
-    pivoted = solve_pivot(record(pivot, profile(), camera))
+    pivoted = solve_pivot(record_hand(pivot, profile(), camera))
     off = np.array(pivoted.gear_cam_m) - pivot.gear_cam_m
     assert (np.abs(off) < 3.0 * np.array(pivoted.gear_cam_sigma_m)).all()
     # What the print's size does apart, it is known to hundredths of a millimetre.
     assert np.linalg.norm(off + pivot.size_error * pivot.gear_cam_m) < 1.5e-4
-    assert draw_mounting(Comparison(profile(), carried, pivoted)).startswith(b"\x89PNG")
+    assert draw_mounting(MountingReport(profile(), carried, pivoted)).startswith(b"\x89PNG")
 
 
 def test_a_picture_is_seen_as_it_is_and_mirrored_as_such() -> None:
     held = _few_pictures("carry", 3.0)
-    pipeline = make_pipeline(seeing(profile()), camera_of(profile().camera))
+    pipeline = make_pipeline(camera_only_profile(profile()), profile_camera(profile().camera))
     for flipped in (False, True):
         state, mirrored, poses = PipelineState(), 0, 0
         for frame in islice(pictures(held, profile(), pipeline.camera), 4):
             image = np.ascontiguousarray(frame.image[:, ::-1]) if flipped else frame.image
             t_s = frame.t_arrival_s
             state, output = step(state, Frame(frame.index, t_s, image, t_s), None, pipeline)
-            mirrored += seen_mirrored(output)
-            pose = seen_pose(output, t_s)
+            mirrored += is_seen_mirrored(output)
+            pose = best_pose(output, t_s)
             poses += pose is not None
             if pose is not None and not flipped:
                 T_target_cam = T_target_cam_at(held, frame.t_exposure_s)
                 R_off = pose.rotation_cam_target @ T_target_cam[:3, :3]
-                assert np.linalg.norm(turn_vector(R_off[None])) < 0.02
+                assert np.linalg.norm(rotation_vectors(R_off[None])) < 0.02
                 place_m = -T_target_cam[:3, :3].T @ T_target_cam[:3, 3]
                 np.testing.assert_allclose(pose.position_cam_target_m, place_m, atol=4e-3)
                 assert pose.covariance is not None

@@ -10,16 +10,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.calibration.mounting.recording import AttitudeSample, Recording, SeenPose
-from perchctl.calibration.mounting.result import student_factor
-from perchctl.calibration.mounting.solve import (
-    Carried,
-    measured,
-    missing,
+from perchctl.calibration import (
+    AttitudeSample,
+    MountingRecording,
+    rotation_matrices,
+    rotation_vectors,
     solve_carry,
     solve_pivot,
 )
-from perchctl.calibration.mounting.turns import turn, turn_vector, turns_from_rpy
+from perchctl.calibration.mounting.recording import SeenPose
+from perchctl.calibration.mounting.result import student_factor
+from perchctl.calibration.mounting.solve import Carried, measured, missing
+from perchctl.calibration.mounting.turns import turns_from_rpy
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.sim.hand import Hand
@@ -29,7 +31,7 @@ ANGLE = st.floats(-np.pi, np.pi)
 
 
 def turn_error_deg(found: Carried, held: Hand) -> float:
-    off = turn_vector((found.R_body_cam @ held.T_body_cam[:3, :3].T)[None])
+    off = rotation_vectors((found.R_body_cam @ held.T_body_cam[:3, :3].T)[None])
     return float(np.degrees(np.linalg.norm(off)))
 
 
@@ -47,13 +49,18 @@ def test_turns_and_their_vectors(rpy: list[tuple[float, float, float]]) -> None:
     R = turns_from_rpy(np.array(rpy))
     for one, angles in zip(R, rpy, strict=True):
         np.testing.assert_allclose(one, rotation_from_rpy(*angles), atol=1e-12)
-    np.testing.assert_allclose(turn(turn_vector(R)), R, atol=2e-5)
+    np.testing.assert_allclose(rotation_matrices(rotation_vectors(R)), R, atol=2e-5)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1.0, 3.05, 3.1415, np.pi])
 def test_the_vector_of_any_turn(size: float) -> None:
     v = size * np.array([[0.6, 0.0, -0.8]])
-    assert np.abs(turn(turn_vector(turn(v))) - turn(v)).max() < 1e-7
+    assert (
+        np.abs(
+            rotation_matrices(rotation_vectors(rotation_matrices(v))) - rotation_matrices(v)
+        ).max()
+        < 1e-7
+    )
 
 
 def test_students_factor_is_the_tables() -> None:
@@ -188,7 +195,7 @@ def test_both_parts_in_a_profiles_terms() -> None:
 # --- what will not do --------------------------------------------------------------------
 
 
-def without(recording: Recording, *axes: int) -> Recording:
+def without(recording: MountingRecording, *axes: int) -> MountingRecording:
     """As if the vehicle had not been turned about these axes of its own."""
     kept = [a for a in range(3) if a not in axes]
     samples = []
@@ -211,7 +218,7 @@ def test_the_missing_turn_is_named(axis: int, name: str) -> None:
         solve_carry(without(recording, axis))
 
 
-def slower(recording: Recording, factor: float) -> Recording:
+def slower(recording: MountingRecording, factor: float) -> MountingRecording:
     return replace(
         recording,
         attitudes=tuple(
@@ -230,7 +237,7 @@ def test_too_short_too_slow_too_few() -> None:
     few = replace(recording, poses=recording.poses[::3])
     assert [w.split(":")[0] for w in missing(few)] == ["more pictures"]
     assert missing(replace(recording, poses=())) == ("bring the target into view",)
-    assert missing(Recording("carry", (), ())) == ("wait for the vehicle",)
+    assert missing(MountingRecording("carry", (), ())) == ("wait for the vehicle",)
 
 
 def test_a_pivot_that_is_not_tilted_enough() -> None:
@@ -255,7 +262,7 @@ def test_a_mirrored_picture_is_recognised() -> None:
 def test_a_target_that_was_carried_about_is_refused() -> None:
     recording = seen(hand("carry", 3), errors=False)
     rng = np.random.default_rng(4)
-    way = turn(np.cumsum(rng.normal(size=(len(recording.poses), 3)) * 0.1, axis=0))
+    way = rotation_matrices(np.cumsum(rng.normal(size=(len(recording.poses), 3)) * 0.1, axis=0))
     moved = tuple(
         SeenPose(p.t_s, p.rotation_cam_target @ R, p.position_cam_target_m)
         for p, R in zip(recording.poses, way, strict=True)

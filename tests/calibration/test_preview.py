@@ -7,12 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perchctl.calibration.guided import Moment
-from perchctl.calibration.preview import LensPreview, flat_places_px
+from perchctl.calibration import CaptureMoment, LensPreview
+from perchctl.calibration.preview import flat_places_px
 from perchctl.commands.calibrate_live import page_state, sketch_of
 from perchctl.display.page.sketch import draw_flat
-from perchctl.vision.camera_model import distort, undistort
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, distort, undistort
 from tests.helpers.boards import CHARUCO, corner_views, draw_camera
 
 K = np.array([[300.0, 0.0, 330.0], [0.0, 302.0, 236.0], [0.0, 0.0, 1.0]])
@@ -88,7 +87,7 @@ def test_views_that_fit_no_lens_leave_the_last_one() -> None:
 def test_the_page_is_given_the_flat_picture_and_says_so() -> None:
     rng = np.random.default_rng(4)
     image = rng.integers(0, 255, (480, 640), np.uint8)
-    moment = Moment(3, image, np.empty((0, 2)), {"x": 0.5}, 9, "hold still", False)
+    moment = CaptureMoment(3, image, np.empty((0, 2)), {"x": 0.5}, 9, "hold still", False)
     assert draw_flat(sketch_of(moment, None)) is None
     assert [row[0] for row in page_state(moment, None)["rows"]] == ["x", "views"]
     preview = LensPreview()

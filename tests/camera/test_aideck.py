@@ -11,23 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.camera import aideck as aideck_module
-from perchctl.camera.aideck import (
-    NO_PICTURE_S,
-    AiDeckAddress,
-    AiDeckSource,
-    aideck_address,
-    decoded,
-)
+from perchctl.camera import aideck_address, check_size, open_source
+from perchctl.camera.aideck import NO_PICTURE_S, AiDeckAddress, AiDeckSource, decoded
 from perchctl.camera.cpx import CpxPicture
-from perchctl.camera.open import open_source
-from perchctl.camera.source import check_size
 from perchctl.camera.stream import MAX_FAILED_CONNECTIONS
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.profile import TargetConfig
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Renderer, Scenario
 from tests.camera.test_live import resized
 from tests.helpers.aideck import (
     AiDeck,

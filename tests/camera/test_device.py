@@ -13,7 +13,8 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.camera.computer import camera_number, cameras, finder_of
+from perchctl.camera import find_cameras
+from perchctl.camera.computer import camera_number, finder_of
 from perchctl.camera.controls import set_controls
 from perchctl.camera.device import Asked, DeviceSource, asked_of, differences, set_up
 from perchctl.camera.v4l2 import (
@@ -112,7 +113,7 @@ def test_one_that_may_not_be_opened_has_its_name_from_the_system(dev: Callable[.
     (names / "video3").mkdir(parents=True)
     (names / "video3" / "name").write_text("Locked\n")
     opener = Opener({3: OSError(errno.EACCES, "Permission denied")})
-    (camera,) = cameras(opener, devices, names, asked=True)
+    (camera,) = find_cameras(opener, devices, names, asked=True)
     assert (camera.number, camera.name, camera.modes) == (3, "Locked", ())
     assert "Permission denied" in camera.problem
     assert camera_number("lock", opener, devices, names) == 3
@@ -124,7 +125,7 @@ def test_no_camera_at_all(dev: Callable[..., Path], monkeypatch: pytest.MonkeyPa
         camera_number("USB", Opener({}), dev(), dev)  # type: ignore[arg-type]
     with pytest.raises(NotFound, match="this computer has no camera"):
         list_cameras(False, ())
-    monkeypatch.setattr(check_cameras, "cameras", lambda asked: [])
+    monkeypatch.setattr(check_cameras, "find_cameras", lambda asked: [])
     done = CliRunner().invoke(app, ["check", "--cameras", "--json"])
     assert done.exit_code == NotFound.exit_code
     said = json.loads(done.stdout)  # an object, as of every failure
@@ -142,7 +143,7 @@ def test_the_list_for_people_and_for_programs(
     dev: Callable[..., Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     devices = dev(0, usb_grabber=0)
-    known = cameras(Opener({0: FakeDevice()}), devices, devices, asked=True)
+    known = find_cameras(Opener({0: FakeDevice()}), devices, devices, asked=True)
     assert list_cameras(False, known) == 0
     told = capsys.readouterr().out
     assert told.startswith("camera:0  USB Video\n")

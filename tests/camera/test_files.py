@@ -11,22 +11,28 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera import files
-from perchctl.camera.credentials import profile_record, without_password
-from perchctl.camera.files import (
+from perchctl.camera import (
     BrokenPicture,
+    FrameSource,
     ImagesSource,
     Recording,
     VideoSource,
+    check_size,
+    files,
+    is_live,
+    open_source,
+    profile_record,
     read_grey,
+    scheme_of,
+    source_spec,
+    without_password,
 )
-from perchctl.camera.open import is_live, open_source, scheme_of, source_spec
-from perchctl.camera.source import FrameSource, check_size, to_grey
+from perchctl.camera.source import to_grey
 from perchctl.commands.calibrate_source import Source, sized
 from perchctl.errors import InvalidValue, NotFound, UsageError
 from perchctl.log.write import make_header
 from perchctl.profile import Profile
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame
 
 
 def clock() -> float:

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from perchctl.camera.health import HealthLimits, HealthState, Verdict, assess, content
+from perchctl.camera import HealthState, HealthVerdict, assess_frame
+from perchctl.camera.health import HealthLimits, content
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.sim import Renderer, Scenario
+from perchctl.vision import CameraModel, Frame
 
 LIMITS = HealthLimits()
 SHAPE = (480, 640)
@@ -88,10 +88,10 @@ def test_sensor_noise_alone_is_not_snow(seed: int, sigma: float, level: float) -
     assert content(noisy(level, sigma, seed), LIMITS) == "ok"
 
 
-def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[Verdict]:
+def judge(images: list[NDArray[np.uint8]], live: bool = True) -> list[HealthVerdict]:
     state, verdicts = HealthState(), []
     for k, image in enumerate(images):
-        state, verdict = assess(state, frame(image, k / 30.0), live)
+        state, verdict = assess_frame(state, frame(image, k / 30.0), live)
         verdicts.append(verdict)
     return verdicts
 
@@ -123,6 +123,6 @@ def test_recordings_may_repeat() -> None:
 
 
 def test_every_verdict_says_what_it_means() -> None:
-    state, verdict = assess(HealthState(), frame(snow(3, 0.5)))
+    state, verdict = assess_frame(HealthState(), frame(snow(3, 0.5)))
     assert "no signal" in verdict.text
     assert state.repeats == 0

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.camera import mjpeg
+from perchctl.camera import UnmirroredSource, mjpeg, open_source
 from perchctl.camera.device import (
     LOST_AFTER_FAILURES,
     Asked,
@@ -23,9 +23,7 @@ from perchctl.camera.device import (
     DeviceSource,
     open_capture,
 )
-from perchctl.camera.mirror import UnmirroredSource
 from perchctl.camera.mjpeg import MjpegSource
-from perchctl.camera.open import open_source
 from perchctl.camera.source import SILENT_AFTER_S, LiveSource
 from perchctl.camera.stream import MAX_FAILED_CONNECTIONS, StreamSource
 from perchctl.errors import NotFound, TimedOut

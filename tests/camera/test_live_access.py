@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from perchctl.camera import open_source
 from perchctl.camera.mjpeg import MjpegSource, redirected
-from perchctl.camera.open import open_source
 from perchctl.camera.source import LiveSource
 from perchctl.errors import NotFound
 from tests.camera.test_live import Server, jpeg, part, stream

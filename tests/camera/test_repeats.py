@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from perchctl.camera import HealthState, NewestSlot, assess_frame
 from perchctl.camera.aideck import AiDeckSource
 from perchctl.camera.device import DeviceSource
-from perchctl.camera.health import HealthState, assess
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.repeats import MOST_AGAIN, RepeatState, repeated
 from perchctl.camera.rtsp import RtspSource
-from perchctl.camera.slot import NewestSlot
 from perchctl.sim.receiver import BLUE_GREY
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.interlaced import Pass
 
 Grey = NDArray[np.uint8]
@@ -167,7 +166,7 @@ def test_repetitions_are_not_frozen_and_a_receiver_that_is_stuck_is() -> None:
         slot.put(picture, k / 60, k / 60)
         frame = slot.take()
         assert frame is not None
-        state, verdict = assess(state, frame)
+        state, verdict = assess_frame(state, frame)
         kinds.append(verdict.kind)
     moving, stuck = kinds[: len(pictures)], kinds[len(pictures) :]
     assert set(moving) == {"ok", "repeated"}

@@ -14,9 +14,8 @@ import av.error
 import numpy as np
 import pytest
 
-from perchctl.camera import rtsp
+from perchctl.camera import open_source, rtsp
 from perchctl.camera.jpeg import MOST_STREAM_PX
-from perchctl.camera.open import open_source
 from perchctl.camera.rtsp import WINDOW_S, RtspSource, Waiting, unresolved
 from perchctl.camera.source import LiveSource
 from perchctl.camera.stream import MAX_FAILED_CONNECTIONS

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 if TYPE_CHECKING:
-    from perchctl.sim.process.handle import SimProcess
+    from perchctl.sim import SimProcess
     from tests.helpers.relay import Relay
 
 
@@ -33,11 +33,11 @@ def elsewhere(
 
 @pytest.fixture(scope="module")
 def sim() -> Iterator[SimProcess]:
-    from perchctl.calibration.files import camera_of
-    from perchctl.sim.process.handle import SimProcess
+    from perchctl.calibration import profile_camera
+    from perchctl.sim import SimProcess
     from tests.helpers.checks import PROFILE
 
-    with SimProcess.start(camera=camera_of(PROFILE.camera)) as process:
+    with SimProcess.start(camera=profile_camera(PROFILE.camera)) as process:
         yield process
 
 

@@ -16,9 +16,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.health import MEANING
-from perchctl.camera.mirror import mirrored_note
+from perchctl.calibration import profile_camera
+from perchctl.camera import VERDICT_TEXTS, mirrored_note
 from perchctl.check import Row, Verdict, camera, computer
 from perchctl.check.camera import Optical
 from perchctl.check.pictures import Blur, Light
@@ -27,18 +26,17 @@ from perchctl.errors import NotFound
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.effects import FOR_EVER, CameraFault
 from perchctl.flight.lockstep import LockstepClock, LockstepSource
-from perchctl.link.mock import MockLink
+from perchctl.link import MockLink
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import load_profile
-from perchctl.sim.scenario import Scenario
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import Scenario, SimulatedVehicle
+from perchctl.target import Optics, make_design
 from perchctl.target.blind import Blind, Mounted
-from perchctl.target.design import GearRanges, Ranges, make_design
-from perchctl.target.limits import Optics
+from perchctl.target.design import GearRanges, Ranges
 from tests.helpers.mission import target_at
 
 PROFILE = load_profile("sim")
-CAMERA = camera_of(PROFILE.camera)
+CAMERA = profile_camera(PROFILE.camera)
 PIPELINE = make_pipeline(PROFILE, CAMERA)
 RANGES = Ranges(3.0, 0.5, 0.16, 0.12, 0.03, 20.0, 20.0, 380.0)
 DESIGN = make_design(PROFILE.target, CAMERA, Optics(), PROFILE, ranges=RANGES)
@@ -206,7 +204,7 @@ def gaps(*gaps_s: float) -> list[tuple[int, float]]:
     ("picture age", "warn", {"ages_s": [0.3] * 20}),
     ("picture age", "fail", {"ages_s": [0.5] * 20}),
     ("picture age", "skipped", {"live": False}),
-    ("pictures", "warn", {"problems": Counter({MEANING["snow"]: 2})}),
+    ("pictures", "warn", {"problems": Counter({VERDICT_TEXTS["snow"]: 2})}),
     ("pictures", "pass", {"repeats": 100}),
     ("lost frames", "pass", {"arrivals": gaps(*[0.033, 0.05, 0.033, 0.05, 0.033] * 4),
                              "repeats": 30}),

@@ -12,8 +12,7 @@ import pytest
 from perchctl.check import Row, Verdict, capture
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.positioning import BodyPose, CaptureFrame
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import READY, telemetry
 

@@ -18,7 +18,7 @@ from perchctl.cli import app
 from perchctl.commands import check as command
 from perchctl.commands.check import CheckRequest, exit_code, run, table
 from perchctl.errors import UsageError
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed
 from tests.helpers.flights import ROOT
 

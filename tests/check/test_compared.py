@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from perchctl.check import Verdict, compared
 from perchctl.cli import app
-from perchctl.flight.clock import wall_date
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.flight import wall_date
+from perchctl.profile import PositioningConfig
 from perchctl.sim.capture.settings import SWAPPED_XY, TRUE_AXES, Y_UP, axes_matrix
 from tests.check.test_hand import recorded
 from tests.helpers.checks import NO_CAMERA, NOWHERE

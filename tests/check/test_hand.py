@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from perchctl.check import Row, Verdict, hand
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
 from perchctl.positioning import BodyPose, Placed
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.sim.carried import Stop, Way, lifted_and_turned
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up

@@ -18,18 +18,11 @@ pytest.importorskip("motioncapture", reason="motion capture needs the extra [moc
 
 from perchctl.check import CheckScope, Row, Verdict, check, compared, hand
 from perchctl.errors import SafetyAbort
-from perchctl.flight.positions import check_compared
+from perchctl.flight import require_comparison
 from perchctl.profile import Profile
-from perchctl.sim.capture.settings import (
-    MILLIMETRES,
-    SWAPPED_XY,
-    Y_UP,
-    CaptureFault,
-    CaptureSettings,
-)
+from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, SimProcess, draw_scenario
+from perchctl.sim.capture.settings import SWAPPED_XY, Y_UP
 from perchctl.sim.carried import Stop, lifted_and_turned
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.process.handle import SimProcess
 from tests.helpers.checks import QUICK, options, wait_for
 from tests.helpers.flights import short_profile
 
@@ -98,7 +91,7 @@ class Lab:
 
     def may_fly(self) -> None:
         """Raises SafetyAbort."""
-        check_compared(self.profile.positioning, self.sim.uri, simulated=False)
+        require_comparison(self.profile.positioning, self.sim.uri, simulated=False)
 
 
 def lab(sim: SimProcess, **changes: Any) -> Lab:
@@ -129,7 +122,7 @@ def test_a_capture_that_is_set_up_right_passes_and_may_be_flown_by(sim: SimProce
 @pytest.mark.parametrize(("fault", "body", "within_s", "words"), [
     (CaptureFault(axes=Y_UP), "crazyflie", UNTIL_BACK_S, "swapped axes: up is y"),
     (CaptureFault(axes=SWAPPED_XY), "crazyflie", UNTIL_BACK_S, r"are turned by (8[5-9]|9.) deg"),
-    (CaptureFault(scale=MILLIMETRES), "crazyflie", WHOLE_S, "these look like millimetres"),
+    (CaptureFault(scale=MILLIMETRES_PER_M), "crazyflie", WHOLE_S, "these look like millimetres"),
     (None, "wand", WHOLE_S, "the vehicle moves, and the rigid body 'wand' stands still"),
 ])  # fmt: skip
 def test_what_is_set_up_wrong_is_named_and_not_flown_by(

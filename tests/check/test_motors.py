@@ -16,8 +16,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import CheckScope, Row, Verdict, gone, health, lift, session
 from perchctl.check.link import Vehicle
-from perchctl.sim.scenario import Scenario
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.vehicle import FLYING, LOCKED, Telemetry
 from tests.helpers.checks import AT_REST, NOWHERE, PROFILE, said
 from tests.helpers.mission import READY

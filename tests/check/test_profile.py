@@ -10,8 +10,7 @@ import pytest
 
 from perchctl.check import Row, Verdict, profile_rows
 from perchctl.check.limits import DOUBTFUL
-from perchctl.profile import Profile, load_profile
-from perchctl.profile.places import data_folder
+from perchctl.profile import Profile, data_folder, load_profile
 from tests.helpers.flights import short_profile
 
 CASES: tuple[tuple[str, Mapping[str, Any], str], ...] = (

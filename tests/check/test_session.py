@@ -16,11 +16,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.check import CheckScope, Row, Verdict, camera, check, health, session
 from perchctl.commands.check import exit_code
 from perchctl.errors import UsageError, broken_motion_capture
-from perchctl.link.scan import Answering, address_of, scan
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Scenario
+from perchctl.link import ScanResult, address_of, find_vehicles
+from perchctl.profile import PositioningConfig, Profile
+from perchctl.sim import Scenario, SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options, wait_for
 from tests.helpers.flights import short_profile
 from tests.helpers.relay import Relay
@@ -106,7 +104,7 @@ def nobody(**profile: Any) -> Profile:
 
 
 def test_a_vehicle_that_does_not_answer_leaves_its_rows_skipped() -> None:
-    there = Answering(("radio://0/60/2M", NOWHERE))
+    there = ScanResult(("radio://0/60/2M", NOWHERE))
     wanted = CheckScope(**(QUICK | {"other_vehicles": lambda uri: there}))
     rows = list(check(options(NOWHERE, profile=nobody()), wanted))
     assert [row.name for row in rows][: len(VEHICLE)] == VEHICLE
@@ -191,7 +189,7 @@ def test_a_scan_names_what_answers() -> None:
     """cflib leaves the sockets of its scan open."""
     answerer = Answerer()
     try:
-        found = scan([None, 0xE7E7E7E701])
+        found = find_vehicles([None, 0xE7E7E7E701])
         rows = {row.found: row for row in session.scan_rows(None)}
     finally:
         answerer.socket.close()

@@ -11,10 +11,10 @@ import pytest
 from perchctl.check import Row, Verdict, link, profile_rows, sight
 from perchctl.check.rehearsal import Looked, Rehearsal, _only_heard
 from perchctl.profile import Profile, load_profile
-from perchctl.target.design import GearRanges, Ranges, make_design
-from perchctl.target.limits import Optics
+from perchctl.target import Optics, make_design
+from perchctl.target.design import GearRanges, Ranges
 from perchctl.vehicle import Telemetry
-from perchctl.vision.types import CameraModel, Detection, Detections, Frame
+from perchctl.vision import CameraModel, Detection, Detections, Frame
 from tests.helpers.checks import AT_REST, PROFILE
 from tests.helpers.flights import short_profile
 from tests.helpers.mission import target_at

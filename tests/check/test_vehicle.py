@@ -15,11 +15,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import Row, Verdict, link
 from perchctl.check.link import Vehicle
-from perchctl.link.probe import Echoes, ProbeLink
+from perchctl.link import Echoes, ProbeLink
 from perchctl.profile import LinkConfig, Profile
+from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Scenario
 from perchctl.vehicle import (
     CAN_FLY,
     CRASHED,

@@ -17,16 +17,15 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
 import perchctl
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.cluster import asking, worker
 from perchctl.cluster import wanted as asked_of
 from perchctl.cluster.asking import ask_all
 from perchctl.cluster.wanted import Answer, Wanted, answer_to, source_sha256, wanted
 from perchctl.cluster.worker import fly_order
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.flight.hands import order_of
-from perchctl.profile import Profile, load_profile
-from perchctl.profile.places import data_file
+from perchctl.flight import flight_order
+from perchctl.profile import Profile, data_file, load_profile
 from tests.helpers.seeds import Ended, ends_at_once
 
 ADDRESS = "tcp://10.0.0.5:4001"
@@ -103,7 +102,7 @@ def test_another_calibration_or_none_is_seen(tmp_path: Path) -> None:
     with wanted([load_profile(str(tmp_path / "mine.yaml"))], None) as found:
         assert answer_to(found, 1).problem is None
         text = file.read_text()
-        focal = str(camera_of(found.profiles[0][0].camera).K[0, 0])
+        focal = str(profile_camera(found.profiles[0][0].camera).K[0, 0])
         assert focal in text
         file.write_text(text.replace(focal, f"{float(focal) + 1.0}"))
         problem = answer_to(found, 1).problem
@@ -173,14 +172,14 @@ def test_one_that_came_later_is_asked_with_its_first_flight(
     asked: Wanted, on_a_worker: Callable[[int], None], tmp_path: Path
 ) -> None:
     on_a_worker(2)
-    good, error = pickle.loads(fly_order(order_of(ends_at_once, (1,)), asked))
+    good, error = pickle.loads(fly_order(flight_order(ends_at_once, (1,)), asked))
     assert not good
     assert isinstance(error, InvalidValue)
     assert str(error).startswith(f"worker {ADDRESS} on ")
     assert "flies 2 flights in one process" in str(error)
     with wanted([], tmp_path) as other:
         on_a_worker(1)
-        good, ended = pickle.loads(fly_order(order_of(ends_at_once, (1,)), other))
+        good, ended = pickle.loads(fly_order(flight_order(ends_at_once, (1,)), other))
         assert good
         assert isinstance(ended, Ended)
         assert [path.name for path in tmp_path.iterdir()] == [other.mark.name]

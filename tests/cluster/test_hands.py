@@ -21,7 +21,8 @@ from perchctl.cluster import cluster_hands, parse_address
 from perchctl.cluster import hands as cluster
 from perchctl.cluster.hands import ClusterHands
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
-from perchctl.flight.campaign import FLOWN_AGAIN, fly_all, run_campaign
+from perchctl.flight import fly_all, run_campaign
+from perchctl.flight.campaign import FLOWN_AGAIN
 from perchctl.flight.record import flown_record
 from perchctl.profile import load_profile
 from tests.helpers.cluster import dies_in_flight, scheduler, worker

@@ -13,10 +13,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("distributed", reason="clusters need the extra [cluster]")
 
 from perchctl.cluster import cluster_hands, parse_address
-from perchctl.flight.campaign import fly_all, run_campaign
-from perchctl.flight.hands import job_processes
+from perchctl.flight import FlightResult, flight_processes, fly_all, run_campaign
 from perchctl.flight.record import flown_record
-from perchctl.flight.results import FlightResult
 from perchctl.profile import load_profile
 from tests.helpers.cluster import dies_in_flight
 
@@ -33,10 +31,10 @@ def test_forty_seeds_in_one_process_in_two_and_on_a_cluster(tmp_path: Path) -> N
     def flown(executor: Executor) -> list[dict[str, Any]]:
         return [flown_record(result) for result in run_campaign(profile, SEEDS, executor)]
 
-    with job_processes(1) as one:
+    with flight_processes(1) as one:
         alone = flown(one)
     assert [record["seed"] for record in alone] == list(SEEDS)
-    with job_processes(2) as two:
+    with flight_processes(2) as two:
         assert flown(two) == alone
     told: list[FlightResult] = []
     fly = partial(dies_in_flight, profile, tmp_path, DEADLY)

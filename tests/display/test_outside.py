@@ -11,12 +11,12 @@ from perchctl.display.panel import WIDTH
 from perchctl.display.status import status_rows
 from perchctl.display.watch import status_of
 from perchctl.log.watch import flight_record
-from perchctl.mission.watch import Outside
+from perchctl.mission import ExternalPositions
 from perchctl.vehicle import ExternalPosition
 from tests.display.test_panel import STATUS, tick
 
 PLACE = ExternalPosition((0.1, -0.2, 0.3))
-WELL = Outside(0.012, None, 300, 99.6, PLACE)
+WELL = ExternalPositions(0.012, None, 300, 99.6, PLACE)
 
 
 def test_positions_from_outside_have_their_line() -> None:
@@ -39,7 +39,7 @@ def test_the_log_has_what_was_sent() -> None:
         0.012, 300, 99.6, 0.1, 0.3,
     ]  # fmt: skip
     assert record["pos_qw"] is None  # a position alone was sent
-    never = flight_record(tick(outside=Outside(math.inf, "none has come", 0, 0.0, None)))
+    never = flight_record(tick(outside=ExternalPositions(math.inf, "none has come", 0, 0.0, None)))
     assert never["pos_age_s"] is None
     assert never["pos_note"] == "none has come"
     assert flight_record(tick())["pos_sent"] is None

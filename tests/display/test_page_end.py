@@ -17,12 +17,18 @@ from perchctl.commands import fly
 from perchctl.display import FlightPage, LivePage, failed_card, summary_card
 from perchctl.display.page.told import answered
 from perchctl.errors import Interrupted
-from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.session import FlyOptions, SessionResult
-from perchctl.log.summary import FlightSummary
-from perchctl.log.watch import LogWatcher
-from perchctl.mission.state import Outcome, Phase, PlannerState
-from perchctl.mission.watch import Event, EventKind, FlightReport, Tick, Watcher
+from perchctl.flight import FlyOptions, OperatorSwitch, SessionResult
+from perchctl.log import FlightSummary, LogWatcher
+from perchctl.mission import (
+    Event,
+    EventKind,
+    FlightReport,
+    Outcome,
+    Phase,
+    PlannerState,
+    Tick,
+    Watcher,
+)
 from perchctl.profile import load_profile
 from perchctl.vehicle import Idle
 from tests.helpers.log import telemetry

@@ -17,13 +17,12 @@ import pytest
 from perchctl.commands.fly import live_page
 from perchctl.commands.track import TrackRequest, resolve, track
 from perchctl.display import FlightPage, LivePage, Sketch
-from perchctl.flight.operator import AGAIN_S, HELD_S, OperatorSwitch
-from perchctl.flight.session import FlyOptions
-from perchctl.mission.state import Operator, Phase, PlannerState
-from perchctl.mission.watch import Tick
+from perchctl.flight import FlyOptions, OperatorSwitch
+from perchctl.flight.operator import AGAIN_S, HELD_S
+from perchctl.mission import Operator, Phase, PlannerState, Tick
 from perchctl.profile import load_profile
 from perchctl.vehicle import Idle
-from perchctl.vision.types import Detection, Detections, Frame, MarkerPose, PipelineOutput, Stage
+from perchctl.vision import Detection, Detections, Frame, MarkerPose, PipelineOutput, Stage
 from tests.helpers.live_page import CORNERS, ask, stop
 from tests.helpers.log import telemetry
 from tests.helpers.mission import note

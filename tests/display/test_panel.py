@@ -18,12 +18,9 @@ from perchctl.display import DisplayWatcher, make_reporter
 from perchctl.display.panel import Reporter, panel
 from perchctl.display.status import FlightStatus, status_rows
 from perchctl.display.watch import status_of
-from perchctl.log.read import read_log
-from perchctl.log.watch import LogWatcher
+from perchctl.log import LogWatcher, read_log
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.planner import start
-from perchctl.mission.state import BatteryOutlook, Observation, Phase
-from perchctl.mission.watch import Tick
+from perchctl.mission import BatteryOutlook, Observation, Phase, Tick, start_mission
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers import log as synthetic
 from tests.helpers.mission import entered, held, note
@@ -226,7 +223,7 @@ def test_a_terminal_that_stands_still_does_not_stop_the_loop() -> None:
 
 def tick(**changes: Any) -> Tick:
     telemetry = synthetic.telemetry(99.99, 0.3)
-    state = start(Observation(t_s=98.0, telemetry=synthetic.telemetry(98.0, 0.1)))
+    state = start_mission(Observation(t_s=98.0, telemetry=synthetic.telemetry(98.0, 0.1)))
     values: dict[str, Any] = {
         "t_s": 100.0,
         "telemetry": telemetry,

@@ -19,9 +19,9 @@ from perchctl.faults.bounds import (
     UnfeltDrift,
     targets_of,
 )
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.sim import Neighbour, Scenario
 
 P = Phase
 SIM, TARGET_ONLY = load_profile("sim"), load_profile("target_only")

@@ -14,10 +14,10 @@ from perchctl.faults import FAULTS, select_faults
 from perchctl.faults.catalogue import AIR, BY_NAME, USUAL_S, Fault, case_of, draw_case
 from perchctl.faults.effects import Operator
 from perchctl.faults.oracle import second_press_s
-from perchctl.flight.operator import OperatorSwitch
-from perchctl.mission.state import Operator as OperatorWord
-from perchctl.mission.state import Phase
-from perchctl.sim.scenario import Scenario
+from perchctl.flight import OperatorSwitch
+from perchctl.mission import Operator as OperatorWord
+from perchctl.mission import Phase
+from perchctl.sim import Scenario
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "faults.md").read_text(encoding="utf-8")
 SCENARIO = Scenario(seed=5)

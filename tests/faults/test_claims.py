@@ -19,11 +19,19 @@ from perchctl.faults.claims import (
     claims_of_rescue,
 )
 from perchctl.faults.oracle import SAY_OFF
-from perchctl.flight.loop import RESCUED
-from perchctl.mission.lander import Finding
-from perchctl.mission.state import TERMINALS, MotorStop, Outcome, Phase
+from perchctl.flight import RESCUED
+from perchctl.mission import (
+    RESCUE,
+    TERMINALS,
+    Event,
+    EventKind,
+    Finding,
+    FlightReport,
+    Outcome,
+    Phase,
+)
+from perchctl.mission.state import MotorStop
 from perchctl.mission.table import TABLE
-from perchctl.mission.watch import RESCUE, Event, EventKind, FlightReport
 
 LAST_ROWS = {row.name: row for row in TABLE if row.to in TERMINALS}
 

@@ -12,12 +12,12 @@ from perchctl.faults import effects as e
 from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.program import LONGEST_S, FaultyClock, ProgramKilled
 from perchctl.faults.radio import ORDERS, FaultyRadio, order_of
+from perchctl.link import BLOCKS_DELETED_AFTER_S
 from perchctl.link.encode import UNLOCK_THRUST, encode
-from perchctl.link.log_blocks import FORGOTTEN_S
 from perchctl.link.mock import TELEMETRY_DELAY_S
-from perchctl.sim.crtp.codec import Packet
+from perchctl.sim import Packet
 from perchctl.vehicle import EmergencyStop, Land, PositionSetpoint, RawThrust, StopMotors
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 SETPOINT = encode(PositionSetpoint(0.0, 0.0, 1.0, 0.0))[0]
 
@@ -102,8 +102,8 @@ def test_a_vehicle_that_starts_again_is_silent_until_its_blocks_are_asked_for() 
     radio.begin(e.Reboots(0.8), 0.0)
     assert not radio.up(SETPOINT, 0.7)
     assert radio.up(SETPOINT, 0.9)
-    assert radio.down("state", 0.9 + FORGOTTEN_S) is None
-    assert radio.down("state", 1.1 + FORGOTTEN_S) is not None
+    assert radio.down("state", 0.9 + BLOCKS_DELETED_AFTER_S) is None
+    assert radio.down("state", 1.1 + BLOCKS_DELETED_AFTER_S) is not None
 
 
 def test_a_cut_uplink_is_cut_for_good() -> None:

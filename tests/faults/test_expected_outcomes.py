@@ -27,12 +27,9 @@ from perchctl.faults.expected_outcomes import (
 from perchctl.faults.facts import LEAST_LIFT, Facts
 from perchctl.faults.oracle import FLAGS
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.powertrain import most_thrust_n
-from perchctl.sim.scenario import Scenario
-from perchctl.sim.thrust_curve import MOTOR_FORCE_N
+from perchctl.sim import MOTOR_FORCE_N, Scenario, draw_scenario, most_thrust_n
 
 BLOW = e.Push((0.7, 0.0, 0.0), 0.04)
 

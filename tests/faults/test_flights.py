@@ -33,10 +33,9 @@ from perchctl.faults.program import PlantedError
 from perchctl.faults.promises import PROMISE_OF, PROMISES
 from perchctl.faults.summary import worst_first
 from perchctl.flight.record import flown_record
-from perchctl.mission import planner
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase, planner
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, SHORT
 
 CELLS = [(fault.name, phase) for fault in FAULTS for phase in fault.phases]
@@ -242,7 +241,7 @@ def test_an_exception_that_no_fault_planted_is_counted(
     error: Exception, counted: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The vehicle is landed all the same."""
-    step = planner.step
+    step = planner.step_mission
 
     def raising(state: Any, *rest: Any) -> Any:
         if state.phase is Phase.SEARCH:

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.faults import effects as e
 from perchctl.faults.inject import (
     CAPTURE_FAULTS,
@@ -23,12 +23,10 @@ from perchctl.faults.inject import (
 )
 from perchctl.faults.truth import WatchedVehicle, sample_of
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission.state import Phase, PlannerState
+from perchctl.mission import Phase, PlannerState
 from perchctl.profile import TargetConfig
-from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.sim import CaptureSettings, Neighbour, Scenario, most_thrust_n
 from perchctl.sim.firmware.commands import RawSetpoint
-from perchctl.sim.powertrain import most_thrust_n
-from perchctl.sim.scenario import Neighbour, Scenario
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, target_xy_m=(0.1, 0.2))

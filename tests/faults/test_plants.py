@@ -16,12 +16,19 @@ from perchctl.commands.positioning import POSITIONINGS, positioned
 from perchctl.faults import flight as faulty
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.faults.oracle import Flag
-from perchctl.flight.operator import OperatorSwitch
-from perchctl.mission import actions, lander, planner
-from perchctl.mission.context import Context
+from perchctl.flight import OperatorSwitch
+from perchctl.mission import (
+    Context,
+    Observation,
+    Operator,
+    Phase,
+    PlannerState,
+    actions,
+    lander,
+    planner,
+)
 from perchctl.mission.lander import Manoeuvre
 from perchctl.mission.release import Acted, stop_motors
-from perchctl.mission.state import Observation, Operator, Phase, PlannerState
 from perchctl.profile import Profile, load_profile
 from perchctl.vehicle import Command, Land
 from tests.helpers.flights import SHORT
@@ -63,11 +70,11 @@ def lands_fast(patch: Patch) -> None:
 
 def says_landed(patch: Patch) -> None:
     """Whatever the end of the flight is."""
-    step = planner.step
+    step = planner.step_mission
 
     def landed(*given: Any) -> tuple[PlannerState, Command]:
         state, command = step(*given)
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             state = replace(state, phase=Phase.LANDED, row="landed")
         return state, command
 
@@ -103,7 +110,7 @@ def lands_late(profile: Profile) -> Profile:
 
 def believes_old_telemetry(patch: Patch) -> None:
     """Whatever is proven or waited for, the newest sample counts as one of this moment."""
-    step = planner.step
+    step = planner.step_mission
 
     def believing(
         state: PlannerState, obs: Observation, *rest: Any

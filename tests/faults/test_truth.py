@@ -11,13 +11,13 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.faults.effects import Reboots
 from perchctl.faults.facts import CUT_S, FactsRecorder
 from perchctl.faults.oracle import Sample
 from perchctl.faults.truth import WatchedVehicle, sample_of
 from perchctl.profile import Profile, TargetConfig, load_profile
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, no_target=True)

@@ -10,9 +10,10 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, SafetyAbort
-from perchctl.mission.state import Outcome, Phase
+from perchctl.mission import Outcome, Phase
 from perchctl.profile.positioning import MOST_LATENCY_S
-from perchctl.sim.capture.settings import MILLIMETRES, SWAPPED_XY, Y_UP, CaptureFault, OtherBody
+from perchctl.sim import MILLIMETRES_PER_M, CaptureFault
+from perchctl.sim.capture.settings import SWAPPED_XY, Y_UP, OtherBody
 from tests.helpers.flights import Flown, fly_short
 
 MOCAP = {"positioning.by": "mocap"}
@@ -48,7 +49,7 @@ def test_it_perches_in_another_world_though_the_body_is_hidden_for_a_moment() ->
         ({"frozen": True}, "is frozen"),
         ({"gone": True}, "no frame has come"),
         ({"swapped": True}, "another body is taken for it"),
-        ({"scale": MILLIMETRES}, "jumped by"),
+        ({"scale": MILLIMETRES_PER_M}, "jumped by"),
     ],
 )
 def test_what_lasts_is_landed_and_named(what: dict[str, Any], words: str) -> None:
@@ -100,7 +101,7 @@ def test_a_capture_that_is_50_ms_late_is_flown_by() -> None:
     ("capture", "words"),
     [
         ({"axes": Y_UP}, "swapped axes"),
-        (wrong(0.0, scale=MILLIMETRES), "millimetres"),
+        (wrong(0.0, scale=MILLIMETRES_PER_M), "millimetres"),
     ],
 )
 def test_swapped_axes_and_millimetres_do_not_take_off(capture: dict[str, Any], words: str) -> None:

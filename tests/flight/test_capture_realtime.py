@@ -22,12 +22,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
 
-from perchctl.calibration.files import load_calibration
-from perchctl.log.read import read_log
+from perchctl.calibration import load_calibration
+from perchctl.log import read_log
 from perchctl.profile import find_calibration, load_profile
-from perchctl.sim.capture.settings import MILLIMETRES, Y_UP, CaptureFault, CaptureSettings
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, SimProcess, draw_scenario
+from perchctl.sim.capture.settings import Y_UP
 from tests.helpers.capture import compared
 from tests.helpers.flights import ROOT, SEED, SHORT, short_profile
 
@@ -156,7 +155,10 @@ def test_hidden_for_good_it_lands_and_says_why(tmp_path: Path) -> None:
     ("capture", "words"),
     [
         (replace(ASIDE, axes=Y_UP), "swapped axes"),
-        (replace(ASIDE, faults=((0.0, 1e6, CaptureFault(scale=MILLIMETRES)),)), "millimetres"),
+        (
+            replace(ASIDE, faults=((0.0, 1e6, CaptureFault(scale=MILLIMETRES_PER_M)),)),
+            "millimetres",
+        ),
     ],
 )
 def test_swapped_axes_and_millimetres_do_not_take_off(

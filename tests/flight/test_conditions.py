@@ -6,21 +6,22 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.flight.conditions import CONDITIONS, NO_CONDITION, Conditions, conditions_of
-from perchctl.flight.failure import Ended, Kind, minimised_failure
+from perchctl.flight import EndedFlight, ScenarioConditions, minimised_failure, scenario_conditions
+from perchctl.flight.conditions import CONDITIONS, NO_CONDITION
+from perchctl.flight.failure import Kind
 from perchctl.profile import Profile, SimulationConfig, load_profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 from tests.helpers.flights import short_profile
 
 SIM = load_profile("sim")
-GOOD = Ended(0, Kind("perched", "", False, False), "hanging still")
-BAD = Ended(0, Kind("landed", "battery-low", False, False), "battery at 2.9 V under load")
-OTHER = Ended(0, Kind("landed", "fence", False, False), "outside the fence")
+GOOD = EndedFlight(0, Kind("perched", "", False, False), "hanging still")
+BAD = EndedFlight(0, Kind("landed", "battery-low", False, False), "battery at 2.9 V under load")
+OTHER = EndedFlight(0, Kind("landed", "fence", False, False), "outside the fence")
 
 
 def test_at_their_full_level_they_are_the_seeds_scenario_to_the_bit() -> None:
     for seed in range(20):
-        conditions = conditions_of(SIM, seed)
+        conditions = scenario_conditions(SIM, seed)
         whole = conditions.toned(dict.fromkeys(conditions.names, 1.0))
         assert draw_scenario(whole, seed) == draw_scenario(SIM, seed)
 
@@ -28,16 +29,16 @@ def test_at_their_full_level_they_are_the_seeds_scenario_to_the_bit() -> None:
 def test_at_level_zero_nothing_is_left_of_them() -> None:
     calm = [
         conditions.toned(dict.fromkeys(conditions.names, 0.0)).simulation
-        for conditions in (conditions_of(SIM, seed) for seed in range(5))
+        for conditions in (scenario_conditions(SIM, seed) for seed in range(5))
     ]
     assert all(each == calm[0] for each in calm)
-    assert conditions_of(SIM.model_copy(update={"simulation": calm[0]}), 7).off == ()
+    assert scenario_conditions(SIM.model_copy(update={"simulation": calm[0]}), 7).off == ()
 
 
 @pytest.mark.parametrize("less", [0.0, 0.5])
 def test_toning_one_down_leaves_the_others(less: float) -> None:
     """Whatever is drawn after it."""
-    conditions = conditions_of(SIM, 2)
+    conditions = scenario_conditions(SIM, 2)
     levels = dict.fromkeys(conditions.names, 1.0)
     whole = _told(conditions, levels)
     for name in conditions.names:
@@ -45,7 +46,7 @@ def test_toning_one_down_leaves_the_others(less: float) -> None:
         assert {other for other in whole if whole[other] != toned[other]} <= {name}, name
 
 
-def _told(conditions: Conditions, levels: dict[str, float]) -> dict[str, str]:
+def _told(conditions: ScenarioConditions, levels: dict[str, float]) -> dict[str, str]:
     profile = conditions.toned(levels)
     scenario = draw_scenario(profile, conditions.seed)
     return {c.name: c.told(profile, scenario) for c in CONDITIONS if c.told is not None}
@@ -55,7 +56,7 @@ def test_a_nominal_world_has_no_other_conditions_than_those_with_words() -> None
     """What only says when, where to or how much is no condition of its own."""
     named = {condition.name for condition in CONDITIONS}
     for seed in range(20):
-        assert set(conditions_of(SIM, seed).names) <= named
+        assert set(scenario_conditions(SIM, seed).names) <= named
 
 
 def test_every_key_of_the_simulation_is_a_condition_or_is_none() -> None:
@@ -71,7 +72,7 @@ def test_every_key_of_the_simulation_is_a_condition_or_is_none() -> None:
             "simulation.first_contact_fails": 1.0,
         }
     )  # fmt: skip
-    conditions = conditions_of(wild, 1)
+    conditions = scenario_conditions(wild, 1)
     assert {"camera_flicker", "estimate_noise_m", "receiver", "neighbours", "interlacing", "target",
             "first contact"} <= set(conditions.names)  # fmt: skip
     assert {"camera_flicker", "estimate_noise_m"} <= set(conditions.gradual)
@@ -83,7 +84,7 @@ def test_every_key_of_the_simulation_is_a_condition_or_is_none() -> None:
     assert not NO_CONDITION & set(conditions.values(levels))
 
 
-def fails_by_weight_and_battery(profile: Profile, seed: int) -> Ended:
+def fails_by_weight_and_battery(profile: Profile, seed: int) -> EndedFlight:
     """Fails otherwise where only the battery is weak."""
     scenario = draw_scenario(profile, seed)
     if scenario.battery_rest_v > 3.95:
@@ -94,9 +95,9 @@ def fails_by_weight_and_battery(profile: Profile, seed: int) -> Ended:
 @pytest.mark.parametrize("jobs", [1, 3])
 def test_a_failure_keeps_its_kind_and_is_the_same_however_many_fly(jobs: int) -> None:
     seed = next(s for s in range(99) if fails_by_weight_and_battery(SIM, s) == BAD)
-    conditions = conditions_of(SIM, seed)
-    flown: list[Ended] = []
-    smaller: list[Ended] = []
+    conditions = scenario_conditions(SIM, seed)
+    flown: list[EndedFlight] = []
+    smaller: list[EndedFlight] = []
     levels = minimised_failure(
         conditions, BAD, None, jobs, flown.append, lambda _levels, ended: smaller.append(ended),
         fails_by_weight_and_battery,

@@ -7,13 +7,14 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from perchctl.flight.senses import REMARK_PICTURES, Senses
+from perchctl.flight import Senses
+from perchctl.flight.senses import REMARK_PICTURES
 from perchctl.geometry import rpy_from_rotation
-from perchctl.link.protocol import Link
+from perchctl.link import Link
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, Telemetry
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 

@@ -13,20 +13,17 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
-from perchctl.flight.campaign import fly_seed, run_campaign
-from perchctl.flight.lockstep import fly_lockstep
+from perchctl.flight import PLAIN_SEED, FlightResult, campaign_summary, fly_lockstep, run_campaign
+from perchctl.flight.campaign import fly_seed
 from perchctl.flight.noticed import SLEW
-from perchctl.flight.results import FlightResult, campaign_summary
-from perchctl.flight.session import PLAIN_SEED
 from perchctl.geometry import rot_z
-from perchctl.log.read import FlightLog, read_log
-from perchctl.mission.state import SEVEN, Operator, Outcome, Phase
-from perchctl.mission.watch import Event, EventKeeper, Tick
+from perchctl.log import FlightLog, read_log
+from perchctl.mission import SEVEN_PHASES, Event, EventKeeper, Operator, Outcome, Phase, Tick
 from perchctl.profile import load_profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile
 
-SEVEN_NAMES = [phase.value for phase in SEVEN]
+SEVEN_NAMES = [phase.value for phase in SEVEN_PHASES]
 MISS_LIMIT_M = 0.020
 ON_THE_FLOOR_M = 0.05
 SLIPPERY_N = 0.1  # a quarter of the weight
@@ -346,7 +343,7 @@ SOFT_MPS = 0.35
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("phase", SEVEN, ids=lambda p: p.value)
+@pytest.mark.parametrize("phase", SEVEN_PHASES, ids=lambda p: p.value)
 def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     """On the floor; or, where the magnet has it already, peeled off in vain and left hanging,
     and reported so."""

@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.flight.history import History, extended
+from perchctl.flight import History, add_samples
 from perchctl.flight.told import events_of
-from perchctl.mission import planner
-from perchctl.mission.state import Outcome
+from perchctl.mission import Outcome, planner
 from perchctl.vehicle import Telemetry
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
 from tests.helpers.mission import observation, telemetry
@@ -25,7 +24,7 @@ SAFETY = PROFILE.safety
 def jumped(*samples: Telemetry) -> bool:
     history, found = History(), False
     for sample in samples:
-        history = extended(history, [sample], SAFETY)
+        history = add_samples(history, [sample], SAFETY)
         found = found or history.jumped
     return found
 
@@ -71,7 +70,7 @@ def battery_age_s(*readings_v: float) -> float:
     history = History()
     for i in range(101):
         sample = telemetry(0.1 * i, battery_v=readings_v[i % len(readings_v)])
-        history = extended(history, [sample], SAFETY)
+        history = add_samples(history, [sample], SAFETY)
     assert history.battery_changed_s is not None
     return 10.0 - history.battery_changed_s
 
@@ -102,7 +101,7 @@ def test_a_battery_that_changes_is_read(readings_v: tuple[float, ...]) -> None:
 @pytest.mark.parametrize(("battery_v", "told"), [(math.nan, True), (0.0, True), (3.8, False)])
 def test_a_flight_without_a_battery_reading_says_so(battery_v: float, told: bool) -> None:
     obs = observation(1.0, telemetry=telemetry(1.0, battery_v=battery_v))
-    events = events_of(None, planner.start(obs), obs, PROFILE)
+    events = events_of(None, planner.start_mission(obs), obs, PROFILE)
     assert any("no battery reading" in event.reason for event in events) is told
 
 
@@ -185,15 +184,15 @@ def test_an_estimate_that_is_no_number_for_long_is_stale() -> None:
 @pytest.mark.parametrize("name", ["position_m", "velocity_mps"])
 def test_a_position_that_is_no_number_takes_no_attitude_with_it(name: str) -> None:
     """It is as old as the last that was one; by acceleration and thrust the way down goes on."""
-    history = extended(History(), [telemetry(1.0, 0.7)], SAFETY)
+    history = add_samples(History(), [telemetry(1.0, 0.7)], SAFETY)
     for i in range(1, 6):
         nowhere = {name: (0.0, math.nan, 0.0)}
-        history = extended(history, [telemetry(1.0 + 0.01 * i, acc_z_g=0.9, **nowhere)], SAFETY)
+        history = add_samples(history, [telemetry(1.0 + 0.01 * i, acc_z_g=0.9, **nowhere)], SAFETY)
     newest = history.newest
     assert newest is not None
     assert (newest.t_s, newest.acc_z_g) == (pytest.approx(1.05), 0.9)
     assert newest.position_m == (0.0, 0.0, 0.7)
     assert newest.behind_s == pytest.approx(0.05)
     assert not history.jumped
-    tilted = extended(history, [telemetry(1.06, roll_rad=math.nan)], SAFETY)
+    tilted = add_samples(history, [telemetry(1.06, roll_rad=math.nan)], SAFETY)
     assert tilted.newest is newest

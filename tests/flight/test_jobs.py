@@ -28,9 +28,8 @@ from perchctl.commands.simulate_request import (
     tell_logs,
 )
 from perchctl.errors import Interrupted, PerchError
-from perchctl.flight.campaign import FLOWN_AGAIN, fly_all
-from perchctl.flight.hands import job_processes
-from perchctl.flight.uninterrupted import uninterrupted
+from perchctl.flight import defer_interrupts, flight_processes, fly_all
+from perchctl.flight.campaign import FLOWN_AGAIN
 from tests.helpers.ended import ended
 from tests.helpers.jobs import campaign
 from tests.helpers.seeds import (
@@ -74,7 +73,7 @@ def test_a_signal_waits_for_what_must_not_be_left_halfway() -> None:
     done: list[str] = []
 
     def load() -> None:
-        with uninterrupted():
+        with defer_interrupts():
             signal.raise_signal(signal.SIGINT)
             done.append("loaded")
 
@@ -116,7 +115,7 @@ def test_a_signal_that_another_thread_takes_waits_too() -> None:
     taken.settimeout(AT_ONCE_S)
 
     def load() -> None:
-        with uninterrupted():
+        with defer_interrupts():
             signal.pthread_kill(other.ident or 0, signal.SIGINT)
             done.append(taken.recv(1))
             done.append(b"loaded")
@@ -183,7 +182,7 @@ def test_a_lost_flight_is_flown_again_and_counted_once(times: int, tmp_path: Pat
     """And those that others were flying meanwhile are flown once."""
     fly = partial(is_lost, folder=tmp_path, times=times)
     told: list[int] = []
-    with job_processes(2) as hands:
+    with flight_processes(2) as hands:
         results = fly_all(fly, [0, 1, 2, 1, 3], hands, lambda result: told.append(result.seed))
     assert [result.seed for result in results] == [0, 1, 2, 3]
     assert sorted(told) == [0, 1, 2, 3]
@@ -195,7 +194,7 @@ def test_a_flight_that_is_lost_always_is_told(tmp_path: Path) -> None:
     fly = partial(is_lost, folder=tmp_path, times=FLOWN_AGAIN + 1)
     with (
         pytest.raises(PerchError, match="flew seed 1 was ended from outside, 3 times in all"),
-        job_processes(1) as hands,
+        flight_processes(1) as hands,
     ):
         fly_all(fly, [1], hands)
     assert len(list(tmp_path.iterdir())) == FLOWN_AGAIN + 1
@@ -211,7 +210,7 @@ def test_any_executor_that_breaks_for_good_is_told() -> None:
 
 
 def test_what_has_no_form_is_told_and_ends_no_process() -> None:
-    with job_processes(1) as hands:
+    with flight_processes(1) as hands:
         assert isinstance(hands.submit(no_form).exception(), RuntimeError)
         assert hands.submit(len, (1, 2)).result() == 2
         assert hands.submit(lambda: None).exception() is not None

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perchctl.mission.state import Operator, Outcome, Phase
-from perchctl.mission.watch import Tick
+from perchctl.mission import Operator, Outcome, Phase, Tick
 from perchctl.vehicle import (
     Land,
     PositionSetpoint,

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from perchctl.flight import loop, senses
-from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, PEEL_S, Finding
-from perchctl.mission.state import Operator, Phase
-from perchctl.mission.watch import Tick
+from perchctl.mission import Finding, Operator, Phase, Tick
+from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, PEEL_S
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
@@ -65,7 +64,7 @@ def test_a_failure_in_vision_lands_first(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_failure_in_the_planner_lands_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop.planner, "step", _later(loop.planner.step, AIRBORNE_TICKS))
+    monkeypatch.setattr(loop, "step_mission", _later(loop.step_mission, AIRBORNE_TICKS))
     landed_after_a_break(Rig())
 
 

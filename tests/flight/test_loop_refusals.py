@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from perchctl.errors import Interrupted, InvalidValue, NotFound, SafetyAbort, TimedOut
-from perchctl.mission.state import Operator
+from perchctl.mission import Operator
 from perchctl.vehicle import (
     CRASHED,
     DECK_FAULT,

@@ -14,23 +14,20 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from numpy.typing import NDArray
 
-from perchctl.calibration.files import camera_of
-from perchctl.camera.mirror import mirrored_note
-from perchctl.camera.open import open_source
-from perchctl.camera.source import FrameSource
+from perchctl.calibration import profile_camera
+from perchctl.camera import FrameSource, mirrored_note, open_source
 from perchctl.faults.catalogue import BY_NAME, draw_case
 from perchctl.faults.effects import FOR_EVER, CameraFault
 from perchctl.faults.flight import FaultyFlight
-from perchctl.flight.lockstep import lockstep_source
-from perchctl.link.mock import MockLink
-from perchctl.mission.state import Phase
+from perchctl.flight import lockstep_source
+from perchctl.link import MockLink
+from perchctl.mission import Phase
 from perchctl.profile import CameraConfig, Profile
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.hand import draw_hand, pictures, record
+from perchctl.sim import SimulatedVehicle, draw_hand, draw_scenario, record_hand
+from perchctl.sim.hand import pictures
 from perchctl.sim.process.control import HostSetup
 from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.vehicle import SimulatedVehicle
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.flights import SEED, fly_short, short_profile
 
 Picture = NDArray[np.uint8]
@@ -57,7 +54,9 @@ def flipped(frames: list[Frame]) -> list[Frame]:
 
 
 def vehicle_of(profile: Profile) -> SimulatedVehicle:
-    return SimulatedVehicle(draw_scenario(profile, SEED), camera_of(profile.camera), profile.target)
+    return SimulatedVehicle(
+        draw_scenario(profile, SEED), profile_camera(profile.camera), profile.target
+    )
 
 
 def test_the_lockstep_camera_mirrors_and_the_flight_sees_it_turned_right() -> None:
@@ -75,7 +74,7 @@ def test_the_lockstep_camera_mirrors_and_the_flight_sees_it_turned_right() -> No
 def published(profile: Profile) -> list[Picture]:
     """By the simulated vehicle's process, on its way to the stream."""
     setup = HostSetup(
-        scenario=draw_scenario(profile, SEED), camera=camera_of(profile.camera),
+        scenario=draw_scenario(profile, SEED), camera=profile_camera(profile.camera),
         target=profile.target,
     )  # fmt: skip
     out: list[Picture] = []
@@ -132,14 +131,14 @@ def test_the_fault_mirrors_against_what_the_profile_says() -> None:
 def test_a_camera_in_a_hand_mirrors_too() -> None:
     def shown(mirrored: bool) -> Iterator[Picture]:
         profile = MIRRORED if mirrored else PLAIN
-        for frame in pictures(hands[mirrored], profile, camera_of(profile.camera)):
+        for frame in pictures(hands[mirrored], profile, profile_camera(profile.camera)):
             yield frame.image
 
     hands = [draw_hand(p, "carry", SEED, seconds=0.3) for p in (PLAIN, MIRRORED)]
     for one, other in zip(shown(False), shown(True), strict=True):
         np.testing.assert_array_equal(one[:, ::-1], other)
     found = [
-        record(hand, profile, camera_of(profile.camera))
+        record_hand(hand, profile, profile_camera(profile.camera))
         for hand, profile in zip(hands, (PLAIN, MIRRORED), strict=True)
     ]
     assert found[0].poses

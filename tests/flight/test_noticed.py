@@ -8,20 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perchctl.flight.history import History
+from perchctl.flight import History
 from perchctl.flight.noticed import (
     SLEW,
     USED_SIGMA_S,
     Noticed,
     noticed,
 )
-from perchctl.mission.context import Context
-from perchctl.mission.state import Phase
-from perchctl.profile import CameraConfig
-from perchctl.profile.vision import USED_LATENCY_S
-from perchctl.vision.consistency import Consistency
-from perchctl.vision.pose import make_pose_setup
-from perchctl.vision.types import CameraModel, MarkerPose
+from perchctl.mission import Context, Phase
+from perchctl.profile import USED_LATENCY_S, CameraConfig
+from perchctl.vision import CameraModel, Consistency, MarkerPose, make_pose_setup
 from tests.helpers.mission import PROFILE, observation, state_in, telemetry
 
 FRAME_S = 1 / 30

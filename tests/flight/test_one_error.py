@@ -13,15 +13,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.display.watch import status_of
-from perchctl.flight import senses
-from perchctl.flight.lockstep import fly_lockstep
+from perchctl.flight import fly_lockstep, senses
 from perchctl.geometry import Array, rot_z, wrap_rad
 from perchctl.log.watch import Truth, flight_record
-from perchctl.mission import planner
-from perchctl.mission.context import Context
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Tick
-from perchctl.sim.draw import draw_scenario
+from perchctl.mission import Context, Phase, Tick, planner
+from perchctl.sim import draw_scenario
 from perchctl.vision import strategies
 from tests.helpers.flights import SEED, NoLog, short_profile
 

@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import Interrupted, UsageError
-from perchctl.flight import session
-from perchctl.flight.operator import AGAIN_S, DELAY_S, HELD_S, INSIST_S, OperatorSwitch
-from perchctl.mission.state import Operator
+from perchctl.flight import OperatorSwitch, session
+from perchctl.flight.operator import AGAIN_S, DELAY_S, HELD_S, INSIST_S
+from perchctl.mission import Operator
 from perchctl.profile import load_profile
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -15,14 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import SafetyAbort, TimedOut
-from perchctl.flight.criteria import unmeasured
-from perchctl.flight.outside import AtRest, apart, strange, with_another_up
+from perchctl.flight import unmeasured_problem, world_problem
+from perchctl.flight.outside import AtRest, apart, with_another_up
 from perchctl.flight.preflight import refuse_strange
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
-from perchctl.mission.state import Operator, Outcome
+from perchctl.mission import Operator, Outcome
 from perchctl.positioning import FeedStatus
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import ExternalPosition, MeasuredBy, PositionSetpoint
 from tests.helpers.capture import TURNS, named_up
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
@@ -55,7 +54,7 @@ def at(x: float, y: float, z: float, q: tuple[float, float, float, float] = LEVE
     (at(0.3, 0.4, 2.1), "swapped axes, another rigid body or zero"),
 ])  # fmt: skip
 def test_a_place_that_is_none_is_named(place: ExternalPosition, words: str | None) -> None:
-    problem = strange(place, REST, MOCAP)
+    problem = world_problem(place, REST, MOCAP)
     if words is None:
         assert problem is None
         return
@@ -68,9 +67,11 @@ def test_a_body_that_stands_out_of_the_target_s_reach_is_another_vehicle_s() -> 
     """Two vehicles in one room: the other one stands level, on the ground, two metres aside."""
     own = MOCAP.target.model_copy(update={"expected_xy_m": (0.3, 0.0), "expected_within_m": 0.3})
     profile = MOCAP.model_copy(update={"target": own})
-    assert strange(at(0.2, -0.5, 0.012), REST, profile) is None
-    assert strange(at(3.0, -0.5, 0.012), REST, MOCAP) is None, "nobody has said where it hangs"
-    problem = strange(at(3.0, -0.5, 0.012), REST, profile)
+    assert world_problem(at(0.2, -0.5, 0.012), REST, profile) is None
+    assert world_problem(at(3.0, -0.5, 0.012), REST, MOCAP) is None, (
+        "nobody has said where it hangs"
+    )
+    problem = world_problem(at(3.0, -0.5, 0.012), REST, profile)
     assert problem is not None
     assert "2.7 m from where its target is expected" in problem.found
     assert "another vehicle's" in problem.advice
@@ -135,7 +136,7 @@ def test_the_estimate_has_to_agree(place: ExternalPosition, agrees: bool) -> Non
 def test_something_tells_the_vehicle_where_it_is(
     by: MeasuredBy, profile: Profile, words: str | None
 ) -> None:
-    problem = unmeasured(by, profile)
+    problem = unmeasured_problem(by, profile)
     assert (problem is None) is (words is None)
     assert problem is None or (words is not None and words in problem.sentence)
 

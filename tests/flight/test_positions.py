@@ -23,17 +23,12 @@ from perchctl.errors import (
     TimedOut,
     UsageError,
 )
-from perchctl.flight import positions
-from perchctl.flight.clock import WallClock
-from perchctl.flight.positions import at_hand, opened_capture, started_feed
-from perchctl.flight.session import FlyOptions, check_options
-from perchctl.link.cflib_link import CflibLink
+from perchctl.flight import FlyOptions, WallClock, capture_for_vehicle, check_options, positions
+from perchctl.flight.positions import opened_capture, started_feed
+from perchctl.link import CflibLink
 from perchctl.positioning import FeedStatus
-from perchctl.profile import LinkConfig, Profile, find_profile, load_profile
-from perchctl.profile.positioning import PositioningConfig
-from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Scenario
+from perchctl.profile import LinkConfig, PositioningConfig, Profile, find_profile, load_profile
+from perchctl.sim import CaptureFault, CaptureSettings, Scenario, SimProcess
 from perchctl.vehicle import ExternalPosition, Telemetry
 from tests.helpers.mission import READY, telemetry
 
@@ -100,7 +95,7 @@ def fed(
     """As a flight's session does it."""
     clock = WallClock()
     with contextlib.ExitStack() as stack:
-        config = at_hand(config, sim.capture)
+        config = capture_for_vehicle(config, sim.capture)
         capture = opened_capture(stack, config, clock)
         link = CflibLink(sim.uri, LinkConfig(), clock.now, positioning=config)
         try:

@@ -13,9 +13,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import senses
 from perchctl.flight.preflight import still_waiting_for
-from perchctl.mission.state import Operator, Outcome
+from perchctl.mission import Operator, Outcome
 from perchctl.vehicle import PositionSetpoint
-from perchctl.vision.types import Detections
+from perchctl.vision import Detections
 from tests.helpers.flights import fly_short
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, Vehicle, noise
 from tests.helpers.mission import READY, target_at, telemetry

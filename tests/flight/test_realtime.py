@@ -27,13 +27,12 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.flight.clock import SLOW
-from perchctl.log.read import FlightLog, read_log
-from perchctl.mission.state import SEVEN
+from perchctl.log import FlightLog, read_log
+from perchctl.mission import SEVEN_PHASES
 from perchctl.profile import find_calibration, load_profile
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import SimProcess, draw_scenario
 from perchctl.vehicle import FLYING, LOCKED
 from tests.helpers.flights import ROOT, SEED, SHORT
 
@@ -100,7 +99,7 @@ def test_a_pipe_gets_one_plain_line_a_phase(whole: Finished) -> None:
     phases = [name for name in lines if name != "holding"]
     # A busy computer may have it look for the target twice: the log tells in which order.
     assert phases == [span.phase for span in read_log(the_log(whole.folder)).phases]
-    assert {p.value for p in SEVEN} <= set(phases)
+    assert {p.value for p in SEVEN_PHASES} <= set(phases)
     assert (phases[0], phases[-1]) == ("APPROACH", "PERCHED")
 
 

@@ -8,8 +8,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import EventKind
+from perchctl.mission import EventKind, Phase
 from tests.helpers.flights import fly_short
 
 PAL = {"camera_rate_hz": 25.0}

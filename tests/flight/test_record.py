@@ -13,10 +13,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.faults import FAULTS, FaultResult
 from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import _parameters
+from perchctl.flight import FlightResult
 from perchctl.flight.record import flown_record, result_from, result_record
-from perchctl.flight.results import FlightResult
 from perchctl.profile import load_profile
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 from tests.helpers.flights import SHORT
 
 SCENARIO = draw_scenario(load_profile("sim"), 17)

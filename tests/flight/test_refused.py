@@ -11,16 +11,17 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort
-from perchctl.flight.campaign import log_of, run_campaign
-from perchctl.flight.compared import FIGURES
-from perchctl.flight.record import flown_record, result_from, result_record
-from perchctl.flight.results import (
+from perchctl.flight import (
     FlightResult,
     campaign_summary,
     campaign_table,
-    none_took_off,
-    worst_first,
+    none_took_off_text,
+    run_campaign,
+    seed_log_path,
 )
+from perchctl.flight.compared import FIGURES
+from perchctl.flight.record import flown_record, result_from, result_record
+from perchctl.flight.results import worst_first
 from tests.helpers.commands import elsewhere, run  # noqa: F401
 from tests.helpers.flights import SHORT, short_profile
 from tests.helpers.results import aborted, landed, perched
@@ -39,7 +40,7 @@ def test_a_flat_battery_is_a_result_and_leaves_no_log(tmp_path: Path) -> None:
         assert result.scenario is not None
         assert 3.2 <= result.scenario.battery_rest_v <= 3.3
         assert result.log is None
-        assert not log_of(result.seed, tmp_path).exists()
+        assert not seed_log_path(result.seed, tmp_path).exists()
         assert flown_record(result_from(result_record(result))) == flown_record(result)
 
 
@@ -64,9 +65,9 @@ def test_it_has_no_time_and_no_attempts_to_compare() -> None:
 
 
 def test_where_none_took_off_it_is_not_the_seeds() -> None:
-    assert none_took_off([]) is None
-    assert none_took_off([REFUSED, LANDED]) is None
-    problem = none_took_off([REFUSED, REFUSED])
+    assert none_took_off_text([]) is None
+    assert none_took_off_text([REFUSED, LANDED]) is None
+    problem = none_took_off_text([REFUSED, REFUSED])
     assert isinstance(problem, SafetyAbort)
     assert "every flight was refused before take-off: the battery is flat" in str(problem)
 

@@ -15,15 +15,9 @@ from hypothesis import strategies as st
 from rich.progress import Task, TaskID
 
 from perchctl.commands.progress import TimeLeft, progress_bar
-from perchctl.flight.results import (
-    ENDS,
-    FlightResult,
-    campaign_summary,
-    campaign_table,
-    worst_first,
-)
-from perchctl.log.read import PhaseSpan, read_log
-from perchctl.log.summary import FlightSummary, summary_of, summary_text
+from perchctl.flight import FlightResult, campaign_summary, campaign_table
+from perchctl.flight.results import ENDS, worst_first
+from perchctl.log import FlightSummary, PhaseSpan, read_log, summarise_flight, summary_text
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.results import aborted, landed, perched
@@ -163,7 +157,7 @@ def test_words_from_a_log(tmp_path: Path) -> None:
     text = summary_text(read_log(writer.path))
     assert text.startswith("PERCHED: hanging still with the motors off\nmiss:      3.1 mm\n")
     assert "SEARCH 0.5 s > ESTIMATE 0.5 s" in text
-    unfinished = summary_of(cut)
+    unfinished = summarise_flight(cut)
     assert (unfinished.outcome, unfinished.reason) == ("unknown", "the log ends in PERCHED")
     assert unfinished.duration_s == pytest.approx(18.6, abs=0.05)
     assert unfinished.battery_min_v == pytest.approx(min(r["battery_v"] for r in records))
@@ -176,7 +170,7 @@ def test_a_battery_that_is_not_measured_has_no_minimum(tmp_path: Path) -> None:
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", synthetic.header())
     writer.write({"t_s": 0.0, "phase": "APPROACH", "battery_v": 0.0})
     writer.close()
-    assert summary_of(read_log(writer.path)).battery_min_v is None
+    assert summarise_flight(read_log(writer.path)).battery_min_v is None
 
 
 class Terminal(io.StringIO):

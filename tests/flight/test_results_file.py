@@ -11,16 +11,17 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.flight.kept import Kept, log_keeper
-from perchctl.flight.results import FlightResult
-from perchctl.flight.results_file import (
-    CampaignHeader,
+from perchctl.flight import (
+    CampaignResults,
+    FlightResult,
     campaign_header,
     commit_of,
+    log_keeper,
     open_results,
     profile_sha256,
 )
-from perchctl.log.recording.place import recording_of
+from perchctl.flight.results_file import CampaignHeader
+from perchctl.log.recording.place import recording_path
 from perchctl.profile import load_profile
 from tests.helpers.results import perched
 
@@ -192,7 +193,7 @@ def _logs(folder: Path) -> list[FlightResult]:
     for seed in range(6):
         log = folder / f"flight_seed{seed}.jsonl"
         log.touch()
-        recording_of(log).touch()
+        recording_path(log).touch()
         outcome = {1: "aborted", 3: "landed"}.get(seed, "perched")
         miss_m = None if outcome != "perched" else {4: 0.009}.get(seed, 0.001 * (seed + 1))
         result = replace(FLOWN, seed=seed, outcome=outcome, miss_m=miss_m, log=log)  # type: ignore[arg-type]
@@ -229,7 +230,7 @@ def test_a_campaign_that_goes_on_judges_the_logs_of_its_own_folder(tmp_path: Pat
         log = folder / f"flight_seed{seed}.jsonl"
         log.touch()
         earlier[seed] = replace(perched(seed, miss_m=0.001 * (seed + 1)), log=log)
-    kept = Kept(range(4), earlier, log_keeper("worst:1"), folder=own)
+    kept = CampaignResults(range(4), earlier, log_keeper("worst:1"), folder=own)
     assert kept.left == [3]
     left = {path.name for path in tmp_path.rglob("*.jsonl")}
     assert left == {"flight_seed1.jsonl", "flight_seed2.jsonl"}
@@ -238,16 +239,16 @@ def test_a_campaign_that_goes_on_judges_the_logs_of_its_own_folder(tmp_path: Pat
 def test_the_logs_of_flights_that_were_broken_off_go(tmp_path: Path) -> None:
     logs = [tmp_path / f"flight_seed{seed}.jsonl" for seed in range(3)]
     logs[0].touch()  # another campaign's
-    kept: Kept[FlightResult] = Kept(range(3), {}, log_keeper("failed"))
+    kept: CampaignResults[FlightResult] = CampaignResults(range(3), {}, log_keeper("failed"))
 
     def stopped() -> None:
         with kept.without_torn(logs):
             for log in logs[1:]:
                 log.touch()
-                recording_of(log).touch()
+                recording_path(log).touch()
             kept.note(replace(FLOWN, seed=1, outcome="landed", miss_m=None, log=logs[1]))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         stopped()
-    assert set(tmp_path.iterdir()) == {logs[0], logs[1], recording_of(logs[1])}
+    assert set(tmp_path.iterdir()) == {logs[0], logs[1], recording_path(logs[1])}

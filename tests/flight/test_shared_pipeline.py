@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.flight import lockstep
 from perchctl.values import replace
 from tests.helpers.flights import short_profile
@@ -19,7 +19,7 @@ from tests.helpers.flights import short_profile
 )
 def test_a_profile_that_differs_has_its_own(change: dict[str, object]) -> None:
     profile, other = short_profile(), short_profile(change)
-    camera, again = camera_of(profile.camera), camera_of(profile.camera)
+    camera, again = profile_camera(profile.camera), profile_camera(profile.camera)
     shared = lockstep._pipeline_of(profile, camera)
     assert lockstep._pipeline_of(short_profile(), again) is shared
     assert lockstep._pipeline_of(other, camera) is not shared
@@ -27,7 +27,7 @@ def test_a_profile_that_differs_has_its_own(change: dict[str, object]) -> None:
 
 def test_so_has_a_camera_that_differs() -> None:
     profile = short_profile()
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     other = replace(camera, dist=camera.dist + 1e-9)
     assert lockstep._pipeline_of(profile, other) is not lockstep._pipeline_of(profile, camera)
     assert lockstep._pipeline_of(profile, other).camera is other
@@ -36,7 +36,7 @@ def test_so_has_a_camera_that_differs() -> None:
 def test_and_a_mask_is_read_each_time(tmp_path_factory: pytest.TempPathFactory) -> None:
     file = tmp_path_factory.mktemp("mask") / "mask.png"
     profile = short_profile()
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     width, height = camera.size_px
     masked = short_profile({"camera.mask": str(file)})
     for rows in (20, 40):

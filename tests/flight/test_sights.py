@@ -10,25 +10,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.calibration.files import camera_of
-from perchctl.flight.history import History, extended
-from perchctl.flight.senses import Senses
+from perchctl.calibration import profile_camera
+from perchctl.flight import History, Senses, add_samples
 from perchctl.flight.sights import CARRIED_FOR_S, Sights, is_carried
 from perchctl.geometry import Place
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry
-from perchctl.vision.types import MarkerPose, Measured
+from perchctl.vision import MarkerPose, MeasuredMarkers
 from tests.helpers.mission import target_at, telemetry
 from tests.helpers.sights import TARGET_ONLY
 
 TARGET = Place(np.array([0.0, 0.0, 2.0]), 0.0)
-PIPELINE = make_pipeline(TARGET_ONLY, camera_of(TARGET_ONLY.camera))
+PIPELINE = make_pipeline(TARGET_ONLY, profile_camera(TARGET_ONLY.camera))
 SAMPLE_S = 0.01
 
 
 def history(samples: list[Telemetry]) -> History:
-    return extended(History(), samples, SafetyConfig())
+    return add_samples(History(), samples, SafetyConfig())
 
 
 def at_rest(lasts_s: float = 0.5, **changes: object) -> list[Telemetry]:
@@ -99,7 +98,7 @@ def test_an_attitude_that_stands_still_places_nobody(frozen: bool) -> None:
         telemetry(1.0 + SAMPLE_S * i, 1.0, **({"roll_rad": 0.1} if frozen and i else {}))
         for i in range(50)
     ]
-    sights.see(Measured(poses={"large": pose}), history(samples), 1.5)
+    sights.see(MeasuredMarkers(poses={"large": pose}), history(samples), 1.5)
     assert bool(sent) is not frozen
 
 

@@ -11,11 +11,9 @@ import pytest
 
 from perchctl.flight import loop
 from perchctl.flight.watchdog import CUT_PERIOD_S
-from perchctl.mission.sent import Sent
-from perchctl.mission.state import Operator, Outcome, Phase
-from perchctl.mission.watch import EventKind, Tick
+from perchctl.mission import EventKind, Operator, Outcome, Phase, SentCommand, Tick
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, Telemetry
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.loop_rig import PROFILE, Broken, Camera, Rig, Vehicle, Watcher
 
 HANG_AT_S = 2.5
@@ -42,7 +40,7 @@ class Guarded(Vehicle):
                 if command is not None:
                     self.own.append((self.now_s, command))
                     self.send(command)
-                    self.told(Sent(self.now_s, "watchdog", command))
+                    self.told(SentCommand(self.now_s, "watchdog", command))
 
 
 def hanging_camera(link: Guarded, for_s: float) -> Camera:
@@ -103,7 +101,7 @@ def test_what_was_decided_before_a_hang_is_not_sent_after_it(
     link = Guarded()
     rig = Rig(link)
     rig.operator = lambda: Operator.LAND if link.now_s > LAND_AT_S else Operator.NONE
-    real, stale = loop.planner.step, []
+    real, stale = loop.step_mission, []
 
     def step(*arguments: Any) -> Any:
         new, command = real(*arguments)
@@ -112,7 +110,7 @@ def test_what_was_decided_before_a_hang_is_not_sent_after_it(
             link.advance_to(link.now_s + 0.6)
         return new, command
 
-    monkeypatch.setattr(loop.planner, "step", step)
+    monkeypatch.setattr(loop, "step_mission", step)
     rig.fly()
     assert stale
     assert stale[0] not in [c for _, c in link.sent]
@@ -125,7 +123,7 @@ def test_a_landing_ordered_while_the_planner_thinks_is_not_taken_back(
     link = Guarded()
     rig = Rig(link)
     rig.operator = lambda: Operator.LAND if link.now_s > LAND_AT_S else Operator.NONE
-    real, slow = loop.planner.step, []
+    real, slow = loop.step_mission, []
 
     def step(state: Any, obs: Any, *more: Any) -> Any:
         if not slow and obs.loop_late_s > 0.5:
@@ -133,7 +131,7 @@ def test_a_landing_ordered_while_the_planner_thinks_is_not_taken_back(
             link.advance_to(link.now_s + 0.1)
         return real(state, obs, *more)
 
-    monkeypatch.setattr(loop.planner, "step", step)
+    monkeypatch.setattr(loop, "step_mission", step)
     rig.camera = hanging_camera(link, 0.97)
     report = rig.fly()
     assert slow

@@ -11,10 +11,17 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import InvalidValue, UsageError
-from perchctl.flight.plot import plot_sweep
-from perchctl.flight.results import FlightResult
-from perchctl.flight.sweep import grid_of, sweep_record, sweep_text, swept
-from perchctl.flight.variants import Variant, VariantResult, whole_seeds
+from perchctl.flight import (
+    FlightResult,
+    VariantResult,
+    plot_sweep,
+    sweep_grid,
+    sweep_record,
+    sweep_results,
+    sweep_text,
+    whole_seeds,
+)
+from perchctl.flight.variants import Variant
 from perchctl.profile import load_profile
 from tests.helpers.results import landed, perched
 
@@ -24,16 +31,18 @@ OTHER = "planner.perch.mode"
 
 
 def test_each_value_is_a_cell_and_the_profiles_own_is_one_of_them() -> None:
-    grid = grid_of(SIM, [f"{KEY}=0.02,0.04,0.08"])
+    grid = sweep_grid(SIM, [f"{KEY}=0.02,0.04,0.08"])
     assert [cell.texts for cell in grid.cells] == [("0.02",), ("0.04",), ("0.08",)]
     assert [cell.profile.planner.align.xy_m for cell in grid.cells] == [0.02, 0.04, 0.08]
     assert grid.own == 1
-    assert grid_of(SIM, [f"{KEY}=0.02,0.08"]).cells[-1].texts == ("0.04",)
-    assert grid_of(SIM, [f"{KEY}=0.02,0.08"]).own == 2
+    assert sweep_grid(SIM, [f"{KEY}=0.02,0.08"]).cells[-1].texts == ("0.04",)
+    assert sweep_grid(SIM, [f"{KEY}=0.02,0.08"]).own == 2
 
 
 def test_two_keys_are_each_with_each_and_values_may_be_lists() -> None:
-    grid = grid_of(SIM, [f"{OTHER}=raw, position", "simulation.mass_kg=[0.04, 0.04],[0.05,0.05]"])
+    grid = sweep_grid(
+        SIM, [f"{OTHER}=raw, position", "simulation.mass_kg=[0.04, 0.04],[0.05,0.05]"]
+    )
     assert [cell.texts for cell in grid.cells[:4]] == [
         ("raw", "[0.04, 0.04]"), ("raw", "[0.05,0.05]"),
         ("position", "[0.04, 0.04]"), ("position", "[0.05,0.05]"),
@@ -62,7 +71,7 @@ def test_what_cannot_be_swept_is_refused(
     sweeps: list[str], error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words.replace("[", r"\[")):
-        grid_of(SIM, sweeps)
+        sweep_grid(SIM, sweeps)
 
 
 def flights(seeds: int, *misses_m: float | None) -> list[tuple[FlightResult, ...]]:
@@ -74,8 +83,8 @@ def flights(seeds: int, *misses_m: float | None) -> list[tuple[FlightResult, ...
 
 
 def test_the_best_is_proven_or_not() -> None:
-    grid = grid_of(SIM, [f"{KEY}=0.02,0.04,0.08"])
-    found = swept(grid, flights(40, 0.001, 0.003, None))
+    grid = sweep_grid(SIM, [f"{KEY}=0.02,0.04,0.08"])
+    found = sweep_results(grid, flights(40, 0.001, 0.003, None))
     assert (found.best, found.figures[0].flights, found.figures[2].good) == (0, 40, 0)
     assert found.figures[0].median_m == pytest.approx(0.0013)
     text = sweep_text(found)
@@ -86,15 +95,15 @@ def test_the_best_is_proven_or_not() -> None:
 
 
 def test_a_best_cell_of_few_seeds_is_not_proven() -> None:
-    grid = grid_of(SIM, [f"{KEY}=0.02,0.04"])
-    found = swept(grid, flights(4, 0.001, 0.003))
+    grid = sweep_grid(SIM, [f"{KEY}=0.02,0.04"])
+    found = sweep_results(grid, flights(4, 0.001, 0.003))
     assert found.best == 0
     assert "no difference proven" in sweep_text(found)
 
 
 def test_of_equal_cells_the_profiles_own_is_the_best() -> None:
-    grid = grid_of(SIM, [f"{KEY}=0.02,0.04"])
-    found = swept(grid, flights(20, 0.002, 0.002))
+    grid = sweep_grid(SIM, [f"{KEY}=0.02,0.04"])
+    found = sweep_results(grid, flights(20, 0.002, 0.002))
     assert found.best == grid.own
     assert found.against_own is None
     assert sweep_text(found).endswith("the profile's own values are the best")
@@ -103,12 +112,12 @@ def test_of_equal_cells_the_profiles_own_is_the_best() -> None:
 def test_chance_among_many_cells_is_no_proof() -> None:
     """Two of ten seeds fail with the own value; the best of 12 others has none that does."""
     values = ",".join(f"{0.01 * k:.2f}" for k in range(5, 17))
-    grid = grid_of(SIM, [f"{KEY}={values}"])
+    grid = sweep_grid(SIM, [f"{KEY}={values}"])
     rows = [
         tuple(landed(k) if cell.own and k < 6 else perched(k) for cell in grid.cells)
         for k in range(10)
     ]
-    found = swept(grid, rows)
+    found = sweep_results(grid, rows)
     assert found.figures[grid.own].good == 4
     assert found.best != grid.own
     assert "no difference proven" in sweep_text(found)
@@ -130,14 +139,14 @@ def test_seeds_count_that_every_cell_has_flown() -> None:
 @pytest.mark.long
 def test_two_keys_are_a_heat_map(tmp_path: Path, second: str) -> None:
     """With the profile's own on it and beside it, and with a cell in which nothing perched."""
-    grid = grid_of(SIM, [f"{OTHER}=raw,position", f"{KEY}={second}"])
-    found = swept(grid, flights(3, None, *([0.002] * (len(grid.cells) - 1))))
+    grid = sweep_grid(SIM, [f"{OTHER}=raw,position", f"{KEY}={second}"])
+    found = sweep_results(grid, flights(3, None, *([0.002] * (len(grid.cells) - 1))))
     plot_sweep(found, tmp_path / "map.png")
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_swept_worlds_are_other_worlds() -> None:
     """A world's values are those of its keys: a profile that has them written out keeps none."""
-    grid = grid_of(load_profile("sim"), ["simulation.set=nominal,rough,extreme"])
+    grid = sweep_grid(load_profile("sim"), ["simulation.set=nominal,rough,extreme"])
     weights = [cell.profile.simulation.mass_kg for cell in grid.cells]
     assert weights == [(0.038, 0.042), (0.042, 0.045), (0.044, 0.045)]

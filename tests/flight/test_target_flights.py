@@ -12,11 +12,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.faults import FAULTS
 from perchctl.faults.catalogue import draw_case
 from perchctl.faults.flight import FaultyFlight
+from perchctl.flight import fly_lockstep
 from perchctl.flight.campaign import fly_seed
-from perchctl.flight.lockstep import fly_lockstep
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, Tick
-from perchctl.sim.draw import draw_scenario
+from perchctl.mission import Event, Phase, Tick
+from perchctl.sim import draw_scenario
 from tests.helpers.sights import TARGET_ONLY
 
 MISS_M = 0.006

@@ -10,16 +10,30 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.display import card_of
-from perchctl.log.read import read_log
-from perchctl.log.shown import show_record, show_text
-from perchctl.log.summary import FlightSummary, summary_of, summary_text
-from perchctl.mission import planner
-from perchctl.mission.context import Context
-from perchctl.mission.ending import HARD_MPS, ContactError, Touchdown, touchdown_of
-from perchctl.mission.imu import BLOW_MPS, Blow, ImuMotion, Reckoning, moved, reckoned
-from perchctl.mission.state import Observation, Operator, Phase
-from perchctl.mission.watch import EventKind
+from perchctl.display import summary_card
+from perchctl.log import (
+    FlightSummary,
+    read_log,
+    show_record,
+    show_text,
+    summarise_flight,
+    summary_text,
+)
+from perchctl.mission import (
+    ContactError,
+    Context,
+    EventKind,
+    ImuMotion,
+    Observation,
+    Operator,
+    Phase,
+    Touchdown,
+    integrate_imu,
+    planner,
+    touchdown_of,
+)
+from perchctl.mission.ending import HARD_MPS
+from perchctl.mission.imu import BLOW_MPS, Blow, Reckoning, reckoned
 from perchctl.profile import load_profile
 from perchctl.report.sections import headline
 from perchctl.report.told import tell
@@ -39,15 +53,13 @@ SENTENCE = "touched down hard: 0.9 m/s, 3.1 g"
 def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdown | None]:
     """The vehicle comes down on a share of the thrust that it hovers on. Returns its true speed
     at the floor, its largest true specific force, g, and what was felt."""
-    from perchctl.link.bursty import radio_of
-    from perchctl.link.mock import MockLink
-    from perchctl.sim.draw import draw_scenario
-    from perchctl.sim.vehicle import SimulatedVehicle
+    from perchctl.link import MockLink, simulated_radio
+    from perchctl.sim import SimulatedVehicle, draw_scenario
 
     profile = load_profile("sim")
     scenario = draw_scenario(profile, seed)
     vehicle = SimulatedVehicle(scenario)
-    link = MockLink(vehicle, profile.link.telemetry_period_s, radio_of(scenario))
+    link = MockLink(vehicle, profile.link.telemetry_period_s, simulated_radio(scenario))
     link.connect()
     motion, carried, last = ImuMotion(), Reckoning(), None
     t_s, dropped_s, hit_s, speed_mps, sink_mps = 1.0, math.inf, math.inf, 0.0, 0.0
@@ -67,7 +79,7 @@ def dropped(seed: int, share: float, blind: bool) -> tuple[float, float, Touchdo
         for sample in link.telemetry():
             if last is None:
                 place = sample.position_m
-            motion = moved(motion, last, sample)
+            motion = integrate_imu(motion, last, sample)
             believed = not blind or t_s < dropped_s
             carried, last = reckoned(carried, motion, sample, believed=believed), sample
     assert last is not None
@@ -104,7 +116,7 @@ def blown(*hits: tuple[float, float, float]) -> ImuMotion:
             if hit_s <= t_s < hit_s + 0.015:
                 acc_g = force_g
         sample = telemetry(t_s, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion = moved(motion, last, sample)
+        motion = integrate_imu(motion, last, sample)
         last = sample
     return motion
 
@@ -122,7 +134,7 @@ def test_an_estimate_that_has_the_blow_before_the_samples_do(steady_s: float) ->
     steady = [(-0.4, 1.001)] * round(100 * steady_s)
     for i, (vz_mps, acc_g) in enumerate([*steady, (0.02, 2.9), (0.02, 3.8), *[(0.02, 1.0)] * 8]):
         sample = telemetry(0.01 * i, 0.0, velocity_mps=(0.0, 0.0, vz_mps), acc_z_g=acc_g)
-        motion, last = moved(motion, last, sample), sample
+        motion, last = integrate_imu(motion, last, sample), sample
     assert (motion.blow.estimated_mps, motion.blow.peak_g) == (-0.4, 3.8)
 
 
@@ -221,7 +233,9 @@ def test_an_attempt_that_failed_leaves_no_contact() -> None:
     )
     falls = telemetry(10.02, HANG_Z_M - 0.1, velocity_mps=(0.0, 0.0, -0.5), acc_z_g=0.2, thrust=0.0)
     for t_s in (10.02, 10.04, 10.06, 10.08):
-        state, _ = planner.step(state, observation(t_s, telemetry=replace(falls, t_s=t_s)), PROFILE)
+        state, _ = planner.step_mission(
+            state, observation(t_s, telemetry=replace(falls, t_s=t_s)), PROFILE
+        )
     assert state.phase is Phase.RECOVER
     assert state.contact_aside_m is None
 
@@ -258,6 +272,6 @@ def test_log_show_and_log_report_tell_both(tmp_path: Path) -> None:
     page = unescape(str(headline(whole))).replace("\xa0", " ")
     assert "1.8 +- 0.6 mm off centre" in page, page
     assert f"It {SENTENCE}" in [sentence.text for sentence in whole.story]
-    card = card_of(summary_of(flown), flown.path)
+    card = summary_card(summarise_flight(flown), flown.path)
     assert ["contact", "1.8 +- 0.6 mm off centre"] in card["rows"]
     assert ["vehicle", SENTENCE] in card["rows"]

@@ -11,15 +11,12 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.mounting.report import Comparison
-from perchctl.calibration.mounting.solve import solve_carry, solve_pivot
-from perchctl.flight.lockstep import fly_lockstep
-from perchctl.log.read import FlightLog, read_log
-from perchctl.mission.state import Outcome, Phase
-from perchctl.profile import Profile, load_profile
-from perchctl.profile.edit import write_values
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.scenario import Scenario
+from perchctl.calibration import MountingReport, solve_carry, solve_pivot
+from perchctl.flight import fly_lockstep
+from perchctl.log import FlightLog, read_log
+from perchctl.mission import Outcome, Phase
+from perchctl.profile import Profile, load_profile, write_profile_values
+from perchctl.sim import Scenario, draw_scenario
 from tests.helpers.mounting import hand, seen
 
 SEEDS = range(20)
@@ -49,8 +46,8 @@ def measured(scenario: Scenario, seed: int, path: Path) -> Profile:
             camera_latency_s=scenario.camera_latency_s,
         )
         parts.append(seen(replace(held, scenario=own)))
-    found = Comparison(load_profile(str(path)), solve_carry(parts[0]), solve_pivot(parts[1]))
-    write_values(path, found.profile_values())
+    found = MountingReport(load_profile(str(path)), solve_carry(parts[0]), solve_pivot(parts[1]))
+    write_profile_values(path, found.profile_values())
     return load_profile(str(path))
 
 

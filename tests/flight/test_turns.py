@@ -7,18 +7,22 @@ from typing import Any
 
 import pytest
 
-from perchctl.flight.clock import WallClock
-from perchctl.flight.loop import fly
-from perchctl.flight.senses import SENSED
+from perchctl.flight import SENSED, WallClock, fly
 from perchctl.flight.turns import Turns
-from perchctl.mission import planner
-from perchctl.mission.state import Observation, Operator, Outcome, PlannerState
-from perchctl.mission.turn import Turn
-from perchctl.mission.watch import Tick, TurnWatcher
+from perchctl.mission import (
+    Observation,
+    Operator,
+    Outcome,
+    PlannerState,
+    Tick,
+    Turn,
+    TurnWatcher,
+    step_mission,
+)
 from perchctl.profile import Profile
 from perchctl.replay.decide import decide, first_of
 from perchctl.vehicle import Command, Land
-from tests.helpers.hangs import hang_in_the_planner
+from tests.helpers.hangs import hang_in_the_planner, plan_by
 from tests.helpers.loop_rig import Rig, Vehicle
 from tests.helpers.loop_rig import Watcher as LooksOn
 
@@ -67,14 +71,14 @@ def test_each_turn_is_told_once_and_in_order(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the landing; a replay demands that deciding on it raises again."""
-    step = planner.step
+    step = step_mission
 
     def fails(state: PlannerState, obs: Observation, profile: Profile) -> Any:
         if obs.t_s > 0.5:
             raise ZeroDivisionError("by the test")
         return step(state, obs, profile)
 
-    monkeypatch.setattr(planner, "step", fails)
+    plan_by(monkeypatch, fails)
     told, rig = Told(), Rig()
     with pytest.raises(ZeroDivisionError):
         fly(replace(rig.parts(), watchers=(told,)))
@@ -86,7 +90,7 @@ def test_what_the_planner_raised_on_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     flown = [tick.turn for tick in told.ticks if tick.turn is not None]
     assert last.number == flown[-1].number + 1
     assert not any(each.differs for each in decide([*flown, last], rig.profile))
-    monkeypatch.setattr(planner, "step", step)  # mended
+    plan_by(monkeypatch, step)  # mended
     *others, again = decide([*flown, last], rig.profile)
     assert not any(each.differs for each in others)
     assert again.difference == ("error", "ZeroDivisionError", None)
@@ -98,7 +102,8 @@ def test_a_planner_that_fails_on_the_first_turn_fails_again(
     def fails(obs: Observation) -> PlannerState:
         raise ValueError("by the test")
 
-    monkeypatch.setattr(planner, "start", fails)
+    for module in ("perchctl.flight.loop", "perchctl.replay.decide"):
+        monkeypatch.setattr(f"{module}.start_mission", fails)
     told, rig = Told(), Rig()
     with pytest.raises(ValueError, match="by the test"):
         fly(replace(rig.parts(), watchers=(told,)))
@@ -130,7 +135,7 @@ def test_a_planner_that_was_interrupted_did_not_fail(monkeypatch: pytest.MonkeyP
     def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(planner, "step", interrupted)
+    plan_by(monkeypatch, interrupted)
     told = Told()
     with pytest.raises(KeyboardInterrupt):
         fly(replace(Rig().parts(), watchers=(told,)))

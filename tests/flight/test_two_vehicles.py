@@ -21,12 +21,10 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import camera_of
-from perchctl.log.read import FlightLog, read_log
+from perchctl.calibration import profile_camera
+from perchctl.log import FlightLog, read_log
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Neighbour
+from perchctl.sim import Neighbour, SimProcess, draw_scenario
 from tests.helpers.flights import ROOT, SEED, SHORT, fly_short, short_profile
 from tests.helpers.room import Heard, Pair, Perch, farthest_m, fly_one, heard, knowing, pair
 
@@ -141,7 +139,7 @@ class Flown:
 
 @contextmanager
 def vehicles(profile: Profile, room: Pair, folder: Path) -> Iterator[list[SimProcess]]:
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     running: list[SimProcess] = []
     try:
         for name, scenario in zip("ab", room.scenarios, strict=True):

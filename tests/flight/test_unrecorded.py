@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
-from perchctl.mission.watch import Event, Tick
-from perchctl.vision.types import TargetEstimate
+from perchctl.flight import fly_lockstep
+from perchctl.flight.lockstep import LockstepFlight
+from perchctl.mission import Event, Tick
+from perchctl.vision import TargetEstimate
 from tests.helpers.flights import SEED, short_profile
 
 SPREAD = {"sigma_m", "sigma_yaw_rad"}

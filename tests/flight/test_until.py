@@ -8,9 +8,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.flight import FlightResult, StopRule
 from perchctl.flight.rates import rate_interval
-from perchctl.flight.results import FlightResult
-from perchctl.flight.until import Enough
 from tests.helpers.results import landed, perched
 
 
@@ -23,8 +22,8 @@ def width(good: int, flights: int) -> float:
     return high - low
 
 
-def flown(order: list[int], most: float, seeds: range) -> Enough:
-    enough = Enough(seeds, most)
+def flown(order: list[int], most: float, seeds: range) -> StopRule:
+    enough = StopRule(seeds, most)
     for seed in order:
         if enough.note(result(seed)):
             break
@@ -57,7 +56,7 @@ def test_the_same_seeds_count_in_whatever_order_they_end(ahead: int) -> None:
 
 
 def test_a_seed_that_is_still_flying_holds_up_the_judgement() -> None:
-    enough = Enough(range(300), 0.5)
+    enough = StopRule(range(300), 0.5)
     assert not any(enough.note(perched(seed)) for seed in range(1, 300))
     assert enough.counted == []
     assert enough.note(perched(0))
@@ -72,21 +71,21 @@ def test_the_bound_may_be_met_first() -> None:
 
 
 def test_a_rate_of_one_takes_as_many_as_its_interval_says() -> None:
-    enough = Enough(range(1000), 0.005)
+    enough = StopRule(range(1000), 0.005)
     last = next(seed for seed in range(1000) if enough.note(perched(seed)))
     assert last + 1 == 736
 
 
 def test_what_it_may_come_to_is_what_the_present_rate_needs() -> None:
     """When all perch, 0.5 % take 736 flights; once one has not, more than there are."""
-    enough = Enough(range(1000), 0.005)
+    enough = StopRule(range(1000), 0.005)
     assert enough.expected() == 1000
     for seed in range(10):
         enough.note(perched(seed))
         assert enough.expected() == 736
     enough.note(landed(10))
     assert enough.expected() == 1000
-    met = Enough(range(1000), 0.5)
+    met = StopRule(range(1000), 0.5)
     for seed in range(100):
         if met.note(perched(seed)):
             break

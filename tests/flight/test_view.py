@@ -15,15 +15,16 @@ from hypothesis import strategies as st
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
-from perchctl.flight.outside import AtRest, strange
+from perchctl.flight import out_of_view, place_seen, target_from, world_problem
+from perchctl.flight.outside import AtRest
 from perchctl.flight.preflight import refuse_out_of_view, refuse_strange, still_waiting_for
-from perchctl.flight.view import LEAN_DEG, out_of_view, place_seen, seen_at
+from perchctl.flight.view import LEAN_DEG
 from perchctl.geometry import Place, rot_z
 from perchctl.positioning import FeedStatus
 from perchctl.positioning.feed import UNSEEN
 from perchctl.profile import Profile
 from perchctl.vehicle import ExternalPosition
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 from tests.helpers.flights import fly_short, short_profile
 from tests.helpers.mission import READY, target_at, telemetry
 
@@ -60,15 +61,15 @@ def test_put_where_the_refusal_says_it_flies(
     """In whatever heading it stands, and the higher the vehicle, the less it sees."""
     place = Place(np.array([x, y, z]), target_yaw)
     problem = out_of_view(place, FEET, yaw_rad, TARGET, CAMERA)
-    over = seen_at((0.0, 0.0, TOP_M), yaw_rad, place, TARGET, CAMERA)
+    over = target_from((0.0, 0.0, TOP_M), yaw_rad, place, TARGET, CAMERA)
     leant_m = over.height_m * math.tan(math.radians(LEAN_DEG))
     farther = (1.0 + leant_m / max(math.hypot(*over.aside_m), 1e-6)) * place.position_m[:2]
     leaning = Place(np.array([*farther, z]), target_yaw)
     # The camera is on the body's axis here: farther aside is as good as leaning.
-    swayed = seen_at((0.0, 0.0, TOP_M), yaw_rad, leaning, TARGET, CAMERA)
+    swayed = target_from((0.0, 0.0, TOP_M), yaw_rad, leaning, TARGET, CAMERA)
     assert (problem is None) is (over.whole and swayed.whole)
     if problem is None:
-        assert seen_at(FEET, yaw_rad, place, TARGET, CAMERA).whole
+        assert target_from(FEET, yaw_rad, place, TARGET, CAMERA).whole
         return
     ways = re.findall(r"([\d.]+) m (forward|back|to the left|to the right)", problem.advice)
     signs = {"forward": (1, 0), "back": (-1, 0), "to the left": (0, 1), "to the right": (0, -1)}
@@ -163,7 +164,7 @@ def test_what_is_refused_speaks_of_the_target() -> None:
     assert moved is not None
     assert "by the target the vehicle has moved by 0.20 m" in moved.sentence
     # A height or a far place cannot be another world's: there is only the vehicle's own.
-    assert strange(ExternalPosition((0.0, 0.0, 0.4)), REST, TARGET) is None
+    assert world_problem(ExternalPosition((0.0, 0.0, 0.4)), REST, TARGET) is None
     own = TARGET.target.model_copy(update={"expected_xy_m": (4.0, 0.0)})
     far = TARGET.model_copy(update={"target": own})
     status = FeedStatus(0.05, None, 20, None, 30.0, ExternalPosition(FEET))

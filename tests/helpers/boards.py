@@ -7,12 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perchctl.calibration.types import Grey, View
+from perchctl.calibration import BoardView, Grey
 from perchctl.geometry import Array
+from perchctl.target import Board, parse_board
 from perchctl.target.board_drawing import black_squares
-from perchctl.target.boards import Board, parse_board
-from perchctl.vision.camera_model import project, undistort
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, project, undistort
 
 CHARUCO = parse_board("charuco:10x7:25mm:18mm:DICT_5X5_100")
 CHESSBOARD = parse_board("chessboard:9x6:25mm")
@@ -78,14 +77,16 @@ def corner_view(
     pose: Array,
     noise_px: float,
     name: str,
-) -> View:
+) -> BoardView:
     """A view without a picture: true corners with noise; those outside of it are missing."""
     corners_m = board.corners_m()
     px = project(corners_m, pose[:3], pose[3:], camera)
     w, h = camera.size_px
     inside = ((px > 4) & (px < (w - 5, h - 5))).all(axis=1)
     noisy = px + rng.normal(0, noise_px, px.shape)
-    return View(name, camera.size_px, np.flatnonzero(inside), corners_m[inside], noisy[inside], 0.8)
+    return BoardView(
+        name, camera.size_px, np.flatnonzero(inside), corners_m[inside], noisy[inside], 0.8
+    )
 
 
 def corner_views(
@@ -95,7 +96,7 @@ def corner_views(
     views: int = 15,
     noise_px: float = 0.05,
     max_tilt_deg: float = 45,
-) -> list[View]:
+) -> list[BoardView]:
     poses = draw_poses(rng, camera, board, views, max_tilt_deg)
     return [
         corner_view(rng, camera, board, pose, noise_px, f"view {i}") for i, pose in enumerate(poses)

@@ -9,9 +9,9 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.link.claim import vehicle_of
+from perchctl.link import vehicle_uri
 from perchctl.positioning import Comparison, save_comparison
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 
 
 def _turns() -> list[Array]:
@@ -47,4 +47,4 @@ def compared(
 ) -> None:
     """As if `perchctl check --lift` had found that, so long ago."""
     at = datetime.now(UTC) - timedelta(seconds=ago_s)
-    assert save_comparison(config, vehicle_of(uri), Comparison(at, passed, found)) is None
+    assert save_comparison(config, vehicle_uri(uri), Comparison(at, passed, found)) is None

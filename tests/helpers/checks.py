@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 from perchctl.check import health, lift, link
-from perchctl.flight.session import FlyOptions
-from perchctl.link.scan import Answering
+from perchctl.flight import FlyOptions
+from perchctl.link import ScanResult
 from perchctl.profile import Profile, find_profile, load_profile
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import SimProcess
 from perchctl.vehicle import Telemetry
 from tests.helpers.mission import READY, telemetry
 
@@ -19,7 +19,7 @@ NOWHERE = "udp://127.0.0.1:9"
 NO_CAMERA = "camera:97"
 QUICK: dict[str, Any] = {
     "listen_s": 0.1, "rehearse_s": 0.2, "lift_s": 0.2, "health_s": 0.2,
-    "other_vehicles": lambda uri: Answering((), "no Crazyradio is plugged in"),
+    "other_vehicles": lambda uri: ScanResult((), "no Crazyradio is plugged in"),
 }  # fmt: skip
 VEHICLE = ["address", *link.NAMES, lift.NAME, *health.NAMES]
 AT_REST = telemetry(

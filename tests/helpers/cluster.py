@@ -12,11 +12,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from perchctl.flight import FlightResult, fly_lockstep
 from perchctl.flight.campaign import fly_seed
-from perchctl.flight.lockstep import fly_lockstep
-from perchctl.flight.results import FlightResult
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, Tick
+from perchctl.mission import Event, Phase, Tick
 from perchctl.profile import Profile
 from tests.helpers.flights import ROOT
 

@@ -17,8 +17,7 @@ from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
 from cflib.crtp.crtpstack import CRTPPacket
 
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario, SimProcess
 
 WAIT_S = 10.0
 CONNECTED_S = 60.0  # all tables, where a busy machine gives it a tenth of a core

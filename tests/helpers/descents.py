@@ -8,17 +8,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from perchctl.flight.history import History, extended
+from perchctl.flight import History, add_samples
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.link.mock import MockLink
-from perchctl.mission import lander, planner
-from perchctl.mission.context import Context
-from perchctl.mission.lander import Finding
-from perchctl.mission.state import Condition, Observation, Phase, PlannerState
+from perchctl.link import MockLink
+from perchctl.mission import (
+    Condition,
+    Context,
+    Finding,
+    Observation,
+    Phase,
+    PlannerState,
+    lander,
+    planner,
+)
 from perchctl.profile import Profile
-from perchctl.sim.body import REST_HEIGHT_M
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import REST_HEIGHT_M, SimulatedVehicle, draw_scenario
 from perchctl.vehicle import ExternalPosition, Idle, PositionSetpoint, Telemetry
 
 TICK_S = 0.02
@@ -69,7 +73,7 @@ class Descent:
         self.each: Callable[[float], None] = lambda t_s: None
         self.link.connect()
         self._stand()
-        self.state = replace(planner.start(self.observe()), phase=Phase.ALIGN)
+        self.state = replace(planner.start_mission(self.observe()), phase=Phase.ALIGN)
 
     @property
     def now_s(self) -> float:
@@ -92,7 +96,7 @@ class Descent:
         self._late += self.link.telemetry()
         arrived = [s for s in self._late if s.t_s <= self.now_s - self.delay_s]
         self._late = self._late[len(arrived) :]
-        self.history = extended(self.history, arrived, self.profile.safety)
+        self.history = add_samples(self.history, arrived, self.profile.safety)
         self.each(self.now_s)
 
     def observe(self) -> Observation:
@@ -141,13 +145,13 @@ class Descent:
             if position:
                 self._send_place()
             obs = change(self.observe())
-            state, command = lander.step(state, obs, self.profile)
+            state, command = lander.step_landing(state, obs, self.profile)
             landed.commands.append((obs.t_s, command))
             if not isinstance(command, Idle):
                 self.link.send(command)
             c = Context(state, obs, self.profile)
             if c.held(Condition.DOWN) >= 0.5:
-                landed.finding = lander.finding(c)
+                landed.finding = lander.rest_finding(c)
                 break
             down, aside = -world.vz_mps, math.hypot(world.vx_mps, world.vy_mps)
             was_up = not world.on_floor()

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from perchctl.sim.firmware import Firmware
+from perchctl.sim import CONTROL_PERIOD_S, Firmware, Scenario
 from perchctl.sim.firmware.commands import HlTakeoff, LowLevelCommand, PositionCommand
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.world import World
 
 STREAM_PERIOD_S = 0.02

@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 
-from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
-from perchctl.log.watch import LogWatcher, Truth
-from perchctl.mission.state import Operator, Phase
-from perchctl.mission.watch import Event, FlightReport
+from perchctl.flight import fly_lockstep
+from perchctl.flight.lockstep import LockstepFlight
+from perchctl.log import LogWatcher
+from perchctl.log.watch import Truth
+from perchctl.mission import Event, FlightReport, Operator, Phase
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_capture, draw_scenario
+from perchctl.sim import draw_capture, draw_scenario
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from perchctl.camera.source import FrameSource
-    from perchctl.mission.turn import Turn
-    from perchctl.mission.watch import Tick
+    from perchctl.camera import FrameSource
+    from perchctl.mission import Tick, Turn
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = str(Path(__file__).with_name("short.yaml"))

@@ -1,15 +1,23 @@
-"""A loop that is hung up inside a turn, once: simulated time goes on meanwhile."""
+"""A planner in another one's place, and a loop that hangs inside a turn, once: simulated time goes
+on meanwhile."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
-from perchctl.link.mock import MockLink, ScriptedLink
-from perchctl.mission import planner
-from perchctl.mission.state import Observation, PlannerState
-from perchctl.vision.types import Frame
+from perchctl.link import MockLink
+from perchctl.link.mock import ScriptedLink
+from perchctl.mission import Observation, PlannerState, step_mission
+from perchctl.vision import Frame
+
+
+def plan_by(monkeypatch: pytest.MonkeyPatch, step: Callable[..., Any]) -> None:
+    """In the flight loop and in a replay of it."""
+    for module in ("perchctl.flight.loop", "perchctl.replay.decide"):
+        monkeypatch.setattr(f"{module}.step_mission", step)
 
 
 def hang_in_the_camera(link: ScriptedLink | MockLink, camera: Any, at_s: float) -> None:
@@ -28,12 +36,12 @@ def hang_in_the_camera(link: ScriptedLink | MockLink, camera: Any, at_s: float) 
 def hang_in_the_planner(
     link: ScriptedLink | MockLink, monkeypatch: pytest.MonkeyPatch, at_s: float
 ) -> None:
-    step, left = planner.step, [True]
+    left = [True]
 
     def hang(state: PlannerState, obs: Observation, *more: Any) -> Any:
         if left and obs.t_s > at_s:
             left.clear()
             link.advance_to(obs.t_s + 0.4)
-        return step(state, obs, *more)
+        return step_mission(state, obs, *more)
 
-    monkeypatch.setattr(planner, "step", hang)
+    plan_by(monkeypatch, hang)

@@ -9,10 +9,8 @@ import numpy as np
 
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim.camera import SimCamera
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.vision.types import Frame
+from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario, SimCamera
+from perchctl.vision import Frame
 from tests.helpers.target_picture import CAMERA
 
 

@@ -10,7 +10,7 @@ from functools import partial
 from perchctl.commands.interrupt import signals_to
 from perchctl.commands.simulate_request import SimulateRequest, fly_each, stop_once
 from perchctl.errors import PerchError
-from perchctl.flight.campaign import fly_all
+from perchctl.flight import fly_all
 from tests.helpers.seeds import Ended, ends_first_only
 
 

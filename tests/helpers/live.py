@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 
 from perchctl.camera.source import LiveSource
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 WAIT_S = 10.0  # bound of every wait; reached only when a test fails
 

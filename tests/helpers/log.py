@@ -13,7 +13,7 @@ import numpy as np
 
 from perchctl.log.fields import tick_record
 from perchctl.log.write import FlightLogWriter, make_header
-from perchctl.mission.watch import Event
+from perchctl.mission import Event
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     Command,
@@ -23,14 +23,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision.types import (
-    Detection,
-    Detections,
-    MarkerPose,
-    PipelineOutput,
-    Stage,
-    TargetEstimate,
-)
+from perchctl.vision import Detection, Detections, MarkerPose, PipelineOutput, Stage, TargetEstimate
 
 PERIOD_S = 0.02
 PLAN: tuple[tuple[str, float, str], ...] = (

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.flight.history import History
-from perchctl.flight.loop import FlightParts, Positions, fly
+from perchctl.flight import FlightParts, History, fly
+from perchctl.flight.loop import Positions
 from perchctl.flight.rescue import Rescued, rescue
 from perchctl.link.mock import ScriptedLink
-from perchctl.mission import planner
-from perchctl.mission.state import Observation, Operator, Phase
-from perchctl.mission.watch import Event, FlightReport, Tick
+from perchctl.mission import Event, FlightReport, Observation, Operator, Phase, Tick, planner
 from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -28,7 +26,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame
 from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
 
 SIZE_PX = (64, 48)
@@ -240,7 +238,7 @@ class Rig:
         """A rescue of what was flying as `known` and `state` say, its positions `age_s` old."""
         ground = replace(known, position_m=(0.0, 0.0, 0.0))
         told = {"phase": Phase.ALIGN, "hover_thrust": HOVER_THRUST, "last": known} | state
-        before = replace(planner.start(Observation(known.t_s, ground)), **told)
+        before = replace(planner.start_mission(Observation(known.t_s, ground)), **told)
         began_s = self.link.now_s
         return rescue(
             self.link,

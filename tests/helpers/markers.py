@@ -10,25 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.profile import DetectorConfig, TargetConfig
-from perchctl.profile.dictionaries import predefined
-from perchctl.vision.camera_model import project
+from perchctl.profile import DetectorConfig, TargetConfig, aruco_dictionary
+from perchctl.vision import MARKERS, Frame, MarkerName, make_aruco_detector, project, square_corners
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import make_detector
 from perchctl.vision.markers.follow import follow, follow_partly
 from perchctl.vision.markers.pattern import Pattern
-from perchctl.vision.pose import square
-from perchctl.vision.types import MARKERS, Frame, MarkerName
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
-SETUP = make_detector(DetectorConfig(), TargetConfig())
+SETUP = make_aruco_detector(DetectorConfig(), TargetConfig())
 SIDES_M: dict[MarkerName, float] = {"large": 0.150, "small": 0.025}
 POSE = pose_of(0.03, -0.02, 0.35, 0.7, 0.05, -0.08)
 
 
 def corners(name: MarkerName, pose: tuple[Array, Array] = POSE) -> Array:
     """The marker's true corners, (4, 2) px."""
-    return project(square(SIDES_M[name]), *pose, CAMERA)
+    return project(square_corners(SIDES_M[name]), *pose, CAMERA)
 
 
 def both(pose: tuple[Array, Array] = POSE, shift_px: float = 0.0) -> dict[MarkerName, Array]:
@@ -60,7 +56,7 @@ def paste(
     image: NDArray[np.uint8], dictionary: str, index: int, at: tuple[int, int], side: int
 ) -> None:
     """Draw a marker on white paper into the picture."""
-    marker = cv2.aruco.generateImageMarker(predefined(dictionary), index, side)
+    marker = cv2.aruco.generateImageMarker(aruco_dictionary(dictionary), index, side)
     x, y = at
     image[y - 12 : y + side + 12, x - 12 : x + side + 12] = 230
     image[y : y + side, x : x + side] = np.where(marker > 0, 230, 20)

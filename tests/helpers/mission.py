@@ -6,11 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from perchctl.mission import planner
-from perchctl.mission.energy import EnergyState
-from perchctl.mission.imu import ImuMotion, moved
-from perchctl.mission.state import Observation, Phase, PlannerState, Severity
-from perchctl.mission.watch import Event, EventKind
+from perchctl.mission import (
+    EnergyState,
+    Event,
+    EventKind,
+    ImuMotion,
+    Observation,
+    Phase,
+    PlannerState,
+    Severity,
+    integrate_imu,
+    planner,
+)
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     ARMED,
@@ -20,7 +27,7 @@ from perchctl.vehicle import (
     PositionSetpoint,
     Telemetry,
 )
-from perchctl.vision.types import Stage, TargetEstimate
+from perchctl.vision import Stage, TargetEstimate
 
 READY = AUTO_ARM | CAN_FLY | ARMED
 AIRBORNE = READY | FLYING
@@ -105,7 +112,7 @@ class Felt:
     def __call__(self, obs: Observation) -> Observation:
         sample = obs.telemetry
         if self._last is None or sample.t_s > self._last.t_s:
-            self._motion = moved(self._motion, self._last, sample)
+            self._motion = integrate_imu(self._motion, self._last, sample)
             self._last = sample
         return replace(obs, imu=self._motion)
 
@@ -132,7 +139,7 @@ def note(t_s: float, text: str) -> Event:
 
 def state_in(phase: Phase, t_s: float = 10.0, z_m: float = 1.0) -> PlannerState:
     """A planner that has just come into `phase` in an undisturbed flight."""
-    state = planner.start(observation(0.0, 0.0))
+    state = planner.start_mission(observation(0.0, 0.0))
     return replace(
         state,
         phase=phase,

@@ -7,12 +7,17 @@ from functools import cache
 
 import numpy as np
 
-from perchctl.calibration.files import camera_of
-from perchctl.calibration.mounting.recording import Part, Recording, SeenPose
-from perchctl.calibration.mounting.seen import seen_by
-from perchctl.calibration.mounting.turns import turn
+from perchctl.calibration import (
+    MountingPart,
+    MountingRecording,
+    pose_basis,
+    profile_camera,
+    rotation_matrices,
+)
+from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.hand import Hand, R_target_cam, attitudes, cam_target_m, draw_hand
+from perchctl.sim import draw_hand
+from perchctl.sim.hand import Hand, R_target_cam, attitudes, cam_target_m
 
 BARE_STREAM = 431
 TURN_SIGMA_RAD = np.radians((0.15, 0.15, 0.05))
@@ -25,7 +30,9 @@ def profile() -> Profile:
     return load_profile("sim")
 
 
-def hand(part: Part, seed: int = 0, seconds: float = 21.0, latency_s: float | None = None) -> Hand:
+def hand(
+    part: MountingPart, seed: int = 0, seconds: float = 21.0, latency_s: float | None = None
+) -> Hand:
     """Slower pictures than the profile's, and a print that is true."""
     drawn = replace(draw_hand(profile(), part, seed, seconds), size_error=0.0)
     scenario = replace(drawn.scenario, camera_rate_hz=15.0)
@@ -41,7 +48,7 @@ def seen(
     wrong: float = 0.0,
     claimed: float = 1.0,
     salt: int = 0,
-) -> Recording:
+) -> MountingRecording:
     """The part as a pipeline would have seen it.
 
     Args:
@@ -62,13 +69,13 @@ def seen(
         jitter = np.clip(rng.normal(size=len(p)), -2.5, 2.5) * scene.camera_jitter_s
         stamped_s = np.maximum.accumulate(stamped_s + jitter)
         noise = rng.normal(size=sigma.shape) * sigma
-        R, p = turn(noise[:, :3]) @ R, p + noise[:, 3:]
+        R, p = rotation_matrices(noise[:, :3]) @ R, p + noise[:, 3:]
     for k in np.flatnonzero(rng.random(len(p)) < wrong):
-        R[k] = turn(rng.normal(size=3) * 0.5) @ R[k]
+        R[k] = rotation_matrices(rng.normal(size=3) * 0.5) @ R[k]
         p[k] = p[k] + rng.normal(size=3) * 0.02
     poses = tuple(
         SeenPose(float(t), R[k], p[k], np.diag(claimed * sigma[k] ** 2))
         for k, t in enumerate(stamped_s)
     )
-    by = seen_by(profile(), camera_of(profile().camera))
-    return Recording(held.part, attitudes(held, positioned, errors), poses, seen_by=by)
+    by = pose_basis(profile(), profile_camera(profile().camera))
+    return MountingRecording(held.part, attitudes(held, positioned, errors), poses, seen_by=by)

@@ -22,10 +22,8 @@ from cflib.crtp.crtpdriver import CRTPDriver
 from cflib.crtp.exceptions import WrongUriType
 from cflib.drivers.crazyradio import Crazyradio, _radio_ack
 
-from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.sim import Packet, Port, Scenario, SimulatedVehicle
 from perchctl.sim.crtp.server import CrtpServer
-from perchctl.sim.scenario import Scenario
-from perchctl.sim.vehicle import SimulatedVehicle
 
 URI = "radio://0/80/2M/E7E7E7E7E7"
 FORGETS_LOGS_S = 1.0

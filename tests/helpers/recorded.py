@@ -15,10 +15,9 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from perchctl.log.fields import event_record
 from perchctl.log.recording.recorder import Recorder
-from perchctl.mission.state import Phase, Severity
-from perchctl.mission.watch import Event, EventKind
+from perchctl.mission import Event, EventKind, Phase, Severity
 from perchctl.profile import Profile
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers import log as synthetic
 
 SIZE_PX = (64, 48)

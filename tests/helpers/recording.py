@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.geometry import (
     R_MARKER_TARGET,
     Array,
@@ -19,11 +19,9 @@ from perchctl.geometry import (
     rot_z,
     rotation_from_rpy,
 )
-from perchctl.profile import TargetConfig
-from perchctl.profile.places import data_folder
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import CameraModel
+from perchctl.profile import TargetConfig, data_folder
+from perchctl.sim import Renderer, Scenario
+from perchctl.vision import CameraModel
 
 CALIBRATION = data_folder("calib") / "example_640x480.yaml"
 CEILING_M, TARGET_YAW_RAD = 2.2, 0.5

@@ -11,12 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from perchctl.flight.lockstep import fly_lockstep
+from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, invert_T, make_T, rot_z, yaw_of
 from perchctl.profile import Profile
-from perchctl.sim.crtp.codec import Packet, Port
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.sim import Neighbour, Packet, Port, Scenario, draw_scenario
 
 COMMANDS = (Port.COMMANDER, Port.COMMANDER_GENERIC, Port.HIGH_LEVEL, Port.SUPERVISOR)
 _POSITION = 7  # type of a setpoint

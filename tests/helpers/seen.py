@@ -8,9 +8,7 @@ import cv2
 import numpy as np
 
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import square
-from perchctl.vision.types import MARKERS, Detection, Detections
+from perchctl.vision import MARKERS, Detection, Detections, project, square_corners
 from tests.helpers.target_picture import CAMERA
 
 SIDES_M = {"large": 0.150, "small": 0.025}
@@ -34,7 +32,7 @@ def seen_from(
     rvec = np.asarray(cv2.Rodrigues(T[:3, :3])[0], dtype=float).ravel()
     found = {}
     for name in MARKERS:
-        true = project(square(scale * SIDES_M[name]), rvec, T[:3, 3], CAMERA)
+        true = project(square_corners(scale * SIDES_M[name]), rvec, T[:3, 3], CAMERA)
         side_px = np.linalg.norm(true[0] - true[2]) / math.sqrt(2.0)
         inside = (true > 0.0).all() and (true < np.array(CAMERA.size_px) - 1).all()
         if name in markers and inside and side_px > LEAST_SIDE_PX:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.geometry import Array, Place, rot_z, wrap_rad
-from perchctl.profile import Profile
-from perchctl.profile.load import load_profile
-from perchctl.vision.pose import PoseSetup, level_rotation, make_pose_setup
-from perchctl.vision.types import Attitude, MarkerPose
+from perchctl.profile import Profile, load_profile
+from perchctl.vision import Attitude, MarkerPose, PoseSetup, level_rotation, make_pose_setup
 
 TARGET_ONLY: Profile = load_profile("target_only")
 SETUP: PoseSetup = make_pose_setup(
     TARGET_ONLY.pose, TARGET_ONLY.target, TARGET_ONLY.camera.mount.T_body_cam, (0.01, -0.02, 0.03),
-    camera_of(TARGET_ONLY.camera),
+    profile_camera(TARGET_ONLY.camera),
 )  # fmt: skip
 
 

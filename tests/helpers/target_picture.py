@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import R_MARKER_TARGET, Array, rotation_from_rpy
-from perchctl.profile.dictionaries import predefined
-from perchctl.vision.camera_model import undistort
-from perchctl.vision.types import CameraModel
+from perchctl.profile import aruco_dictionary
+from perchctl.vision import CameraModel, undistort
 
 LARGE_M, SMALL_M, SHEET_M = 0.150, 0.025, 0.200
 BACKGROUND = 120.0
@@ -91,7 +90,7 @@ def side_by_side(
 
 def bits_of(name: str, index: int) -> NDArray[np.uint8]:
     """The inner bits of a marker, 1 = white, (n, n)."""
-    dictionary = predefined(name)
+    dictionary = aruco_dictionary(name)
     rows = np.ascontiguousarray(dictionary.bytesList[index : index + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, dictionary.markerSize))
 

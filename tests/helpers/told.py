@@ -8,12 +8,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from perchctl.log import FlightLog, to_plain
 from perchctl.log.fields import event_record
-from perchctl.log.jsonl import to_plain
-from perchctl.log.read import FlightLog
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.state import Phase
-from perchctl.mission.watch import Event, EventKind
+from perchctl.mission import Event, EventKind, Phase
 from tests.helpers import log as synthetic
 
 Change = Callable[[dict[str, Any]], None]

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.link.assemble import BLOCKS, MOST_CARRIED_S, Assembler
+from perchctl.mission import Condition, Context, Observation, Phase, PlannerState
 from perchctl.mission.conditions import BY_PLACE, PROOFS, conditions_since
-from perchctl.mission.context import Context
-from perchctl.mission.state import Condition, Observation, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
 

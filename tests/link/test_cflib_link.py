@@ -17,12 +17,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound
-from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S, CflibLink
-from perchctl.link.estimate import EstimateLink
-from perchctl.mission.sent import Sent
+from perchctl.link import CflibLink, EstimateLink
+from perchctl.link.cflib_link import LANDING_WAIT_S, SILENCE_S
+from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario, SimProcess
 from perchctl.vehicle import (
     CAN_FLY,
     FLYING,
@@ -132,9 +131,9 @@ class Nobody:
         return None
 
 
-def told_by(link: CflibLink) -> list[Sent]:
+def told_by(link: CflibLink) -> list[SentCommand]:
     """Collects what the link sends of itself."""
-    told: list[Sent] = []
+    told: list[SentCommand] = []
     link.guard(Nobody(), told.append)
     return told
 

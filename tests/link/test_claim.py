@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.link import connection
-from perchctl.link.claim import claim, vehicle_of
+from perchctl.link import connection, vehicle_uri
+from perchctl.link.claim import claim
 from perchctl.link.connection import open_connection, plain_cause
 
 RADIO = "radio://0/80/2M/E7E7E7E701"
@@ -67,7 +67,7 @@ def another_program(uri: str) -> Iterator[subprocess.Popen[str]]:
     ],
 )
 def test_which_uris_are_of_one_vehicle(one: str, other: str, same: bool) -> None:
-    assert (vehicle_of(one) == vehicle_of(other)) is same
+    assert (vehicle_uri(one) == vehicle_uri(other)) is same
 
 
 def test_a_second_program_is_refused_and_told_who_has_it_until_that_one_is_gone() -> None:

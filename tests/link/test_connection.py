@@ -18,7 +18,7 @@ from cflib.crtp import radiodriver
 
 from perchctl.link import connection as room
 from perchctl.link.connection import DEAD_S, Connection
-from perchctl.sim.crtp.codec import Packet, Port
+from perchctl.sim import Packet, Port
 
 PACKET = Packet(Port.SUPERVISOR, 1, b"\x03")
 STEP_S = 0.05

@@ -16,11 +16,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
+from perchctl.link import MockLink
 from perchctl.link.connection import send_packets
 from perchctl.link.encode import ARM, LAND_TIMES, UNLOCK_THRUST, encode
-from perchctl.link.mock import MockLink
-from perchctl.sim.crtp.codec import MAX_DATA, Packet
-from perchctl.sim.crtp.commands import CommandService
+from perchctl.sim import CommandService, Packet
+from perchctl.sim.crtp.codec import MAX_DATA
 from perchctl.sim.firmware.commands import HlLand, PositionCommand, RawSetpoint
 from perchctl.vehicle import (
     Command,

@@ -11,13 +11,9 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import ConnectionFailed
-from perchctl.link import evidence
-from perchctl.link.cflib_link import CflibLink
+from perchctl.link import CflibLink, EstimateLink, MockLink, evidence
 from perchctl.link.connection import Connection
-from perchctl.link.estimate import EstimateLink
-from perchctl.link.mock import MockLink
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import SimProcess, SimulatedVehicle
 from perchctl.vehicle import FLYING, HL_ACTIVE, LOCKED, EmergencyStop, Land
 from tests.helpers.mission import AIRBORNE, READY, telemetry
 from tests.link.test_cflib_link import (

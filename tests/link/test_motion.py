@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from perchctl.errors import TimedOut
-from perchctl.link import motion
+from perchctl.link import MotionLink, motion
 from perchctl.link.cflib_link import SILENCE_S
-from perchctl.link.motion import PLACE_BLOCK, TURN_BLOCK, MotionLink, Motions
+from perchctl.link.motion import PLACE_BLOCK, TURN_BLOCK, Motions
 from perchctl.link.telemetry import VARIANCE_BLOCK
 from perchctl.profile import LinkConfig
 from perchctl.vehicle import FLYING

@@ -16,20 +16,17 @@ import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, TimedOut
 from perchctl.geometry import rot_z
-from perchctl.link.cflib_link import CflibLink
+from perchctl.link import (
+    RESET_PARAMETER,
+    CflibLink,
+    check_estimator_parameters,
+    estimator_parameters,
+)
 from perchctl.link.connection import Connection, send_packets
 from perchctl.link.encode import encode_external
-from perchctl.link.outside import (
-    AGREE_WITHIN_S,
-    RESET,
-    RESETS,
-    Settling,
-    check_parameters,
-    parameters_of,
-)
+from perchctl.link.outside import AGREE_WITHIN_S, RESETS, Settling
 from perchctl.positioning import FeedStatus, Placed
-from perchctl.profile import LinkConfig
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import LinkConfig, PositioningConfig
 from perchctl.vehicle import FLYING, ExternalPosition, Telemetry
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf", connect_timeout_s=2.0)
@@ -91,7 +88,7 @@ class Bench:
     def set_value(self, name: str, value: str) -> None:
         self.orders.append((name, float(value)))
         self.values[name] = float(value)
-        if name == RESET and float(value) == 1.0:
+        if name == RESET_PARAMETER and float(value) == 1.0:
             if self.deaf > 0:
                 self.deaf -= 1
                 return
@@ -125,15 +122,18 @@ def test_the_filter_starts_where_the_capture_sees_the_vehicle() -> None:
     bench = Bench()
     bench.settle()
     assert [bench.values[name] for name in INITIAL] == pytest.approx([1.2, -0.7, 0.03, 2.0])
-    assert [order for order in bench.orders if order[0] == RESET] == [(RESET, 1.0), (RESET, 0.0)]
-    assert bench.orders[-2:] == [(RESET, 1.0), (RESET, 0.0)]
+    assert [order for order in bench.orders if order[0] == RESET_PARAMETER] == [
+        (RESET_PARAMETER, 1.0),
+        (RESET_PARAMETER, 0.0),
+    ]
+    assert bench.orders[-2:] == [(RESET_PARAMETER, 1.0), (RESET_PARAMETER, 0.0)]
     assert bench.now_s < 51.0
 
 
 def test_a_reset_that_is_lost_is_ordered_again() -> None:
     bench = Bench(deaf=2)
     bench.settle()
-    assert bench.orders.count((RESET, 1.0)) == 3
+    assert bench.orders.count((RESET_PARAMETER, 1.0)) == 3
 
 
 def refused(bench: Bench, kind: type[PerchError]) -> str:
@@ -169,12 +169,12 @@ def test_a_vehicle_that_takes_off_in_between_is_not_reset_again() -> None:
 
     def lift(name: str, value: str) -> None:
         plain(name, value)
-        if name == RESET:
+        if name == RESET_PARAMETER:
             bench.telemetry = replace(bench.telemetry, supervisor=0x020E | FLYING)
 
     bench.set_value = lift  # type: ignore[method-assign]
     assert "may be flying" in refused(bench, ConnectionFailed)
-    assert bench.orders.count((RESET, 1.0)) == 1
+    assert bench.orders.count((RESET_PARAMETER, 1.0)) == 1
 
 
 def test_agreement_counts_over_fresh_telemetry_only() -> None:
@@ -183,7 +183,7 @@ def test_agreement_counts_over_fresh_telemetry_only() -> None:
 
     def fall_silent(name: str, value: str) -> None:
         plain(name, value)
-        if name == RESET:
+        if name == RESET_PARAMETER:
             bench.silent_after_s = bench.now_s
 
     bench.set_value = fall_silent  # type: ignore[method-assign]
@@ -201,19 +201,19 @@ def test_a_vehicle_that_is_carried_is_waited_for() -> None:
 
 
 def test_a_firmware_without_the_filter_is_one_sentence() -> None:
-    words = refused(Bench(lacks=RESET), NotFound)
+    words = refused(Bench(lacks=RESET_PARAMETER), NotFound)
     assert "has no parameter kalman.resetEstimation, which positioning from outside needs" in words
     assert "update the firmware" in words
 
 
 def test_the_user_s_own_parameters_may_not_contradict() -> None:
-    assert parameters_of(PositioningConfig()) == {}
-    check_parameters({"stabilizer.estimator": 2, "ctrlMel.mass": 0.03}, CONFIG)
-    check_parameters({"stabilizer.estimator": 1}, PositioningConfig())
+    assert estimator_parameters(PositioningConfig()) == {}
+    check_estimator_parameters({"stabilizer.estimator": 2, "ctrlMel.mass": 0.03}, CONFIG)
+    check_estimator_parameters({"stabilizer.estimator": 1}, PositioningConfig())
     with pytest.raises(InvalidValue, match=r"stabilizer\.estimator to 1, but .* it is 2"):
-        check_parameters({"stabilizer.estimator": 1}, CONFIG)
+        check_estimator_parameters({"stabilizer.estimator": 1}, CONFIG)
     with pytest.raises(InvalidValue, match=r"take it out of link\.parameters"):
-        check_parameters({"locSrv.extPosStdDev": 0.01}, CONFIG)
+        check_estimator_parameters({"locSrv.extPosStdDev": 0.01}, CONFIG)
 
 
 # --- Through cflib's lock ---------------------------------------------------------------------

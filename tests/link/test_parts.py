@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
+from perchctl.link import UDEV_HELP, check_uri
 from perchctl.link import scan as scan_room
 from perchctl.link.telemetry import (
     ATTITUDE_BLOCK,
@@ -19,7 +20,6 @@ from perchctl.link.telemetry import (
     telemetry_from,
 )
 from perchctl.link.timebase import WRAP_MS, Timebase
-from perchctl.link.uri import UDEV_HELP, check_uri
 
 SIZES = {"float": 4, "FP16": 2, "uint16_t": 2, "int8_t": 1}
 
@@ -136,7 +136,7 @@ def test_a_scan_gives_uris_that_are_taken(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("cflib.crtp.CLASSES", [Radio])
     monkeypatch.setattr(scan_room, "ready_cflib", lambda: None)
     monkeypatch.setattr(scan_room, "_radio_problem", lambda: "")
-    found = scan_room.scan([0x01]).uris
+    found = scan_room.find_vehicles([0x01]).uris
     assert found == ("radio://0/80/2M", "radio://0/80/2M/0000000001")
     assert list(map(check_uri, found)) == ["radio", "radio"]
 

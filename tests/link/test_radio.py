@@ -20,13 +20,12 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from cflib.crtp import radiodriver
 from cflib.crtp.crtpstack import CRTPPacket
 
+from perchctl.link import CflibLink
 from perchctl.link import connection as connection_room
-from perchctl.link.cflib_link import CflibLink
 from perchctl.link.encode import encode
-from perchctl.mission.sent import Sent
+from perchctl.mission import SentCommand
 from perchctl.profile import LinkConfig
-from perchctl.sim.crtp.codec import Packet, Port
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Packet, Port, Scenario
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, Telemetry
 from tests.helpers.radio import FORGETS_LOGS_S, URI, Air, OpaqueRadio, plug_in
 
@@ -317,7 +316,7 @@ def test_the_end_of_the_first_driver_is_one_of_many(driver: type[Any], cache: An
 
 
 def test_an_order_that_may_have_been_lost_with_the_link_is_sent_again(flown: Flown) -> None:
-    told: list[Sent] = []
+    told: list[SentCommand] = []
     flown.link.guard(Nobody(), told.append)
     began_s = time.monotonic()
     flown.link.send(LAND)

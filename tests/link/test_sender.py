@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from perchctl.link.sender import GUARD_PERIOD_S, HANGS_S, STALE_S, Sender
-from perchctl.mission.sent import Sent
+from perchctl.mission import SentCommand
 from perchctl.vehicle import Command, EmergencyStop, Land, PositionSetpoint, StopMotors
 
 LIMIT_S = 5.0
@@ -164,7 +164,7 @@ def test_a_stop_does_not_wait_for_the_rest_of_a_landing(library: Library, make: 
 def test_the_last_order_is_sent_again_unless_it_was_followed_or_is_old(
     library: Library, make: Make
 ) -> None:
-    told: list[Sent] = []
+    told: list[SentCommand] = []
     sender = make(told=told.append)
     sender.again(0.0)  # nothing has been sent
     sender.put(LAND)
@@ -325,7 +325,7 @@ def test_a_watchdogs_thread_that_has_ended_is_noticed_and_started_again(
 def test_the_guard_is_asked_by_itself_and_what_it_wants_is_told(
     library: Library, make: Make
 ) -> None:
-    told: list[Sent] = []
+    told: list[SentCommand] = []
     make(guard=EmergencyStop, told=told.append)
     until(lambda: len(told) >= 3)
     assert set(library.taken) == {STOP}

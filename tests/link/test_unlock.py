@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from perchctl.link import MockLink, Radio
 from perchctl.link.encode import UNLOCK_TIMES
-from perchctl.link.mock import MockLink, Radio
-from perchctl.sim.crtp.codec import Packet
-from perchctl.sim.scenario import Scenario
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import Packet, Scenario, SimulatedVehicle
 from perchctl.vehicle import RawThrust
 
 

@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue
+from perchctl.log import (
+    FlightLog,
+    PhaseSpan,
+    compare_flights,
+    comparison_record,
+    comparison_text,
+    plot_comparison,
+    read_log,
+)
 from perchctl.log.compare.align import stretches, ticks_of
-from perchctl.log.compare.plot import plot_comparison
-from perchctl.log.compare.table import compared, comparison_record, comparison_text
-from perchctl.log.read import FlightLog, PhaseSpan, read_log
 from tests.helpers import log as synthetic
 
 
@@ -68,7 +74,7 @@ def pair(tmp_path: Path) -> tuple[FlightLog, FlightLog]:
 
 
 def test_what_differs_is_in_the_table(pair: tuple[FlightLog, FlightLog]) -> None:
-    found = compared(*pair)
+    found = compare_flights(*pair)
     assert found.profile == {
         "camera.latency_s": (0.07, 0.1),
         "log.plot": (True, "not there"),
@@ -86,7 +92,7 @@ def test_what_differs_is_in_the_table(pair: tuple[FlightLog, FlightLog]) -> None
 
 
 def test_a_flight_beside_itself(pair: tuple[FlightLog, FlightLog]) -> None:
-    found = compared(pair[0], pair[0])
+    found = compare_flights(pair[0], pair[0])
     assert "their profiles are the same" in comparison_text(found)
     assert {d for d in comparison_record(found)["differences"].values() if d is not None} == {0}
 

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from perchctl.log.energy import USUAL_MAH, energy_of
+from perchctl.log import energy_history
+from perchctl.log.energy import USUAL_MAH
 from perchctl.mission.energy import FULL_A
 from perchctl.vehicle import FULL_THRUST
 from tests.helpers.log import PLAN
@@ -18,7 +19,7 @@ def test_charge_is_the_thrust_over_time_and_each_phase_has_its_part() -> None:
     def change(record: dict[str, Any]) -> None:
         record["thrust"] = 0.5 * FULL_THRUST
 
-    energy = energy_of(made(change))
+    energy = energy_history(made(change))
     flown_s = sum(duration_s for _, duration_s, _ in PLAN)
     assert energy.used_mah == pytest.approx(0.5 * FULL_A * flown_s / 3.6, rel=0.01)
     for phase, (name, duration_s, _) in zip(energy.phases, PLAN, strict=True):
@@ -30,21 +31,21 @@ def test_charge_is_the_thrust_over_time_and_each_phase_has_its_part() -> None:
 def test_a_hole_in_the_log_is_not_flown() -> None:
     log = made()
     log.records[500:] = [r | {"t_s": r["t_s"] + 600.0} for r in log.records[500:]]
-    assert energy_of(log).used_mah < energy_of(made()).used_mah * 1.1
+    assert energy_history(log).used_mah < energy_history(made()).used_mah * 1.1
 
 
 def test_voltages_are_the_readings_and_none_is_unknown() -> None:
     def fall(record: dict[str, Any]) -> None:
         record["battery_v"] = 4.0 - 0.02 * record["t_s"]
 
-    energy = energy_of(made(fall))
+    energy = energy_history(made(fall))
     assert energy.start_v == pytest.approx(4.0 - 0.02 * 1.1)
     assert energy.lowest_v == energy.end_v < energy.start_v
 
     def none(record: dict[str, Any]) -> None:
         record["battery_v"] = None
 
-    energy = energy_of(made(none))
+    energy = energy_history(made(none))
     assert math.isnan(energy.lowest_v)
     assert energy.fit is None
     assert energy.left is None
@@ -53,12 +54,12 @@ def test_voltages_are_the_readings_and_none_is_unknown() -> None:
 def test_the_battery_is_the_profile_s_or_the_usual_one() -> None:
     log = made()
     log.header["profile"]["vehicle"]["battery_mah"] = 350.0
-    assert (energy_of(log).battery_mah, energy_of(log).assumed) == (350.0, False)
+    assert (energy_history(log).battery_mah, energy_history(log).assumed) == (350.0, False)
     del log.header["profile"]["vehicle"]["battery_mah"]
-    assert (energy_of(log).battery_mah, energy_of(log).assumed) == (USUAL_MAH, True)
+    assert (energy_history(log).battery_mah, energy_history(log).assumed) == (USUAL_MAH, True)
 
 
 def test_a_log_without_a_tick_has_used_nothing() -> None:
     log = made()
     log.records.clear()
-    assert energy_of(log).used_mah == 0.0
+    assert energy_history(log).used_mah == 0.0

@@ -13,13 +13,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue
-from perchctl.log.exact import from_exact, to_exact
-from perchctl.log.jsonl import decode
+from perchctl.log import decode_line, from_exact, to_exact
 from perchctl.log.sent import sent_line, sent_of
 from perchctl.log.turn import turn_line, turn_of
-from perchctl.mission.sent import Sent
-from perchctl.mission.state import Condition, Observation, Operator, Outcome, Phase
-from perchctl.mission.turn import FrameSeen, Outside, PoseSeen, Taken, Turn, TurnTiming
+from perchctl.mission import (
+    Condition,
+    ExternalPositions,
+    FrameSeen,
+    Observation,
+    Operator,
+    Outcome,
+    Phase,
+    PoseSeen,
+    SentCommand,
+    Turn,
+    TurnInputs,
+    TurnTiming,
+)
 from perchctl.positioning import FeedStatus
 from perchctl.vehicle import (
     Command,
@@ -32,7 +42,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision.types import CameraModel, Stage, TargetEstimate
+from perchctl.vision import CameraModel, Stage, TargetEstimate
 
 floats = st.floats(width=64)
 vectors = st.tuples(floats, floats, floats)
@@ -92,7 +102,7 @@ SENT = [
 @pytest.mark.parametrize("command", [Idle(), *SENT])
 def test_a_command_keeps_its_kind(command: Command) -> None:
     """Three of them have no field at all."""
-    turn = Turn(0, "flown", 0.0, 0.0, Taken(), command=command)
+    turn = Turn(0, "flown", 0.0, 0.0, TurnInputs(), command=command)
     back = there_and_back(Turn, turn).command
     assert type(back) is type(command)
     assert bits(back) == bits(command)
@@ -135,11 +145,11 @@ def test_a_number_of_numpy_s_keeps_its_width() -> None:
 def whole_turn() -> Turn:
     sample = Telemetry(1.0, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 1.0, 4e4, 3.9, 542)
     return Turn(
-        7, "redone", 1.0, 1.3, Taken((replace(sample, t_s=0.9), sample), look=False,
+        7, "redone", 1.0, 1.3, TurnInputs((replace(sample, t_s=0.9), sample), look=False,
         frame=FrameSeen(3, 0.9, 0.95, "woven", True, 12)),
         {"joint": PoseSeen(0.9, np.ones(3), 0.1)},
         Observation(1.3, sample, estimate((1.0, 2.0, 3.0), None, 0.1)), Land(0.0, 2.0),
-        Phase.LANDING, "fence", True, 2, Outside(0.1, None, 3, 99.0, None),
+        Phase.LANDING, "fence", True, 2, ExternalPositions(0.1, None, 3, 99.0, None),
         TurnTiming(0.01, 0.001, 0.0001, 0.02), Outcome.SAFETY, "beyond the fence", "KeyError",
     )  # fmt: skip
 
@@ -149,17 +159,17 @@ def test_a_turn_is_one_line_and_comes_back() -> None:
     line = turn_line(turn)
     assert line.count(b"\n") == 1
     assert line.count(b"position_m") == 2  # the newest sample stands there once
-    assert bits(turn_of(decode(line))) == bits(turn)
+    assert bits(turn_of(decode_line(line))) == bits(turn)
 
 
 @pytest.mark.parametrize("command", SENT)
 def test_what_was_sent_is_one_line_and_comes_back(command: Command) -> None:
-    sent = Sent(0.1 + 0.2, "watchdog", command)
+    sent = SentCommand(0.1 + 0.2, "watchdog", command)
     line = sent_line(sent)
     assert line.count(b"\n") == 1
-    assert bits(sent_of(decode(line))) == bits(sent)
+    assert bits(sent_of(decode_line(line))) == bits(sent)
     with pytest.raises(InvalidValue, match="sent at soon s cannot be read"):
-        sent_of(decode(line) | {"t_s": "soon"})
+        sent_of(decode_line(line) | {"t_s": "soon"})
 
 
 def test_an_observation_of_older_telemetry_has_its_own() -> None:
@@ -168,7 +178,7 @@ def test_an_observation_of_older_telemetry_has_its_own() -> None:
     assert turn.observation is not None
     older = replace(turn.observation, telemetry=turn.taken.samples[0])
     turn = replace(turn, observation=older)
-    back = turn_of(decode(turn_line(turn)))
+    back = turn_of(decode_line(turn_line(turn)))
     assert bits(back) == bits(turn)
 
 
@@ -184,7 +194,7 @@ def test_an_observation_of_older_telemetry_has_its_own() -> None:
      ({"role": "flying"}, "role: 'flying' is none of waiting, redone, flown, failed")],
 )  # fmt: skip
 def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> None:
-    record = decode(turn_line(whole_turn())) | changes
+    record = decode_line(turn_line(whole_turn())) | changes
     with pytest.raises(InvalidValue) as caught:
         turn_of(record)
     assert "turn 7 cannot be read" in str(caught.value)
@@ -192,7 +202,7 @@ def test_what_is_no_turn_is_one_sentence(changes: dict[str, Any], why: str) -> N
 
 
 def test_a_field_of_a_later_version_that_is_missing_has_its_default() -> None:
-    record = decode(turn_line(whole_turn()))
+    record = decode_line(turn_line(whole_turn()))
     del record["attempts"]
     assert turn_of(record).attempts == 0
     del record["began_s"]

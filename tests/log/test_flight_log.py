@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from perchctl.log import read_log, to_plain
 from perchctl.log.fields import FIELDS, tick_record
-from perchctl.log.jsonl import to_plain
 from perchctl.log.place import log_path
-from perchctl.log.read import read_log
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.state import BatteryOutlook
-from perchctl.mission.watch import Outside
+from perchctl.mission import BatteryOutlook, ExternalPositions
 from perchctl.vehicle import (
     EmergencyStop,
     ExternalPosition,
@@ -26,7 +24,7 @@ from perchctl.vehicle import (
     RawThrust,
     StopMotors,
 )
-from perchctl.vision.consistency import Consistency
+from perchctl.vision import Consistency
 from tests.helpers import log as synthetic
 from tests.helpers.mission import held
 
@@ -142,7 +140,7 @@ def test_every_field_is_filled_by_something() -> None:
             camera_age_s=0.1,
             consistency=Consistency(0.01, 0.004, (0.01, 0.02, 0.03), (0.01, 0.01, 0.02)),
             delay_used_s=0.005,
-            outside=Outside(
+            outside=ExternalPositions(
                 0.012,
                 "hidden",
                 7,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.log.read import read_log
+from perchctl.log import read_log
 from tests.helpers.small_log import _python, small_log
 
 

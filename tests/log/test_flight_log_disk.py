@@ -12,12 +12,9 @@ from typing import Any
 import pytest
 
 from perchctl.errors import InvalidValue
-from perchctl.log import write
-from perchctl.log.read import read_log
-from perchctl.log.watch import LogWatcher
+from perchctl.log import LogWatcher, read_log, write
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.watch import FlightReport
+from perchctl.mission import FlightReport, Outcome, Phase
 from tests.helpers import log as synthetic
 from tests.helpers.small_log import _python, small_log
 

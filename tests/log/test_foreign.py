@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.log import read
-from perchctl.log.read import read_log
+from perchctl.log import read, read_log
 from tests.helpers import log as synthetic
 from tests.helpers.commands import run
 

@@ -10,8 +10,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.log.jsonl import decode, encode, to_plain
-from perchctl.mission.state import Phase
+from perchctl.log import decode_line, to_plain
+from perchctl.log.jsonl import encode
+from perchctl.mission import Phase
 
 
 def test_plain_values() -> None:
@@ -29,7 +30,7 @@ def test_plain_values() -> None:
     line = encode(values)
     assert line.endswith(b"\n")
     assert line.count(b"\n") == 1
-    back = decode(line)
+    back = decode_line(line)
     assert back["nan"] == [None, None, None]
     assert back["array"] == [[1.234568, 0.0]]
     assert "-0.0" not in line.decode()
@@ -49,6 +50,6 @@ json_values = st.recursive(
 def test_encoding_is_one_line_and_stable(record: dict[str, Any]) -> None:
     line = encode(record)
     assert line.count(b"\n") == 1
-    back = decode(line)
+    back = decode_line(line)
     assert back == {k: v for k, v in to_plain(record).items() if v is not None}
     assert encode(back) == line

@@ -15,16 +15,11 @@ import pytest
 
 from perchctl.commands import fly
 from perchctl.errors import LogIncomplete
-from perchctl.flight.session import FlyOptions, SessionResult
-from perchctl.log import write
+from perchctl.flight import FlyOptions, SessionResult
+from perchctl.log import FlightSummary, LogWatcher, read_log, summary_text, write
 from perchctl.log.behind import Behind
-from perchctl.log.read import read_log
-from perchctl.log.summary import FlightSummary, summary_text
-from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.turn import Taken, Turn
-from perchctl.mission.watch import FlightReport
+from perchctl.mission import FlightReport, Outcome, Phase, Turn, TurnInputs
 from perchctl.profile import load_profile
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
@@ -103,7 +98,7 @@ def test_half_a_minute_may_wait_and_turns_give_way_to_ticks_and_events(
     monkeypatch.setattr(os, "write", disk)
     places = round(0.5 * 2 * loop_hz)
     for i in range(places):
-        writer.turn(Turn(i, "flown", i / loop_hz, i / loop_hz, Taken()))
+        writer.turn(Turn(i, "flown", i / loop_hz, i / loop_hz, TurnInputs()))
     taken = places - writer.lost_records
     assert taken in (round(0.8 * places), round(0.8 * places) + 1)  # one is being written
     lost = writer.lost_records

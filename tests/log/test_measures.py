@@ -7,11 +7,18 @@ from pathlib import Path
 
 import pytest
 
+from perchctl.log import (
+    FlightLog,
+    list_lines,
+    list_log,
+    newest_logs,
+    read_log,
+    show_record,
+    show_text,
+)
 from perchctl.log.measures import holds_of, last_contact, measures_of, shown
-from perchctl.log.newest import listed, newest_logs
-from perchctl.log.read import FlightLog, read_log
-from perchctl.log.shown import COLUMNS, list_lines, show_record, show_text
-from perchctl.mission.watch import Event
+from perchctl.log.shown import COLUMNS
+from perchctl.mission import Event
 from tests.helpers import log as synthetic
 from tests.helpers.mission import note
 
@@ -103,8 +110,7 @@ def test_a_killed_flight_says_what_is_lost(tmp_path: Path) -> None:
 
 
 def test_the_rows_that_were_taken_are_told(tmp_path: Path) -> None:
-    from perchctl.mission.state import Phase
-    from perchctl.mission.watch import EventKind
+    from perchctl.mission import EventKind, Phase
 
     entered = Event(4.1, EventKind.PHASE, "hovering in the perching area", Phase.SEARCH,
                     row="approached")  # fmt: skip
@@ -127,7 +133,7 @@ def test_the_newest_is_by_its_last_record_and_bad_ones_are_named(tmp_path: Path)
         os.utime(path, (1000 - age, 1000 - age))
     assert newest_logs(tmp_path) == [empty, killed, old]
     assert newest_logs(tmp_path, 1) == [empty]
-    lines = list(list_lines([listed(path) for path in newest_logs(tmp_path)]))
+    lines = list(list_lines([list_log(path) for path in newest_logs(tmp_path)]))
     assert [line.split()[0] for line in lines] == [
         "log", "flight_empty.jsonl", "killed.jsonl", "flight_old.jsonl",
     ]  # fmt: skip
@@ -139,4 +145,4 @@ def test_the_newest_is_by_its_last_record_and_bad_ones_are_named(tmp_path: Path)
 
 def test_the_end_of_a_log_of_another_version_is_not_believed(tmp_path: Path) -> None:
     path = synthetic.write(tmp_path / "f.jsonl", {"version": 99}, synthetic.SUMMARY, most=5)
-    assert "schema version 99" in (listed(path).problem or "")
+    assert "schema version 99" in (list_log(path).problem or "")

@@ -10,9 +10,8 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.log.plot import plot_flight, title_of
-from perchctl.log.read import FlightLog, read_log
-from perchctl.log.summary import summary_of
+from perchctl.log import FlightLog, plot_flight, read_log, summarise_flight
+from perchctl.log.plot import title_of
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers.disk import full_disk
@@ -107,7 +106,7 @@ def test_many_attempts_and_names_that_matplotlib_would_typeset(tmp_path: Path) -
 
 
 def test_title(log: FlightLog) -> None:
-    assert title_of(log, summary_of(log)).split() == [
+    assert title_of(log, summarise_flight(log)).split() == [
         "profile",
         "sim,",
         "seed",
@@ -120,7 +119,7 @@ def test_title(log: FlightLog) -> None:
         "mm",
     ]
     cut = FlightLog(log.path, {}, log.records, [], None, True)
-    assert "unknown (the log ends in PERCHED)" in title_of(cut, summary_of(cut))
+    assert "unknown (the log ends in PERCHED)" in title_of(cut, summarise_flight(cut))
 
 
 def test_nothing_to_plot(log: FlightLog, tmp_path: Path) -> None:

@@ -10,23 +10,16 @@ from typing import Any
 
 import pytest
 
-from perchctl.flight.history import History
-from perchctl.flight.loop import fly
+from perchctl.flight import History, fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.link.sender import Sender
-from perchctl.log import write
-from perchctl.log.read import read_log
-from perchctl.log.recording import export_mcap
+from perchctl.log import LogWatcher, export_mcap, read_log, show_record, show_text, write
 from perchctl.log.recording import recorder as recording_module
 from perchctl.log.recording.recorder import Recorder
 from perchctl.log.sent import sent_values, takeovers_of
-from perchctl.log.shown import show_record, show_text
-from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.sent import Sent
-from perchctl.mission.state import Operator, Outcome, Phase
-from perchctl.mission.watch import FlightReport
+from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
 from perchctl.profile import load_profile
 from perchctl.report.story import story_of
 from perchctl.report.track import Track
@@ -40,11 +33,11 @@ from tests.helpers.recorded import MemoryDisk
 
 HOLD, LAND = PositionSetpoint(0.1, 0.2, 1.0 / 3.0, 0.0), Land(-0.05, 2.0)
 TOLD = (
-    Sent(4.0, "watchdog", HOLD),
-    Sent(4.05, "watchdog", HOLD),
-    Sent(4.7, "watchdog", LAND),
-    Sent(9.0, "rescue", EmergencyStop()),
-    Sent(9.5, "farewell", RawThrust(0)),
+    SentCommand(4.0, "watchdog", HOLD),
+    SentCommand(4.05, "watchdog", HOLD),
+    SentCommand(4.7, "watchdog", LAND),
+    SentCommand(9.0, "rescue", EmergencyStop()),
+    SentCommand(9.5, "farewell", RawThrust(0)),
 )
 
 
@@ -93,7 +86,7 @@ def test_what_one_sends_in_one_go_is_told_together() -> None:
         ("watchdog", 4.0, 4.7), ("rescue", 9.0, 9.0), ("farewell", 9.5, 9.5),
     ]  # fmt: skip
     assert goes[0].text == "position setpoints (2), landing ordered (1)"
-    later = Sent(4.7 + 2.1, "watchdog", StopMotors())
+    later = SentCommand(4.7 + 2.1, "watchdog", StopMotors())
     assert len(takeovers_of((*TOLD[:3], later))) == 2
 
 
@@ -136,10 +129,10 @@ def test_a_rescue_s_orders_are_told() -> None:
 
 def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
     sent: list[Command] = []
-    told: list[Sent] = []
+    told: list[SentCommand] = []
     enough = threading.Event()
 
-    def tell(each: Sent) -> None:
+    def tell(each: SentCommand) -> None:
         told.append(each)
         if len(told) == 3:
             enough.set()
@@ -155,7 +148,9 @@ def test_the_sender_tells_of_its_guard_and_not_of_the_loop() -> None:
     assert sender.problem is None
     assert HOLD in sent
     assert all(each.command != HOLD for each in told)
-    assert Sent in {type(each) for each in told if each.by == "reconnect" and each.command == LAND}
+    assert SentCommand in {
+        type(each) for each in told if each.by == "reconnect" and each.command == LAND
+    }
     assert len(told) == len(sent) - 1
 
 

@@ -8,12 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from perchctl.log.export.table import columns_of
-from perchctl.log.jsonl import line_of
+from perchctl.log import export_mcap, json_line, log_columns, read_log, show_record, show_text
 from perchctl.log.plot import spans_of
-from perchctl.log.read import read_log
-from perchctl.log.recording import export_mcap
-from perchctl.log.shown import show_record, show_text
 from perchctl.mission import conditions
 from perchctl.replay import replay
 from perchctl.report.track import Track
@@ -37,7 +33,7 @@ def path(tmp_path: Path) -> Path:
             tick = {"kind": "tick", "t_s": record["t_s"], "phase": record["phase"]}
             lines.append(tick | {"ex_m": 0.0, "tracked": True})
     path = tmp_path / "f.jsonl"
-    path.write_bytes(b"".join(map(line_of, lines)))
+    path.write_bytes(b"".join(map(json_line, lines)))
     return path
 
 
@@ -48,7 +44,7 @@ def test_all_outputs_of_a_log_have_one_zero(path: Path, monkeypatch: pytest.Monk
     assert log.since(float(log.records[0]["t_s"])) == 0.0
     assert at_s > SOONER_S
 
-    columns = {column.name: column.values for column in columns_of(log)}
+    columns = {column.name: column.values for column in log_columns(log)}
     export_mcap(path, path.with_suffix(".mcap"))
     ticks = map(json.loads, messages(path.with_suffix(".mcap"))["/tick"])
     monkeypatch.setitem(conditions.CONDITIONS, conditions.Condition.SETTLED, lambda c: False)

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.mission import planner
-from perchctl.mission.state import (
+from perchctl.mission import (
     FLYING_PHASES,
     Observation,
     Operator,
@@ -17,6 +16,7 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
     Severity,
+    planner,
 )
 from perchctl.vehicle import (
     CRASHED,
@@ -134,7 +134,7 @@ def _run(state: PlannerState, event: Event, lasts_s: float) -> tuple[PlannerStat
     for i in range(1, steps + 1):
         t_s = 10.0 + 0.02 * i
         obs = event(observation(t_s, state.entry_m[2]))
-        state, command = planner.step(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILE)
         commands.append(command)
         if state.phase in (Phase.LANDING, Phase.ABORTED) and state.row != "":
             break
@@ -171,7 +171,7 @@ def test_a_landing_is_never_undone(name: str) -> None:
     orders = 0
     for i in range(200):
         obs = observation(20.0 + 0.02 * i, 0.8)
-        state, command = planner.step(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILE)
         assert state.phase is Phase.LANDING
         assert isinstance(command, RawThrust if name == LEVEL else Land | Idle | PositionSetpoint)
         if isinstance(command, PositionSetpoint):
@@ -184,9 +184,9 @@ def test_a_landing_is_never_undone(name: str) -> None:
 def test_ctrl_c_once_lands_and_twice_stops(phase: Phase) -> None:
     state = _begin(phase, "")
     obs = observation(10.02, state.entry_m[2], operator=Operator.LAND)
-    state, command = planner.step(state, obs, PROFILE)
+    state, command = planner.step_mission(state, obs, PROFILE)
     down(command, state.entry_m[2])
-    state, command = planner.step(
+    state, command = planner.step_mission(
         state, observation(10.04, state.entry_m[2], operator=Operator.STOP), PROFILE
     )
     assert isinstance(command, EmergencyStop)
@@ -208,7 +208,7 @@ def test_ctrl_c_once_lands_and_twice_stops(phase: Phase) -> None:
 def test_a_short_fault_never_climbs(phase: Phase, event: Event) -> None:
     state = state_in(phase)
     before = state.setpoint
-    state, command = planner.step(state, event(observation(10.02)), PROFILE)
+    state, command = planner.step_mission(state, event(observation(10.02)), PROFILE)
     if state.phase is Phase.RECOVER:  # the target is lost in the ascent: down, not up
         assert isinstance(command, PositionSetpoint)
         assert before is not None
@@ -224,7 +224,7 @@ def test_nothing_but_search_ascent_and_perch_climbs() -> None:
         start_z = state.setpoint.z_m if state.setpoint else 0.0
         for i in range(1, 20):
             obs = observation(10.0 + 0.02 * i, state.entry_m[2])
-            state, command = planner.step(state, obs, PROFILE)
+            state, command = planner.step_mission(state, obs, PROFILE)
             if state.phase is not phase:
                 break
             if isinstance(command, PositionSetpoint) and phase is not Phase.COMPLETE:
@@ -237,18 +237,18 @@ def test_no_stop_without_contact_tumble_word_or_attitude() -> None:
         state = _begin(phase, "")
         for i in range(1, 300):
             obs = observation(10.0 + 0.02 * i, state.entry_m[2])
-            state, command = planner.step(state, obs, PROFILE)
+            state, command = planner.step_mission(state, obs, PROFILE)
             assert not isinstance(command, EmergencyStop | StopMotors)
 
 
 def test_landing_ends_when_the_motors_are_off() -> None:
-    state, command = planner.step(
+    state, command = planner.step_mission(
         state_in(Phase.ALIGN), observation(10.02, operator=Operator.LAND), PROFILE
     )
     down(command, 1.0, by_itself=False)
     for i in range(20):
         off = telemetry(14.0 + 0.02 * i, 0.01, thrust=0.0, supervisor=READY)
-        state, _ = planner.step(state, observation(off.t_s, telemetry=off), PROFILE)
+        state, _ = planner.step_mission(state, observation(off.t_s, telemetry=off), PROFILE)
     assert state.phase is Phase.LANDED
     assert state.outcome is Outcome.OPERATOR
 
@@ -264,7 +264,7 @@ def test_the_perch_ends_by_itself(mode: str) -> None:
     sent: list[object] = []
     for i in range(1, 200):
         t_s = 10.0 + 0.02 * i
-        state, command = planner.step(state, observation(t_s, 2.09), profile)
+        state, command = planner.step_mission(state, observation(t_s, 2.09), profile)
         if state.phase is not Phase.PERCH:
             break
         sent.append(command)
@@ -293,7 +293,7 @@ def run_hanging(
     for i in range(1, ticks):
         t_s = 10.0 + 0.02 * i
         obs = observation(t_s, telemetry=telemetry(t_s, HANG_Z_M, thrust=thrust))
-        state, command = planner.step(state, change(obs, i), PROFILE)
+        state, command = planner.step_mission(state, change(obs, i), PROFILE)
         if isinstance(command, RawThrust):
             thrust = float(command.thrust)
         elif isinstance(command, StopMotors):
@@ -343,7 +343,7 @@ def test_a_landing_at_the_ceiling_peels_off_first() -> None:
     obs = observation(10.02, telemetry=telemetry(10.02, HANG_Z_M))
     for i in range(1, 60):
         obs = observation(10.0 + 0.02 * i, telemetry=telemetry(10.0 + 0.02 * i, HANG_Z_M))
-        state, command = planner.step(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILE)
         assert isinstance(command, PositionSetpoint)
         assert command.z_m <= HANG_Z_M
     assert command.z_m < HANG_Z_M - 0.2
@@ -356,12 +356,12 @@ def test_a_slip_is_caught_from_above_then_held_where_it_is() -> None:
     )
     for i in range(1, 4):
         tel = replace(falling, t_s=10.0 + 0.02 * i)
-        state, command = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(tel.t_s, telemetry=tel), PROFILE)
     assert state.phase is Phase.RECOVER
     assert isinstance(command, PositionSetpoint)
     assert command.z_m > HANG_Z_M + 0.5  # a setpoint below would cost the change of mode's dip
     caught = telemetry(10.18, HANG_Z_M - 0.2, velocity_mps=(0.0, 0.0, 0.01))
-    state, command = planner.step(state, observation(10.18, telemetry=caught), PROFILE)
+    state, command = planner.step_mission(state, observation(10.18, telemetry=caught), PROFILE)
     assert isinstance(command, PositionSetpoint)
     assert command.z_m < HANG_Z_M - 0.1
 
@@ -372,12 +372,12 @@ def test_a_slip_with_half_of_the_thrust_left_is_caught_gently() -> None:
     for i in range(1, 4):
         t_s = 10.0 + 0.02 * i
         tel = telemetry(t_s, HANG_Z_M - 0.04, velocity_mps=(0.0, 0.0, -0.3), thrust=30000.0)
-        state, command = planner.step(state, observation(t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(t_s, telemetry=tel), PROFILE)
     assert state.phase is Phase.RECOVER
     assert isinstance(command, PositionSetpoint)
     assert HANG_Z_M < command.z_m < HANG_Z_M + 0.3
     slow = telemetry(10.2, HANG_Z_M - 0.07, velocity_mps=(0.0, 0.0, -0.05))
-    state, command = planner.step(state, observation(10.2, telemetry=slow), PROFILE)
+    state, command = planner.step_mission(state, observation(10.2, telemetry=slow), PROFILE)
     assert isinstance(command, PositionSetpoint)
     assert command.z_m < HANG_Z_M - 0.05
 
@@ -391,7 +391,7 @@ def test_a_slip_on_nearly_the_whole_thrust_is_let_sink() -> None:
         tel = telemetry(
             t_s, HANG_Z_M - 0.03, velocity_mps=(0.0, 0.0, -0.15), thrust=0.9 * HOVER_THRUST
         )
-        state, command = planner.step(state, observation(t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(t_s, telemetry=tel), PROFILE)
         assert isinstance(command, PositionSetpoint)
         assert state.phase is Phase.COMPLETE or command.z_m < HANG_Z_M - 0.05
     assert state.phase is Phase.RECOVER
@@ -403,7 +403,7 @@ def test_a_free_fall_is_answered_in_the_tick_that_shows_it() -> None:
     falls = telemetry(
         10.02, HANG_Z_M - 0.001, velocity_mps=(0.0, 0.0, -0.1), acc_z_g=0.1, thrust=1000.0
     )
-    state, command = planner.step(state, observation(10.02, telemetry=falls), PROFILE)
+    state, command = planner.step_mission(state, observation(10.02, telemetry=falls), PROFILE)
     assert state.phase is Phase.RECOVER
     assert isinstance(command, PositionSetpoint)
     assert command.z_m > HANG_Z_M + 0.5
@@ -418,13 +418,13 @@ def test_a_slip_in_a_landing_is_caught_and_the_landing_goes_on(stopped_s: float 
         tel = telemetry(
             10.0 + 0.02 * i, HANG_Z_M - 0.01, velocity_mps=(0.0, 0.0, -0.3), acc_z_g=0.2, thrust=0.0
         )
-        state, command = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(tel.t_s, telemetry=tel), PROFILE)
     assert state.phase is Phase.LANDING
     assert isinstance(command, PositionSetpoint)
     assert command.z_m > HANG_Z_M + 0.5
     for i in range(1, 40):
         tel = telemetry(10.2 + 0.02 * i, HANG_Z_M - 0.2)
-        state, command = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(tel.t_s, telemetry=tel), PROFILE)
         assert isinstance(command, PositionSetpoint)
         assert command.z_m <= HANG_Z_M - 0.2 + 1e-9
     assert state.stopped_s is None
@@ -438,7 +438,7 @@ def test_unknown_is_not_on_the_ground() -> None:
     orders = 0
     for i in range(1, 200):
         t_s = 10.0 + 0.02 * i
-        state, command = planner.step(state, observation(t_s, telemetry=last), PROFILE)
+        state, command = planner.step_mission(state, observation(t_s, telemetry=last), PROFILE)
         orders += isinstance(command, Land)
         assert state.phase in (Phase.APPROACH, Phase.LANDING)
     assert state.phase is Phase.LANDING
@@ -452,6 +452,6 @@ def test_an_old_tilt_cuts_no_motor(phase: Phase) -> None:
     last = telemetry(10.0, state.entry_m[2], roll_rad=1.2)
     for i in range(1, 80):
         obs = observation(10.0 + 0.02 * i, telemetry=last)
-        state, command = planner.step(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILE)
         assert not isinstance(command, EmergencyStop | StopMotors)
         assert state.phase is not Phase.ABORTED

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-from perchctl.mission import planner
+from perchctl.mission import ImuMotion, Phase, PlannerState, planner
 from perchctl.mission.conditions import OTHERWISE_MPS
-from perchctl.mission.imu import ImuMotion, Reckoning
+from perchctl.mission.imu import Reckoning
 from perchctl.mission.lander import LEAST_ORDERS
-from perchctl.mission.state import Phase, PlannerState
 from perchctl.vehicle import HL_ACTIVE, RawThrust, StopMotors
 from tests.helpers.mission import (
     AIRBORNE,
@@ -46,7 +45,7 @@ def test_a_climb_that_goes_sideways_is_ended_level_by_thrust_alone(
             acc_z_g=acc_g + felt_too_much_g,
         )  # fmt: skip
         obs = observation(t_s, telemetry=tel, target=target_at(t_s, body_m=tel.position_m))
-        state, command = planner.step(state, felt(obs), MOCAP)
+        state, command = planner.step_mission(state, felt(obs), MOCAP)
         if isinstance(command, RawThrust):
             thrust = float(command.thrust)
         if z_m <= 0.0:
@@ -67,10 +66,10 @@ def test_what_is_astray_and_unfelt_for_a_moment_keeps_the_speed_that_it_had() ->
         reckoning=Reckoning(imu=began.imu, velocity_mps=(0.0, 0.0, -0.4)),
     )  # fmt: skip
     tel = telemetry(10.3, velocity_mps=(0.0, 0.0, 0.8))
-    after, _ = planner.step(state, felt(observation(10.3, telemetry=tel)), MOCAP)
+    after, _ = planner.step_mission(state, felt(observation(10.3, telemetry=tel)), MOCAP)
     assert after.reckoning.velocity_mps[2] == pytest.approx(-0.4)
     tel = telemetry(10.32, velocity_mps=(0.0, 0.0, 0.8), acc_z_g=1.1)
-    again, _ = planner.step(after, felt(observation(10.32, telemetry=tel)), MOCAP)
+    again, _ = planner.step_mission(after, felt(observation(10.32, telemetry=tel)), MOCAP)
     assert -0.4 < again.reckoning.velocity_mps[2] < -0.38
 
 
@@ -85,12 +84,12 @@ def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
             t_s, position_m=body_m, thrust=thrust, supervisor=READY if thrust == 0 else AIRBORNE
         )
         obs = felt(observation(t_s, telemetry=tel, target=None))
-        state, command = planner.step(state, obs, MOCAP)
+        state, command = planner.step_mission(state, obs, MOCAP)
         if isinstance(command, RawThrust):
             thrust = float(command.thrust)
         elif isinstance(command, StopMotors):
             thrust = 0.0
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             break
     assert state.phase is Phase.LANDED
 
@@ -98,7 +97,7 @@ def test_what_went_astray_comes_to_rest_whatever_its_position_says() -> None:
 @pytest.mark.parametrize("profile", [PROFILE, MOCAP])
 def test_only_positions_from_outside_go_astray(profile: Any) -> None:
     tel = telemetry(10.02, position_m=(0.2, 0.0, 0.02))
-    state, _ = planner.step(
+    state, _ = planner.step_mission(
         state_in(Phase.APPROACH, z_m=0.2), observation(10.02, telemetry=tel), profile
     )
     assert (state.phase is Phase.LANDING) is (profile is MOCAP)
@@ -116,7 +115,7 @@ def test_a_draught_is_not_another_world(
 ) -> None:
     tel = telemetry(10.02, position_m=(aside_m, 0.0, z_m))
     obs = observation(10.02, telemetry=tel)
-    state, _ = planner.step(state_in(phase, z_m=z_m), obs, MOCAP)
+    state, _ = planner.step_mission(state_in(phase, z_m=z_m), obs, MOCAP)
     assert (state.row == "position-astray") is lands
 
 
@@ -129,7 +128,7 @@ def test_what_a_gust_carries_off_is_not_in_another_world(
     """Moving air is felt as a force from the side. Near the floor nothing asks for it."""
     tel = telemetry(10.02, position_m=(0.3, 0.0, z_m))
     obs = observation(10.02, telemetry=tel, imu=ImuMotion(t_s=10.02, pushed_s=pushed_s))
-    state, _ = planner.step(state_in(Phase.ESTIMATE, z_m=0.5), obs, MOCAP)
+    state, _ = planner.step_mission(state_in(Phase.ESTIMATE, z_m=0.5), obs, MOCAP)
     assert (state.row == "position-astray") is lands
 
 
@@ -147,7 +146,7 @@ def test_positions_that_are_late_swing_it_up_and_down(
     tel = telemetry(10.02, 1.0, velocity_mps=(0.0, 0.0, climb_mps))
     for profile in (MOCAP, PROFILE):
         begin = state_in(phase, z_m=1.0)
-        state, _ = planner.step(begin, observation(10.02, telemetry=tel), profile)
+        state, _ = planner.step_mission(begin, observation(10.02, telemetry=tel), profile)
         assert (state.row == "position-astray") is (lands and profile is MOCAP)
         if state.row == "position-astray":
             assert "late" in state.reason
@@ -157,14 +156,14 @@ def test_what_has_touched_the_ceiling_is_left_to_its_landing() -> None:
     """The magnet may hold it aside of its setpoint: that is no other world."""
     begin = replace(state_in(Phase.LANDING, z_m=1.0), contact_z_m=1.0)
     obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 1.0)))
-    state, _ = planner.step(begin, obs, MOCAP)
+    state, _ = planner.step_mission(begin, obs, MOCAP)
     assert state.row != "position-astray"
 
 
 def test_a_landing_that_goes_astray_is_named_anew_and_flown_level() -> None:
     begin = replace(state_in(Phase.LANDING, z_m=0.5), reason="camera.mount", row="mounting")
     obs = observation(10.02, telemetry=telemetry(10.02, position_m=(0.5, 0.0, 0.5)))
-    state, command = planner.step(begin, obs, MOCAP)
+    state, command = planner.step_mission(begin, obs, MOCAP)
     assert isinstance(command, RawThrust)
     assert state.astray
     assert "swapped axes" in state.reason
@@ -184,7 +183,7 @@ def test_a_landing_of_its_own_is_not_left_to_positions_that_move_otherwise(
     for t_s in times(0.2):
         state = replace(state, reckoning=replace(state.reckoning, beside_mps=(0.0, -beside_mps)))
         tel = telemetry(t_s, supervisor=AIRBORNE | HL_ACTIVE)
-        state, command = planner.step(state, felt(observation(t_s, telemetry=tel)), MOCAP)
+        state, command = planner.step_mission(state, felt(observation(t_s, telemetry=tel)), MOCAP)
     assert state.astray is (beside_mps > OTHERWISE_MPS)
     assert isinstance(command, RawThrust) is state.astray
 
@@ -200,7 +199,7 @@ def test_a_tilt_that_wrong_positions_have_turned_is_taken_off_the_reckoned_motio
             beside = replace(state.reckoning, beside_mps=(0.0, 0.3))
             state = replace(state, reckoning=beside)
         tel = telemetry(t_s, roll_rad=-0.05 + 1e-6 * (round(100 * t_s) % 7))  # alive
-        state, _ = planner.step(state, felt(observation(t_s, telemetry=tel)), MOCAP)
+        state, _ = planner.step_mission(state, felt(observation(t_s, telemetry=tel)), MOCAP)
     assert state.row == "position-astray"
     assert abs(state.reckoning.velocity_mps[1]) < 0.15
 
@@ -220,7 +219,7 @@ def come_down(height_m: float, felt: Felt, felt_too_much_g: float) -> tuple[Plan
             acc_z_g=acc_g + felt_too_much_g,
         )  # fmt: skip
         obs = felt(observation(t_s, telemetry=tel, target=None))
-        state, command = planner.step(state, obs, MOCAP)
+        state, command = planner.step_mission(state, obs, MOCAP)
         if isinstance(command, RawThrust):
             thrust = float(command.thrust)
         if z_m <= 0.0:

@@ -10,25 +10,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import planner
-from perchctl.mission.budget import floor_of, needs_of, outlook, watched
-from perchctl.mission.context import Context
-from perchctl.mission.energy import (
-    CURVE,
+from perchctl.mission import (
+    Context,
     EnergyState,
-    Floor,
+    Outcome,
+    Phase,
+    PlannerState,
     charge_at,
-    fitted,
-    left_s,
-    loaded_v,
-    resting_v,
-    updated,
+    fit_battery,
+    planner,
+    update_energy,
     used_mah,
 )
-from perchctl.mission.state import Outcome, Phase, PlannerState
+from perchctl.mission.budget import floor_of, needs_of, outlook, watched
+from perchctl.mission.energy import CURVE, Floor, left_s, loaded_v, resting_v
 from perchctl.profile import Profile, load_profile
+from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.cell import Cell, CellKind
-from perchctl.sim.scenario import CONTROL_PERIOD_S
 from perchctl.vehicle import FULL_THRUST
 from tests.helpers.mission import (
     FINE_BATTERY,
@@ -63,7 +61,7 @@ def hovering(
         for _ in range(round(PERIOD_S / CONTROL_PERIOD_S)):
             cell.step(4.4 * load)
         reading_v += 0.1 * (cell.battery_v - reading_v)  # the firmware's, low-passed
-        energy = updated(energy, PERIOD_S, reading_v, load * FULL_THRUST, MAH)
+        energy = update_energy(energy, PERIOD_S, reading_v, load * FULL_THRUST, MAH)
         yield Moment(
             t_s, energy, cell.rest_v - (cell.rest_v - cell.battery_v) / (load or 1) * hover
         )
@@ -115,7 +113,7 @@ def test_a_battery_larger_than_assumed_is_not_thought_fuller_near_its_end() -> N
 
 def test_a_voltage_above_the_curve_is_nothing_spent() -> None:
     begun = EnergyState(ground_v=4.35, load=HOVER)
-    energy = updated(begun, PERIOD_S, 4.35 - 0.63 * HOVER, HOVER_THRUST, MAH)
+    energy = update_energy(begun, PERIOD_S, 4.35 - 0.63 * HOVER, HOVER_THRUST, MAH)
     assert energy.fit[2] == pytest.approx(0.0, abs=1e-3)
 
 
@@ -132,13 +130,13 @@ def test_a_light_vehicle_s_battery_is_not_asked_for_a_long_press() -> None:
 @pytest.mark.parametrize("ohm", [0.12, 0.143, 0.2])
 def test_the_sag_is_found_within_seconds(ohm: float) -> None:
     last = list(hovering(4.1, CellKind(resistance_ohm=ohm), 5.0))[-1]
-    assert fitted(last.energy).sag_v == pytest.approx(4.4 * ohm, rel=0.05)
+    assert fit_battery(last.energy).sag_v == pytest.approx(4.4 * ohm, rel=0.05)
     assert loaded_v(last.energy, HOVER) == pytest.approx(last.under_load_v, abs=0.02)
 
 
 def test_a_hungry_battery_is_found_out_while_it_flies() -> None:
     tame, hungry = (
-        fitted(list(hovering(4.1, CellKind(charge=charge), 30.0))[-1].energy).hunger
+        fit_battery(list(hovering(4.1, CellKind(charge=charge), 30.0))[-1].energy).hunger
         for charge in (1.0, 0.5)
     )
     assert 1.0 <= tame < 1.15
@@ -148,7 +146,7 @@ def test_a_hungry_battery_is_found_out_while_it_flies() -> None:
 def test_the_count_of_the_thrust() -> None:
     energy = EnergyState()
     for _ in range(500):
-        energy = updated(energy, PERIOD_S, 3.7, FULL_THRUST, MAH)
+        energy = update_energy(energy, PERIOD_S, 3.7, FULL_THRUST, MAH)
     assert used_mah(energy, MAH) == pytest.approx(4.4 / 3.6 * 10.0)
 
 
@@ -156,7 +154,7 @@ def test_the_count_of_the_thrust() -> None:
 def test_without_a_reading_nothing_is_known(reading_v: float) -> None:
     energy = EnergyState()
     for i in range(500):
-        energy = updated(energy, PERIOD_S, reading_v, HOVER_THRUST * (i > 50), MAH)
+        energy = update_energy(energy, PERIOD_S, reading_v, HOVER_THRUST * (i > 50), MAH)
     assert left_s(energy, FLOOR, MAH) is None
     assert energy.unknown_s == pytest.approx(10.0)
 
@@ -166,7 +164,7 @@ def test_a_moment_without_readings_is_counted_on() -> None:
     before = moments[-1].energy
     blind = before
     for _ in range(200):
-        blind = updated(blind, PERIOD_S, math.nan, HOVER_THRUST, MAH)
+        blind = update_energy(blind, PERIOD_S, math.nan, HOVER_THRUST, MAH)
     known_s, counted_s = (left_s(each, FLOOR, MAH, HOVER) for each in (before, blind))
     assert known_s is not None
     assert counted_s == pytest.approx(known_s - 4.0, abs=0.5)
@@ -176,7 +174,7 @@ def test_readings_that_begin_under_load_are_taken_as_usual_ones() -> None:
     """As after a reading that came late: the sag is not known, and what is usual counts."""
     energy = EnergyState()
     for _ in range(200):
-        energy = updated(energy, PERIOD_S, 3.5, HOVER_THRUST, MAH)
+        energy = update_energy(energy, PERIOD_S, 3.5, HOVER_THRUST, MAH)
     assert energy.rest_v == pytest.approx(3.5 + 0.63 * HOVER, abs=0.05)
 
 
@@ -203,7 +201,7 @@ def test_the_curve_rises() -> None:
 def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
     energy = FINE_BATTERY
     for volts, thrust in readings:
-        energy = updated(energy, PERIOD_S, volts, thrust, MAH)
+        energy = update_energy(energy, PERIOD_S, volts, thrust, MAH)
     seconds = left_s(energy, FLOOR, MAH)
     assert seconds is not None
     assert 0.0 <= seconds < 1e5
@@ -213,7 +211,7 @@ def test_no_reading_breaks_it(readings: list[tuple[float, float]]) -> None:
 @pytest.mark.parametrize("thrust", [0.0, HOVER_THRUST])
 def test_what_no_cell_can_have_is_no_reading(reading_v: float, thrust: float) -> None:
     before = FINE_BATTERY if thrust else EnergyState()
-    assert updated(before, PERIOD_S, reading_v, thrust, MAH) == updated(
+    assert update_energy(before, PERIOD_S, reading_v, thrust, MAH) == update_energy(
         before, PERIOD_S, math.nan, thrust, MAH
     )
 
@@ -260,7 +258,7 @@ def flown(
     for i in range(1, round(seconds / PERIOD_S)):
         t_s = 10.0 + PERIOD_S * i
         sample = telemetry(t_s, **tel)  # type: ignore[arg-type]
-        state, _ = planner.step(state, observation(t_s, telemetry=sample), profile)
+        state, _ = planner.step_mission(state, observation(t_s, telemetry=sample), profile)
         if state.phase is not phase:
             break
     return state
@@ -337,7 +335,7 @@ def test_who_has_no_target_goes_on_searching() -> None:
     state = replace(state_in(Phase.RECOVER), energy=FINE_BATTERY, target_m=None)
     for i in range(1, 100):
         t_s = 10.0 + PERIOD_S * i
-        state, _ = planner.step(state, observation(t_s, target=None), PROFILE)
+        state, _ = planner.step_mission(state, observation(t_s, target=None), PROFILE)
         if state.phase is not Phase.RECOVER:
             break
     assert state.row == "recovered"

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, Array, rot_z, rotation_from_rpy
-from perchctl.mission.felt import LEAST_LATER_S, STEP_S, WINDOW_S, FeltWatch, begun_anew, felt
+from perchctl.mission import VisualInertialWindow, drop_sights, estimate_motion
+from perchctl.mission.felt import LEAST_LATER_S, STEP_S, WINDOW_S
 from perchctl.vehicle import Telemetry
 
 TARGET_M = np.array([0.3, -0.2, 1.9])
@@ -74,10 +75,10 @@ def watched(
     seed: int = 0,
     sway_m: float = 0.0,
     anew: bool = False,
-) -> FeltWatch:
+) -> VisualInertialWindow:
     """`sway_m`: what the sights wander by for another reason; `anew`: begun anew before them."""
     rng = np.random.default_rng(seed)
-    watch = begun_anew(FeltWatch()) if anew else FeltWatch()
+    watch = drop_sights(VisualInertialWindow()) if anew else VisualInertialWindow()
     flown = [swing.sample(0.01 * k, offset_g) for k in range(int((for_s + 2.2) * 100) + 1)]
     for i in range(int(for_s * RATE_HZ)):
         t_s = 2.0 + i / RATE_HZ
@@ -86,7 +87,7 @@ def watched(
         x, y, z = swing.way_m(t_s - later_s, turned_rad)
         x, y = x + float(rng.normal(0.0, 1e-3)), y + float(rng.normal(0.0, 1e-3))
         x += sway_m * math.sin(25.0 * t_s)
-        watch = felt(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0))
+        watch = estimate_motion(watch, t_s, (x, y, z), samples, (0.0, 0.0, 0.0))
     return watch
 
 

@@ -8,10 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import planner
-from perchctl.mission.context import Context
+from perchctl.mission import FLYING_PHASES, Context, Operator, Phase, planner
 from perchctl.mission.guidance import FLOOR_M, limited
-from perchctl.mission.state import FLYING_PHASES, Operator, Phase
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import PROFILE, READY, observation, state_in, target_at, telemetry
 
@@ -39,16 +37,16 @@ def test_a_target_that_seems_to_lie_below_is_not_dived_to() -> None:
             target = target_at(t_s, (0.0, 0.0, -1.0), body_m, tracked=False, measured=False)
             tel = telemetry(t_s, position_m=body_m)
             obs = observation(t_s, telemetry=tel, target=target)
-            state, command = planner.step(state, obs, PROFILE)
+            state, command = planner.step_mission(state, obs, PROFILE)
             if isinstance(command, PositionSetpoint):
                 assert command.z_m >= FLOOR_M
                 z_m = command.z_m
 
 
 def test_a_take_off_begins_on_the_ground() -> None:
-    state = planner.start(observation(0.0, 0.0))
+    state = planner.start_mission(observation(0.0, 0.0))
     tel = telemetry(0.02, 0.0, thrust=0.0, supervisor=READY)
-    _, command = planner.step(state, observation(0.02, telemetry=tel), PROFILE)
+    _, command = planner.step_mission(state, observation(0.02, telemetry=tel), PROFILE)
     assert isinstance(command, PositionSetpoint)
     assert command.z_m < FLOOR_M
 
@@ -63,7 +61,7 @@ def test_a_landing_is_handed_over_above_the_floor(handover_m: float) -> None:
     for i in range(1, 1000):
         t_s = 10.0 + 0.02 * i
         obs = observation(t_s, z_m, operator=Operator.LAND)
-        state, command = planner.step(state, obs, profile)
+        state, command = planner.step_mission(state, obs, profile)
         if not isinstance(command, PositionSetpoint):
             break
         lowest_m = command.z_m

@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import planner
+from perchctl.mission import Outcome, Phase, planner
 from perchctl.mission.mounting import MountWatch, Sight, explained, sight_of, watched
-from perchctl.mission.state import Outcome, Phase
 from perchctl.vehicle import PositionSetpoint
 from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry
 
@@ -109,7 +108,7 @@ def test_a_landing_for_the_mounting_stops_at_once() -> None:
         mount=MountWatch(against=9, turn_rad=math.pi / 2),
         setpoint=PositionSetpoint(0.3, 0.0, 1.0, 0.0),
     )
-    state, command = planner.step(state, observation(10.02), PROFILE)
+    state, command = planner.step_mission(state, observation(10.02), PROFILE)
     assert state.row == "mounting"
     assert isinstance(command, PositionSetpoint)
     assert math.hypot(command.x_m, command.y_m) < 0.02
@@ -177,7 +176,7 @@ def _mission(deg: float, hold: bool = False) -> tuple[planner.PlannerState, floa
         target = target_at(t_s, (at.real, at.imag, CEILING_M), tel.position_m)
         late_s = 0.5 if hold else 0.0
         obs = observation(t_s, telemetry=tel, target=target, loop_late_s=late_s)
-        state, command = planner.step(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILE)
         if state.phase is Phase.LANDING:
             break
         assert isinstance(command, PositionSetpoint)
@@ -211,7 +210,7 @@ def test_the_first_decimetres_are_flown_slowly() -> None:
         t_s = 10.0 + 0.02 * i
         at = seen(t_s, 0j)
         target = target_at(t_s, (at.real, at.imag, CEILING_M))
-        state, _ = planner.step(state, observation(t_s, target=target), PROFILE)
+        state, _ = planner.step_mission(state, observation(t_s, target=target), PROFILE)
     assert state.setpoint is not None
     assert math.hypot(state.setpoint.x_m, state.setpoint.y_m) <= 0.25 * 0.3 + 1e-9
 
@@ -222,6 +221,6 @@ def test_a_target_below_the_vehicle_is_not_believed() -> None:
     for i in range(1, 30):
         t_s = 10.0 + 0.02 * i
         target = target_at(t_s, (0.0, 0.0, -0.2))
-        state, _ = planner.step(state, observation(t_s, target=target), PROFILE)
+        state, _ = planner.step_mission(state, observation(t_s, target=target), PROFILE)
     assert state.row == "mounting"
     assert "camera.mount does not look up" in state.reason

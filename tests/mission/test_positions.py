@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.mission import planner
+from perchctl.mission import Context, Observation, Outcome, Phase, PlannerState, planner
 from perchctl.mission.conditions import contact_aside_m
-from perchctl.mission.context import Context
-from perchctl.mission.state import Observation, Outcome, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import LOCKED, Command, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
@@ -54,7 +52,7 @@ def flown(
     """Until the time is over, or the phase is another."""
     phase, sent = state.phase, []
     for t_s in times(lasts_s):
-        state, command = planner.step(state, look(t_s), MOCAP)
+        state, command = planner.step_mission(state, look(t_s), MOCAP)
         sent.append(command)
         if state.phase is not phase:
             break
@@ -72,7 +70,7 @@ def test_a_short_occlusion_is_held_and_the_flight_goes_on(phase: Phase) -> None:
     for t_s in times(0.5):
         hidden_s = t_s - BEGIN_S if t_s - BEGIN_S <= 0.3 else 0.0
         obs = observation(t_s, begin.entry_m[2], **hidden(hidden_s))
-        state, command = planner.step(state, obs, MOCAP)
+        state, command = planner.step_mission(state, obs, MOCAP)
         if hidden_s > HOLD_S:
             held.append((state.hold, state.setpoint, command))
     assert state.phase in (*HELD_PHASES, Phase.PERCH)
@@ -90,7 +88,7 @@ def test_a_lasting_occlusion_lands_and_says_why(phase: Phase) -> None:
     state, sent = begin, []
     for t_s in times(2.0):
         obs = observation(t_s, begin.entry_m[2], new_frame=False, **hidden(t_s - BEGIN_S))
-        state, command = planner.step(state, obs, MOCAP)
+        state, command = planner.step_mission(state, obs, MOCAP)
         sent.append(command)
         if state.phase is not phase:
             break
@@ -117,7 +115,7 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
         )  # fmt: skip
         obs = see(observation(t_s, telemetry=tel, new_frame=False))
         if i % 2 == 0 and t_s > BEGIN_S:
-            state, command = planner.step(state, obs, PROFILE)
+            state, command = planner.step_mission(state, obs, PROFILE)
             sent.append(command)
         if state.phase is Phase.LANDING:
             break
@@ -130,7 +128,9 @@ def test_a_deck_whose_positions_end_is_noticed_by_the_variance(phase: Phase, los
 
 
 def test_what_was_never_measured_lands_at_once() -> None:
-    state, _ = planner.step(state_in(Phase.ALIGN), observation(10.02, **hidden(math.inf)), MOCAP)
+    state, _ = planner.step_mission(
+        state_in(Phase.ALIGN), observation(10.02, **hidden(math.inf)), MOCAP
+    )
     assert state.phase is Phase.LANDING
     assert "no position has come" in state.reason
 
@@ -221,10 +221,10 @@ class Hangs:
 def released(it: Hangs, state: PlannerState, lasts_s: float = 12.0) -> tuple[PlannerState, list]:
     sent = []
     for t_s in times(lasts_s):
-        state, command = planner.step(state, it.look(t_s), MOCAP)
+        state, command = planner.step_mission(state, it.look(t_s), MOCAP)
         it.obeys(command)
         sent.append((t_s, command))
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             break
     return state, sent
 
@@ -253,7 +253,7 @@ def test_the_same_slide_with_decks_is_a_slip() -> None:
     state = replace(at_the_magnet(), released_s=BEGIN_S)
     for t_s in times(0.3):
         obs = replace(it.look(t_s), position_age_s=0.0)
-        state, _ = planner.step(state, obs, PROFILE)
+        state, _ = planner.step_mission(state, obs, PROFILE)
     assert state.row == "slipped"
 
 
@@ -265,7 +265,7 @@ def test_a_magnet_that_gives_way_is_noticed_without_a_position(
     it = Hangs(drift_mps, carries)
     state = replace(at_the_magnet(), released_s=BEGIN_S)
     for t_s in times(4.0):
-        state, command = planner.step(state, it.look(t_s), MOCAP)
+        state, command = planner.step_mission(state, it.look(t_s), MOCAP)
         if state.phase is not Phase.COMPLETE:
             break
         assert not isinstance(command, StopMotors)
@@ -302,10 +302,10 @@ def test_what_nobody_saw_hang_has_not_perched(
     for t_s in times(4.0):
         heard = t_s > BEGIN_S + silence_s
         obs = felt(off(t_s, gained_mps=gained_mps) if heard else off(BEGIN_S))
-        state, command = planner.step(state, replace(obs, t_s=t_s), MOCAP)
+        state, command = planner.step_mission(state, replace(obs, t_s=t_s), MOCAP)
         assert not isinstance(command, Land | PositionSetpoint)
         reasons.append(state.reason)
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             break
     assert state.phase is ends
     if ends is Phase.ABORTED:
@@ -320,7 +320,7 @@ def test_a_locked_vehicle_hangs_where_it_has_not_fallen_from(
     state, felt = replace(at_the_magnet(), **STOPPED), Felt()
     felt(off(BEGIN_S - 0.02))
     locked = felt(off(BEGIN_S + silence_s, READY | LOCKED, gained_mps))
-    state, _ = planner.step(state, locked, MOCAP)
+    state, _ = planner.step_mission(state, locked, MOCAP)
     assert state.phase is (Phase.ABORTED if gained_mps else Phase.PERCHED)
 
 
@@ -349,17 +349,19 @@ def test_a_drifting_descent_is_no_floor() -> None:
     for t_s in times(0.9):
         tel = telemetry(t_s, 0.9, thrust=20000.0)
         obs = observation(t_s, telemetry=tel, target=None, **hidden(1.0))
-        state, command = planner.step(state, obs, MOCAP)
+        state, command = planner.step_mission(state, obs, MOCAP)
         assert not isinstance(command, StopMotors)
 
 
 def test_the_ground_stays_where_it_was_when_the_drift_ends() -> None:
     """The estimate steps back to the truth: what was remembered before the drift is true."""
     begin = replace(state_in(Phase.ALIGN), ground_m=(0.0, 0.0, 0.0))
-    state, _ = planner.step(begin, observation(10.02, 1.3, **hidden(0.5)), MOCAP)
-    back, _ = planner.step(state, observation(10.04, 1.0, jumped=True), MOCAP)
+    state, _ = planner.step_mission(begin, observation(10.02, 1.3, **hidden(0.5)), MOCAP)
+    back, _ = planner.step_mission(state, observation(10.04, 1.0, jumped=True), MOCAP)
     assert back.ground_m == (0.0, 0.0, 0.0)
-    without, _ = planner.step(replace(state, stale_s=None), observation(10.04, jumped=True), MOCAP)
+    without, _ = planner.step_mission(
+        replace(state, stale_s=None), observation(10.04, jumped=True), MOCAP
+    )
     assert without.ground_m != (0.0, 0.0, 0.0)
 
 
@@ -376,9 +378,9 @@ def test_what_a_blind_landing_put_its_weight_on_is_not_called_the_ceiling() -> N
     felt = Felt()
     felt(off(BEGIN_S - TURN_S))
     locked = felt(off(BEGIN_S, READY | LOCKED))
-    assert planner.step(state, locked, MOCAP)[0].phase is Phase.ABORTED
+    assert planner.step_mission(state, locked, MOCAP)[0].phase is Phase.ABORTED
     hung = replace(state, phase=Phase.COMPLETE)
-    assert planner.step(hung, locked, MOCAP)[0].phase is Phase.PERCHED
+    assert planner.step_mission(hung, locked, MOCAP)[0].phase is Phase.PERCHED
 
 
 def test_a_release_that_is_held_goes_by_where_the_estimate_is_now() -> None:
@@ -386,7 +388,9 @@ def test_a_release_that_is_held_goes_by_where_the_estimate_is_now() -> None:
     away."""
     state = replace(state_in(Phase.COMPLETE, z_m=HANG_Z_M), contact_z_m=HANG_Z_M, released_s=9.0)
     late = telemetry(BEGIN_S - 0.2, HANG_Z_M + 0.4, thrust=1000.0)
-    _, command = planner.step(state, observation(BEGIN_S, telemetry=late, **hidden(4.0)), MOCAP)
+    _, command = planner.step_mission(
+        state, observation(BEGIN_S, telemetry=late, **hidden(4.0)), MOCAP
+    )
     assert isinstance(command, PositionSetpoint)
     assert command.z_m > late.position_m[2]
 
@@ -410,7 +414,7 @@ def test_the_spread_of_a_contact_grows_with_what_the_estimate_may_slide(
             tracked=False, sigma_m=np.full(3, 1e-4),
         )  # fmt: skip
         obs = observation(t_s, HANG_Z_M, target=remembered)
-        state, _ = planner.step(state, obs, profile)
+        state, _ = planner.step_mission(state, obs, profile)
     _, sigma_m = contact_aside_m(Context(state, obs, profile))
     assert least_m <= sigma_m <= most_m
 
@@ -430,5 +434,5 @@ def test_positions_that_come_back_do_not_move_a_gear_that_has_not_moved(
         )
         gone_s = since_s - 0.3 if silent and since_s < 0.9 else 0.0
         obs = observation(t_s, telemetry=tel, target=target, position_age_s=max(0.0, gone_s))
-        state, _ = planner.step(state, felt(obs), MOCAP)
+        state, _ = planner.step_mission(state, felt(obs), MOCAP)
     assert math.hypot(*state.reckoning.aside_m) == pytest.approx(aside_m, abs=0.01)

@@ -11,21 +11,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.mission import planner
-from perchctl.mission.felt import Mismatch
-from perchctl.mission.imu import ImuMotion
-from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
-from perchctl.mission.row import Row, risen
-from perchctl.mission.state import (
+from perchctl.mission import (
     FLYING_PHASES,
     TERMINALS,
+    ImuMotion,
     Observation,
     Operator,
     Outcome,
     Phase,
     PlannerState,
     Severity,
+    planner,
 )
+from perchctl.mission.felt import Mismatch
+from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
+from perchctl.mission.row import Row, risen
 from perchctl.mission.table import TABLE, first_match
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -81,7 +81,7 @@ class Case:
         state = replace(state_in(self.phase, START_S, self.z_m), **self.state)
         for i in range(1, max(2, round(self.lasts_s / PERIOD_S)) + 1):
             obs = self.look(START_S + PERIOD_S * i)
-            state, command = planner.step(state, obs, self.profile, table)
+            state, command = planner.step_mission(state, obs, self.profile, table)
             if state.phase is self.to:
                 fits = self.command is None or isinstance(command, self.command)
                 return fits and state.outcome is self.outcome
@@ -356,7 +356,7 @@ def test_what_was_locked_while_it_landed_has_not_perched() -> None:
         contact_z_m=CONTACT_Z_M, outcome=O.OPERATOR,
     )  # fmt: skip
     locked = flown(CONTACT_Z_M, thrust=0.0, supervisor=READY | LOCKED)(START_S + PERIOD_S)
-    state, _ = planner.step(state, locked, PROFILE)
+    state, _ = planner.step_mission(state, locked, PROFILE)
     assert (state.phase, state.row, state.outcome) == (P.PERCHED, "hung-but-locked", O.OPERATOR)
 
 
@@ -386,11 +386,11 @@ def test_from_landing_on_the_severity_only_rises(rows: list[Severity]) -> None:
 
 def test_a_landing_goes_on_to_its_end() -> None:
     state: PlannerState = state_in(P.ALIGN)
-    state, _ = planner.step(state, observation(START_S, operator=Operator.LAND), PROFILE)
+    state, _ = planner.step_mission(state, observation(START_S, operator=Operator.LAND), PROFILE)
     assert state.severity is Severity.LAND
     for i in range(1, 30):
         tel = telemetry(START_S + 0.1 * i, 0.01, **OFF)
-        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        state, _ = planner.step_mission(state, observation(tel.t_s, telemetry=tel), PROFILE)
         assert state.severity is Severity.LAND
         if state.phase in TERMINALS:
             break

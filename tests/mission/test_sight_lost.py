@@ -12,10 +12,20 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.mission import lander, planner
-from perchctl.mission.context import BLOWN_MPS, CORRECTED_S, Context
+from perchctl.mission import (
+    Context,
+    ImuMotion,
+    Observation,
+    Operator,
+    Phase,
+    PlannerState,
+    Severity,
+    lander,
+    planner,
+)
+from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
 from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
-from perchctl.mission.imu import ImuMotion, Reckoning
+from perchctl.mission.imu import Reckoning
 from perchctl.mission.lander import (
     BRAKE_RAD_PER_MPS,
     HOVER_WITHIN,
@@ -23,7 +33,6 @@ from perchctl.mission.lander import (
     SINK_MPS,
     UNLEARNED_WITHIN,
 )
-from perchctl.mission.state import Observation, Operator, Phase, PlannerState, Severity
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, Idle, Land, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.mission import (
@@ -60,7 +69,9 @@ def flown(
     for i in range(1, round(lasts_s / TURN_S) + 1):
         t_s = BEGIN_S + TURN_S * i
         tel = telemetry(t_s, z_m, position_variance_m2=variance_m2)
-        state, command = planner.step(state, unseen(t_s, z_m, TURN_S * i, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(
+            state, unseen(t_s, z_m, TURN_S * i, telemetry=tel), PROFILE
+        )
         turns.append((state, command))
     return turns
 
@@ -111,7 +122,7 @@ def test_it_is_held_then_sinks_and_then_comes_down_level(phase: Phase) -> None:
 def test_nothing_climbs_without_a_sight(age_s: float, z_m: float, phase: Phase) -> None:
     """Not even a search, which would climb by a position that drifts."""
     state = replace(state_in(phase, z_m=z_m), searches=2, search_step_s=0.0)
-    after, _ = planner.step(
+    after, _ = planner.step_mission(
         state, unseen(BEGIN_S + TURN_S, z_m, max(age_s, HOLD_S + 0.01)), PROFILE
     )
     assert after.setpoint is None or after.setpoint.z_m <= z_m
@@ -133,7 +144,7 @@ def test_the_estimates_own_doubt_ends_the_waiting_sooner() -> None:
         BEGIN_S + TURN_S, 1.0, 0.1,
         telemetry=telemetry(BEGIN_S + TURN_S, 1.0, position_variance_m2=1.1 * BLIND_VARIANCE_M2),
     )  # fmt: skip
-    assert planner.step(state_in(Phase.ALIGN), doubtful, PROFILE)[0].phase is Phase.ALIGN
+    assert planner.step_mission(state_in(Phase.ALIGN), doubtful, PROFILE)[0].phase is Phase.ALIGN
 
 
 def test_a_sight_in_time_goes_on_with_the_flight() -> None:
@@ -141,7 +152,7 @@ def test_a_sight_in_time_goes_on_with_the_flight() -> None:
     assert state.hold
     for i in range(40):
         t_s = BEGIN_S + 1.2 + TURN_S * (i + 1)
-        state, command = planner.step(state, observation(t_s, 1.0), PROFILE)
+        state, command = planner.step_mission(state, observation(t_s, 1.0), PROFILE)
         assert isinstance(command, PositionSetpoint)
     assert not state.hold
     assert state.phase is not Phase.LANDING
@@ -151,7 +162,7 @@ def test_once_blind_it_stays_so_though_the_target_is_seen_again() -> None:
     """Each change of the mode costs height; and severity does not fall."""
     state = flown(state_in(Phase.ALIGN), LAND_S + 0.2)[-1][0]
     assert state.severity is Severity.LAND
-    _, command = planner.step(state, observation(BEGIN_S + 2.0, 0.9), PROFILE)
+    _, command = planner.step_mission(state, observation(BEGIN_S + 2.0, 0.9), PROFILE)
     assert isinstance(command, RawThrust)
 
 
@@ -170,7 +181,7 @@ def test_it_brakes_the_felt_speed_aside_whether_or_not_the_target_is_seen_again(
     state = blind(1.0, (vx_mps, vy_mps, -SINK_MPS))
     tel = telemetry(BEGIN_S + TURN_S, 1.0, velocity_mps=(0.0, 0.0, -0.5), yaw_rad=yaw_rad)
     obs = observation(tel.t_s, telemetry=tel, position_age_s=age_s)
-    _, command = planner.step(state, obs, PROFILE)
+    _, command = planner.step_mission(state, obs, PROFILE)
     assert isinstance(command, RawThrust)
     # Nose down is forwards, roll to the right is to the right (docs/firmware.md).
     ahead, left = command.pitch_rad, -command.roll_rad
@@ -192,7 +203,7 @@ def test_a_vehicle_that_moves_otherwise_than_its_estimate_is_not_held_by_it(
     reckoning = Reckoning(imu=ImuMotion(t_s=BEGIN_S), velocity_mps=(felt_mps, 0.0, 0.0))
     begin = replace(state_in(Phase.RECOVER), t_s=BEGIN_S, reckoning=reckoning)
     obs = unseen(BEGIN_S + TURN_S, 1.0, 0.6, imu=ImuMotion(t_s=BEGIN_S + TURN_S))
-    state, _ = planner.step(begin, obs, PROFILE)
+    state, _ = planner.step_mission(begin, obs, PROFILE)
     assert (state.row == "position-lost") is lands
 
 
@@ -211,7 +222,7 @@ def test_a_blow_that_only_the_accelerometer_feels_ends_the_waiting_and_is_braked
             acc_x_g=ahead_g if blown else 0.0, acc_y_g=aside_g if blown else 0.0,
         )  # fmt: skip
         obs = unseen(tel.t_s, 1.0, max(0.01, passed_s - 0.1), telemetry=tel)
-        state, command = planner.step(state, felt(obs), PROFILE)
+        state, command = planner.step_mission(state, felt(obs), PROFILE)
         if state.phase is Phase.LANDING:
             break
     if abs(gained_mps - BLOWN_MPS) < 0.05:
@@ -248,8 +259,8 @@ def test_what_was_stopped_as_it_hung_and_has_not_fallen_since_hangs(
         obs = unseen(t_s, 1.9, 0.6 + TURN_S * i, telemetry=tel, target=None)
         if TURN_S * i < 0.6:
             obs = replace(obs, telemetry=replace(tel, thrust=1.0))  # not seen to be off yet
-        state, command = planner.step(state, felt(obs), PROFILE)
-        if planner.is_over(state):
+        state, command = planner.step_mission(state, felt(obs), PROFILE)
+        if planner.is_mission_over(state):
             break
         assert not isinstance(command, Land | PositionSetpoint | RawThrust)
     assert state.phase is ends, state.reason
@@ -261,7 +272,7 @@ def test_what_slips_off_the_magnet_has_its_whole_way_down_before_it() -> None:
     thrusts = []
     for entered_s in (BEGIN_S - 1.0, BEGIN_S - 8.0):
         obs = unseen(BEGIN_S + TURN_S, 1.5, 6.0)
-        _, command = planner.step(replace(hung, entered_s=entered_s), obs, PROFILE)
+        _, command = planner.step_mission(replace(hung, entered_s=entered_s), obs, PROFILE)
         assert isinstance(command, RawThrust)
         thrusts.append(command.thrust)
     assert thrusts[0] == pytest.approx(HOVER_THRUST, abs=0.02 * HOVER_THRUST)
@@ -269,12 +280,12 @@ def test_what_slips_off_the_magnet_has_its_whole_way_down_before_it() -> None:
 
 
 def test_a_landing_that_loses_it_goes_on_blindly() -> None:
-    state, _ = planner.step(
+    state, _ = planner.step_mission(
         state_in(Phase.ALIGN), observation(BEGIN_S + TURN_S, operator=Operator.LAND), PROFILE
     )
     assert state.phase is Phase.LANDING
     assert state.blind_s is None
-    state, command = planner.step(state, unseen(BEGIN_S + 2.0, 0.9, LAND_S + 0.1), PROFILE)
+    state, command = planner.step_mission(state, unseen(BEGIN_S + 2.0, 0.9, LAND_S + 0.1), PROFILE)
     assert state.blind_s is not None
     assert isinstance(command, RawThrust)
 
@@ -287,13 +298,13 @@ def test_a_landing_of_its_own_near_the_floor_is_left_to_its_end() -> None:
     )
     for i in range(1, 40):
         obs = unseen(BEGIN_S + TURN_S * i, 0.25, LAND_S + TURN_S * i)
-        state, command = planner.step(state, obs, mocap)
+        state, command = planner.step_mission(state, obs, mocap)
         assert isinstance(command, Land | Idle)
 
 
 def test_how_long_it_may_take_counts_from_the_loss_and_not_from_the_landing() -> None:
     state = blind(0.8, (0.0, 0.0, -SINK_MPS), entered_s=BEGIN_S - 20.0, level_thrust=HOVER_THRUST)
-    _, command = planner.step(state, unseen(BEGIN_S + TURN_S, 0.8, 2.5), PROFILE)
+    _, command = planner.step_mission(state, unseen(BEGIN_S + TURN_S, 0.8, 2.5), PROFILE)
     assert isinstance(command, RawThrust)
     assert command.thrust > 0.97 * HOVER_THRUST
 
@@ -306,7 +317,9 @@ def test_a_speed_from_before_it_was_held_unheard_is_none_any_more(
     way down that was heard so far the last speed is the present one."""
     state = blind(1.0, (0.0, 0.0, 0.7), entered_s=entered_s, level_thrust=HOVER_THRUST)
     tel = telemetry(BEGIN_S - 1.1, 1.0, velocity_mps=(0.0, 0.0, 0.7))
-    _, command = planner.step(state, unseen(BEGIN_S + TURN_S, 1.0, 2.0, telemetry=tel), PROFILE)
+    _, command = planner.step_mission(
+        state, unseen(BEGIN_S + TURN_S, 1.0, 2.0, telemetry=tel), PROFILE
+    )
     assert isinstance(command, RawThrust)
     assert (command.thrust < 0.75 * HOVER_THRUST) is falls
 
@@ -322,7 +335,9 @@ def test_unheard_its_time_begins_after_its_own_estimate_has_flown_it(
         level_thrust=0.9 * HOVER_THRUST, entry_m=(0.0, 0.0, 0.3), under_way_mps=-0.4,
     )  # fmt: skip
     tel = telemetry(heard_s, 0.3)
-    state, command = planner.step(state, unseen(BEGIN_S + TURN_S, 0.3, 3.0, telemetry=tel), PROFILE)
+    state, command = planner.step_mission(
+        state, unseen(BEGIN_S + TURN_S, 0.3, 3.0, telemetry=tel), PROFILE
+    )
     assert isinstance(command, RawThrust)
     assert (command.thrust < 0.9 * HOVER_THRUST) is overdue
 
@@ -342,7 +357,7 @@ def test_what_an_impact_left_of_a_speed_goes_while_it_rests_at_its_contact(
     for i in range(1, 30):
         obs = felt(unseen(BEGIN_S + TURN_S * i, 1.0, 2.0))
         obs = replace(obs, imu=replace(obs.imu, fell_s=obs.t_s - fell_ago_s))
-        state, _ = planner.step(state, obs, PROFILE)
+        state, _ = planner.step_mission(state, obs, PROFILE)
     rests = state.reckoning.velocity_mps == (0.0, 0.0, 0.0)
     assert rests is goes
 
@@ -350,7 +365,7 @@ def test_what_an_impact_left_of_a_speed_goes_while_it_rests_at_its_contact(
 @pytest.mark.parametrize("hover", [0.0, HOVER_THRUST])
 def test_blind_from_the_take_off_it_has_a_thrust_to_come_down_on(hover: float) -> None:
     state = replace(state_in(Phase.APPROACH, z_m=0.3), hover_thrust=hover)
-    after, command = planner.step(state, unseen(BEGIN_S + TURN_S, 0.3, math.inf), PROFILE)
+    after, command = planner.step_mission(state, unseen(BEGIN_S + TURN_S, 0.3, math.inf), PROFILE)
     assert after.phase is Phase.LANDING
     assert after.hover_thrust > 0.0
     assert isinstance(command, RawThrust | Land)
@@ -361,7 +376,7 @@ def test_a_hover_thrust_that_was_not_learned_yet_is_felt(felt_g: float) -> None:
     """What just sinks is carried by less than its weight; flown on that it would fall."""
     state = replace(state_in(Phase.APPROACH, z_m=0.3), hover_thrust=0.0)
     tel = telemetry(BEGIN_S + TURN_S, 0.3, thrust=felt_g * HOVER_THRUST, acc_z_g=felt_g)
-    after, _ = planner.step(
+    after, _ = planner.step_mission(
         state, unseen(BEGIN_S + TURN_S, 0.3, LAND_S + 0.1, telemetry=tel), PROFILE
     )
     assert after.blind_s is not None
@@ -373,7 +388,7 @@ def test_blind_it_brakes_what_sinks_faster_than_it_should(speed_mps: float) -> N
     """By the felt speed, whatever the estimate says."""
     state = blind(1.0, (0.0, 0.0, speed_mps))
     tel = telemetry(BEGIN_S + TURN_S, 1.0, velocity_mps=(0.0, 0.0, 0.5))
-    _, command = planner.step(state, unseen(tel.t_s, 1.0, 2.0, telemetry=tel), PROFILE)
+    _, command = planner.step_mission(state, unseen(tel.t_s, 1.0, 2.0, telemetry=tel), PROFILE)
     assert isinstance(command, RawThrust)
     beside = abs(speed_mps + SINK_MPS) < 0.02
     assert beside or (command.thrust > HOVER_THRUST) == (speed_mps < -SINK_MPS)
@@ -403,12 +418,12 @@ def test_a_blind_way_down_whose_speed_has_drifted_ends_all_the_same(
             supervisor=READY if stopped else AIRBORNE,
         )  # fmt: skip
         obs = felt(unseen(t_s, 1.0, 2.0, telemetry=tel, target=None))
-        state, command = planner.step(state, obs, PROFILE)
+        state, command = planner.step_mission(state, obs, PROFILE)
         assert not isinstance(command, Land)
         stopped |= isinstance(command, StopMotors)
         thrust = float(command.thrust) if isinstance(command, RawThrust) else thrust
         thrust = 0.0 if stopped else thrust
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             break
     assert stopped
     assert state.phase is ends, state.reason
@@ -427,7 +442,7 @@ def test_a_press_without_a_contact_backs_off_before_dead_reckoning_leads_aside()
 
 def test_by_other_means_a_press_has_the_time_that_it_always_had() -> None:
     state = state_in(Phase.PERCH, z_m=2.1)
-    after, _ = planner.step(state, unseen(BEGIN_S + TURN_S, 2.1, 1.3), Profile())
+    after, _ = planner.step_mission(state, unseen(BEGIN_S + TURN_S, 2.1, 1.3), Profile())
     assert after.row != "pressed-blindly"
 
 
@@ -451,7 +466,7 @@ def pressed_past_the_sight(
         obs = observation(
             t_s, telemetry=tel, target=target, new_frame=not i, position_age_s=TURN_S * i
         )
-        state, _ = planner.step(state, felt(obs), PROFILE)
+        state, _ = planner.step_mission(state, felt(obs), PROFILE)
         if state.phase is not Phase.PERCH:
             break
     return state
@@ -489,7 +504,7 @@ def test_what_is_felt_to_be_held_is_within_reach_whatever_late_pictures_say(
         obs = observation(
             t_s, telemetry=tel, target=target, new_frame=TURN_S * i < 0.2, position_age_s=age_s
         )
-        state, _ = planner.step(state, felt(obs), PROFILE)
+        state, _ = planner.step_mission(state, felt(obs), PROFILE)
     assert (state.reach_s is not None) is within
     if within:
         landing = lander.begun(state, obs, PROFILE)

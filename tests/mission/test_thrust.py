@@ -7,10 +7,17 @@ from typing import Any
 
 import pytest
 
-from perchctl.mission import lander, planner
+from perchctl.mission import (
+    Condition,
+    Context,
+    Observation,
+    Outcome,
+    Phase,
+    PlannerState,
+    lander,
+    planner,
+)
 from perchctl.mission.conditions import CONDITIONS, contact_thrust
-from perchctl.mission.context import Context
-from perchctl.mission.state import Condition, Observation, Outcome, Phase, PlannerState
 from perchctl.profile import Profile
 from perchctl.vehicle import FULL_THRUST, PositionSetpoint
 from tests.helpers.mission import CEILING_M, PROFILE, observation, state_in, target_at, telemetry
@@ -35,7 +42,7 @@ def flown(
         sample = telemetry(t_s, z_m, **tel)
         target = target_at(t_s, (aside_m, 0.0, CEILING_M), sample.position_m)
         obs = observation(t_s, telemetry=sample, target=target)
-        new, _ = planner.step(state, obs, profile)
+        new, _ = planner.step_mission(state, obs, profile)
         if new.phase is not state.phase:
             return new
         state = new
@@ -146,7 +153,7 @@ def test_a_change_of_phase_does_not_hide_a_weak_vehicle() -> None:
     for i in range(1, 115):
         t_s = 10.0 + 0.02 * i
         sample = telemetry(t_s, thrust=float(FULL_THRUST))
-        state, _ = planner.step(state, observation(t_s, telemetry=sample), PROFILE)
+        state, _ = planner.step_mission(state, observation(t_s, telemetry=sample), PROFILE)
         rows.append(state.row)
     assert "aligned" in rows
     assert rows[-1] == "too-weak"
@@ -189,7 +196,7 @@ def pressed_late(t_s: float, late_s: float) -> Observation:
 def test_a_press_ends_before_the_turn_that_would_be_too_late(late_s: float) -> None:
     timeout_s = PROFILE.planner.perch.timeout_s
     state = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.02)
-    state, _ = planner.step(state, pressed_late(10.0 + timeout_s - 0.2, late_s), PROFILE)
+    state, _ = planner.step_mission(state, pressed_late(10.0 + timeout_s - 0.2, late_s), PROFILE)
     assert state.phase is (Phase.RECOVER if late_s else Phase.PERCH)
 
 
@@ -200,7 +207,7 @@ def test_what_backs_off_from_a_press_is_not_held_to_it() -> None:
     above = state_in(Phase.PERCH, 10.0, CONTACT_Z_M + 0.25)
     state = replace(above, since=saturated, caught=True)
     for _ in range(2):
-        state, command = planner.step(state, pressed_late(t_s, 0.3), PROFILE)
+        state, command = planner.step_mission(state, pressed_late(t_s, 0.3), PROFILE)
         assert state.phase is Phase.RECOVER  # and full thrust is no sign of a heavy vehicle
         assert state.hold
         assert isinstance(command, PositionSetpoint)

@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 
-from perchctl.mission import planner
-from perchctl.mission.guards import CATCHABLE_M
+from perchctl.mission import CATCHABLE_M, Outcome, Phase, PlannerState, planner
 from perchctl.mission.lander import MOST_DRIFT_M, PLANNED_MPS, SETTLING_S, own_landing
-from perchctl.mission.state import Outcome, Phase, PlannerState
 from perchctl.vehicle import (
     FULL_THRUST,
     HL_ACTIVE,
@@ -39,7 +37,7 @@ from tests.helpers.mission import (
 def ticked(
     state: PlannerState, t_s: float, tel: Telemetry, **obs: object
 ) -> tuple[PlannerState, Command]:
-    return planner.step(state, observation(t_s, telemetry=tel, **obs), PROFILE)
+    return planner.step_mission(state, observation(t_s, telemetry=tel, **obs), PROFILE)
 
 
 def released(phase: Phase = Phase.COMPLETE) -> PlannerState:
@@ -76,7 +74,7 @@ def test_a_raw_release_waits_for_telemetry_too() -> None:
     profile = PROFILE.model_copy(update={"planner": planned})
     state = replace(released(), released_s=None, setpoint=None, entered_s=9.6)
     obs = observation(10.2, telemetry=hangs(10.0))
-    assert isinstance(planner.step(state, obs, profile)[1], PositionSetpoint)
+    assert isinstance(planner.step_mission(state, obs, profile)[1], PositionSetpoint)
 
 
 # --- after the stop -------------------------------------------------------------------
@@ -94,7 +92,7 @@ def after(state: PlannerState, z_m: float, silence_s: float = 0.0) -> PlannerSta
     for i in range(1, 50):
         t_s = 10.0 + silence_s + 0.02 * i
         off = telemetry(t_s, z_m, thrust=0.0, supervisor=READY)
-        state, _ = planner.step(state, felt(observation(t_s, telemetry=off)), PROFILE)
+        state, _ = planner.step_mission(state, felt(observation(t_s, telemetry=off)), PROFILE)
     return state
 
 
@@ -317,7 +315,7 @@ def test_what_stands_still_is_telemetry_that_grows_old(frozen: dict[str, Any]) -
     for i in range(70):
         t_s = 10.0 + 0.02 * i
         tel = telemetry(t_s, **(frozen if i else {}))
-        state, _ = planner.step(state, felt(observation(t_s, telemetry=tel)), PROFILE)
+        state, _ = planner.step_mission(state, felt(observation(t_s, telemetry=tel)), PROFILE)
         if state.phase is Phase.LANDING:
             break
     assert state.row == "telemetry-stale"

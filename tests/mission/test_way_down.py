@@ -11,15 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.mission import planner
+from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
 from perchctl.mission.release import UNREAD_S
-from perchctl.mission.state import (
-    Observation,
-    Operator,
-    Outcome,
-    Phase,
-    PlannerState,
-)
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
@@ -56,7 +49,7 @@ def test_a_floor_at_the_wrong_height_is_a_floor() -> None:
     for i in range(1, 60):
         t_s = 10.0 + 0.02 * i
         tel = telemetry(t_s, 0.4, thrust=20000.0)
-        state, command = planner.step(state, observation(t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(t_s, telemetry=tel), PROFILE)
         if isinstance(command, StopMotors):
             break
     assert 0.5 <= t_s - 10.0 < 0.7
@@ -67,11 +60,11 @@ def test_a_way_down_that_begins_pressed_goes_far_below_until_it_is_away(phase: P
     """The integrators that a second of full thrust has wound up hold it there for seconds."""
     state = replace(state_in(phase, z_m=1.0), pressed=True)
     tel = telemetry(10.02, 1.0, thrust=65535.0)
-    state, command = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
+    state, command = planner.step_mission(state, observation(10.02, telemetry=tel), PROFILE)
     assert isinstance(command, PositionSetpoint)
     assert command.z_m < 0.2
     away = telemetry(10.5, 0.85, thrust=45000.0, velocity_mps=(0.0, 0.0, -0.1))
-    state, command = planner.step(state, observation(10.5, telemetry=away), PROFILE)
+    state, command = planner.step_mission(state, observation(10.5, telemetry=away), PROFILE)
     assert not state.pressed
     assert isinstance(command, PositionSetpoint)
     assert command.z_m > 0.4
@@ -82,7 +75,7 @@ def test_what_presses_when_its_way_down_begins_is_remembered() -> None:
         state = state_in(Phase.SEARCH, z_m=1.0)
         tel = telemetry(10.02, 1.0, thrust=thrust)
         obs = observation(10.02, telemetry=tel, operator=Operator.LAND)
-        state, _ = planner.step(state, obs, PROFILE)
+        state, _ = planner.step_mission(state, obs, PROFILE)
         assert state.phase is Phase.LANDING
         assert state.pressed is pressed
 
@@ -172,7 +165,7 @@ def test_a_landing_stops_no_motor_without_the_floor_or_the_ceiling(
             )  # fmt: skip
             obs = observation(t_s, telemetry=tel, **doubt)
             seen.append(obs)
-            state, command = planner.step(state, obs, PROFILE)
+            state, command = planner.step_mission(state, obs, PROFILE)
             assert not isinstance(command, EmergencyStop)
             assert state.ground_m is not None
             ground_z_m[t_s] = state.ground_m[2]
@@ -192,7 +185,7 @@ def test_a_landing_that_is_proven_stops_the_motors(z_m: float) -> None:
     sent: list[object] = []
     for i in range(1, 120):
         tel = telemetry(10.0 + 0.02 * i, z_m, thrust=1000.0)
-        state, command = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(tel.t_s, telemetry=tel), PROFILE)
         sent.append(command)
     assert any(isinstance(c, StopMotors) for c in sent)
 
@@ -216,7 +209,7 @@ def test_a_loop_that_hangs_in_every_turn_sees_a_landing_end(
         if heard or i % samples < 2:
             obs = felt(obs)
         if i % samples == 0:
-            state, _ = planner.step(state, obs, PROFILE)
+            state, _ = planner.step_mission(state, obs, PROFILE)
     assert state.phase is ends
 
 
@@ -228,7 +221,7 @@ def test_the_supervisors_word_has_no_age(bit: int) -> None:
     """Whoever was locked before the telemetry stopped has its motors off: no landing is flown."""
     state = state_in(Phase.ALIGN)
     last = telemetry(10.0, supervisor=AIRBORNE | bit)
-    state, command = planner.step(state, observation(10.5, telemetry=last), PROFILE)
+    state, command = planner.step_mission(state, observation(10.5, telemetry=last), PROFILE)
     assert state.phase is Phase.ABORTED
     assert isinstance(command, StopMotors)
 
@@ -239,7 +232,7 @@ def test_what_hangs_teaches_no_hover_thrust() -> None:
     state = state_in(Phase.ASCEND)
     for i in range(1, 200):
         tel = telemetry(10.0 + 0.02 * i, 1.0, thrust=20000.0)
-        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel), PROFILE)
+        state, _ = planner.step_mission(state, observation(tel.t_s, telemetry=tel), PROFILE)
         assert state.hover_thrust > 0.8 * HOVER_THRUST
 
 
@@ -261,7 +254,9 @@ def test_what_has_not_come_down_hangs_where_the_target_is(
     for i in range(1, 120):
         tel = telemetry(10.0 + 0.02 * i, z_m, thrust=0.0, supervisor=READY)
         target = target_at(tel.t_s, body_m=(0.0, 0.0, z_m), measured=False, measured_s=-20.0)
-        state, _ = planner.step(state, observation(tel.t_s, telemetry=tel, target=target), PROFILE)
+        state, _ = planner.step_mission(
+            state, observation(tel.t_s, telemetry=tel, target=target), PROFILE
+        )
     assert state.phase is ends
     assert words in state.reason
 
@@ -284,9 +279,9 @@ def in_a_hand(
         if unseen_s:
             target = replace(target, measured=False, tracked=False, measured_s=seen_until_s)
         obs = observation(t_s, telemetry=tel, target=target, position_age_s=unseen_s)
-        state, command = planner.step(state, felt(obs), profile)
+        state, command = planner.step_mission(state, felt(obs), profile)
         sent.append((t_s, command))
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             break
         match command:
             case RawThrust(order):
@@ -362,9 +357,9 @@ def backed_off_from(
         )  # fmt: skip
         unseen_s = t_s - 10.0 if profile.positioning.by == "target" else 0.0
         obs = observation(t_s, telemetry=tel, target=target, position_age_s=unseen_s)
-        state, command = planner.step(state, felt(obs), profile)
+        state, command = planner.step_mission(state, felt(obs), profile)
         rows.add(state.row)
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             break
         match command:
             case RawThrust(order):
@@ -413,7 +408,7 @@ def test_what_fell_from_where_it_touched_the_target_is_not_caught_there(position
 def test_what_has_left_its_contact_forgets_where_that_was() -> None:
     begin = replace(state_in(Phase.RECOVER, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
     begin = replace(begin, contact_aside_m=0.01, contact_sigma_m=0.01)
-    state, _ = planner.step(begin, observation(10.02, HANG_Z_M - 0.1), PROFILE)
+    state, _ = planner.step_mission(begin, observation(10.02, HANG_Z_M - 0.1), PROFILE)
     assert (state.contact_z_m, state.contact_aside_m) == (None, None)
 
 
@@ -422,12 +417,12 @@ def test_a_step_of_the_estimates_height_moves_what_is_remembered(step_m: float) 
     """The vehicle has not moved: held where it is, over a ground that is as far below."""
     state = state_in(Phase.ALIGN)
     for i in range(1, 4):
-        state, _ = planner.step(state, observation(10.0 + 0.02 * i), PROFILE)
+        state, _ = planner.step_mission(state, observation(10.0 + 0.02 * i), PROFILE)
     assert state.ground_m is not None
     ground_m = state.ground_m[2]
     tel = telemetry(10.08, 1.0 + step_m)
     obs = observation(10.08, telemetry=tel, jumped=True)
-    state, command = planner.step(state, obs, PROFILE)
+    state, command = planner.step_mission(state, obs, PROFILE)
     assert isinstance(command, PositionSetpoint)
     assert command.z_m == pytest.approx(1.0 + step_m, abs=0.02)
     assert state.ground_m is not None
@@ -439,11 +434,11 @@ def test_a_vehicle_still_at_the_ceiling_has_not_recovered() -> None:
     state = replace(state_in(Phase.RECOVER, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
     for i in range(1, 60):
         obs = observation(10.0 + 0.02 * i, HANG_Z_M)
-        state, _ = planner.step(state, obs, PROFILE)
+        state, _ = planner.step_mission(state, obs, PROFILE)
     assert state.phase is Phase.RECOVER
     for i in range(60, 120):
         obs = observation(10.0 + 0.02 * i, HANG_Z_M - 0.1)
-        state, _ = planner.step(state, obs, PROFILE)
+        state, _ = planner.step_mission(state, obs, PROFILE)
     assert state.phase is not Phase.RECOVER
 
 
@@ -455,7 +450,7 @@ def test_a_short_descent_is_enough_to_have_left(descend_m: float) -> None:
     state = replace(state_in(Phase.RECOVER, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
     for i in range(1, 60):
         obs = observation(10.0 + 0.02 * i, HANG_Z_M - descend_m)
-        state, _ = planner.step(state, obs, profile)
+        state, _ = planner.step_mission(state, obs, profile)
     assert state.phase is not Phase.RECOVER
 
 
@@ -463,7 +458,7 @@ def test_what_peels_off_too_fast_is_caught() -> None:
     """At thrustMin the magnet lets go of a vehicle that has no thrust to go on down with."""
     state = replace(state_in(Phase.LANDING, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
     falls = telemetry(10.02, HANG_Z_M - 0.03, velocity_mps=(0.0, 0.0, -0.5), thrust=20000.0)
-    state, command = planner.step(state, observation(10.02, telemetry=falls), PROFILE)
+    state, command = planner.step_mission(state, observation(10.02, telemetry=falls), PROFILE)
     assert state.phase is Phase.LANDING
     assert isinstance(command, PositionSetpoint)
     assert command.z_m > HANG_Z_M + 0.5
@@ -478,7 +473,7 @@ def test_a_release_in_a_landing_begins_on_telemetry_that_is_a_little_late(
     for i in range(1, 80):
         t_s = 10.0 + 0.02 * i
         tel = telemetry(t_s - age_s, HANG_Z_M, thrust=20000.0)
-        state, command = planner.step(state, observation(t_s, telemetry=tel), PROFILE)
+        state, command = planner.step_mission(state, observation(t_s, telemetry=tel), PROFILE)
         assert not isinstance(command, StopMotors)
     assert (state.released_s is not None) is released
 
@@ -495,7 +490,7 @@ def test_a_flight_that_ends_hanging_unseen_is_kept_from_locking(still: bool) -> 
         entered_s=10.0 - PROFILE.planner.landing.timeout_s,
     )
     tel = telemetry(9.8, HANG_Z_M, thrust=1000.0)
-    state, command = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
+    state, command = planner.step_mission(state, observation(10.02, telemetry=tel), PROFILE)
     assert state.phase is Phase.ABORTED
     assert isinstance(command, StopMotors) is still
 
@@ -508,7 +503,7 @@ def test_a_falling_vehicle_does_not_hang_at_its_contact() -> None:
     tel = telemetry(
         10.02, HANG_Z_M - 0.05, velocity_mps=(0.0, 0.0, -0.9), thrust=0.0, supervisor=READY | LOCKED
     )
-    state, _ = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
+    state, _ = planner.step_mission(state, observation(10.02, telemetry=tel), PROFILE)
     assert state.phase is not Phase.PERCHED
 
 
@@ -518,7 +513,7 @@ def test_without_a_heading_a_slip_is_not_caught_by_position() -> None:
         state_in(Phase.LANDING, z_m=1.8), caught=False, catch_above_m=0.2, heading_lost=True
     )
     tel = telemetry(10.02, 1.8, velocity_mps=(0.0, 0.0, -0.5))
-    state, command = planner.step(state, observation(10.02, telemetry=tel), PROFILE)
+    state, command = planner.step_mission(state, observation(10.02, telemetry=tel), PROFILE)
     assert isinstance(command, RawThrust)
     assert state.caught
 
@@ -544,8 +539,8 @@ def test_a_completion_whose_telemetry_stands_still_ends(
     for i in range(1, 50 * 50):
         t_s = 10.0 + 0.02 * i
         tel = telemetry(t_s, HANG_Z_M, **frozen)
-        state, command = planner.step(state, felt(observation(t_s, telemetry=tel)), profile)
+        state, command = planner.step_mission(state, felt(observation(t_s, telemetry=tel)), profile)
         assert isinstance(command, (StopMotors, Idle))
-        if planner.is_over(state):
+        if planner.is_mission_over(state):
             break
     assert state.phase is ends

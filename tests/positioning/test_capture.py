@@ -18,7 +18,7 @@ from perchctl.positioning import FeedThread, PositionFeed, open_capture
 from perchctl.positioning import capture as capture_module
 from perchctl.positioning.capture import MotionCapture, setup_of
 from perchctl.positioning.child import CaptureSetup
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 from tests.positioning.fake_library import write_library
 

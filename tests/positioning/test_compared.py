@@ -27,7 +27,7 @@ from perchctl.positioning.compared import (
     decoded,
     encoded,
 )
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from tests.helpers.capture import compared as was_compared
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")
@@ -119,11 +119,11 @@ def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
     """Two vehicles with the same body's name by turns."""
     was_compared(CONFIG, OTHER_URI)
     with pytest.raises(SafetyAbort) as refused:
-        positions.check_compared(CONFIG, URI, simulated=False)
+        positions.require_comparison(CONFIG, URI, simulated=False)
     said = str(refused.value)
     assert f"compared with another vehicle ({OTHER}), and never with this one ({VEHICLE})" in said
     assert "run perchctl check --lift" in said
-    positions.check_compared(CONFIG, OTHER_URI, simulated=False)
+    positions.require_comparison(CONFIG, OTHER_URI, simulated=False)
     # Nor by a file that was copied to its place; what is damaged beside it is no vehicle.
     (mine, theirs) = (compared.path_of(compared.set_up_of(CONFIG, v)) for v in (VEHICLE, OTHER))
     mine.write_bytes(theirs.read_bytes())
@@ -137,9 +137,9 @@ def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
 
 def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:
     was_compared(CONFIG, "radio://0/80/2M/E7E7E7E701")
-    positions.check_compared(CONFIG, "radio://1/80/2M/e7e7e7e701", simulated=False)
+    positions.require_comparison(CONFIG, "radio://1/80/2M/e7e7e7e701", simulated=False)
     with pytest.raises(SafetyAbort, match="another vehicle"):
-        positions.check_compared(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
+        positions.require_comparison(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
 
 
 def test_what_says_nothing_of_the_axes_is_no_other_set_up() -> None:
@@ -165,10 +165,10 @@ def spoil(how: str) -> None:
 @pytest.mark.parametrize("how", ["empty", "cut", "huge", "no zone", "deep", "folder", "of old"])
 def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
     was_compared(CONFIG, URI)
-    positions.check_compared(CONFIG, URI, simulated=False)
+    positions.require_comparison(CONFIG, URI, simulated=False)
     spoil(how)
     with pytest.raises(SafetyAbort, match=r"is not known: .*remove that file") as refused:
-        positions.check_compared(CONFIG, URI, simulated=False)
+        positions.require_comparison(CONFIG, URI, simulated=False)
     assert "\n" not in str(refused.value)
 
 
@@ -183,10 +183,10 @@ def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
     row = check_compared.kept(lifted, CONFIG, URI, positions.wall_date())
     assert row.verdict is Verdict.WARN
     with pytest.raises(SafetyAbort, match=lifted.found):
-        positions.check_compared(CONFIG, URI, simulated=False)
+        positions.require_comparison(CONFIG, URI, simulated=False)
     again = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, positions.wall_date())
     assert again.verdict is Verdict.PASS
-    positions.check_compared(CONFIG, URI, simulated=False)
+    positions.require_comparison(CONFIG, URI, simulated=False)
 
 
 def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
@@ -203,7 +203,7 @@ def test_a_record_that_cannot_be_written_warns(folder: Path) -> None:
     assert row.verdict is Verdict.WARN
     assert "not written" in row.found
     with pytest.raises(SafetyAbort):
-        positions.check_compared(CONFIG, URI, simulated=False)
+        positions.require_comparison(CONFIG, URI, simulated=False)
 
 
 @pytest.mark.parametrize("removable", [True, False])
@@ -222,13 +222,13 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     assert "No space left" in row.found
     if removable:
         with pytest.raises(SafetyAbort, match="never compared"):
-            positions.check_compared(CONFIG, URI, simulated=False)
+            positions.require_comparison(CONFIG, URI, simulated=False)
 
 
 def test_decks_and_the_simulator_s_own_room_ask_for_none() -> None:
     deck = CONFIG.model_copy(update={"by": "deck"})
     for config, simulated in ((deck, False), (CONFIG, True)):
-        positions.check_compared(config, URI, simulated=simulated)
+        positions.require_comparison(config, URI, simulated=simulated)
         assert check_compared.comparison_rows(config, URI, NOW, simulated=simulated) == []
 
 

@@ -31,7 +31,7 @@ from perchctl.positioning import (
 from perchctl.positioning import feed as feeding
 from perchctl.positioning.feed import QUIET_S
 from perchctl.positioning.judge import STALE_S
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 
 FEW = settings(max_examples=20)  # each example is a flight

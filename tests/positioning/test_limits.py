@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from pydantic import ValidationError
 
-from perchctl.profile.positioning import MOST_LATENCY_S, PositioningConfig
+from perchctl.profile import PositioningConfig
+from perchctl.profile.positioning import MOST_LATENCY_S
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,7 @@ from perchctl.cli import app
 from perchctl.commands.complete import positionings
 from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
-from perchctl.profile import Profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, Profile
 from perchctl.startup import failure_record
 from perchctl.weights.truth import open_named
 

@@ -13,7 +13,7 @@ from perchctl.geometry import Place
 from perchctl.positioning import SightFeed
 from perchctl.positioning.sight import GROUND_FRAMES, OLDEST_S, body_place, target_place
 from perchctl.vehicle import ExternalPosition
-from perchctl.vision.types import Attitude, MarkerPose
+from perchctl.vision import Attitude, MarkerPose
 from tests.helpers.mission import target_at
 from tests.helpers.sights import SETUP, TARGET_ONLY, attitude, seen
 

@@ -9,9 +9,8 @@ import yaml
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.files import mode_of
-from perchctl.profile import load_profile
-from perchctl.profile.edit import with_values, writable_profile, write_values
-from perchctl.profile.places import data_folder
+from perchctl.profile import data_folder, load_profile, writable_profile, write_profile_values
+from perchctl.profile.edit import with_values
 
 MEASURED = {
     "camera.mount.rpy_deg": (-0.41, 0.9, 89.62),
@@ -79,7 +78,7 @@ def test_the_old_file_is_kept_beside_and_never_lost(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("extends: crazyflie\ncamera:\n  latency_s: 0.1  # a guess\n", encoding="utf-8")
     first = path.read_text(encoding="utf-8")
-    asides = [write_values(path, {"camera.latency_s": number}) for number in (0.09, 0.08)]
+    asides = [write_profile_values(path, {"camera.latency_s": number}) for number in (0.09, 0.08)]
     assert [aside.name for aside in asides] == ["mine.yaml.bak", "mine.yaml.bak2"]
     assert asides[0].read_text(encoding="utf-8") == first
     assert asides[1].read_text(encoding="utf-8") == first.replace("0.1 ", "0.09 ")
@@ -91,7 +90,7 @@ def test_what_cannot_be_written_says_the_numbers(tmp_path: Path) -> None:
     text = "camera: {latency_s: &late 0.1}\nsimulation: {camera_jitter_s: *late}\n"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InvalidValue, match=r"mine.yaml: .*write them.*camera.latency_s: 0.09$"):
-        write_values(path, {"camera.latency_s": 0.09})
+        write_profile_values(path, {"camera.latency_s": 0.09})
     assert path.read_text(encoding="utf-8") == text
     assert [p.name for p in tmp_path.iterdir()] == ["mine.yaml"]
 
@@ -113,7 +112,7 @@ def test_a_profile_that_would_not_load_is_left_as_it_was(
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
     (dotted,) = values
     with pytest.raises(InvalidValue, match=rf"would not load.*{fault}.*write them.*{dotted}: "):
-        write_values(path, values)
+        write_profile_values(path, values)
     assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
@@ -121,7 +120,7 @@ def test_what_is_asked_before_the_writing_says_no_old_key_again(tmp_path: Path) 
     """The tests make a warning an error."""
     path = tmp_path / "mine.yaml"
     path.write_text("extends: sim\ncamera: {T_body_cam: {rpy_deg: [0, 0, 9]}}\n", encoding="utf-8")
-    write_values(path, {"camera.latency_s": 0.09})
+    write_profile_values(path, {"camera.latency_s": 0.09})
 
 
 def test_permissions_stay_and_the_old_text_is_for_the_same_eyes(tmp_path: Path) -> None:
@@ -129,7 +128,7 @@ def test_permissions_stay_and_the_old_text_is_for_the_same_eyes(tmp_path: Path) 
     for mode in (0o600, 0o664):
         path.write_text("extends: crazyflie\n", encoding="utf-8")
         path.chmod(mode)
-        aside = write_values(path, {"camera.latency_s": 0.09})
+        aside = write_profile_values(path, {"camera.latency_s": 0.09})
         assert (mode_of(path), mode_of(aside)) == (mode, mode)
 
 

@@ -10,8 +10,8 @@ import pytest
 from pydantic import ValidationError
 
 from perchctl.check.limits import DOUBTFUL
-from perchctl.profile import Profile
-from perchctl.profile.limits import IMPOSSIBLE, Limit
+from perchctl.profile import Limit, Profile
+from perchctl.profile.limits import IMPOSSIBLE
 from tests.helpers.flights import short_profile
 
 BROKEN: tuple[Mapping[str, Any], ...] = (

@@ -22,9 +22,14 @@ from perchctl.commands.new_profile import NewProfileRequest, run
 from perchctl.commands.new_profile_answers import QUESTIONS, WRITTEN
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import mode_of
-from perchctl.profile import find_calibration, load_profile
+from perchctl.profile import (
+    PICTURE_EDGES,
+    edges_beside,
+    find_calibration,
+    load_profile,
+    picture_edges,
+)
 from perchctl.profile.keys import keys
-from perchctl.profile.picture import EDGES, edges_beside, edges_of
 from tests.profile.test_written import uncommented
 
 mm = st.decimals(-299, 299, places=1).map(str)
@@ -34,7 +39,7 @@ places = st.tuples(mm, mm, mm).filter(lambda place: any(abs(float(x)) >= 1 for x
 @st.composite
 def answers(draw: st.DrawFn) -> dict[str, str]:
     """Allowed answers to all questions."""
-    front = draw(st.sampled_from(sorted(EDGES)))
+    front = draw(st.sampled_from(sorted(PICTURE_EDGES)))
     large = draw(st.decimals(20, 400, places=1))
     simulated = draw(st.booleans())
     return {
@@ -65,7 +70,7 @@ def test_the_file_loads_and_equals_what_was_answered(said: dict[str, str]) -> No
     assert (mine.link.uri, mine.camera.source) == (said["uri"], said["source"])
     assert mine.camera.latency_s == pytest.approx(float(said["latency"]) / 1e3, abs=1e-12)
     assert find_calibration(mine.camera.calibration).name == "example_640x480.yaml"
-    assert edges_of(mine.camera.mount, mine.camera.mirrored) == (said["front"], said["left"])
+    assert picture_edges(mine.camera.mount, mine.camera.mirrored) == (said["front"], said["left"])
     for key, found in (
         ("camera", mine.camera.mount.position_m),
         ("gear", mine.vehicle.gear_body_m),
@@ -107,7 +112,7 @@ def test_enter_takes_every_default(tmp_path: Path) -> None:
     assert one.link.uri.startswith("radio://")
 
 
-@pytest.mark.parametrize("front", sorted(EDGES))
+@pytest.mark.parametrize("front", sorted(PICTURE_EDGES))
 def test_a_mirrored_picture_is_asked_about_and_named(
     front: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -256,7 +261,7 @@ def test_a_dialogue_that_is_left_says_how_to_go_on(
     assert done.exit_code == 0, done.output
     mine = load_profile(str(output))
     assert (mine.link.uri, mine.vehicle.gear_body_m) == ("usb://0", (0.0, 0.0, 0.031))
-    assert edges_of(mine.camera.mount, mine.camera.mirrored) == ("left", "top")
+    assert picture_edges(mine.camera.mount, mine.camera.mirrored) == ("left", "top")
 
 
 def test_nobody_to_ask_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

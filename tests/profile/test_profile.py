@@ -11,11 +11,10 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 import perchctl
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.commands.profile import ProfileRequest, run
 from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
-from perchctl.profile import Profile, find_calibration, load_profile
-from perchctl.profile.places import listing
+from perchctl.profile import Profile, file_names, find_calibration, load_profile
 
 
 @pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"])
@@ -25,7 +24,7 @@ def test_shipped_profiles_load(name: str) -> None:
 
 def test_the_shipped_profiles_are_all_listed() -> None:
     assert {"sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"} <= set(
-        listing("profiles")
+        file_names("profiles")
     )
 
 

@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 import yaml
 
-from perchctl.profile import Mounting, Profile, load_profile
+from perchctl.profile import (
+    PICTURE_EDGES,
+    Mounting,
+    Profile,
+    edges_beside,
+    editor_schema,
+    load_profile,
+    mount_from_edges,
+    picture_edges,
+    profile_text,
+)
 from perchctl.profile.keys import keys
-from perchctl.profile.picture import EDGES, edges_beside, edges_of, mount_from_edges
-from perchctl.profile.written import editor_schema, profile_text
 from tests.helpers.flights import short_profile
 
 HOSTILE = "a: b # c, 'd' \"e\" [f] {g} \\ \N{GREEK SMALL LETTER MU}\nnext: line"
@@ -68,7 +76,7 @@ def test_the_schema_holds_each_key_with_meaning_and_unit() -> None:
 PLACES = {"front": (1.0, 0.0, 0.0), "left": (0.0, 1.0, 0.0)}
 
 
-@pytest.mark.parametrize("front", EDGES)
+@pytest.mark.parametrize("front", PICTURE_EDGES)
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_a_hand_over_the_vehicle_comes_in_where_it_was_said(front: str, mirrored: bool) -> None:
     """A point above the vehicle's front, or its left side, is seen at that edge."""
@@ -81,10 +89,10 @@ def test_a_hand_over_the_vehicle_comes_in_where_it_was_said(front: str, mirrored
         x, y, z = mount.T_body_cam[:3, :3].T @ above
         seen = (-x if mirrored else x, y)  # in the picture as the camera gives it
         assert z > 0
-        np.testing.assert_allclose(seen, EDGES[edge], atol=1e-12)
-    assert edges_of(mount, mirrored) == (front, left)
+        np.testing.assert_allclose(seen, PICTURE_EDGES[edge], atol=1e-12)
+    assert picture_edges(mount, mirrored) == (front, left)
 
 
 @pytest.mark.parametrize("rpy_deg", [(180, 0, 0), (0, 0, 45), (0, 90, 0)])
 def test_a_camera_that_fits_no_edges_has_none(rpy_deg: tuple[float, float, float]) -> None:
-    assert edges_of(Mounting(rpy_deg=rpy_deg), False) is None
+    assert picture_edges(Mounting(rpy_deg=rpy_deg), False) is None

@@ -11,10 +11,9 @@ from typing import Any
 
 import pytest
 
-from perchctl.log.read import FlightLog, read_log
-from perchctl.log.setup import other_computer
+from perchctl.log import FlightLog, computer_differences, read_log
 from perchctl.log.write import SCHEMA_VERSION
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase
 from perchctl.replay import replay
 from perchctl.replay.run import Replay
 from perchctl.replay.told import difference_text
@@ -41,7 +40,7 @@ def test_the_planner_decides_as_it_did(name: str) -> None:
     if found.first is None:
         assert found.ticks > 50
         return
-    assert other_computer(found.log.header), f"{difference_text(found.first)}; {ANEW}"
+    assert computer_differences(found.log.header), f"{difference_text(found.first)}; {ANEW}"
     assert not _beyond_last_bits(found), f"{difference_text(found.first)}; {ANEW}"
 
 

@@ -11,9 +11,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.faults import FAULTS
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.flight.campaign import fly_seed
-from perchctl.log.read import read_log
-from perchctl.log.recording import pictures_of
-from perchctl.profile.changed import changed
+from perchctl.log import read_log, recorded_pictures
+from perchctl.profile import changed_profile
 from perchctl.replay import pose_changes, replay
 from perchctl.replay.run import Replay
 from tests.helpers.flights import short_profile
@@ -41,7 +40,7 @@ def recorded(folder: Path, seed: int) -> Replay:
     """Fly with pictures; decide and see again."""
     path = folder / "f.jsonl"
     fly_seed(short_profile(), seed, path, record=True)
-    return replay(read_log(path), pictures_of(path))
+    return replay(read_log(path), recorded_pictures(path))
 
 
 def check_seen(found: Replay) -> None:
@@ -65,8 +64,8 @@ def test_a_recorded_flight_is_seen_again(tmp_path: Path) -> None:
     check_seen(recorded(tmp_path, 0))
     path = tmp_path / "f.jsonl"
     log = read_log(path)
-    nearer = changed(short_profile(), ["vehicle.gear_body_m=[0, 0, 0.031]"])
-    found = replay(log, pictures_of(path), nearer)
+    nearer = changed_profile(short_profile(), ["vehicle.gear_body_m=[0, 0, 0.031]"])
+    found = replay(log, recorded_pictures(path), nearer)
     assert found.changed == ("vehicle.gear_body_m",)
     joint = next(change for change in pose_changes(found) if change.name == "joint")
     moved_m = 0.031 - short_profile().vehicle.gear_body_m[2]

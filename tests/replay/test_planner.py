@@ -17,20 +17,25 @@ import perchctl
 from perchctl.commands import log_plot, log_replay
 from perchctl.commands.log_replay import ReplayRequest
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
-from perchctl.log.exact import to_exact
-from perchctl.log.jsonl import line_of
-from perchctl.log.read import FlightLog, read_log
-from perchctl.log.setup import camera_in, mask_in, profile_of
+from perchctl.log import (
+    FlightLog,
+    flown_camera,
+    flown_mask,
+    flown_profile,
+    json_line,
+    read_log,
+    to_exact,
+)
 from perchctl.log.write import FlightLogWriter, make_header
-from perchctl.mission import conditions, guidance, planner
-from perchctl.profile import Profile
-from perchctl.profile.changed import changed
+from perchctl.mission import conditions, guidance, step_mission
+from perchctl.profile import Profile, changed_profile
 from perchctl.replay import changed_gates, replay, replay_lines, replay_record
 from perchctl.replay.compare import first_differing, same
 from perchctl.replay.run import changed_keys
 from perchctl.replay.whatif import CAUTION, Gate
 from perchctl.vehicle import Idle, PositionSetpoint, RawThrust, StopMotors
 from tests.helpers.commands import run
+from tests.helpers.hangs import plan_by
 from tests.replay.test_corpus import FOLDER, corpus
 
 PERCHED = FOLDER / "perched.jsonl.gz"
@@ -47,7 +52,7 @@ def log_of(folder: Path, lines: list[bytes], name: str = "f.jsonl") -> Path:
 
 
 def altered(line: bytes, **changes: Any) -> bytes:
-    return line_of(json.loads(line) | changes)
+    return json_line(json.loads(line) | changes)
 
 
 # --- the same planner, and another ---------------------------------------------------------
@@ -86,7 +91,7 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """And passes a log of version 3, which does not hold it."""
-    step = planner.step
+    step = step_mission
 
     def says_otherwise(state: Any, obs: Any, profile: Any) -> Any:
         new, command = step(state, obs, profile)
@@ -95,7 +100,7 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
     log, old = corpus("hung"), corpus("perched")
     at = [turn for turn in log.turns if turn.role == "flown"]
     first = next(k for k, turn in enumerate(at) if "hovering" in (turn.reason or ""))
-    monkeypatch.setattr(planner, "step", says_otherwise)
+    plan_by(monkeypatch, says_otherwise)
     found = replay(log)
     assert found.first is not None
     assert (found.first.tick, found.first.field) == (first, "reason")
@@ -106,7 +111,7 @@ def test_a_changed_word_of_the_planner_is_named_by_tick_and_field(
 
 
 def test_a_planner_that_broke_down_has_to_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    step, log = planner.step, replace(corpus("hung"))
+    step, log = step_mission, replace(corpus("hung"))
     *turns, last = log.turns
     failed = replace(
         last, role="failed", command=None, phase=None, outcome=None, reason=None, error="KeyError"
@@ -123,7 +128,7 @@ def test_a_planner_that_broke_down_has_to_again(monkeypatch: pytest.MonkeyPatch)
             raise KeyError("by the test")
         return step(state, obs, profile)
 
-    monkeypatch.setattr(planner, "step", fails)
+    plan_by(monkeypatch, fails)
     again = replay(log)
     assert again.same
     assert any("breaks down on turn" in note for note in again.notes)
@@ -207,7 +212,7 @@ def test_a_lost_record_ends_the_replay(tmp_path: Path) -> None:
 
 def test_a_log_of_before_has_no_turns(tmp_path: Path) -> None:
     header = {**json.loads(lines_of()[0]), "version": 2, "perchctl": "0.1.0"}
-    log = read_log(log_of(tmp_path, [line_of(header)]))
+    log = read_log(log_of(tmp_path, [json_line(header)]))
     assert log.turns == []
     with pytest.raises(InvalidValue, match=r"perchctl 0\.1\.0 wrote it.*cannot be replayed"):
         replay(log)
@@ -234,13 +239,13 @@ def test_the_header_s_profile_is_the_flown_one_to_the_bit(tmp_path: Path) -> Non
     writer = FlightLogWriter.open(tmp_path / "f.jsonl", make_header(profile, uri="", source=""))
     writer.close()
     log = read_log(writer.path)
-    back = profile_of(log.header)
+    back = flown_profile(log.header)
     assert changed_keys(profile, back) == ("camera.source",)
     assert back.safety.jump_m == 0.1 + 0.2
     assert b"secret" not in writer.path.read_bytes()
-    camera = camera_in(log.header)
+    camera = flown_camera(log.header)
     assert camera is not None
-    assert mask_in(log.header, camera) is None
+    assert flown_mask(log.header, camera) is None
 
 
 def test_a_mask_goes_with_the_log(tmp_path: Path) -> None:
@@ -253,14 +258,14 @@ def test_a_mask_goes_with_the_log(tmp_path: Path) -> None:
     profile = Profile.model_validate({"camera": {"mask": str(tmp_path / "mask.png")}})
     header = json.loads(json.dumps(to_exact(make_header(profile, uri="", source=""))))
     (tmp_path / "mask.png").unlink()
-    camera = camera_in(header)
+    camera = flown_camera(header)
     assert camera is not None
-    mask = mask_in(header, camera)
+    mask = flown_mask(header, camera)
     assert mask is not None
     assert np.array_equal(mask, picture > 0)
     header["mask"] = base64.b64encode(zlib.compress(bytes(40_000_000))).decode()
     tracemalloc.start()
-    mask = mask_in(header, camera)
+    mask = flown_mask(header, camera)
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert mask is not None
@@ -273,8 +278,10 @@ def test_a_mask_goes_with_the_log(tmp_path: Path) -> None:
 
 def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
     log = corpus("perched")
-    dwell_s = profile_of(log.header).planner.ascend.settle_dwell_s
-    later = changed(profile_of(log.header), [f"planner.ascend.settle_dwell_s={dwell_s + 0.2}"])
+    dwell_s = flown_profile(log.header).planner.ascend.settle_dwell_s
+    later = changed_profile(
+        flown_profile(log.header), [f"planner.ascend.settle_dwell_s={dwell_s + 0.2}"]
+    )
     found = replay(log, None, later)
     assert found.changed == ("planner.ascend.settle_dwell_s",)
     assert found.first is not None
@@ -292,7 +299,7 @@ def test_what_if_names_tick_gates_and_what_it_cannot_know() -> None:
 
 def test_what_if_nothing_would_differ() -> None:
     log = corpus("perched")
-    wider = changed(profile_of(log.header), ["safety.max_height_m=9"])
+    wider = changed_profile(flown_profile(log.header), ["safety.max_height_m=9"])
     found = replay(log, None, wider)
     assert found.same
     assert changed_gates(found) == []
@@ -302,7 +309,7 @@ def test_what_if_nothing_would_differ() -> None:
 def test_what_acts_on_pictures_only_is_said() -> None:
     log = corpus("perched")
     found = replay(
-        log, None, changed(profile_of(log.header), ["kalman.n_max=3", "link.loop_hz=20"])
+        log, None, changed_profile(flown_profile(log.header), ["kalman.n_max=3", "link.loop_hz=20"])
     )
     assert any(
         n.startswith("kalman.n_max: what it would change in the pictures") for n in found.notes
@@ -335,13 +342,13 @@ def test_gates_are_counted_in_words(times_s: tuple[float, ...], text: str) -> No
 )
 def test_a_setting_that_is_none(setting: str, error: type[Exception], why: str) -> None:
     with pytest.raises(error) as caught:
-        changed(Profile(), [setting])
+        changed_profile(Profile(), [setting])
     assert why in str(caught.value)
     assert "--set" in str(caught.value)
 
 
 def test_settings_follow_one_another() -> None:
-    profile = changed(
+    profile = changed_profile(
         Profile(),
         ["planner.align.xy_m=0.02", "planner.align.xy_m=0.03", "link.parameters={a.b: 1}"],
     )
@@ -403,14 +410,14 @@ def test_a_fault_of_the_planner_is_not_the_file_s(
         raise ValueError("by the test")
 
     path = log_of(tmp_path, lines_of()[:120])
-    monkeypatch.setattr("perchctl.mission.planner.step", fails)
+    plan_by(monkeypatch, fails)
     code = log_replay.run(ReplayRequest(path, as_json=True))
     found = json.loads(capsys.readouterr().out)
     assert code == 61
     assert found["first_difference"]["field"] == "error"
     assert found["first_difference"]["replayed"] == "ValueError"
     assert (found["ticks"], found["differences"]) == (1, 1)
-    monkeypatch.setattr("perchctl.log.plot.plot_flight", fails)
+    monkeypatch.setattr("perchctl.log.plot_flight", fails)
     with pytest.raises(ValueError, match="by the test"):
         log_plot.run(log_plot.PlotRequest(path))
 

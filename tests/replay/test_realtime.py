@@ -14,13 +14,11 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.calibration.files import load_calibration
-from perchctl.log.read import read_log
-from perchctl.log.recording import pictures_of
+from perchctl.calibration import load_calibration
+from perchctl.log import read_log, recorded_pictures
 from perchctl.profile import find_calibration, load_profile
 from perchctl.replay import replay
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import SimProcess, draw_scenario
 from tests.helpers.flights import ROOT, SEED, SHORT
 
 FLIGHT_LIMIT_S = 120.0
@@ -54,7 +52,7 @@ def test_a_flight_in_real_time_replays(tmp_path: Path) -> None:
     to the bit."""
     path = flown(tmp_path)
     log = read_log(path)
-    found = replay(log, pictures_of(path))
+    found = replay(log, recorded_pictures(path))
     assert found.first is None
     assert found.seen is not None
     assert (found.seen.first, found.seen.ended) == (None, "")

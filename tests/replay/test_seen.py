@@ -21,9 +21,7 @@ from typing import Any
 
 import pytest
 
-from perchctl.log.exact import to_exact
-from perchctl.log.recording import pictures_of
-from perchctl.log.setup import other_computer
+from perchctl.log import computer_differences, recorded_pictures, to_exact
 from perchctl.replay import replay
 from perchctl.replay.run import Replay
 from perchctl.replay.told import difference_text
@@ -46,7 +44,7 @@ ELSEWHERE = {
 
 
 def seen_again() -> Replay:
-    return replay(corpus("seen"), pictures_of(FOLDER / "seen.mcap"))
+    return replay(corpus("seen"), recorded_pictures(FOLDER / "seen.mcap"))
 
 
 def beyond(found: Replay) -> list[tuple[int, str, Any, Any]]:
@@ -86,7 +84,7 @@ def test_the_pictures_show_what_they_showed() -> None:
     assert found.seen is not None
     assert (found.seen.frames, found.seen.ended) == (PICTURES, "")
     assert not beyond(found), f"{beyond(found)[:1]}; {ANEW}"
-    if not other_computer(found.log.header):
+    if not computer_differences(found.log.header):
         first = found.seen.first
         assert first is None, f"{difference_text(first)}; {ANEW}"
 

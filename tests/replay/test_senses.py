@@ -11,18 +11,15 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.flight import senses
-from perchctl.flight.loop import fly
-from perchctl.log.read import FlightLog, read_log
-from perchctl.log.watch import LogWatcher
+from perchctl.flight import fly, senses
+from perchctl.log import FlightLog, LogWatcher, read_log
 from perchctl.log.write import FlightLogWriter, make_header
-from perchctl.mission.state import Operator, Phase
-from perchctl.mission.watch import Tick
+from perchctl.mission import Operator, Phase, Tick
 from perchctl.pipeline import FieldState, Pipeline
-from perchctl.profile.changed import changed
+from perchctl.profile import changed_profile
 from perchctl.replay import Picture, replay, replay_lines, replay_record
 from perchctl.replay.run import Replay
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle
 
@@ -134,7 +131,9 @@ def test_with_another_latency_the_pictures_are_of_another_time(
     as_flown_s = given_s.copy()
     given_s.clear()
     latency_s = PROFILE.camera.start_latency_s + 0.02
-    found = replay(log, flight[1], changed(PROFILE, [f"camera.latency_s={latency_s}"]), Rig().setup)
+    found = replay(
+        log, flight[1], changed_profile(PROFILE, [f"camera.latency_s={latency_s}"]), Rig().setup
+    )
     assert found.seen is not None
     assert not found.seen.ended
     assert given_s == pytest.approx([t_s - 0.02 for t_s in as_flown_s])
@@ -186,7 +185,7 @@ def test_a_recording_that_cannot_be_read_costs_the_planner_nothing(
     assert part.seen is not None
     assert part.seen.frames > 5
     assert part.same
-    other = changed(PROFILE, ["kalman.n_max=3"])
+    other = changed_profile(PROFILE, ["kalman.n_max=3"])
     what_if = replay(log, damaged([], error), other, Rig().setup)
     assert what_if.ticks == found.ticks
     assert any(note.startswith("kalman.n_max: ") for note in what_if.notes)

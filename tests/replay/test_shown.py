@@ -14,22 +14,17 @@ from pathlib import Path
 import pytest
 
 import perchctl.mission
-from perchctl.camera.health import MEANING
-from perchctl.flight import history
-from perchctl.flight.senses import SENSED
-from perchctl.log.read import FlightLog
-from perchctl.log.setup import profile_of
-from perchctl.mission.turn import Turn
-from perchctl.profile import Profile
-from perchctl.profile.changed import changed
-from perchctl.profile.mission import SafetyConfig
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.camera import VERDICT_TEXTS
+from perchctl.flight import SENSED, history
+from perchctl.log import FlightLog, flown_profile
+from perchctl.mission import Turn
+from perchctl.profile import PositioningConfig, Profile, SafetyConfig, changed_profile
 from perchctl.replay import replay, replay_lines, replay_record
 from perchctl.replay.compare import first_differing, same
 from perchctl.replay.run import Replay
 from perchctl.replay.shown import shown
 from perchctl.vehicle import Telemetry
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.loop_rig import PROFILE, Camera, Rig
 from tests.replay.test_corpus import corpus
 from tests.replay.test_senses import begun, flown
@@ -38,13 +33,13 @@ JUDGED = ("jumped", "turned_rad", "battery_age_s", "camera_age_s", "new_frame", 
 
 
 def what_if(log: FlightLog, *settings: str) -> Replay:
-    return replay(log, None, changed(profile_of(log.header), settings))
+    return replay(log, None, changed_profile(flown_profile(log.header), settings))
 
 
 def flown_by(log: FlightLog, *settings: str) -> FlightLog:
     """The log of a flight by another profile, which was shown what that makes of it."""
-    was = profile_of(log.header)
-    profile = changed(was, settings)
+    was = flown_profile(log.header)
+    profile = changed_profile(was, settings)
     turns = [
         replace(each.turn, observation=each.observation) for each in shown(log.turns, was, profile)
     ]
@@ -84,7 +79,7 @@ def stepped(key: str) -> FlightLog:
         else replace(turn, taken=replace(turn.taken, samples=tuple(map(step, turn.taken.samples))))
         for turn in log.turns
     ]
-    return with_turns(log, turns, profile_of(log.header))
+    return with_turns(log, turns, flown_profile(log.header))
 
 
 @pytest.mark.parametrize("key", STEPS)
@@ -193,7 +188,7 @@ def test_with_pictures_it_is_judged_alike(tmp_path: Path, setting: str) -> None:
     """What needs none is the same to the bit as by the loop's own senses, with pictures."""
     log, pictures = flown(tmp_path, Rig(camera=Unsteady()))
     log = begun(log)
-    other = changed(PROFILE, [setting])
+    other = changed_profile(PROFILE, [setting])
     seen = replay(log, pictures, other, Rig().setup).seen
     alone = replay(log, None, other).shown
     assert seen is not None
@@ -215,7 +210,7 @@ def test_with_pictures_it_is_judged_alike(tmp_path: Path, setting: str) -> None:
 def test_another_latency_of_a_capture_makes_positions_older() -> None:
     log = corpus("external-occluded")
     found = what_if(log, "positioning={by: mocap, latency_s: 0.04, host: x}")
-    later_s = 0.04 - profile_of(log.header).positioning.latency_s
+    later_s = 0.04 - flown_profile(log.header).positioning.latency_s
     assert found.shown is not None
     assert found.shown.first is not None
     assert found.shown.first.field == "position_age_s"
@@ -268,5 +263,5 @@ def test_what_was_asked_before_take_off_is_said() -> None:
 
 def test_repeated_and_late_are_told_apart() -> None:
     """By their words: a late picture is found in a log by its own."""
-    assert not any("late" in text for text in MEANING.values())
+    assert not any("late" in text for text in VERDICT_TEXTS.values())
     assert {*JUDGED} < {*SENSED}

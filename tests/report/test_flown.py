@@ -17,10 +17,10 @@ from perchctl.faults import FaultResult
 from perchctl.faults.catalogue import BY_NAME, Case
 from perchctl.faults.effects import FOR_EVER, CameraFault, Effect, Killed
 from perchctl.faults.flight import fly_with_fault
-from perchctl.log.read import read_log
-from perchctl.mission.state import Phase
+from perchctl.log import read_log
+from perchctl.mission import Phase
 from perchctl.report import ReportedFlight, write_report
-from perchctl.sim.draw import draw_scenario
+from perchctl.sim import draw_scenario
 from tests.helpers.browser import Browser, browsing, why_no_browser
 from tests.helpers.flights import SEED, short_profile
 

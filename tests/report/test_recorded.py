@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.log.recording import pictures_of
+from perchctl.log import recorded_pictures
 from perchctl.log.recording.recorder import Recorder
 from perchctl.profile import Profile
 from perchctl.report.pictures import decisions_of
 from perchctl.report.track import Track
 from perchctl.report.write import told_of
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers import log as synthetic
 from tests.helpers.told import flown_s, made, written
 
@@ -41,9 +41,9 @@ def log(tmp_path: Path) -> Path:
 
 
 def test_single_pictures_are_given_and_no_others(log: Path) -> None:
-    every = [picture.number for picture in pictures_of(log)]
+    every = [picture.number for picture in recorded_pictures(log)]
     wanted = {every[3], every[40]}
-    some = list(pictures_of(log, numbers=wanted))
+    some = list(recorded_pictures(log, numbers=wanted))
     assert {picture.number for picture in some} == wanted
     for picture in some:
         np.testing.assert_array_equal(picture.image, grey(picture.number))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.mission.state import Phase
+from perchctl.mission import Phase
 from perchctl.report.losses import losses_of
 from perchctl.report.motion import exposure_s_of, focal_px_of, motion_of
 from perchctl.report.story import Sentence, story_of

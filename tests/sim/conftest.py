@@ -10,7 +10,7 @@ import pytest
 from tests.helpers.crtp_rig import Client, Pilot
 
 if TYPE_CHECKING:
-    from perchctl.sim.process.handle import SimProcess
+    from perchctl.sim import SimProcess
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
@@ -23,7 +23,7 @@ def toc_cache(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="session")
 def shared_pilot(toc_cache: str) -> Iterator[object]:
-    from perchctl.sim.process.handle import SimProcess
+    from perchctl.sim import SimProcess
 
     with SimProcess.start(pace="stepped") as sim:
         pilot = Pilot(sim, toc_cache)
@@ -41,7 +41,7 @@ def pilot(shared_pilot: object) -> object:
 
 @pytest.fixture(scope="module")
 def sim() -> Iterator[SimProcess]:
-    from perchctl.sim.process.handle import SimProcess
+    from perchctl.sim import SimProcess
 
     with SimProcess.start(pace="stepped") as process:
         process.advance(1.0)

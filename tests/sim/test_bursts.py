@@ -9,11 +9,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.faults.radio import FaultyRadio
-from perchctl.link.bursty import BurstyRadio, radio_of
-from perchctl.link.mock import TELEMETRY_DELAY_S, Radio
-from perchctl.sim.bursts import CONNECTED_S, Bursts
-from perchctl.sim.crtp.codec import Packet
-from perchctl.sim.scenario import Scenario
+from perchctl.link import Radio, simulated_radio
+from perchctl.link.bursty import BurstyRadio
+from perchctl.link.mock import TELEMETRY_DELAY_S
+from perchctl.sim import Bursts, Packet, Scenario
+from perchctl.sim.bursts import CONNECTED_S
 
 STEP_S = 0.005
 PACKET = Packet(7, 0, b"\x07")
@@ -59,9 +59,9 @@ def test_nothing_is_lost_before_the_take_off_nor_without_a_share() -> None:
 
 def test_both_directions_are_lost_together() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
-    radio, same = radio_of(scenario), Bursts(2, 0.3, 0.3)
+    radio, same = simulated_radio(scenario), Bursts(2, 0.3, 0.3)
     assert isinstance(radio, BurstyRadio)
-    assert type(radio_of(Scenario())) is Radio
+    assert type(simulated_radio(Scenario())) is Radio
     for step in range(4000):
         t_s = step * STEP_S
         lost = same.lost(t_s)
@@ -71,7 +71,7 @@ def test_both_directions_are_lost_together() -> None:
 
 def test_faults_are_laid_over_the_same_radio() -> None:
     scenario = Scenario(seed=2, radio_loss=0.3, radio_burst_s=0.3)
-    plain, faulty = radio_of(scenario), FaultyRadio(radio_of(scenario))
+    plain, faulty = simulated_radio(scenario), FaultyRadio(simulated_radio(scenario))
     for step in range(2000):
         t_s = step * STEP_S
         assert faulty.up(PACKET, t_s) is plain.up(PACKET, t_s)

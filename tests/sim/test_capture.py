@@ -14,17 +14,10 @@ import pytest
 from perchctl.errors import InvalidValue
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.positioning import CaptureFrame, Placed
-from perchctl.profile.positioning import PositioningConfig
-from perchctl.sim.capture.settings import (
-    MILLIMETRES,
-    SWAPPED_XY,
-    TRUE_AXES,
-    Y_UP,
-    CaptureFault,
-    CaptureSettings,
-    OtherBody,
-)
-from perchctl.sim.capture.system import LockstepCapture, SimCapture
+from perchctl.profile import PositioningConfig
+from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, LockstepCapture
+from perchctl.sim.capture.settings import SWAPPED_XY, TRUE_AXES, Y_UP, OtherBody
+from perchctl.sim.capture.system import SimCapture
 
 STEP_S = 0.002
 EXACT = CaptureSettings(position_noise_m=0.0, attitude_noise_rad=0.0, jitter_s=0.0)
@@ -111,7 +104,7 @@ def test_axes_scale_and_world() -> None:
     assert seen() == pytest.approx(AT)
     assert seen(CaptureFault(axes=Y_UP)) == pytest.approx((x, z, -y))
     assert seen(settings=replace(EXACT, axes=SWAPPED_XY)) == pytest.approx((y, -x, z))
-    assert seen(CaptureFault(scale=MILLIMETRES)) == pytest.approx((300.0, -200.0, 500.0))
+    assert seen(CaptureFault(scale=MILLIMETRES_PER_M)) == pytest.approx((300.0, -200.0, 500.0))
     turned = replace(EXACT, heading_rad=math.pi / 2, origin_m=(1.0, 0.0, 0.0))
     assert seen(settings=turned) == pytest.approx((1.0 - y, x, z))
     level = last(EXACT, CaptureFault(axes=Y_UP)).bodies["crazyflie"]

@@ -11,9 +11,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_rpy
+from perchctl.sim import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.carried import Stop, Way, lifted_and_turned
 from perchctl.sim.firmware.vehicle import Firmware
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.world import World
 
 HOME = (0.0, 0.0, 0.012)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from perchctl.sim import CONTROL_PERIOD_S
 from perchctl.sim.cell import Cell, CellKind
 from perchctl.sim.firmware.power import _LEVELS_V
-from perchctl.sim.scenario import CONTROL_PERIOD_S
 
 HOVER_A = 3.8
 

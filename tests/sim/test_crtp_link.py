@@ -10,7 +10,7 @@ import pytest
 from cflib.crtp.udpdriver import UdpDriver
 
 from perchctl.errors import ConnectionFailed
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import SimProcess
 from tests.helpers.crtp_rig import WAIT_S, Client
 
 # --- Connecting -------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from cflib.crazyflie.mem import MemoryElement
 
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import SimProcess
 from tests.helpers.crtp_client import _block
 from tests.helpers.crtp_rig import READY, WAIT_S, Client, Pilot
 

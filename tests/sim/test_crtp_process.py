@@ -17,10 +17,8 @@ from pathlib import Path
 import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue
-from perchctl.sim.crtp.codec import Packet, Port
-from perchctl.sim.process.handle import SimProcess
+from perchctl.sim import CONTROL_PERIOD_S, Packet, Port, Scenario, SimProcess
 from perchctl.sim.process.runner import MAX_LAG_S, Runner
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from tests.helpers.crtp_process import ROOT, WAIT_S, wired
 from tests.helpers.crtp_rig import Client
 

@@ -11,9 +11,8 @@ from cflib.crazyflie.syncCrazyflie import SyncCrazyflie
 from cflib.utils.power_switch import PowerSwitch
 
 from perchctl.errors import InvalidValue
+from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.handle import SimProcess
-from perchctl.sim.scenario import Scenario
 from tests.helpers.crtp_client import _block
 from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot
 

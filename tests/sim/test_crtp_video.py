@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
-from perchctl.profile.places import data_file
-from perchctl.sim.process.handle import SimProcess
+from perchctl.profile import data_file
+from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.process.mjpeg import MjpegServer
-from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 from tests.helpers.crtp_process import WAIT_S, _parts
 
 

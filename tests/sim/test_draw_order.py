@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.profile import SimulationConfig, load_profile
-from perchctl.sim.draw import draw_points, draw_scenario
+from perchctl.sim import draw_points, draw_scenario
 
 
 @pytest.mark.parametrize("frames", [None, (0, 0), (9, 9), (8, 9)])

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.profile import TargetConfig, load_profile
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.vehicle import SimulatedVehicle
+from perchctl.sim import SimulatedVehicle, draw_scenario
 from perchctl.values import replace
 
 PROFILE = load_profile("sim")
@@ -18,7 +17,7 @@ PROFILE = load_profile("sim")
 def test_time_in_leaps_shows_what_time_in_steps_shows(readout_s: float) -> None:
     scenario = replace(draw_scenario(PROFILE, 3), camera_readout_s=readout_s)
     leaping, stepping = (
-        SimulatedVehicle(scenario, camera_of(PROFILE.camera), TargetConfig()) for _ in range(2)
+        SimulatedVehicle(scenario, profile_camera(PROFILE.camera), TargetConfig()) for _ in range(2)
     )
     pictures: list[list[bytes]] = [[], []]
     for vehicle in (leaping, stepping):

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from perchctl.sim.body import REST_HEIGHT_M
+from perchctl.sim import REST_HEIGHT_M
 from perchctl.sim.firmware.commands import (
     HlGoTo,
     HlLand,

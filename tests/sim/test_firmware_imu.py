@@ -7,8 +7,8 @@ import math
 import pytest
 
 from perchctl.geometry import GRAVITY_MPS2
+from perchctl.sim import Scenario
 from perchctl.sim.firmware.imu import IMU_EVERY, Imu
-from perchctl.sim.scenario import Scenario
 from tests.helpers.firmware_rig import Rig
 from tests.sim.test_firmware_outside import (
     HERE,

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.sim.body import REST_HEIGHT_M
-from perchctl.sim.firmware import Firmware
+from perchctl.sim import REST_HEIGHT_M, Firmware
 from perchctl.sim.firmware.commands import HlGoTo, PositionCommand
 from perchctl.sim.firmware.controller import Pid
 from perchctl.sim.firmware.planner import AxisState, Polynomial

@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+from perchctl.sim import Scenario
 from perchctl.sim.gusts import Gust, blown
-from perchctl.sim.scenario import Scenario
 from perchctl.sim.wind import Wind
 from perchctl.sim.world import SUCTION_LENGTH_M
 

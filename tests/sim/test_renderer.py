@@ -19,10 +19,9 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.profile import TargetConfig
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.sim import Neighbour, Renderer, Scenario
 from perchctl.target.drawing import marker_corners_m
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])
 PLUMB_BOB = CameraModel((640, 480), K, np.array([-0.17, 0.04, 0.0004, -0.0007, -0.003]))

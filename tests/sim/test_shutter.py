@@ -11,14 +11,17 @@ import pytest
 
 from perchctl.geometry import Array, make_T, rot_z
 from perchctl.profile import Profile, TargetConfig
-from perchctl.sim.camera import SimCamera
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim import (
+    CONTROL_PERIOD_S,
+    Renderer,
+    Scenario,
+    SimCamera,
+    SimulatedVehicle,
+    draw_scenario,
+)
 from perchctl.sim.shutter import FLICKER_HZ, Shutter, blended
 from perchctl.sim.surfaces import Picture
-from perchctl.sim.vehicle import SimulatedVehicle
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = CameraModel((640, 480), K, np.zeros(5))

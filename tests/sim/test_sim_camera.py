@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array
 from perchctl.profile import TargetConfig
-from perchctl.sim.camera import DeliveredFrame, SimCamera
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.vehicle import SimulatedVehicle
-from perchctl.vision.types import CameraModel
+from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario, SimCamera, SimulatedVehicle
+from perchctl.sim.camera import DeliveredFrame
+from perchctl.vision import CameraModel
 
 
 @dataclass(frozen=True, eq=False)

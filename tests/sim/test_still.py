@@ -11,10 +11,9 @@ import pytest
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Renderer, Scenario
 from perchctl.sim.still import Stills, rounded
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 CAMERA = CameraModel(
     (320, 240), np.array([[200.0, 0, 159.5], [0, 200.0, 119.5], [0, 0, 1.0]]), np.zeros(5)

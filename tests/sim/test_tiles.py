@@ -15,13 +15,12 @@ import perchctl.sim.placed as placed
 import perchctl.sim.renderer as rendering
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
+from perchctl.sim import Neighbour, Renderer, Scenario
 from perchctl.sim.pixels import defocused
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Neighbour, Scenario
 from perchctl.sim.shutter import Shot
 from perchctl.sim.surfaces import SheetTexture
 from perchctl.sim.tiles import Reach, Tiles, pixels_of, tiles_of
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])
 CAMERA = CameraModel((640, 480), K, np.array([-0.17, 0.04, 0.0004, -0.0007, -0.003]))

@@ -11,14 +11,10 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.display.status import event_text
-from perchctl.flight.lockstep import fly_lockstep
-from perchctl.log.read import read_log
-from perchctl.mission.state import Phase, Severity
-from perchctl.mission.watch import Event, EventKeeper, EventKind
-from perchctl.sim.bursts import Bursts
-from perchctl.sim.draw import draw_scenario
-from perchctl.sim.scenario import Scenario
-from perchctl.sim.told import Teller
+from perchctl.flight import fly_lockstep
+from perchctl.log import read_log
+from perchctl.mission import Event, EventKeeper, EventKind, Phase, Severity
+from perchctl.sim import Bursts, EventExplainer, Scenario, draw_scenario
 from tests.helpers.flights import SEED, short_profile
 
 BURST = Scenario(camera_rate_hz=30.0, camera_burst=(10.0, 15))
@@ -35,73 +31,75 @@ def hold(reason: str) -> Event:
 
 @pytest.mark.parametrize("row", ["estimate-lost", "align-lost", "ascend-lost", "camera-gone"])
 def test_lost_frames_are_told_with_what_they_led_to(row: str) -> None:
-    tell = Teller(BURST)
+    tell = EventExplainer(BURST)
     assert tell(phase(row), 10.6) == "15 frames lost"
     assert tell(phase(row), 9.9) == tell(phase(row), 12.0) == ""
-    assert Teller(Scenario())(phase(row), 10.6) == ""
+    assert EventExplainer(Scenario())(phase(row), 10.6) == ""
 
 
 def test_a_hold_for_want_of_pictures_is_told_and_no_other() -> None:
-    tell = Teller(BURST)
+    tell = EventExplainer(BURST)
     assert tell(hold("no picture for 0.5 s"), 10.6) == "15 frames lost"
     assert tell(hold("telemetry is 0.5 s old"), 10.6) == ""
     assert tell(phase("slipped"), 10.6) == ""
 
 
 def test_the_first_slip_is_told_where_the_first_contact_is_weak() -> None:
-    tell = Teller(WEAK)
+    tell = EventExplainer(WEAK)
     assert tell(phase("slipped"), 5.0) == "the first contact holds 20 % of the weight"
     assert tell(phase("slipped"), 9.0) == ""
-    assert Teller(BURST)(phase("slipped"), 5.0) == ""
+    assert EventExplainer(BURST)(phase("slipped"), 5.0) == ""
 
 
 def test_a_target_that_is_not_there_is_told() -> None:
-    assert Teller(Scenario(no_target=True))(phase("searched-out"), 9.0) == "there is no target"
-    assert Teller(Scenario())(phase("searched-out"), 9.0) == ""
+    assert (
+        EventExplainer(Scenario(no_target=True))(phase("searched-out"), 9.0) == "there is no target"
+    )
+    assert EventExplainer(Scenario())(phase("searched-out"), 9.0) == ""
 
 
 def test_a_silent_radio_is_told_and_not_one_that_was_heard() -> None:
     scenario = Scenario(seed=1, radio_loss=0.1, radio_burst_s=0.5)
     bursts = Bursts(1, 0.1, 0.5)
     begin_s = next(t / 100.0 for t in range(100000) if bursts.lost(t / 100.0))
-    tell = Teller(scenario)
+    tell = EventExplainer(scenario)
     assert tell(hold("telemetry is 0.3 s old"), begin_s - 0.1) == ""
     assert tell(hold("telemetry is 0.3 s old"), begin_s + 0.3).startswith(
         "the radio passed nothing"
     )
     assert tell(phase("link-lost"), begin_s + 0.3).startswith("the radio passed nothing")
     assert tell(phase("slipped"), begin_s + 0.3) == ""
-    assert Teller(Scenario())(phase("link-lost"), begin_s + 0.3) == ""
+    assert EventExplainer(Scenario())(phase("link-lost"), begin_s + 0.3) == ""
 
 
 def test_weight_and_an_old_cell_are_told_with_what_they_lead_to() -> None:
     old = Scenario(mass_kg=0.0447, cell_resistance_ohm=0.17, cell_charge=0.6)
     told = "44.7 g, a cell of 170 mohm that holds 60 % of a new one's charge"
-    assert Teller(old)(phase("too-little-left"), 9.0) == told
-    assert Teller(Scenario(mass_kg=0.0447))(phase("too-weak"), 9.0) == "44.7 g"
-    assert Teller(Scenario())(phase("battery-low"), 9.0) == ""
+    assert EventExplainer(old)(phase("too-little-left"), 9.0) == told
+    assert EventExplainer(Scenario(mass_kg=0.0447))(phase("too-weak"), 9.0) == "44.7 g"
+    assert EventExplainer(Scenario())(phase("battery-low"), 9.0) == ""
 
 
 def test_what_cannot_see_the_vehicle_is_told() -> None:
     deck = Scenario(ceiling_z_m=2.8, flow_reach_m=2.5, bare_floors=((0.0, 0.0, 0.4),))
     told = "the flow deck is blind above 2.5 m and over 0.8 m of bare floor"
-    assert Teller(deck)(phase("estimate-unsure"), 9.0) == told
-    assert Teller(Scenario(flow_reach_m=2.5))(phase("estimate-unsure"), 9.0) == ""
+    assert EventExplainer(deck)(phase("estimate-unsure"), 9.0) == told
+    assert EventExplainer(Scenario(flow_reach_m=2.5))(phase("estimate-unsure"), 9.0) == ""
     capture = Scenario(capture_holes_s=((8.0, 1.0),))
-    assert Teller(capture)(phase("position-lost"), 9.5) == (
+    assert EventExplainer(capture)(phase("position-lost"), 9.5) == (
         "the motion capture did not see it for 1.0 s"
     )
-    assert Teller(capture)(phase("position-lost"), 11.0) == ""
+    assert EventExplainer(capture)(phase("position-lost"), 11.0) == ""
 
 
 def test_what_the_print_is_like_is_told() -> None:
     glossy = Scenario(gloss=0.5, target_tilt_rad=(math.radians(3.0), 0.0))
     assert (
-        Teller(glossy)(phase("ascend-lost"), 9.0)
+        EventExplainer(glossy)(phase("ascend-lost"), 9.0)
         == "perhaps a lamp's reflection in the glossy print"
     )
-    assert Teller(glossy)(phase("no-contact"), 9.0) == "the target is tilted by 3.0 deg"
-    assert Teller(Scenario())(phase("no-contact"), 9.0) == ""
+    assert EventExplainer(glossy)(phase("no-contact"), 9.0) == "the target is tilted by 3.0 deg"
+    assert EventExplainer(Scenario())(phase("no-contact"), 9.0) == ""
 
 
 @pytest.mark.long

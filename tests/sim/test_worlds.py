@@ -16,8 +16,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 import itertools
 
 from perchctl.profile import Profile, load_profile
-from perchctl.sim.draw import draw_capture, draw_scenario
-from perchctl.sim.scenario import Scenario
+from perchctl.sim import Scenario, draw_capture, draw_scenario
 
 NOMINAL_SHA256 = "b8d613ad776dbc378846d5e8d02d5fcdc3e0384a4bfb241e780905d9d4b55071"
 """Of the nominal scenarios of seeds 0 to 20: figures of earlier campaigns are of these."""

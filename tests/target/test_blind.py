@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig, VehicleConfig
-from perchctl.target.blind import Mounted, blind_lines, blind_record, mounted
-from perchctl.vision.types import CameraModel
+from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
+from perchctl.profile.vision import VehicleConfig
+from perchctl.target import blind_lines, mounted_camera
+from perchctl.target.blind import Mounted, blind_record
+from perchctl.vision import CameraModel
 
 CAMERA = CameraModel(
     (640, 480),
@@ -26,7 +28,7 @@ def of(gear_m: tuple[float, float, float], yaw_deg: float = 0.0) -> Mounted:
         camera=CameraConfig(mount=mount),
         vehicle=VehicleConfig(gear_body_m=(x + 0.01, y, z + 0.005)),
     )
-    return mounted(TargetConfig(), CAMERA, profile)
+    return mounted_camera(TargetConfig(), CAMERA, profile)
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,9 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.board_drawing import black_squares, board_rectangles, tag_cells
-from perchctl.target.boards import Board, parse_board
-from perchctl.target.checks import check_target, white_centre_ids
-from perchctl.target.lengths import parse_length
-from perchctl.target.page import parse_page
+from perchctl.target import Board, check_target, parse_board, parse_length, parse_page, tag_cells
+from perchctl.target.board_drawing import black_squares, board_rectangles
+from perchctl.target.checks import white_centre_ids
 
 
 def target_of(

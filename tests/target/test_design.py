@@ -15,17 +15,24 @@ import numpy as np
 import pytest
 
 from perchctl.profile import Profile, TargetConfig, load_profile
+from perchctl.target import (
+    FieldOfView,
+    Optics,
+    TargetDesign,
+    check_target,
+    compare_designs,
+    describe_design,
+    design_record,
+    draw_design,
+    error_curve,
+    make_design,
+    suggest_target,
+)
 from perchctl.target.bound import pose_bound
-from perchctl.target.checks import check_target
-from perchctl.target.compare import comparison
-from perchctl.target.design import Design, Ranges, error_curve, make_design
-from perchctl.target.design_text import design_record, design_text
+from perchctl.target.design import Ranges
 from perchctl.target.drawing import marker_corners_m
-from perchctl.target.limits import Optics
-from perchctl.target.plot import draw_design
-from perchctl.target.suggest import suggest
-from perchctl.target.visible import FieldOfView, square_outline, turned_outline
-from perchctl.vision.types import CameraModel
+from perchctl.target.visible import square_outline, turned_outline
+from perchctl.vision import CameraModel
 
 TARGET = TargetConfig()
 ROOT = Path(__file__).resolve().parents[2]
@@ -58,7 +65,7 @@ def bench() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def paper_design(profile: Profile) -> Design:
+def paper_design(profile: Profile) -> TargetDesign:
     return make_design(TARGET, PAPER_CAMERA, Optics(2.5), profile, 2.4)
 
 
@@ -70,7 +77,7 @@ def test_ranges_agree_with_the_renderer(bench: ModuleType, focal_px: float, blur
         assert designed == pytest.approx(measured, rel=0.15), name
 
 
-def test_the_paper_s_ranges_and_where_they_differ(paper_design: Design) -> None:
+def test_the_paper_s_ranges_and_where_they_differ(paper_design: TargetDesign) -> None:
     """z2 and z3 agree; a blur that explains z1 = 115 cm would be 3.5 px, not 2.5."""
     r = paper_design.ranges
     assert r.z2_m == pytest.approx(0.25, rel=0.15)
@@ -78,7 +85,7 @@ def test_the_paper_s_ranges_and_where_they_differ(paper_design: Design) -> None:
     assert r.z3_m == pytest.approx(0.17, rel=0.05), "facing across, the marker needs more room"
     assert r.z1_m is not None
     assert 1.15 < r.z1_m < 1.75
-    text = design_text(paper_design, error_curve(paper_design), "paper.yaml")
+    text = describe_design(paper_design, error_curve(paper_design), "paper.yaml")
     assert "z1 115 cm" in text
     assert "a blur of 3." in text
     assert "at any turn it is 17" in text
@@ -131,7 +138,7 @@ def test_the_bound_is_what_least_squares_spreads(sides: list[float], z_m: float)
     assert spread == pytest.approx([bound.x_m, bound.y_m, bound.z_m, bound.yaw_rad], rel=0.15)
 
 
-def test_the_curve_holds_what_is_seen(paper_design: Design) -> None:
+def test_the_curve_holds_what_is_seen(paper_design: TargetDesign) -> None:
     curve = error_curve(paper_design)
     r = paper_design.ranges
     assert r.z2_m is not None
@@ -149,7 +156,7 @@ def warnings_of(profile: Profile, ranges: Ranges, **changes: Any) -> str:
     return " | ".join(design.warnings)
 
 
-def test_gaps_are_named(profile: Profile, paper_design: Design) -> None:
+def test_gaps_are_named(profile: Profile, paper_design: TargetDesign) -> None:
     ranges = paper_design.ranges
     assert warnings_of(profile, ranges) == ""
     assert "gap at the search height" in warnings_of(profile, ranges, z1_m=0.9)
@@ -171,7 +178,7 @@ def test_gaps_are_named(profile: Profile, paper_design: Design) -> None:
 def test_what_is_suggested_covers_the_way(
     profile: Profile, focal_px: float, blur_px: float, ceiling_m: float | None
 ) -> None:
-    found, design = suggest(camera_of(focal_px), Optics(blur_px), profile, 0.05, ceiling_m)
+    found, design = suggest_target(camera_of(focal_px), Optics(blur_px), profile, 0.05, ceiling_m)
     assert design.warnings == ()
     assert found.notes == ()
     assert design.ranges.z1_m is not None
@@ -185,10 +192,12 @@ def test_what_is_suggested_covers_the_way(
 def test_what_is_suggested_is_more_exact_than_the_target_there_is(profile: Profile) -> None:
     """At every range at which both are seen; and it says what its sizes follow from."""
     camera, optics = camera_of(380.0), Optics(2.0)
-    found, design = suggest(camera, optics, profile, 0.05, 2.4)
+    found, design = suggest_target(camera, optics, profile, 0.05, 2.4)
     present = make_design(profile.target, camera, optics, profile, 2.4)
     assert found.target.large.side_m > profile.target.large.side_m
-    rows = {row[:30].strip(): row[30:].split()[-2:] for row in comparison(design, present, "sim")}
+    rows = {
+        row[:30].strip(): row[30:].split()[-2:] for row in compare_designs(design, present, "sim")
+    }
     assert rows[""] == ["proposed", "sim"]
     errors = [values for what, values in rows.items() if what.startswith("least error")]
     assert len(errors) == 4
@@ -196,7 +205,7 @@ def test_what_is_suggested_is_more_exact_than_the_target_there_is(profile: Profi
     large, small = found.reasons
     assert "a4 holds no larger" in large
     assert "the larger, the more exact" in small
-    larger, _ = suggest(camera, optics, profile, 0.05, 2.4, "a3")
+    larger, _ = suggest_target(camera, optics, profile, 0.05, 2.4, "a3")
     assert larger.page == "a3"
     assert larger.target.large.side_m > found.target.large.side_m
     assert "not inside of the magnet" in larger.reasons[1]
@@ -204,11 +213,11 @@ def test_what_is_suggested_is_more_exact_than_the_target_there_is(profile: Profi
 
 @pytest.mark.long
 def test_what_no_target_can_cover_is_said(profile: Profile) -> None:
-    found, _ = suggest(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
+    found, _ = suggest_target(camera_of(250.0), Optics(1.5), profile, 0.008, 4.0)
     assert any("small marker would have to be" in note for note in found.notes)
 
 
-def test_the_plot_and_the_record(paper_design: Design) -> None:
+def test_the_plot_and_the_record(paper_design: TargetDesign) -> None:
     png = draw_design(paper_design, error_curve(paper_design))
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None

@@ -9,13 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.drawing import (
-    black_rectangles,
-    draw_bitmap,
-    draw_target,
-    ink_coverage,
-    marker_cells,
-)
+from perchctl.target import draw_target, ink_coverage
+from perchctl.target.drawing import black_rectangles, draw_bitmap, marker_cells
 
 targets = st.builds(
     lambda large_id, small_id, large_m, ratio: TargetConfig(

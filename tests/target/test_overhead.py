@@ -10,19 +10,16 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import Mounting, TargetConfig
-from perchctl.target.overhead import (
-    SURE_PX,
-    aside_words,
-    edge_room,
-    least_side_px,
-    overhead,
+from perchctl.target import (
+    FieldOfView,
+    edge_margin,
+    offset_text,
+    overhead_view,
     reach_at,
     sight_from,
 )
-from perchctl.target.visible import FieldOfView
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import square
-from perchctl.vision.types import CameraModel
+from perchctl.target.overhead import SURE_PX, least_side_px
+from perchctl.vision import CameraModel, project, square_corners
 
 TARGET = TargetConfig()
 SIDE_M = TARGET.large.side_m
@@ -43,7 +40,7 @@ mounts = st.builds(
 def in_picture(mount: Mounting, centre_m: Array, yaw_rad: float) -> bool:
     """By the lens itself: all corners of the large marker at least 3 px inside. `centre_m` from
     the camera, body axes."""
-    corners = (square(SIDE_M) @ rot_z(yaw_rad).T + centre_m) @ mount.T_body_cam[:3, :3]
+    corners = (square_corners(SIDE_M) @ rot_z(yaw_rad).T + centre_m) @ mount.T_body_cam[:3, :3]
     if (corners[:, 2] <= 0.0).any():
         return False
     px = project(corners, np.zeros(3), np.zeros(3), CAMERA)
@@ -109,11 +106,11 @@ def test_a_sight_is_the_lens_s_wherever_the_body_stands(
 
 
 def test_so_far_the_large_marker_has_the_least_side() -> None:
-    where = overhead(TARGET, CAMERA, Mounting())
+    where = overhead_view(TARGET, CAMERA, Mounting())
     assert abs(F * SIDE_M / where.highest_m - SURE_PX) < 1e-9
     assert least_side_px(10.0) == SURE_PX, "a sharper picture promises no more"
     assert least_side_px(30.0) > 30.0
-    blurred = overhead(TARGET, CAMERA, Mounting(), plain_px=30.0)
+    blurred = overhead_view(TARGET, CAMERA, Mounting(), plain_px=30.0)
     assert blurred.highest_m < where.highest_m * SURE_PX / 30.0
     assert [r.height_m for r in where.reaches] == [1.0, 2.0]
     assert "the axis points straight up" in where.words
@@ -132,24 +129,24 @@ def test_a_lean_is_told_by_the_vehicle_s_own_sides() -> None:
         (1.0, -1.0, 0.0): "points straight up",
     }
     for rpy_deg, words in leans.items():
-        assert words in overhead(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg)).words, rpy_deg
+        assert words in overhead_view(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg)).words, rpy_deg
 
 
 def test_a_camera_that_looks_aside_sees_nothing_overhead() -> None:
     for rpy_deg in ((180.0, 0.0, 0.0), (0.0, -90.0, 0.0)):
-        where = overhead(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
+        where = overhead_view(TARGET, CAMERA, Mounting(rpy_deg=rpy_deg))
         assert where.reaches == ()
         assert "camera that looks up" in where.words
 
 
 def test_a_way_is_named_by_the_vehicle_s_sides() -> None:
-    assert aside_words((0.31, -0.12)) == "0.31 m forward and 0.12 m to the right"
-    assert aside_words((-0.5, 0.004)) == "0.50 m back"
-    assert aside_words((0.0, 0.2)) == "0.20 m to the left"
+    assert offset_text((0.31, -0.12)) == "0.31 m forward and 0.12 m to the right"
+    assert offset_text((-0.5, 0.004)) == "0.50 m back"
+    assert offset_text((0.0, 0.2)) == "0.20 m to the left"
 
 
 def test_the_room_is_that_to_the_nearest_edge() -> None:
     box = np.array([[100.0, 100.0], [200.0, 100.0], [200.0, 200.0], [100.0, 200.0]])
-    assert edge_room(box, (640, 480)) == (100.5) / 640
-    assert edge_room(box + np.array([0.0, 275.0]), (640, 480)) == 4.5 / 640
-    assert edge_room(box - 150.0, (640, 480)) < 0.0
+    assert edge_margin(box, (640, 480)) == (100.5) / 640
+    assert edge_margin(box + np.array([0.0, 275.0]), (640, 480)) == 4.5 / 640
+    assert edge_margin(box - 150.0, (640, 480)) < 0.0

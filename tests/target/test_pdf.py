@@ -13,14 +13,21 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target.boards import Board, parse_board
-from perchctl.target.page import Circle, Filled, Item, Line, Page, Polygon, Text, parse_page
+from perchctl.target import (
+    Board,
+    Page,
+    board_page,
+    parse_board,
+    parse_page,
+    pdf_bytes,
+    png_bytes,
+    svg_bytes,
+    target_pages,
+)
+from perchctl.target.page import Circle, Filled, Item, Line, Polygon, Text
 from perchctl.target.page import text_width as width_of
-from perchctl.target.pdf import pdf_bytes
-from perchctl.target.png import png_bytes
 from perchctl.target.reading import PlainReader
-from perchctl.target.sheets import board_page, fitting_page, target_pages
-from perchctl.target.svg import svg_bytes
+from perchctl.target.sheets import fitting_page
 from tests.helpers.raster import DPI, PX_PER_MM, black_runs_mm, page_picture
 
 TARGET = TargetConfig()

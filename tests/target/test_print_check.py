@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from perchctl.profile import TargetConfig
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.print_check import SizeRatio, combined, size_ratio, verdict
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 TARGET = TargetConfig()
 K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])

@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.profile import load_profile
-from perchctl.target.design import Ranges, make_design
-from perchctl.target.limits import Optics
+from perchctl.target import Optics, Page, make_design, tile_page
+from perchctl.target.design import Ranges
 from perchctl.target.overhead import SURE_PX
-from perchctl.target.page import PAGES_MM, Circle, Line, Page, Text
+from perchctl.target.page import PAGES_MM, Circle, Line, Text
 from perchctl.target.sheets import UNPRINTABLE
 from perchctl.target.suggest import Suggestion
-from perchctl.target.tiles import OVERLAP, tiles
-from perchctl.vision.types import CameraModel
+from perchctl.target.tiles import OVERLAP
+from perchctl.vision import CameraModel
 from tests.helpers.flights import short_profile
 from tests.target.test_design import PAPER_CAMERA
 
@@ -41,7 +41,7 @@ def test_whatever_is_on_the_page_is_on_a_sheet(
     """`radius` marks the spot: it is in view of one to four sheets."""
     spot = Circle(across * width, down * height, 1.0)
     whole = Page(width, height, (spot,))
-    sheets = tiles(whole, PAGES_MM[name])
+    sheets = tile_page(whole, PAGES_MM[name])
     if sheets == [whole]:
         assert min(width, height) <= min(PAGES_MM[name])
         return
@@ -50,12 +50,12 @@ def test_whatever_is_on_the_page_is_on_a_sheet(
 
 def test_a_page_that_fits_stays_as_it_is() -> None:
     page = Page(297.0, 210.0, ())
-    assert tiles(page, PAGES_MM["a4"]) == [page]
+    assert tile_page(page, PAGES_MM["a4"]) == [page]
 
 
 def test_neighbours_share_the_seam_and_its_mark() -> None:
     page = Page(500.0, 250.0, (Text(250.0, 120.0, "x"),))
-    left, right = tiles(page, PAGES_MM["a3"])
+    left, right = tile_page(page, PAGES_MM["a3"])
     for sheet in (left, right):
         assert len([i for i in sheet.items if isinstance(i, Line)]) == 2
     (mark, _), (same, _) = (

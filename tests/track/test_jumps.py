@@ -9,7 +9,7 @@ import pytest
 
 from perchctl.track import Notes, Tally, Tracked
 from perchctl.track.jumps import jumped
-from perchctl.vision.types import MarkerPose
+from perchctl.vision import MarkerPose
 
 FRAME_S = 1.0 / 30.0
 

@@ -11,7 +11,7 @@ import pytest
 from perchctl.display import Sketch
 from perchctl.errors import InvalidValue
 from perchctl.track.files import OverlayFile
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 from tests.helpers.disk import full_disk
 
 RNG = np.random.default_rng(3)

@@ -13,8 +13,7 @@ import pytest
 
 from perchctl.geometry import wrap_rad, yaw_of
 from perchctl.profile import TargetConfig, load_profile
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import square
+from perchctl.vision import project, square_corners
 from tests.helpers.recording import (
     STAGE_OF,
     VIEWS,
@@ -79,7 +78,7 @@ def test_stills_give_one_line_a_picture_and_the_truth(pictures: Path) -> None:
         assert abs(wrap_rad(found["yaw_rad"] - yaw_of(R))) < math.radians(0.2)
         for marker, side_m in (("large", target.large.side_m), ("small", target.small.side_m)):
             if line[marker] is not None:
-                true_px = project(square(side_m), rvec, t, camera())
+                true_px = project(square_corners(side_m), rvec, t, camera())
                 assert np.abs(np.array(line[marker]["corners_px"]) - true_px).max() < limit_px
 
 

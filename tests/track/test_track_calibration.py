@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration.files import SizeMissing, load_calibration
+from perchctl.calibration import load_calibration
+from perchctl.calibration.files import SizeMissing
 from perchctl.errors import InvalidValue
 from tests.helpers.recording import (
     VIEWS,

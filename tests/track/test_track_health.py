@@ -15,7 +15,7 @@ from perchctl.commands.output import say
 from perchctl.commands.track import frames
 from perchctl.profile import load_profile
 from perchctl.track import Notes, Tracker, camera_pipeline
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 from tests.helpers.recording import (
     VIEWS,
     camera,

@@ -18,9 +18,9 @@ from perchctl.profile import (
     PoseConfig,
     Profile,
     TargetConfig,
-    VehicleConfig,
 )
-from perchctl.vision.types import CameraModel
+from perchctl.profile.vision import VehicleConfig
+from perchctl.vision import CameraModel
 from tests.helpers.target_picture import CAMERA
 
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"

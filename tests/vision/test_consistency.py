@@ -10,18 +10,21 @@ import pytest
 
 from perchctl.geometry import Array, rotation_from_rpy
 from perchctl.profile import Profile
-from perchctl.vision.consistency import (
-    STAMPS_S,
-    STEP_S,
+from perchctl.vision import (
+    ATTITUDE_STEP_S,
+    Attitude,
+    CameraModel,
     Consistency,
-    Moment,
-    Sums,
-    added,
-    moment_of,
-    solved,
+    ConsistencySums,
+    MarkerPose,
+    PoseSetup,
+    add_moment,
+    consistency_moment,
+    make_pose_setup,
+    rotation_vector,
+    solve_consistency,
 )
-from perchctl.vision.pose import PoseSetup, make_pose_setup, rotation_vector
-from perchctl.vision.types import Attitude, CameraModel, MarkerPose
+from perchctl.vision.consistency import STAMPS_S, Moment
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))
@@ -66,7 +69,9 @@ def _flown(t_s: float, truth: Truth, phase: Array) -> tuple[Array, Array]:
     return place, np.array([0.03 * shake[3], 0.03 * shake[4], 1.2 * s + 0.03 * shake[2]])
 
 
-def _fly(truth: Truth, setup: PoseSetup, rng: np.random.Generator, *, told_s: float = 0.0) -> Sums:
+def _fly(
+    truth: Truth, setup: PoseSetup, rng: np.random.Generator, *, told_s: float = 0.0
+) -> ConsistencySums:
     """The sums after a flight whose pictures are late by `told_s`, as far as the profile knows,
     and by `truth.delay_s` more."""
     phase = rng.uniform(0.0, 2.0 * math.pi, 5)
@@ -94,7 +99,7 @@ def _fly(truth: Truth, setup: PoseSetup, rng: np.random.Generator, *, told_s: fl
         way = _flown(t_s + 1e-3, truth, phase)[0] - _flown(t_s - 1e-3, truth, phase)[0]
         return tuple(way / 2e-3 + np.array([*truth.drift_mps, 0.0]))
 
-    sums = Sums()
+    sums = ConsistencySums()
     for i in range(10, round(FLIGHT_S / FRAME_S)):
         exposed_s = i * FRAME_S
         late_s = truth.delay_s + rng.normal(0.0, JITTER_S)
@@ -110,16 +115,20 @@ def _fly(truth: Truth, setup: PoseSetup, rng: np.random.Generator, *, told_s: fl
             POSE_RAD, 0.1, cov=cov,
         )  # fmt: skip
         t_s = exposed_s + late_s
-        before, after = estimated(t_s - told_s - STEP_S), estimated(t_s - told_s + STEP_S)
-        sums = added(
-            sums, moment_of(t_s, pose, before, after, velocity(t_s - told_s), told_s, setup)
+        before, after = (
+            estimated(t_s - told_s - ATTITUDE_STEP_S),
+            estimated(t_s - told_s + ATTITUDE_STEP_S),
+        )
+        sums = add_moment(
+            sums,
+            consistency_moment(t_s, pose, before, after, velocity(t_s - told_s), told_s, setup),
         )
     return sums
 
 
 def _seen(truth: Truth, setup: PoseSetup, seed: int = 0, told_s: float = 0.0) -> Consistency:
     sums = _fly(truth, setup, np.random.default_rng(seed), told_s=told_s)
-    found = solved(sums, ATTITUDE_SIGMA_RAD)
+    found = solve_consistency(sums, ATTITUDE_SIGMA_RAD)
     assert found is not None
     return found
 
@@ -183,7 +192,7 @@ def test_a_world_that_jumps_spoils_nothing(setup: PoseSetup) -> None:
 
 
 def test_too_few_frames_are_no_finding() -> None:
-    assert solved(Sums(rows=60), 0.0) is None
+    assert solve_consistency(ConsistencySums(rows=60), 0.0) is None
 
 
 def test_the_sums_do_not_grow_and_the_old_ones_stay(setup: PoseSetup) -> None:
@@ -192,19 +201,22 @@ def test_the_sums_do_not_grow_and_the_old_ones_stay(setup: PoseSetup) -> None:
     kept = old.level.copy(), old.information.copy()
     rows = np.ones((3, 8))
     moment = Moment(old.t_s + FRAME_S, rows, np.full(3, 1e-6), 1.0)
-    new = added(old, moment)
+    new = add_moment(old, moment)
     assert new is not old
     assert np.array_equal(old.level, kept[0])
     assert np.array_equal(old.information, kept[1])
     assert np.array_equal(rows, np.ones((3, 8)))
-    assert added(new, replace(moment, t_s=old.t_s)) is new  # an older frame is none
+    assert add_moment(new, replace(moment, t_s=old.t_s)) is new  # an older frame is none
 
 
 def test_scatter_beyond_the_claimed_widens_the_intervals(setup: PoseSetup) -> None:
     calm = _fly(Truth(), setup, np.random.default_rng(1))
     wild = calm.information.copy()
     wild[0, 0] *= 9.0
-    narrow, wide = solved(calm, 0.0), solved(replace(calm, information=wild), 0.0)
+    narrow, wide = (
+        solve_consistency(calm, 0.0),
+        solve_consistency(replace(calm, information=wild), 0.0),
+    )
     assert narrow is not None
     assert wide is not None
     assert wide.turn_sigma_rad[2] > 1.5 * narrow.turn_sigma_rad[2]

@@ -14,19 +14,20 @@ import pytest
 
 from perchctl.geometry import Array
 from perchctl.pipeline import FieldState, Pipeline, PipelineState, pictures, step
-from perchctl.vision.fields import (
+from perchctl.vision import (
+    CameraModel,
     FieldsMode,
-    combing,
+    Frame,
+    PictureKind,
+    classify_fields,
+    detect_markers,
+    estimate_pose,
     field_picture,
-    halves,
     is_combed,
-    looked_at,
-    separated,
+    separate_fields,
 )
-from perchctl.vision.markers.detect import detect
+from perchctl.vision.fields import combing, halves
 from perchctl.vision.markers.ghost import with_ghosts
-from perchctl.vision.pose import estimate_pose
-from perchctl.vision.types import CameraModel, Frame, PictureKind
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -106,7 +107,7 @@ def test_no_shared_whole_picture_is_taken_for_two(folder: str) -> None:
 def kinds(state: FieldState, frames: list[Frame], mode: FieldsMode = "auto") -> list[Any]:
     found = []
     for frame in frames:
-        state, parts = separated(state, frame, mode)
+        state, parts = separate_fields(state, frame, mode)
         found.append(tuple(part.fields for part in parts))
     return found
 
@@ -143,7 +144,7 @@ def test_a_standing_picture_says_nothing_of_the_order() -> None:
     state = FieldState()
     for k in range(8):
         again = replace(frame, t_s=frame.t_s + k * PAL_S)
-        state, parts = separated(state, again, "auto")
+        state, parts = separate_fields(state, again, "auto")
         assert [part.fields for part in parts] == ["woven"]
     assert abs(state.votes) < 0.1
 
@@ -170,7 +171,7 @@ def test_fields_are_half_a_period_apart(period_s: float, apart_s: float) -> None
     for k in range(40):
         index += 1 + (rng.random() < 0.1)
         t_s = index * period_s + rng.normal(0.0, 0.03 * period_s)
-        state, parts = separated(state, replace(frames[k % 3], t_s=t_s), "top")
+        state, parts = separate_fields(state, replace(frames[k % 3], t_s=t_s), "top")
     early, late = parts
     assert (early.t_s + late.t_s) / 2.0 == pytest.approx(t_s)
     assert late.t_s - early.t_s == pytest.approx(apart_s, rel=0.03)
@@ -189,8 +190,8 @@ def test_the_profile_may_know_better() -> None:
 def test_what_was_looked_at_is_not_looked_at_again() -> None:
     _, (frame,) = woven_frames(1)
     whole = replace(frame, fields="whole")
-    assert looked_at(whole, "auto") is whole
-    assert looked_at(frame, "auto").fields == "woven"
+    assert classify_fields(whole, "auto") is whole
+    assert classify_fields(frame, "auto").fields == "woven"
     top, bottom = halves(frame)
     assert (top.fields, bottom.fields) == ("top", "bottom")
     assert (top.index, top.t_s, top.t_arrival_s) == (frame.index, frame.t_s, frame.t_arrival_s)
@@ -274,7 +275,7 @@ def test_sides_along_the_rows_of_a_field_claim_what_interpolation_does_to_them(
         T = pose_of(0.0, 0.0005 * k, 0.4)
         image = render(*T, noise=2.0, seed=k)
         field = Frame(0, 0.0, field_picture(image, first_row), fields=kind)
-        seen = detect(field, None, setup.detector, CAMERA).large
+        seen = detect_markers(field, None, setup.detector, CAMERA).large
         assert seen is not None
         assert seen.lying_sigma_px > 0.0
         for name, d in (("claimed", seen), ("as elsewhere", replace(seen, lying_sigma_px=0.0))):

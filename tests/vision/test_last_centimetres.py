@@ -10,9 +10,16 @@ import pytest
 from perchctl.geometry import Array
 from perchctl.pipeline import PipelineState, step
 from perchctl.profile import DetectorConfig, Profile
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import estimate_pose, make_pose_setup, square
-from perchctl.vision.types import Attitude, Detection, Frame, PipelineOutput
+from perchctl.vision import (
+    Attitude,
+    Detection,
+    Frame,
+    PipelineOutput,
+    estimate_pose,
+    make_pose_setup,
+    project,
+    square_corners,
+)
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 # Of the target in the camera: beside the gear along width and height, and under it.
@@ -71,7 +78,7 @@ def test_a_pose_heeds_the_covariance_of_its_corners() -> None:
     the pose claims as much as they do."""
     setup = make_pose_setup(Profile().pose, Profile().target, np.eye(4), (0.0, 0.0, 0.0), CAMERA)
     true = pose_of(0.0, -0.01, 0.05, 0.1)
-    at = project(square(0.025), *true, CAMERA)
+    at = project(square_corners(0.025), *true, CAMERA)
     vague = np.tile([0.0, 1.0], 4)  # all of them together, along the picture's height
     cov = 0.02**2 * np.eye(8) + 4.0 * np.outer(vague, vague)
     off = at + 2.0 * vague.reshape(4, 2)

@@ -15,11 +15,10 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.geometry import make_T, rot_z
 from perchctl.pipeline import Pipeline, PipelineOutput, PipelineState, make_pipeline, step
 from perchctl.profile import Profile
-from perchctl.sim.renderer import Renderer
-from perchctl.sim.scenario import Neighbour, Scenario
+from perchctl.sim import Neighbour, Renderer, Scenario
+from perchctl.vision import Attitude, CameraModel, Detection, Detections, Frame
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.search import choose
-from perchctl.vision.types import Attitude, CameraModel, Detection, Detections, Frame
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
 CAMERA = CameraModel((640, 480), K, np.zeros(5))

@@ -10,8 +10,8 @@ import pytest
 from perchctl.geometry import Array, yaw_of
 from perchctl.pipeline import FieldState, PipelineState, make_pipeline, pictures, step
 from perchctl.profile import Profile
+from perchctl.vision import Detection, Detections
 from perchctl.vision.rolling import UNKNOWN_READOUT_S, seen_at_once
-from perchctl.vision.types import Detection, Detections
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import KalmanConfig
+from perchctl.vision import predict_track
 from perchctl.vision.filter import (
     MAX_PREDICTION_S,
     MEASURED,
@@ -26,7 +27,6 @@ from perchctl.vision.filter import (
     Z,
     foreseen,
     make_filter,
-    predicted,
     start_track,
     step_track,
     transition,
@@ -209,7 +209,7 @@ def test_what_is_not_measured_drifts_at_most(
     if coasting:
         found = step_track(track, None, 10.0 + max(min(later_s, 0.9), 0.01), WORLD)
     else:
-        found = predicted(track, 10.0 + later_s, WORLD)
+        found = predict_track(track, 10.0 + later_s, WORLD)
     assert found is not None
     moved_m = float(np.linalg.norm(found.x[POSITION]))
     assert moved_m <= WORLD.drift_mps * min(max(later_s, 0.01), MAX_PREDICTION_S) + 1e-12
@@ -235,8 +235,11 @@ def test_what_is_foreseen_is_what_is_predicted_and_measured(
     track = MarkerTrack(
         t_s=1.0, x=rng.normal(0.0, 0.5, 8), P=half @ half.T, bias=rng.normal(size=(8, 4))
     )
-    wanted, found = predicted(track, 1.0 + later_s, setup), foreseen(track, 1.0 + later_s, setup)
-    bare = predicted(track, 1.0 + later_s, setup, spread=False)
+    wanted, found = (
+        predict_track(track, 1.0 + later_s, setup),
+        foreseen(track, 1.0 + later_s, setup),
+    )
+    bare = predict_track(track, 1.0 + later_s, setup, spread=False)
     assert np.array_equal(bare.x, wanted.x)
     assert bare.t_s == wanted.t_s
     assert found.R is not None

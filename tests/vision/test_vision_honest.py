@@ -20,13 +20,9 @@ from perchctl.geometry import (
 )
 from perchctl.pipeline import Pipeline, follow
 from perchctl.profile import KalmanConfig, TargetConfig
+from perchctl.vision import Attitude, MarkerPose, PipelineState
 from perchctl.vision.filter import TILTS, X, Y, Z, make_filter, process_noise
 from perchctl.vision.places import measurement
-from perchctl.vision.types import (
-    Attitude,
-    MarkerPose,
-    PipelineState,
-)
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]

@@ -9,17 +9,15 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import MergeConfig, WeightsConfig
+from perchctl.vision import MarkerPose, Stage, better_conditioned, stage_of
 from perchctl.vision.merge import (
-    better,
     choose_stage,
     disagree,
     merge_pair,
     merge_variance,
     stage_by_range,
-    stage_of,
     weight_matrix,
 )
-from perchctl.vision.types import MarkerPose, Stage
 
 unit = st.floats(0.0, 1.0)
 weights = st.builds(WeightsConfig, x=unit, y=unit, z=unit, yaw=unit)
@@ -145,5 +143,5 @@ def test_markers_disagree_beyond_the_limit_unless_they_are_vague() -> None:
 
 def test_the_better_conditioned_marker_wins() -> None:
     large, small = pose((0, 0, 0.5), 0.001), pose((0, 0, 0.5), 0.004, "small")
-    assert better(large, small) is large
-    assert better(pose((0, 0, 0.5), 0.01), small) is small
+    assert better_conditioned(large, small) is large
+    assert better_conditioned(pose((0, 0, 0.5), 0.01), small) is small

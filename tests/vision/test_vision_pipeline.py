@@ -30,17 +30,17 @@ from perchctl.profile import (
     PoseConfig,
     TargetConfig,
 )
-from perchctl.vision.pose import estimate_pose
-from perchctl.vision.predict import expected_corners
-from perchctl.vision.solve import Candidate
-from perchctl.vision.types import (
+from perchctl.vision import (
     Attitude,
     Frame,
     PipelineOutput,
     PipelineState,
-    Sighting,
+    PoseCandidate,
     Stage,
+    estimate_pose,
+    expected_corners,
 )
+from perchctl.vision.types import Sighting
 from tests.helpers.target_picture import pose_of, render
 
 Build = Callable[..., Pipeline]
@@ -311,7 +311,7 @@ def test_single_poses_are_those_solved_for_themselves(build: Build) -> None:
     attitude = fly(0)
     _, output = step(PipelineState(), Frame(0, attitude.t_s, view(attitude)), attitude, setup)
     joint = output.poses["joint"]
-    start = Candidate(joint.rvec_rad, joint.tvec_m)
+    start = PoseCandidate(joint.rvec_rad, joint.tvec_m)
     for name in ("large", "small"):
         detection = output.detections.get(name)  # type: ignore[arg-type]
         assert detection is not None

@@ -18,17 +18,19 @@ from perchctl.geometry import (
     wrap_rad,
 )
 from perchctl.profile import PoseConfig, TargetConfig
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import (
+from perchctl.vision import (
+    Attitude,
+    Detection,
+    MarkerPose,
+    PoseCandidate,
     PoseSetup,
     estimate_pose,
     make_pose_setup,
-    mirror_solution,
     normal_cam,
-    square,
+    project,
+    square_corners,
 )
-from perchctl.vision.solve import Candidate
-from perchctl.vision.types import Attitude, Detection, MarkerPose
+from perchctl.vision.pose import mirror_solution
 from tests.helpers.target_picture import CAMERA, pose_of
 
 SIDES = {"large": 0.150, "small": 0.025}
@@ -60,7 +62,7 @@ def marker(
     by_lines: bool = False,
 ) -> Detection:
     """Corners that err on their own, or as intersections of lines that do."""
-    corners = project(square(SIDES[name]), rvec, tvec, CAMERA)
+    corners = project(square_corners(SIDES[name]), rvec, tvec, CAMERA)
     if rng is not None and by_lines:
         corners = corners + line_errors(corners, noise_px, rng)
     elif rng is not None:
@@ -170,7 +172,9 @@ def test_the_other_tilt_looks_the_same_and_its_other_tilt_is_the_first() -> None
     back = mirror_solution(other, tvec)
     assert back is not None
     assert np.allclose(cv2.Rodrigues(back)[0], cv2.Rodrigues(rvec)[0], atol=1e-9)
-    shift = project(square(0.025), other, tvec, CAMERA) - project(square(0.025), rvec, tvec, CAMERA)
+    shift = project(square_corners(0.025), other, tvec, CAMERA) - project(
+        square_corners(0.025), rvec, tvec, CAMERA
+    )
     assert np.abs(shift).max() < 0.05
     sight = tvec / np.linalg.norm(tvec)
     n, m = (cv2.Rodrigues(r)[0][:, 2] for r in (rvec, other))
@@ -343,6 +347,6 @@ def test_a_start_from_the_joint_pose_gives_the_markers_own_pose() -> None:
     joint = must(estimate_pose(both, 0.0, attitude, PLAIN))
     for one in both:
         alone = must(estimate_pose([one], 0.0, attitude, PLAIN))
-        start = Candidate(joint.rvec_rad, joint.tvec_m)
+        start = PoseCandidate(joint.rvec_rad, joint.tvec_m)
         started = must(estimate_pose([one], 0.0, attitude, PLAIN, start=start))
         assert np.allclose(alone.e_m, started.e_m, atol=2e-5)

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.profile import CameraConfig, PoseConfig, TargetConfig
-from perchctl.vision.pose import make_pose_setup
-from perchctl.vision.predict import expected_corners, sighted
-from perchctl.vision.types import Attitude, MarkerPose, Sighting
+from perchctl.vision import Attitude, MarkerPose, expected_corners, make_pose_setup, update_sight
+from perchctl.vision.types import Sighting
 from tests.helpers.target_picture import CAMERA
 
 SETUP = make_pose_setup(
@@ -68,7 +67,7 @@ def errors_px(flight: Flight, frames: int, *, told: bool = True) -> Iterator[flo
             points = SETUP.object_points["large"]
             true = cv2.projectPoints(points, pose.rvec_rad, pose.tvec_m, CAMERA.K, CAMERA.dist)[0]
             yield float(np.abs(expected["large"] - true.reshape(4, 2)).max())
-        sight = sighted(sight, pose, attitude, SETUP)
+        sight = update_sight(sight, pose, attitude, SETUP)
 
 
 def rms(values: list[float]) -> float:
@@ -110,8 +109,8 @@ def test_what_is_not_of_now_teaches_nothing(gap_s: float) -> None:
     attitude, pose = flight.at(1.0)
     before = Sighting(pose, attitude, (1e-4, 2e-4))
     later, seen = flight.at(1.0 + gap_s)
-    assert sighted(before, seen, later, SETUP).off_rad2 == before.off_rad2
-    assert sighted(before, seen, None, SETUP).off_rad2 == before.off_rad2
+    assert update_sight(before, seen, later, SETUP).off_rad2 == before.off_rad2
+    assert update_sight(before, seen, None, SETUP).off_rad2 == before.off_rad2
 
 
 def test_two_accounts_that_never_erred_count_alike() -> None:

@@ -7,12 +7,19 @@ import pytest
 
 from perchctl.geometry import make_T, rotation_from_rpy, wrap_rad
 from perchctl.profile import KalmanConfig, PoseConfig, TargetConfig
-from perchctl.vision.camera_model import project
+from perchctl.vision import (
+    Attitude,
+    Detection,
+    MarkerPose,
+    PoseSetup,
+    estimate_pose,
+    make_pose_setup,
+    project,
+    square_corners,
+)
 from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import disagree
 from perchctl.vision.places import measurement
-from perchctl.vision.pose import PoseSetup, estimate_pose, make_pose_setup, square
-from perchctl.vision.types import Attitude, Detection, MarkerPose
 from tests.helpers.target_picture import CAMERA, pose_of
 
 SIDES = {"large": 0.150, "small": 0.025}
@@ -36,7 +43,7 @@ def solved(
     rvec, tvec = pose_of(*place)
     detections = []
     for name in seen:
-        corners = square(scale * SIDES[name])
+        corners = square_corners(scale * SIDES[name])
         corners[:, 2] = curl_per_m * (corners**2).sum(axis=1)
         px = project(corners, rvec, tvec, CAMERA)
         if rng is not None:
@@ -90,7 +97,7 @@ def test_corners_that_err_are_no_curl() -> None:
     rvec, tvec = pose_of(0.0, 0.0, 0.2, 0.4, 0.0, 0.0)
     detections = []
     for name, side_m in SIDES.items():
-        px = project(square(side_m), rvec, tvec, CAMERA)
+        px = project(square_corners(side_m), rvec, tvec, CAMERA)
         if name == "small":
             px = px + np.array([[0.5, 0.4], [-0.4, 0.3], [0.4, -0.3], [-0.3, -0.4]])
         detections.append(Detection(name, px, 0.02, True))  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ import pytest
 from perchctl.geometry import Array, wrap_rad
 from perchctl.pipeline import step
 from perchctl.profile import PoseConfig
-from perchctl.vision.types import Frame, PipelineOutput, PipelineState
+from perchctl.vision import Frame, PipelineOutput, PipelineState
 
 
 def look(truth: dict[str, Any], build: Any, entry: dict[str, Any], **config: Any) -> PipelineOutput:

@@ -6,36 +6,29 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project, undistort_px
+from perchctl.vision import Detection, PoseCandidate, project, square_corners, undistort_px
 from perchctl.vision.points import Points, make_points
-from perchctl.vision.pose import rotation_matrix, square
-from perchctl.vision.solve import (
-    Candidate,
-    Scored,
-    TiltPrior,
-    gauss_newton,
-    mirror_solution,
-)
-from perchctl.vision.types import Detection
+from perchctl.vision.pose import rotation_matrix
+from perchctl.vision.solve import Scored, TiltPrior, gauss_newton, mirror_solution
 from tests.helpers.target_picture import CAMERA, pose_of
 
-TRUE = Candidate(*pose_of(0.03, -0.02, 0.5, 0.4, 0.15, -0.1))
+TRUE = PoseCandidate(*pose_of(0.03, -0.02, 0.5, 0.4, 0.15, -0.1))
 UNKNOWN = TiltPrior(None, math.radians(5.0))
 
 
 def points(noise_px: float = 0.0) -> Points:
-    corners = project(square(0.15), TRUE.rvec, TRUE.tvec, CAMERA)
+    corners = project(square_corners(0.15), TRUE.rvec, TRUE.tvec, CAMERA)
     corners = corners + np.random.default_rng(0).normal(0.0, 1.0, (4, 2)) * noise_px
     detection = Detection("large", corners, 0.05, False)
-    return make_points([detection], square(0.15), undistort_px(corners, CAMERA), CAMERA.K)
+    return make_points([detection], square_corners(0.15), undistort_px(corners, CAMERA), CAMERA.K)
 
 
-def normal(candidate: Candidate) -> Array:
+def normal(candidate: PoseCandidate) -> Array:
     return rotation_matrix(candidate.rvec)[:, 2]
 
 
 def test_from_a_start_that_is_near_the_pose_is_found() -> None:
-    found = gauss_newton(points(), Candidate(TRUE.rvec + 0.03, TRUE.tvec + 0.01))
+    found = gauss_newton(points(), PoseCandidate(TRUE.rvec + 0.03, TRUE.tvec + 0.01))
     assert isinstance(found, Scored)
     assert np.allclose(found.rvec, TRUE.rvec, atol=1e-4)
     assert np.allclose(found.tvec, TRUE.tvec, atol=1e-4)
@@ -46,7 +39,7 @@ def test_from_a_start_that_is_near_the_pose_is_found() -> None:
 
 @pytest.mark.parametrize("tvec", [(0.0, 0.0, -0.5), (3.0, 3.0, 0.05), (np.nan, 0.0, 0.5)])
 def test_from_a_start_that_is_not_nothing_settles(tvec: tuple[float, float, float]) -> None:
-    found = gauss_newton(points(), Candidate(TRUE.rvec, np.array(tvec)))
+    found = gauss_newton(points(), PoseCandidate(TRUE.rvec, np.array(tvec)))
     assert found is None or found.rms_px > 1.0
 
 
@@ -59,7 +52,7 @@ def test_the_error_is_the_root_mean_square_over_the_corners() -> None:
 def test_a_known_tilt_is_contradicted_beyond_its_spread_alone() -> None:
     other_rvec = mirror_solution(TRUE.rvec, TRUE.tvec)
     assert other_rvec is not None
-    other = Candidate(other_rvec, TRUE.tvec)
+    other = PoseCandidate(other_rvec, TRUE.tvec)
     known = TiltPrior(normal(TRUE), math.radians(5.0))
     assert not known.contradicts(TRUE)
     assert known.contradicts(other)
@@ -68,9 +61,9 @@ def test_a_known_tilt_is_contradicted_beyond_its_spread_alone() -> None:
 
 
 def test_corners_with_a_covariance_of_their_own_count_as_it_says() -> None:
-    corners = project(square(0.15), TRUE.rvec, TRUE.tvec, CAMERA)
+    corners = project(square_corners(0.15), TRUE.rvec, TRUE.tvec, CAMERA)
     half = np.random.default_rng(1).normal(0.0, 0.1, (8, 8))
     cov_px2 = half @ half.T + 0.01 * np.eye(8)
     detection = Detection("large", corners, 0.05, True, cov_px2=cov_px2)
-    made = make_points([detection], square(0.15), undistort_px(corners, CAMERA), CAMERA.K)
+    made = make_points([detection], square_corners(0.15), undistort_px(corners, CAMERA), CAMERA.K)
     assert np.allclose(made.whitening @ cov_px2 @ made.whitening.T, np.eye(8), atol=1e-9)

@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.commands.fit_weights_collect import _truth
 from perchctl.commands.fit_weights_request import CollectRequest
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, UsageError
 from perchctl.geometry import rot_z
 from perchctl.positioning import BodyPose, CaptureFrame, capture
-from perchctl.profile import find_calibration, load_profile
-from perchctl.profile.positioning import PositioningConfig
+from perchctl.profile import PositioningConfig, find_calibration, load_profile
 from perchctl.weights import SessionFile, truth
 from perchctl.weights.collect import MarkerReader, collecting_pipeline, fault_of
 from perchctl.weights.table import HEADER, NEEDED, read_csv

@@ -8,13 +8,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from perchctl.calibration.mounting.eye import Eye
-from perchctl.calibration.mounting.recording import AttitudeSample, Part, Recording, SeenPose
+from perchctl.calibration.mounting.recording import (
+    AttitudeSample,
+    MountingPart,
+    MountingRecording,
+    SeenPose,
+)
 from perchctl.calibration.mounting.solve import MIRRORED, missing
-from perchctl.camera.source import FrameSource, Grey
+from perchctl.camera import FrameSource, Grey
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import Array
 
-LEAST_S: dict[Part, float] = {"carry": 30.0, "pivot": 20.0}
+LEAST_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
 """For which a part is recorded, also where no turn is missing any more: more pictures, and as
 many times smaller intervals."""
 MOST_S = 180.0
@@ -30,19 +35,19 @@ SHARE_OVER = 60
 LEAST_SHARE = 0.3
 
 
-class Tape:
+class MountingTape:
     """What one part has recorded so far."""
 
-    def __init__(self, part: Part, seen_by: str = "") -> None:
-        self.part: Part = part
+    def __init__(self, part: MountingPart, seen_by: str = "") -> None:
+        self.part: MountingPart = part
         self.seen_by = seen_by
         self.attitudes: list[AttitudeSample] = []
         self.poses: list[SeenPose] = []
         self.mirrored = 0
 
-    def recording(self) -> Recording:
+    def recording(self) -> MountingRecording:
         attitudes, poses = tuple(self.attitudes), tuple(self.poses)
-        return Recording(self.part, attitudes, poses, self.mirrored, self.seen_by)
+        return MountingRecording(self.part, attitudes, poses, self.mirrored, self.seen_by)
 
     def __bool__(self) -> bool:
         return bool(self.attitudes or self.poses)
@@ -62,7 +67,7 @@ class Moment:
     index: int
     image: Grey
     outlines: tuple[tuple[str, Array], ...]
-    part: Part
+    part: MountingPart
     seconds: float
     poses: int
     share: float
@@ -71,7 +76,7 @@ class Moment:
 
 
 @dataclass(frozen=True)
-class Sensors:
+class VehicleSensors:
     """The vehicle's side: new attitudes, oldest first, and what is wrong, if anything is."""
 
     attitudes: Callable[[], list[AttitudeSample]] = list
@@ -79,10 +84,10 @@ class Sensors:
 
 
 def capture(
-    tape: Tape,
+    tape: MountingTape,
     source: FrameSource,
     eye: Eye,
-    sensors: Sensors,
+    sensors: VehicleSensors,
     show: Callable[[Moment], None],
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
@@ -125,7 +130,7 @@ def capture(
 class _Run:
     """How far a part is."""
 
-    def __init__(self, tape: Tape, eye: Eye, now_s: float) -> None:
+    def __init__(self, tape: MountingTape, eye: Eye, now_s: float) -> None:
         self._tape, self._eye = tape, eye
         self._start_s: float | None = None
         self._judged_s = -JUDGED_EVERY_S

@@ -24,7 +24,7 @@ from perchctl.calibration.mounting.spread import (
     squared_distance,
     weights,
 )
-from perchctl.calibration.mounting.turns import turn, turn_vector
+from perchctl.calibration.mounting.turns import rotation_matrices, rotation_vectors
 from perchctl.geometry import Array
 
 KNOT_S = 2.0
@@ -161,10 +161,10 @@ def _rows(state: State, felt: Felt, seen: Seen, factor: float, jitter_s: float) 
     within = (exposed_s >= felt.t_s[0]) & (exposed_s <= felt.t_s[-1])
     body = turned_at(whole, exposed_s)
     hats = _hats(state.knots_s, body.t_s)
-    R_world_body = turn(hats @ state.walk) @ body.R_world_body
+    R_world_body = rotation_matrices(hats @ state.walk) @ body.R_world_body
     R_cam_world = state.R_body_cam.T @ R_world_body.transpose(0, 2, 1)
     predicted = R_cam_world @ state.R_world_target
-    misfit = turn_vector(seen.R_cam_target @ predicted.transpose(0, 2, 1))
+    misfit = rotation_vectors(seen.R_cam_target @ predicted.transpose(0, 2, 1))
     along = -body.rate_radps @ state.R_body_cam
     design = np.zeros((len(misfit), 3, KNOTS + 3 * len(state.knots_s)))
     design[:, :, TURN] = state.R_body_cam.T
@@ -210,8 +210,8 @@ def _estimated(state: State, felt: Felt, whole: Turned) -> tuple[Array, Array]:
     """The vehicle's own attitude, by its mean over each second; it errs slowly."""
     some = slice(None, None, _ESTIMATES_APART)
     hats = _hats(state.knots_s, felt.t_s[some])
-    R_world_body = turn(hats @ state.walk) @ whole.R_world_body[some]
-    off = turn_vector(felt.estimate[some] @ R_world_body.transpose(0, 2, 1))
+    R_world_body = rotation_matrices(hats @ state.walk) @ whole.R_world_body[some]
+    off = rotation_vectors(felt.estimate[some] @ R_world_body.transpose(0, 2, 1))
     misfit = off - R_world_body @ state.off_rad
     n = len(misfit)
     design = np.zeros((n, 3, KNOTS + state.walk.size))
@@ -230,8 +230,8 @@ def _estimated(state: State, felt: Felt, whole: Turned) -> tuple[Array, Array]:
 def _moved(state: State, step: Array) -> State:
     return replace(
         state,
-        R_body_cam=turn(step[TURN]) @ state.R_body_cam,
-        R_world_target=turn(step[TARGET]) @ state.R_world_target,
+        R_body_cam=rotation_matrices(step[TURN]) @ state.R_body_cam,
+        R_world_target=rotation_matrices(step[TARGET]) @ state.R_world_target,
         bias_radps=state.bias_radps + step[BIAS],
         scale=state.scale + step[SCALE],
         off_rad=state.off_rad + step[OFF],

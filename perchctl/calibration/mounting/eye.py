@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.seen import seeing, seen_mirrored, seen_pose
-from perchctl.camera.health import HealthState, assess
+from perchctl.calibration.mounting.seen import best_pose, camera_only_profile, is_seen_mirrored
+from perchctl.camera import HealthState, assess_frame
 from perchctl.geometry import Array
 from perchctl.pipeline import FieldState, make_pipeline, pictures, step
 from perchctl.profile import Profile
-from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
+from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
 
 
 class Eye:
@@ -20,7 +20,7 @@ class Eye:
     """
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
-        self._pipeline = make_pipeline(seeing(profile), camera)
+        self._pipeline = make_pipeline(camera_only_profile(profile), camera)
         self._live = live
         self._state = PipelineState()
         self._fields = FieldState()
@@ -31,7 +31,7 @@ class Eye:
 
     def look(self, frame: Frame) -> list[SeenPose]:
         """The target's pose in a frame, in each of its two fields where it has such."""
-        self._health, judged = assess(self._health, frame, self._live)
+        self._health, judged = assess_frame(self._health, frame, self._live)
         if judged.kind == "repeated":
             return []
         self.outlines, self.trouble = (), ""
@@ -44,12 +44,12 @@ class Eye:
         for picture in found:
             self._state, output = step(self._state, picture, None, self._pipeline)
             self._remember(output)
-            pose = seen_pose(output, picture.t_s)
+            pose = best_pose(output, picture.t_s)
             if pose is not None:
                 seen.append(pose)
         return seen
 
     def _remember(self, output: PipelineOutput) -> None:
-        self.mirrored += seen_mirrored(output)
+        self.mirrored += is_seen_mirrored(output)
         found = ((name, output.detections.get(name)) for name in MARKERS)
         self.outlines = tuple((name, d.corners_px) for name, d in found if d is not None)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.calibration.mounting.recording import AttitudeSample
-from perchctl.calibration.mounting.turns import nearest_turn, turn, turns_from_rpy
+from perchctl.calibration.mounting.turns import nearest_turn, rotation_matrices, turns_from_rpy
 from perchctl.geometry import Array
 
 
@@ -74,7 +74,7 @@ def sum_up(felt: Felt, bias_radps: Array, scale: Array) -> Turned:
     rate = unbiased * (1.0 + scale)
     dt = np.diff(felt.t_s)[:, None]
     before, after = rate[:-1], rate[1:]
-    steps = turn(0.5 * dt * (before + after) + dt**2 / 12.0 * np.cross(before, after))
+    steps = rotation_matrices(0.5 * dt * (before + after) + dt**2 / 12.0 * np.cross(before, after))
     R = products(np.concatenate([np.eye(3)[None], steps]))
     R = nearest_turn(np.einsum("nij,nkj->ik", felt.estimate, R)) @ R
     return Turned(
@@ -121,7 +121,7 @@ def turned_at(turned: Turned, t_s: Array) -> Turned:
 
     return Turned(
         t_s=t_s,
-        R_world_body=turned.R_world_body[k] @ turn(way),
+        R_world_body=turned.R_world_body[k] @ rotation_matrices(way),
         rate_radps=turned.rate_radps[k] + share * change,
         of_bias=between(turned.of_bias),
         of_scale=between(turned.of_scale),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from perchctl.calibration.mounting.recording import AttitudeSample, Recording, SeenPose
+from perchctl.calibration.mounting.recording import AttitudeSample, MountingRecording, SeenPose
 from perchctl.geometry import Array
 
 CARRY_S, PIVOT_S = 20.0, 12.0
@@ -20,13 +20,13 @@ TILT_DEG = 25.0
 _MOST_LATE_S = 1.0
 
 
-def missing(recording: Recording) -> tuple[str, ...]:
+def missing(recording: MountingRecording) -> tuple[str, ...]:
     """Which motion is still lacking, in a few words each; nothing: it is enough."""
     lacking = _carry(recording) if recording.part == "carry" else _pivot(recording)
     return tuple(lacking)
 
 
-def _carry(recording: Recording) -> list[str]:
+def _carry(recording: MountingRecording) -> list[str]:
     attitudes, poses = recording.attitudes, recording.poses
     if len(attitudes) < 2 or len(poses) < 2:
         return ["bring the target into view"] if len(attitudes) >= 2 else ["wait for the vehicle"]
@@ -51,7 +51,7 @@ def _carry(recording: Recording) -> list[str]:
     return lacking
 
 
-def _pivot(recording: Recording) -> list[str]:
+def _pivot(recording: MountingRecording) -> list[str]:
     if len(recording.poses) < 2:
         return ["bring the target into view"]
     lacking = []
@@ -65,7 +65,7 @@ def _pivot(recording: Recording) -> list[str]:
     return lacking + _length(recording, PIVOT_S)
 
 
-def _length(recording: Recording, least_s: float) -> list[str]:
+def _length(recording: MountingRecording, least_s: float) -> list[str]:
     t_s = [p.t_s for p in recording.poses]
     # Time in which the target is seen.
     seen_s = float(np.minimum(np.diff(np.sort(t_s)), 0.2).sum())

@@ -12,7 +12,7 @@ from perchctl.calibration.mounting.carry import TURN, Solved
 from perchctl.calibration.mounting.felt import Felt
 from perchctl.calibration.mounting.result import Left, covariance
 from perchctl.calibration.mounting.spread import robust_shares, weights
-from perchctl.calibration.mounting.turns import turn
+from perchctl.calibration.mounting.turns import rotation_matrices
 from perchctl.geometry import Array
 
 LEAST_POSES = 100
@@ -43,7 +43,7 @@ def camera_place(
     # The camera's turn is not known exactly either.
     values, axes = np.linalg.eigh(solved.cov[TURN, TURN])
     for value, axis in zip(values, axes.T, strict=True):
-        turned = turn(axis * np.sqrt(max(value, 0.0))) @ solved.state.R_body_cam
+        turned = rotation_matrices(axis * np.sqrt(max(value, 0.0))) @ solved.state.R_body_cam
         other, *_ = _least_squares(
             R, body_m[near], p_cam_target_m[near] @ turned.T, sigma_m, t_s[near]
         )

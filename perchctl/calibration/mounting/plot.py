@@ -8,7 +8,7 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 
-from perchctl.calibration.mounting.report import Comparison, mounting_lines
+from perchctl.calibration.mounting.report import MountingReport, mounting_lines
 from perchctl.calibration.mounting.result import IN_95, Carried, Pivoted
 from perchctl.geometry import Array
 from perchctl.plot import BLUE, GREEN, GREY, GRID, ORANGE, VERMILLION, new_figure, save_png
@@ -19,7 +19,7 @@ _AXES = (BLUE, ORANGE, GREEN)
 _WIDEST = 99.0  # percentile that still fits on an axis: the outliers lie beyond
 
 
-def draw_mounting(c: Comparison) -> bytes:
+def draw_mounting(c: MountingReport) -> bytes:
     """The report as a PNG: the numbers, and a row of panels for each part that was done."""
     rows = [part for part in (c.carried, c.pivoted) if part is not None]
     heights_in = [TOP_IN] + [ROW_IN] * len(rows)
@@ -57,7 +57,7 @@ def _numbers(axes: Axes, lines: list[str]) -> None:
     )  # fmt: skip
 
 
-def _from_above(axes: Axes, c: Comparison) -> None:
+def _from_above(axes: Axes, c: MountingReport) -> None:
     """Camera, gear and the picture's right and bottom in the body, forward up: measured, and as
     the profile has it."""
     mount, tip_m = c.profile.camera.mount, np.array(c.profile.vehicle.gear_body_m)

@@ -19,7 +19,7 @@ from perchctl.errors import InvalidValue, NotFound
 from perchctl.files import write_files
 from perchctl.geometry import Array
 
-Part = Literal["carry", "pivot"]
+MountingPart = Literal["carry", "pivot"]
 FORMAT = 1
 _DECIMALS = 9
 _MOST_NOT_A_TURN = 1e-3  # of R R^T - 1
@@ -58,19 +58,19 @@ class SeenPose:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class MountingRecording:
     """One part. `mirrored_pictures` counts those in which the target was seen mirrored only;
     `seen_by` says what else the poses rest on (see `perchctl.calibration.mounting.seen`), empty
     where that is not known."""
 
-    part: Part
+    part: MountingPart
     attitudes: tuple[AttitudeSample, ...]
     poses: tuple[SeenPose, ...]
     mirrored_pictures: int = 0
     seen_by: str = ""
 
 
-def write_recordings(path: Path, recordings: Sequence[Recording]) -> None:
+def write_recordings(path: Path, recordings: Sequence[MountingRecording]) -> None:
     """Write the whole file, or nothing.
 
     Raises:
@@ -84,7 +84,7 @@ def write_recordings(path: Path, recordings: Sequence[Recording]) -> None:
     write_files({path: ("\n".join(lines) + "\n").encode()})
 
 
-def read_recordings(path: Path) -> tuple[Recording, ...]:
+def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
     """The parts of a file, in its order.
 
     Raises:
@@ -110,11 +110,12 @@ def read_recordings(path: Path) -> tuple[Recording, ...]:
     if not parts:
         raise InvalidValue(f"{path} is empty: name a recording of calibrate --mount")
     return tuple(
-        Recording(p.part, tuple(p.attitudes), tuple(p.poses), p.mirrored, p.seen_by) for p in parts
+        MountingRecording(p.part, tuple(p.attitudes), tuple(p.poses), p.mirrored, p.seen_by)
+        for p in parts
     )
 
 
-def _lines(recording: Recording) -> Iterator[dict[str, Any]]:
+def _lines(recording: MountingRecording) -> Iterator[dict[str, Any]]:
     yield {
         "part": recording.part,
         "format": FORMAT,
@@ -146,8 +147,8 @@ def _plain(value: Any) -> Any:
 
 
 class _Growing:
-    def __init__(self, part: Part, mirrored: int, seen_by: str) -> None:
-        self.part: Part = part
+    def __init__(self, part: MountingPart, mirrored: int, seen_by: str) -> None:
+        self.part: MountingPart = part
         self.mirrored = mirrored
         self.seen_by = seen_by
         self.attitudes: list[AttitudeSample] = []
@@ -159,8 +160,10 @@ def _add(parts: list[_Growing], record: Any) -> None:
     if not isinstance(record, dict):
         raise ValueError("not a JSON object")
     if "part" in record:
-        if record["part"] not in get_args(Part):
-            raise ValueError(f"part {record['part']!r} is none of {', '.join(get_args(Part))}")
+        if record["part"] not in get_args(MountingPart):
+            raise ValueError(
+                f"part {record['part']!r} is none of {', '.join(get_args(MountingPart))}"
+            )
         if record["format"] != FORMAT:
             raise ValueError(f"format {record['format']!r}, this version reads {FORMAT}")
         mirrored, seen_by = int(record["mirrored_pictures"]), str(record.get("seen_by", ""))

@@ -22,7 +22,7 @@ KEYS = ("rpy_deg", "latency_s", "gear_cam_m")
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class MountingReport:
     """What was measured of a profile's vehicle; a part that was not done is None."""
 
     profile: Profile
@@ -96,7 +96,7 @@ def turn_between_deg(A: Array, B: Array) -> float:
     return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
 
 
-def mounting_lines(c: Comparison) -> list[str]:
+def mounting_lines(c: MountingReport) -> list[str]:
     """Each number, its 95 % interval, and what the profile says instead."""
     lines = []
     m, mount = c.measured, c.profile.camera.mount
@@ -133,7 +133,7 @@ def _latency_lines(latency_s: float, sigma_s: float, wrote_s: float | None) -> l
 
 
 def _gear_lines(
-    c: Comparison, gear_cam_m: tuple[float, ...], sigma_m: tuple[float, ...]
+    c: MountingReport, gear_cam_m: tuple[float, ...], sigma_m: tuple[float, ...]
 ) -> list[str]:
     wrote_m = written_gear_cam_m(c.profile)
     apart_m = np.array(gear_cam_m) - wrote_m
@@ -154,7 +154,7 @@ def _line(
     ]
 
 
-def _notes(c: Comparison) -> list[str]:
+def _notes(c: MountingReport) -> list[str]:
     """What has to be known with the numbers."""
     if c.carried is None:
         return ["the gear's place in the body rests on the profile's camera.mount.rpy_deg"]
@@ -172,7 +172,7 @@ def _notes(c: Comparison) -> list[str]:
     return notes
 
 
-def mounting_record(c: Comparison) -> dict[str, Any]:
+def mounting_record(c: MountingReport) -> dict[str, Any]:
     """The measured part of the object of `calibrate --mount --json`; null is not measured."""
     m, mount = c.measured, c.profile.camera.mount
     return {
@@ -196,7 +196,7 @@ def mounting_record(c: Comparison) -> dict[str, Any]:
     }
 
 
-def keys_text(c: Comparison) -> str:
+def keys_text(c: MountingReport) -> str:
     """The profile's keys, as they are typed into it."""
     lines = []
     for key, value in c.profile_values().items():

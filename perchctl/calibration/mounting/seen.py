@@ -7,21 +7,21 @@ import zlib
 import numpy as np
 
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.turns import cross_matrix, turn
+from perchctl.calibration.mounting.turns import cross_matrix, rotation_matrices
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.pipeline import camera_profile
 from perchctl.profile import Profile
-from perchctl.vision.types import CameraModel, MarkerPose, PipelineOutput
+from perchctl.vision import CameraModel, MarkerPose, PipelineOutput
 
 
-def seeing(profile: Profile) -> Profile:
+def camera_only_profile(profile: Profile) -> Profile:
     """The profile with the camera in the place of vehicle and gear: for a pipeline that knows
     nothing of how the camera is mounted."""
     bare = camera_profile(profile)
     return bare.model_copy(update={"pose": profile.pose})
 
 
-def seen_by(profile: Profile, camera: CameraModel) -> str:
+def pose_basis(profile: Profile, camera: CameraModel) -> str:
     """What poses rest on beside the pictures, in words: the printed sizes and the lens."""
     sides_mm = [f"{1e3 * m.side_m:g}" for m in (profile.target.large, profile.target.small)]
     K = camera.K
@@ -30,7 +30,7 @@ def seen_by(profile: Profile, camera: CameraModel) -> str:
     return f"markers of {' and '.join(sides_mm)} mm, calibration {number:08x}"
 
 
-def seen_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
+def best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
     """The surest of a picture's poses, None without one.
 
     Args:
@@ -48,13 +48,13 @@ def seen_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
         cov = J @ cov @ J.T
     return SeenPose(
         t_s=t_s,
-        rotation_cam_target=turn(pose.rvec_rad) @ R_MARKER_TARGET,
+        rotation_cam_target=rotation_matrices(pose.rvec_rad) @ R_MARKER_TARGET,
         position_cam_target_m=pose.tvec_m,
         covariance=cov if cov is not None and np.isfinite(cov).all() else None,
     )
 
 
-def seen_mirrored(output: PipelineOutput) -> bool:
+def is_seen_mirrored(output: PipelineOutput) -> bool:
     """Whether the target was seen in the mirror only."""
     return output.detections.mirrored and not output.poses
 

@@ -10,10 +10,10 @@ from perchctl.calibration.mounting import carry, pivot
 from perchctl.calibration.mounting.felt import felt, sum_up
 from perchctl.calibration.mounting.motion import missing, tilts_rad
 from perchctl.calibration.mounting.place import camera_place
-from perchctl.calibration.mounting.recording import Part, Recording, SeenPose
+from perchctl.calibration.mounting.recording import MountingPart, MountingRecording, SeenPose
 from perchctl.calibration.mounting.result import Carried, Measured, Pivoted, measured
 from perchctl.calibration.mounting.start import LATENCIES_S, first_guess
-from perchctl.calibration.mounting.turns import turn
+from perchctl.calibration.mounting.turns import rotation_matrices
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, rpy_from_rotation
 
@@ -31,13 +31,13 @@ MIRRORED = (
     "the picture is mirrored: switch that off in the camera, or change camera.mirrored in the "
     "profile"
 )
-_AGAIN: dict[Part, str] = {
+_AGAIN: dict[MountingPart, str] = {
     "carry": "turn the vehicle by hand in view of the target for 30 s, about all axes",
     "pivot": "keep the tip on its point and tilt the vehicle around it to all sides for 20 s",
 }
 
 
-def solve_carry(recording: Recording) -> Carried:
+def solve_carry(recording: MountingRecording) -> Carried:
     """The camera's turn in the body and its latency.
 
     Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
@@ -79,7 +79,7 @@ def solve_carry(recording: Recording) -> Carried:
     )
 
 
-def solve_pivot(recording: Recording, size_sigma: float = 0.005) -> Pivoted:
+def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivoted:
     """The gear's tip in the camera's frame.
 
     Args:
@@ -111,7 +111,7 @@ def solve_pivot(recording: Recording, size_sigma: float = 0.005) -> Pivoted:
     )
 
 
-def check(recording: Recording, part: Part) -> None:
+def check(recording: MountingRecording, part: MountingPart) -> None:
     """Raises InvalidValue where a solve would be in vain."""
     if recording.part != part:
         raise InvalidValue(f"this is a recording of the {recording.part}, not of the {part}")
@@ -178,11 +178,11 @@ def _check_pivot(seen: pivot.Seen, solved: pivot.Solved) -> None:
         )
 
 
-def _in_order(recording: Recording) -> list[SeenPose]:
+def _in_order(recording: MountingRecording) -> list[SeenPose]:
     return sorted(recording.poses, key=lambda p: p.t_s)
 
 
-def _carry_poses(recording: Recording) -> carry.Seen:
+def _carry_poses(recording: MountingRecording) -> carry.Seen:
     poses = _in_order(recording)
     return carry.Seen(
         t_s=np.array([p.t_s for p in poses]),
@@ -205,7 +205,11 @@ def _rpy_sigma_deg(R: Array, cov_rad2: Array) -> tuple[float, float, float]:
     step = 1e-6
     here = np.array(rpy_from_rotation(R))
     J = np.stack(
-        [np.array(rpy_from_rotation(turn(step * axis) @ R)) - here for axis in np.eye(3)], axis=1
+        [
+            np.array(rpy_from_rotation(rotation_matrices(step * axis) @ R)) - here
+            for axis in np.eye(3)
+        ],
+        axis=1,
     )
     J = (J + np.pi) % (2.0 * np.pi) - np.pi
     return _degrees(np.sqrt(np.diagonal(J @ cov_rad2 @ J.T)) / step)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.calibration.mounting.felt import Turned, turned_at
-from perchctl.calibration.mounting.turns import nearest_turn, turn_vector
+from perchctl.calibration.mounting.turns import nearest_turn, rotation_vectors
 from perchctl.geometry import Array
 
 LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
@@ -38,12 +38,12 @@ def first_guess(turned: Turned, t_s: Array, R_cam_target: Array) -> Start | None
     first, second = _pairs(t_s)
     if len(first) < 3:
         return None
-    seen = turn_vector(R_cam_target[first] @ R_cam_target[second].transpose(0, 2, 1))
+    seen = rotation_vectors(R_cam_target[first] @ R_cam_target[second].transpose(0, 2, 1))
     guesses = []
     for latency_s in LATENCIES_S:
         a = turned_at(turned, t_s[first] - latency_s).R_world_body
         b = turned_at(turned, t_s[second] - latency_s).R_world_body
-        guesses.append(_fit(turn_vector(a.transpose(0, 2, 1) @ b), seen))
+        guesses.append(_fit(rotation_vectors(a.transpose(0, 2, 1) @ b), seen))
     misfit = np.array([m for _, m in guesses])
     best = int(np.argmin(misfit))
     return Start(guesses[best][0], float(LATENCIES_S[best]), misfit)

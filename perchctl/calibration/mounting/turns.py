@@ -20,7 +20,7 @@ def cross_matrix(v: Array) -> Array:
     return out
 
 
-def turn(v: Array) -> Array:
+def rotation_matrices(v: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
     small = angle < _SMALL
@@ -31,7 +31,7 @@ def turn(v: Array) -> Array:
     return np.asarray(np.eye(3) + a * K + b * (K @ K))
 
 
-def turn_vector(R: Array) -> Array:
+def rotation_vectors(R: Array) -> Array:
     """Rotation vectors (n, 3), no longer than pi, of matrices (n, 3, 3)."""
     v = 0.5 * np.stack(
         [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1
@@ -51,7 +51,7 @@ def turn_vector(R: Array) -> Array:
 def turns_from_rpy(rpy_rad: Array) -> Array:
     """As `perchctl.geometry.rotation_from_rpy` of many, (n, 3) to (n, 3, 3)."""
     zero = np.zeros(len(rpy_rad))
-    x, y, z = (turn(np.stack(v, axis=1)) for v in (
+    x, y, z = (rotation_matrices(np.stack(v, axis=1)) for v in (
         (rpy_rad[:, 0], zero, zero), (zero, rpy_rad[:, 1], zero), (zero, zero, rpy_rad[:, 2])
     ))  # fmt: skip
     return np.asarray(z @ y @ x)

@@ -7,15 +7,14 @@ import math
 from collections.abc import Callable, Iterator
 from functools import partial
 
-from perchctl.camera.source import FrameSource, WatchedSource
+from perchctl.camera import FrameSource, WatchedSource
 from perchctl.display.page.live import LivePage, PageState
 from perchctl.display.page.sketch import Sketch
 from perchctl.display.page.told import Card, answered
 from perchctl.display.status import status_rows
 from perchctl.display.watch import status_of
-from perchctl.mission.planner import is_over
-from perchctl.mission.watch import RESCUE, Event, EventKind, Tick
-from perchctl.vision.types import MARKERS, CameraModel, Frame, PipelineOutput
+from perchctl.mission import RESCUE, Event, EventKind, Tick, is_mission_over
+from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput
 
 AXES_OF_SIDE = 0.5
 """Length of the drawn axes, in sides of the large marker."""
@@ -56,7 +55,7 @@ class FlightPage:
             if self._pressed_s is None and self.page.stop_requested:
                 self._pressed_s = tick.t_s
             did = answered(self._events, self._pressed_s)
-            self.page.tell(partial(flight_state, tick, did), live=not is_over(tick.state))
+            self.page.tell(partial(flight_state, tick, did), live=not is_mission_over(tick.state))
         except Exception as error:
             self.page.remember(error)
 
@@ -103,7 +102,7 @@ def flight_state(tick: Tick, stop_did: str = "") -> PageState:
         "battery_v": volts if math.isfinite(volts) else None,
         "rows": [list(row) for row in status_rows(status)],
         "note": f"held: {status.hold}" if status.hold else _seen_note(tick.output),
-        "over": is_over(tick.state),
+        "over": is_mission_over(tick.state),
         "stop_did": stop_did,
     }
 

@@ -19,7 +19,7 @@ import cv2
 from perchctl.display.page.server import PageServer
 from perchctl.display.page.sketch import Sketch, draw_flat, draw_sketch
 from perchctl.errors import InvalidValue
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 JPEG_QUALITY = 80
 WAIT_S = 0.5

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel, project
 
 # Blue, green, red.
 _OUTLINE = {"large": (0, 200, 255), "small": (255, 200, 0)}

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from perchctl.log.summary import FlightSummary
-from perchctl.mission.state import TERMINALS, Phase
-from perchctl.mission.watch import Event, EventKind
+from perchctl.log import FlightSummary
+from perchctl.mission import TERMINALS, Event, EventKind, Phase
 
 Card = dict[str, Any]
 GOOD = "perched"

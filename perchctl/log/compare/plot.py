@@ -24,7 +24,7 @@ from perchctl.log.plot import (
     while_tracked,
 )
 from perchctl.log.read import FlightLog
-from perchctl.log.summary import summary_of
+from perchctl.log.summary import summarise_flight
 from perchctl.plot import BLUE, GREY, GRID, VERMILLION, new_figure, save_figure
 
 SIZE_IN = (11.0, 16.0)
@@ -105,6 +105,6 @@ def _legend(logs: Sequence[FlightLog]) -> list[Line2D]:
         shown = str(log.path)
         if len(shown) > _MOST_OF_A_PATH:
             shown = f"...{shown[3 - _MOST_OF_A_PATH :]}"
-        text = f"{name}: {shown}   |   {title_of(log, summary_of(log))}".replace("\n", " ")
+        text = f"{name}: {shown}   |   {title_of(log, summarise_flight(log))}".replace("\n", " ")
         handles.append(Line2D([], [], color=colour, linewidth=width, label=text))
     return handles

@@ -9,7 +9,7 @@ from typing import Any
 from perchctl.log.measures import Measures, measures_of, shown
 from perchctl.log.read import FlightLog
 from perchctl.log.shown import hung, plain, profile_name
-from perchctl.log.summary import FlightSummary, summary_of
+from perchctl.log.summary import FlightSummary, summarise_flight
 
 _NAME, _CELL = 32, 14
 _NOT_THERE = "not there"
@@ -36,12 +36,12 @@ class Comparison:
     profile: dict[str, tuple[Any, Any]]
 
 
-def compared(one: FlightLog, other: FlightLog) -> Comparison:
+def compare_flights(one: FlightLog, other: FlightLog) -> Comparison:
     """Errors: InvalidValue for a field that is not a number."""
     logs = (one, other)
     return Comparison(
         logs,
-        (summary_of(one), summary_of(other)),
+        (summarise_flight(one), summarise_flight(other)),
         (measures_of(one), measures_of(other)),
         tuple(_phase_times(one, other)),
         profile_differences(one.header.get("profile"), other.header.get("profile")),
@@ -49,6 +49,7 @@ def compared(one: FlightLog, other: FlightLog) -> Comparison:
 
 
 def comparison_text(found: Comparison) -> str:
+    """The comparison of two flights as a table, for people."""
     return "\n".join(_lines(found))
 
 

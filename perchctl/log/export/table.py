@@ -13,7 +13,7 @@ from typing import Any, Literal
 from perchctl.errors import InvalidValue
 from perchctl.log.fields import FIELDS
 from perchctl.log.read import FlightLog
-from perchctl.profile.keys import unit_of
+from perchctl.profile import key_unit
 
 Kind = Literal["number", "integer", "flag", "text"]
 
@@ -44,10 +44,10 @@ class Column:
     @property
     def unit(self) -> str:
         """``m/s``; empty for a plain number or a word."""
-        return unit_of(self.name)
+        return key_unit(self.name)
 
 
-def columns_of(log: FlightLog) -> list[Column]:
+def log_columns(log: FlightLog) -> list[Column]:
     """`t_s` first, from 0; then the log's fields in their order, with lists flattened, what
     happened in words, and how long the parts of the turn took.
 

@@ -1,6 +1,6 @@
 """A flight's recording: an MCAP file beside the log, with the pictures.
 
-`pictures_of` reads the pictures back, `export_mcap` makes such a file of a log. The libraries
+`recorded_pictures` reads the pictures back, `export_mcap` makes such a file of a log. The libraries
 are loaded with the first call: most flights of a campaign are not recorded.
 """
 
@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from perchctl.log.read import FlightLog, read_log
-from perchctl.log.recording.place import recording_of
+from perchctl.log.recording.place import recording_path
 
 if TYPE_CHECKING:
     from perchctl.log.recording.export import Exported
     from perchctl.log.recording.pictures import Picture
 
-__all__ = ["export_mcap", "pictures_of", "recording_of"]
+__all__ = ["export_mcap", "recorded_pictures", "recording_path"]
 
 
-def pictures_of(
+def recorded_pictures(
     path: Path | str, *, exact: bool = True, numbers: Container[int] | None = None
 ) -> Iterator[Picture]:
     """The pictures `(number, t_s, image)`, oldest first, of a recording or of the log that it lies
@@ -35,7 +35,7 @@ def pictures_of(
     """
     from perchctl.log.recording.pictures import pictures_in
 
-    return pictures_in(recording_of(path), exact, numbers)
+    return pictures_in(recording_path(path), exact, numbers)
 
 
 def export_mcap(

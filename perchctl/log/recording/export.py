@@ -12,20 +12,20 @@ from typing import Any, Literal
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
 from perchctl.log.read import FlightLog
 from perchctl.log.recording.container import DiskStream
 from perchctl.log.recording.layout import layout
 from perchctl.log.recording.messages import FRAME, IMAGE
-from perchctl.log.recording.place import LAYOUT_SUFFIX, SUFFIX, recording_of
+from perchctl.log.recording.place import LAYOUT_SUFFIX, SUFFIX, recording_path
 from perchctl.log.recording.walk import Walked, walk
 from perchctl.log.recording.writing import Writing
 from perchctl.log.sent import sent_values
-from perchctl.log.setup import camera_in, profile_of
+from perchctl.log.setup import flown_camera, flown_profile
 from perchctl.profile import Profile
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 Kind = Literal["event", "sent", "tick", "frame"]
 
@@ -81,12 +81,12 @@ def exported(log: FlightLog, out_path: Path, overwrite: bool) -> Exported:
 def _setup(log: FlightLog, notes: list[str]) -> tuple[Profile | None, CameraModel | None]:
     """The profile and the calibration that were flown, as far as they are known."""
     try:
-        profile = profile_of(log.header)
+        profile = flown_profile(log.header)
     except InvalidValue as error:
         notes.append(f"without the camera's mounting, the vehicle and the target: {error}")
         return None, None
     with contextlib.suppress(PerchError):
-        return profile, camera_in(log.header) or camera_of(profile.camera)
+        return profile, flown_camera(log.header) or profile_camera(profile.camera)
     notes.append(
         f"without the camera's calibration: the log does not hold it, and "
         f"{profile.camera.calibration} is not here"
@@ -108,7 +108,7 @@ def _frames(log: FlightLog, notes: list[str]) -> Iterator[tuple[float, Kind, _Fr
     """The recording's, in its order; none where there is no recording."""
     image: Walked | None = None
     try:
-        for each in walk(recording_of(log.path), (IMAGE, FRAME)):
+        for each in walk(recording_path(log.path), (IMAGE, FRAME)):
             if each.topic == IMAGE:
                 image = each
                 continue

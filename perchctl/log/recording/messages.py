@@ -32,7 +32,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from perchctl.geometry import quaternion_from_rotation, quaternion_from_rpy
 from perchctl.log.recording.times import NS, Epoch
 from perchctl.profile import Profile
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 WORLD, BODY, GEAR, CAMERA, TARGET = "world", "body", "gear", "camera", "target"
 

@@ -12,7 +12,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
-from perchctl.camera.files import picture_in
+from perchctl.camera import decode_picture
 from perchctl.errors import InvalidValue
 from perchctl.log.recording.messages import FRAME, IMAGE
 from perchctl.log.recording.walk import Walked, walk
@@ -30,7 +30,7 @@ class Picture(NamedTuple):
 def pictures_in(
     path: Path, exact: bool, numbers: Container[int] | None = None
 ) -> Iterator[Picture]:
-    """As `perchctl.log.recording.pictures_of`, of the recording itself."""
+    """As `perchctl.log.recording.recorded_pictures`, of the recording itself."""
     data: Walked | None = None
     for each in walk(path, (IMAGE, FRAME)):
         if each.topic == IMAGE:
@@ -44,7 +44,7 @@ def pictures_in(
 
 def _picture(path: Path, data: Walked, frame: dict[str, Any], exact: bool) -> Picture:
     try:
-        grey = picture_in(CompressedImage.FromString(data.data).data)
+        grey = decode_picture(CompressedImage.FromString(data.data).data)
     except ValueError as error:
         raise InvalidValue(f"{path}: picture {frame['number']} {error}") from None
     if exact and zlib.crc32(grey.data) != frame["crc32"]:

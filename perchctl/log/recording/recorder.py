@@ -13,14 +13,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.log.behind import Behind
 from perchctl.log.recording.container import DiskStream, Stream
 from perchctl.log.recording.end import RecordingEnd
 from perchctl.log.recording.writing import Writing, encoded, told_of
 from perchctl.profile import Profile
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame
 
 CLOSE_TIMEOUT_S = 5.0
 MOST_BEHIND = 1500
@@ -77,7 +77,7 @@ class Recorder:
         self._handed_bytes = 0
         self._closed = False
         # Of the thread that writes.
-        self._writing = Writing(stream, header, profile, camera_of(profile.camera))
+        self._writing = Writing(stream, header, profile, profile_camera(profile.camera))
         self._over = False
         self._done_bytes = 0
         self._flushed_s: float | None = None

@@ -17,7 +17,7 @@ from perchctl.log.recording.scene import scene_message
 from perchctl.log.recording.shapes import LOOP_TIMES
 from perchctl.log.recording.times import Epoch, epoch_of
 from perchctl.profile import Profile
-from perchctl.vision.types import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame
 
 PNG_LEVEL = 1
 """Fast; the next levels cost twice the time for a twentieth of the size."""

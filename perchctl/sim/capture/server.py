@@ -18,7 +18,7 @@ from perchctl.errors import ConnectionFailed
 from perchctl.positioning import CaptureFrame
 from perchctl.sim.capture import natnet
 
-SYSTEM = "optitrack"
+SIMULATED_SYSTEM = "optitrack"
 """As `motioncapture` calls it."""
 _HOST = "127.0.0.1"
 _POLL_S = 0.2

@@ -17,7 +17,7 @@ Y_UP = "+x+z-y"
 """The capture's second axis is up, as some systems have it out of the box."""
 SWAPPED_XY = "+y-x+z"
 """The capture's axes lie a quarter turn from those along which its bodies were defined."""
-MILLIMETRES = 1000.0
+MILLIMETRES_PER_M = 1000.0
 
 
 @dataclass(frozen=True)

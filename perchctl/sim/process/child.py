@@ -13,10 +13,10 @@ from collections.abc import Sequence
 
 import cv2
 
-from perchctl.calibration.files import load_calibration
+from perchctl.calibration import load_calibration
 from perchctl.children import connect_back
 from perchctl.errors import PerchError
-from perchctl.profile.places import data_file
+from perchctl.profile import data_file
 from perchctl.sim.capture.natnet import COMMAND_PORT
 from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.process.control import START_TIMEOUT_S, HostSetup

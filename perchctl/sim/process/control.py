@@ -10,7 +10,7 @@ from perchctl.profile import TargetConfig
 from perchctl.sim.capture.settings import CaptureSettings
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 Pace = Literal["realtime", "stepped"]
 START_TIMEOUT_S = 30.0

@@ -36,7 +36,7 @@ from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.control import LINGER_S, START_TIMEOUT_S, HostSetup, Pace
 from perchctl.sim.process.shared import SharedTime
 from perchctl.sim.scenario import Scenario
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 
 ANSWER_TIMEOUT_S = 15.0
 SLOWEST_PACE = 20.0

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from perchctl.geometry import rpy_from_rotation
-from perchctl.sim.bursts import bursts_of
-from perchctl.sim.capture.server import SYSTEM, CaptureServer
+from perchctl.sim.bursts import radio_bursts
+from perchctl.sim.capture.server import SIMULATED_SYSTEM, CaptureServer
 from perchctl.sim.crtp.server import CrtpServer
 from perchctl.sim.crtp.udp import Address, UdpEndpoint
 from perchctl.sim.process.control import HostSetup
@@ -38,7 +38,7 @@ class VehicleHost:
         self._steps = 0
         self.vehicle = self._new_vehicle(setup.scenario)
         self.server = CrtpServer(self.vehicle.firmware, setup.link)
-        self.endpoint = UdpEndpoint(setup.port, setup.link, bursts_of(setup.scenario))
+        self.endpoint = UdpEndpoint(setup.port, setup.link, radio_bursts(setup.scenario))
         self.stream: MjpegServer | None = None
         self.positions: CaptureServer | None = None
         self._truth: TextIO | None = None
@@ -66,7 +66,7 @@ class VehicleHost:
     @property
     def capture(self) -> tuple[str, str] | None:
         """The motion capture's kind, as `motioncapture` calls it, and its address."""
-        return None if self.positions is None else (SYSTEM, self.positions.host)
+        return None if self.positions is None else (SIMULATED_SYSTEM, self.positions.host)
 
     @property
     def elapsed_s(self) -> float:

@@ -21,7 +21,7 @@ from typing import Any
 from perchctl.children import Channel
 from perchctl.sim.capture.settings import CaptureFault
 from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.shared import LOOP_PATIENCE_S, MARGIN_S, SharedTime
+from perchctl.sim.process.shared import CLOCK_MARGIN_S, LOOP_PATIENCE_S, SharedTime
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
 MAX_LAG_S = 1.0
@@ -80,7 +80,7 @@ class Runner:
     def catch_up(self) -> float:
         """Step up to now, some steps at most at once; how long to wait for the next step."""
         now_s = self._clock() - self._origin_s
-        max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else MARGIN_S
+        max_lag_s = MAX_LAG_S if math.isinf(self._shared.limit_s) else CLOCK_MARGIN_S
         if now_s - self._host.elapsed_s > max_lag_s:
             self._origin_s += now_s - self._host.elapsed_s - max_lag_s
             now_s = self._clock() - self._origin_s
@@ -99,7 +99,7 @@ class Runner:
         most: what hangs for good must not stop time."""
         limit_s, before_s = self._shared.limit_s, self._limit_s
         loop_late = self._host.elapsed_s >= limit_s
-        if math.isinf(limit_s) or not (loop_late or self._host.picture_late_s > MARGIN_S):
+        if math.isinf(limit_s) or not (loop_late or self._host.picture_late_s > CLOCK_MARGIN_S):
             self._waiting_since_s = None
             return False
         now_s, self._limit_s = self._clock(), limit_s

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-MARGIN_S = 0.02
+CLOCK_MARGIN_S = 0.02
 """Simulated time may run so far past the moment that the flight loop waits for."""
 LOOP_PATIENCE_S = 2.0
 """The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""

@@ -56,7 +56,7 @@ _SMALL_PLACES = 12  # that make it the small marker that was seen
 _INVERTED = 1e-3  # normalised; the lens model holds where its inverse is one
 
 
-def prepare(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
+def prepare_cut_markers(patterns: Mapping[MarkerName, Pattern], camera: CameraModel) -> None:
     """Makes what `cut_markers` keeps of a target and a camera before it is in a hurry."""
     drawing = patterns["large"].drawing
     outline_of(drawing), texture_of(drawing), lattice_of(camera)
@@ -132,7 +132,7 @@ def cut_markers(
     return {} if corners is None else {name: corners}
 
 
-def shows_enough(
+def shows_enough_of_target(
     pose: RigidPose, patterns: Mapping[MarkerName, Pattern], camera: CameraModel
 ) -> bool:
     """Whether what a picture taken in that pose shows of the target is enough to measure it."""

@@ -30,7 +30,7 @@ from perchctl.vision.markers.cut import (
     may_be_whole,
     measured_lately,
 )
-from perchctl.vision.markers.detector import DetectorSetup, make_detector
+from perchctl.vision.markers.detector import DetectorSetup
 from perchctl.vision.markers.follow import follow, follow_partly
 from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.improve import improved, lines_suffice
@@ -43,7 +43,7 @@ from perchctl.vision.markers.seen_edges import ROOM_PX
 from perchctl.vision.markers.shift import known_from
 from perchctl.vision.markers.square import completed, nested, side_lengths_px, within
 from perchctl.vision.markers.visible_cells import KnownBy
-from perchctl.vision.own import Chooser
+from perchctl.vision.own import TargetSelector
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -55,20 +55,18 @@ from perchctl.vision.types import (
     PictureKind,
 )
 
-__all__ = ["DetectorSetup", "detect", "make_detector"]
-
 _SEARCHED_SIDE_PX = 13.0  # smaller markers are not found by a search
 _Seen = dict[MarkerName, RefinedCorners]
 
 
-def detect(
+def detect_markers(
     frame: Frame,
     previous: Detections | None,
     setup: DetectorSetup,
     camera: CameraModel,
     expected: Mapping[MarkerName, Array] | None = None,
     empty_frames: int | None = None,
-    own: Chooser | None = None,
+    own: TargetSelector | None = None,
 ) -> Detections:
     """Find and refine the target's markers in one frame.
 
@@ -135,7 +133,7 @@ def _looked(
     lately: bool,
     was_cut: bool,
     turn: int | None,
-    own: Chooser | None,
+    own: TargetSelector | None,
 ) -> Detections:
     """What is in a picture of one moment; `hidden` (h, w) is where that is not seen, `lately`
     whether the target was measured a moment ago, `was_cut` no marker of it being whole, `turn` of

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.profile.dictionaries import predefined
+from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
 from perchctl.vision.markers.drawing import drawing_of
 from perchctl.vision.markers.mask import GearMask
 from perchctl.vision.markers.pattern import Pattern, Rim, pattern_of, rim_of_bits
@@ -43,7 +42,7 @@ _LOOSE_THRESHOLDS = Thresholds(15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """What `detect` needs, made once by `make_detector`; nothing in it changes later.
+    """What `detect` needs, made once by `make_aruco_detector`; nothing in it changes later.
 
     `dictionaries` are the large and the small marker's, each with the marker and, behind it
     (`MIRROR_INDEX`), its mirror image where that cannot be confused with the marker
@@ -66,7 +65,7 @@ class DetectorSetup:
         return self.refinement == "line"
 
 
-def make_detector(
+def make_aruco_detector(
     config: DetectorConfig, target: TargetConfig, mask: GearMask | None = None
 ) -> DetectorSetup:
     """Dictionaries of just the target's ids, and how its markers look."""
@@ -124,7 +123,7 @@ def _rim(bits: NDArray[np.uint8], side_m: float) -> Rim:
 
 
 def _bits(marker: MarkerConfig) -> NDArray[np.uint8]:
-    source = predefined(marker.dictionary)
+    source = aruco_dictionary(marker.dictionary)
     rows = np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1])
     return np.asarray(cv2.aruco.Dictionary.getBitsFromByteList(rows, source.markerSize))
 

@@ -23,7 +23,7 @@ from perchctl.vision.markers.detector import (
     strict_detector,
 )
 from perchctl.vision.markers.square import mean_side_px, nested, within
-from perchctl.vision.own import Chooser
+from perchctl.vision.own import TargetSelector
 from perchctl.vision.types import MARKERS, MarkerName
 
 Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]
@@ -74,7 +74,7 @@ def search(
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     look: Look = "all",
-    own: Chooser | None = None,
+    own: TargetSelector | None = None,
 ) -> Found:
     """By the window, if there is one, and by the whole picture where that gave too little; only
     one of them with a `look` that is "near", "window" or "sharp". Large markers are looked for at
@@ -102,7 +102,7 @@ def search_halved(
     image: NDArray[np.uint8],
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
-    own: Chooser | None = None,
+    own: TargetSelector | None = None,
 ) -> Found | None:
     """By the window, at half the size: a millisecond. None where that did not show all that should
     be whole in the picture, or where that is too small for it."""
@@ -150,7 +150,7 @@ def _pass(
     expected: Mapping[MarkerName, Array],
     setup: DetectorSetup,
     thresholds: Thresholds,
-    own: Chooser | None,
+    own: TargetSelector | None,
     halved: bool = False,
 ) -> Found:
     """What one pass of OpenCV's detector over the box gives, or over that at half its size."""
@@ -182,7 +182,7 @@ def choose(
     candidates: Mapping[MarkerName, list[Array]],
     expected: Mapping[MarkerName, Array],
     ratio: float,
-    own: Chooser | None = None,
+    own: TargetSelector | None = None,
 ) -> dict[MarkerName, Array]:
     """At most one of each marker: look-alikes and what does not fit together are dropped.
 
@@ -221,7 +221,7 @@ def _chosen(
     wholes: list[tuple[float, int, int]],
     large: list[Array],
     expected: Mapping[MarkerName, Array],
-    own: Chooser | None,
+    own: TargetSelector | None,
 ) -> tuple[float, int, int]:
     """Of several whole targets."""
     if len(wholes) == 1 or not (expected or own):
@@ -236,7 +236,7 @@ def _chosen(
 
 
 def _possible(
-    candidates: Mapping[MarkerName, list[Array]], own: Chooser
+    candidates: Mapping[MarkerName, list[Array]], own: TargetSelector
 ) -> Mapping[MarkerName, list[Array]]:
     """Without the markers that are too far aside. A lone one is left to the pipeline, which says
     why it is not taken."""
@@ -249,7 +249,7 @@ def _possible(
     return kept if any(kept.values()) else candidates
 
 
-def _least_aside(name: MarkerName, quads: list[Array], own: Chooser) -> list[Array]:
+def _least_aside(name: MarkerName, quads: list[Array], own: TargetSelector) -> list[Array]:
     if len(quads) < 2:
         return quads
     away = [own.aside_m(name, quad) for quad in quads]

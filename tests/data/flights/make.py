@@ -30,16 +30,21 @@ import pytest  # noqa: E402
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage  # noqa: E402
 
 from perchctl.faults.flight import fly_fault_seed  # noqa: E402
-from perchctl.flight import lockstep  # noqa: E402
-from perchctl.flight.lockstep import fly_lockstep  # noqa: E402
-from perchctl.flight.loop import FlightParts  # noqa: E402
+from perchctl.flight import (  # noqa: E402
+    FlightParts,
+    fly_lockstep,
+    lockstep,
+)
+from perchctl.log import LogWatcher  # noqa: E402
 from perchctl.log.recording.container import Container, DiskStream  # noqa: E402
 from perchctl.log.recording.messages import FRAME, IMAGE  # noqa: E402
-from perchctl.log.recording.place import recording_of  # noqa: E402
+from perchctl.log.recording.place import recording_path  # noqa: E402
 from perchctl.log.recording.walk import walk  # noqa: E402
-from perchctl.log.watch import LogWatcher  # noqa: E402
-from perchctl.mission.state import Operator, Phase  # noqa: E402
-from perchctl.mission.watch import FlightReport  # noqa: E402
+from perchctl.mission import (  # noqa: E402
+    FlightReport,
+    Operator,
+    Phase,
+)
 from tests.helpers.flights import short_profile  # noqa: E402
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner  # noqa: E402
 
@@ -109,9 +114,9 @@ def made(name: str) -> Path:
         log = Path(folder) / f"{name}.jsonl"
         FLIGHTS[name](log)
         lines = [line for line in log.read_bytes().splitlines(True) if line.startswith(KEPT)]
-        if recording_of(log).is_file():
+        if recording_path(log).is_file():
             lines = lines[: _end_of(lines)]
-            _keep_pictures(recording_of(log), HERE / f"{name}.mcap")
+            _keep_pictures(recording_path(log), HERE / f"{name}.mcap")
     path = HERE / f"{name}.jsonl.gz"
     path.write_bytes(gzip.compress(b"".join(lines), compresslevel=9, mtime=0))
     return path
@@ -160,7 +165,7 @@ def main() -> None:
         if name not in FLIGHTS:
             sys.exit(f"{name} is none of {', '.join(FLIGHTS)}")
         path = made(name)
-        for file in (path, recording_of(path)):
+        for file in (path, recording_path(path)):
             if file.is_file():
                 print(f"{file.name}: {file.stat().st_size / 1000:.0f} kB")
 

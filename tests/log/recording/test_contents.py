@@ -23,7 +23,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import (
     Array,
@@ -32,14 +32,14 @@ from perchctl.geometry import (
     rotation_from_quaternion,
     rotation_from_rpy,
 )
-from perchctl.log.recording import pictures_of
+from perchctl.log import recorded_pictures
 from perchctl.log.recording.layout import layout
 from perchctl.log.recording.messages import calibration_message
 from perchctl.log.recording.shapes import SCHEMAS
 from perchctl.log.sent import sent_values
-from perchctl.mission.sent import Sent
+from perchctl.mission import SentCommand
 from perchctl.vehicle import Land
-from perchctl.vision.types import CameraModel
+from perchctl.vision import CameraModel
 from tests.helpers import recorded
 
 OFFICIAL = {
@@ -75,7 +75,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recording") / "flight.mcap"
     recorder = recorded.recorder(path, **STARTED)
     recorded.fly(recorder, FLIGHT)
-    recorder.sent(sent_values(Sent(FLIGHT.ticks[-1]["t_s"], "watchdog", Land(-0.05, 2.0))))
+    recorder.sent(sent_values(SentCommand(FLIGHT.ticks[-1]["t_s"], "watchdog", Land(-0.05, 2.0))))
     end = recorder.close()
     assert (end.pictures, end.missing, end.problem) == (len(FLIGHT.frames), 0, None)
     return path
@@ -87,7 +87,7 @@ def found(recording: Path) -> dict[str, list[Any]]:
 
 
 def test_each_picture_is_the_pipeline_s_to_the_bit(recording: Path) -> None:
-    found = list(pictures_of(recording))
+    found = list(recorded_pictures(recording))
     assert [(p.number, p.t_s) for p in found] == [(f.index, f.t_s) for f in FLIGHT.frames]
     for got, frame in zip(found, FLIGHT.frames, strict=True):
         assert got.image.dtype == np.uint8
@@ -101,7 +101,7 @@ def test_a_jpeg_lies_there_as_it_came(found: dict[str, list[Any]]) -> None:
 
 
 def test_the_logs_own_path_names_it_too(recording: Path) -> None:
-    assert next(pictures_of(recording.with_suffix(".jsonl"))).number == 0
+    assert next(recorded_pictures(recording.with_suffix(".jsonl"))).number == 0
 
 
 def test_a_picture_that_decodes_otherwise_here_is_said(
@@ -112,16 +112,16 @@ def test_a_picture_that_decodes_otherwise_here_is_said(
     real = cv2.imdecode
     monkeypatch.setattr(cv2, "imdecode", lambda *args: real(*args) // 2)
     with pytest.raises(InvalidValue, match="picture 0 decodes to other pixels"):
-        next(pictures_of(recording))
-    assert next(pictures_of(recording, exact=False)).number == 0
+        next(recorded_pictures(recording))
+    assert next(recorded_pictures(recording, exact=False)).number == 0
 
 
 def test_no_recording_and_none_of_ours(tmp_path: Path) -> None:
     with pytest.raises(NotFound, match="does not exist"):
-        next(pictures_of(tmp_path / "flight.jsonl"))
+        next(recorded_pictures(tmp_path / "flight.jsonl"))
     (tmp_path / "flight.mcap").write_bytes(b"GIF89a and more")
     with pytest.raises(InvalidValue, match="no recording"):
-        next(pictures_of(tmp_path / "flight.jsonl"))
+        next(recorded_pictures(tmp_path / "flight.jsonl"))
 
 
 def test_readers_find_it_whole(recording: Path, found: dict[str, list[Any]]) -> None:
@@ -293,7 +293,7 @@ def test_values_that_are_no_numbers_make_no_transform(tmp_path: Path) -> None:
 
 def test_the_calibration_is_the_flights(found: dict[str, list[Any]]) -> None:
     (said,) = found["/camera/calibration"]
-    camera = camera_of(recorded.PROFILE.camera)
+    camera = profile_camera(recorded.PROFILE.camera)
     assert (said.width, said.height, said.frame_id) == (*camera.size_px, "camera")
     assert said.distortion_model == "plumb_bob"
     assert list(said.D) == list(camera.dist)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.log.recording import export_mcap, pictures_of
+from perchctl.log import export_mcap, recorded_pictures
 from perchctl.log.recording.layout import layout
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
@@ -60,7 +60,7 @@ def _values(message: Any) -> list[float]:
 
 def test_its_pictures_are_the_flights_to_the_bit(log: Path, tmp_path: Path) -> None:
     export_mcap(log, tmp_path / "out.mcap")
-    found = list(pictures_of(tmp_path / "out.mcap"))
+    found = list(recorded_pictures(tmp_path / "out.mcap"))
     assert [(p.number, p.t_s) for p in found] == [(f.index, f.t_s) for f in FLIGHT.frames]
     assert all((p.image == FLIGHT.frames[p.number].image).all() for p in found)
 
@@ -81,7 +81,7 @@ def test_a_cut_recording_becomes_a_whole_file(log: Path, tmp_path: Path) -> None
     """In its own place, where that is asked for."""
     recording = tmp_path / "flight.mcap"
     recording.write_bytes(recording.read_bytes()[:150_000])
-    kept = len(list(pictures_of(recording)))
+    kept = len(list(recorded_pictures(recording)))
     assert 0 < kept < 60
     done = export_mcap(log, recording, overwrite=True)
     assert done.pictures == kept

@@ -16,16 +16,14 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from mcap.reader import make_reader
 
-from perchctl.calibration.files import camera_of
+from perchctl.calibration import profile_camera
 from perchctl.flight import lockstep
 from perchctl.flight.campaign import fly_seed
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rotation_from_quaternion
-from perchctl.log.read import read_log
-from perchctl.log.recording import container, pictures_of
+from perchctl.log import read_log, recorded_pictures
+from perchctl.log.recording import container
 from perchctl.profile import load_profile
-from perchctl.vision.camera_model import project
-from perchctl.vision.pose import square
-from perchctl.vision.types import Frame
+from perchctl.vision import Frame, project, square_corners
 from tests.helpers import recorded
 from tests.helpers.commands import run
 from tests.helpers.flights import SEED, SHORT
@@ -55,7 +53,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
 def test_every_frame_of_a_flight_is_there_to_the_bit(flown: tuple[Path, list[Frame]]) -> None:
     path, given = flown
     new = [frame for frame in given if not frame.repeated]
-    found = list(pictures_of(path))
+    found = list(recorded_pictures(path))
     assert [(p.number, p.t_s) for p in found] == [(f.index, f.t_s) for f in new]
     assert all(np.array_equal(p.image, f.image) for p, f in zip(found, new, strict=True))
     summary = read_log(path).summary
@@ -81,7 +79,7 @@ def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(
     that were found: a frame turned about any axis would be off by the marker's side."""
     path, _ = flown
     profile = load_profile(SHORT)
-    camera = camera_of(profile.camera)
+    camera = profile_camera(profile.camera)
     records = read_log(path).records
     said = recorded.messages(path.with_suffix(".mcap"))["/tf"]
     errors = []
@@ -93,7 +91,7 @@ def test_the_target_of_the_transforms_lies_on_that_of_the_pictures(
         T_cam_marker = T_cam_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
         rvec = np.asarray(cv2.Rodrigues(T_cam_marker[:3, :3])[0], dtype=float).ravel()
         side_m = profile.target.large.side_m
-        drawn = project(square(side_m), rvec, T_cam_marker[:3, 3], camera)
+        drawn = project(square_corners(side_m), rvec, T_cam_marker[:3, 3], camera)
         found = np.reshape(record["large_px"], (4, 2))
         side_px = np.linalg.norm(found[1] - found[0])
         errors.append(float(np.abs(drawn - found).max() / side_px))
@@ -123,7 +121,7 @@ def test_a_disk_that_fills_up_ends_the_recording_and_not_the_flight(
     (note,) = notes
     assert "the recording has ended (No space left on device)" in note
     assert here.summary is not None
-    assert 0 < here.summary["pictures"] == len(list(pictures_of(path)))
+    assert 0 < here.summary["pictures"] == len(list(recorded_pictures(path)))
     assert here.summary["pictures_missing"] > 0
     with path.with_suffix(".mcap").open("rb") as stream:
         list(make_reader(stream, validate_crcs=True).iter_messages())

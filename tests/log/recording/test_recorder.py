@@ -22,15 +22,12 @@ from mcap.records import Attachment, Channel, Chunk, Header, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from perchctl.errors import InvalidValue
-from perchctl.log.read import read_log
-from perchctl.log.recording import container, pictures_of, walk
+from perchctl.log import LogWatcher, read_log, recorded_pictures, summarise_flight, summary_text
+from perchctl.log.recording import container, walk
 from perchctl.log.recording import recorder as recording_module
 from perchctl.log.recording.recorder import Recorder
-from perchctl.log.summary import summary_of, summary_text
-from perchctl.log.watch import LogWatcher
 from perchctl.log.write import FlightLogWriter
-from perchctl.mission.state import Outcome, Phase
-from perchctl.mission.watch import FlightReport
+from perchctl.mission import FlightReport, Outcome, Phase
 from perchctl.profile import Profile
 from tests.helpers import log as synthetic
 from tests.helpers import recorded
@@ -47,7 +44,7 @@ def onto(disk: MemoryDisk, live: bool = False, profile: Profile = recorded.PROFI
 def pictures_on(disk: MemoryDisk, tmp_path: Path) -> list[int]:
     path = tmp_path / "f.mcap"
     path.write_bytes(disk.data)
-    return [picture.number for picture in pictures_of(path)]
+    return [picture.number for picture in recorded_pictures(path)]
 
 
 def until(met: Callable[[], object]) -> None:
@@ -96,7 +93,7 @@ def test_a_write_that_fails_leaves_no_piece_of_itself(tmp_path: Path) -> None:
     assert path.stat().st_size <= 130_000
     with path.open("rb") as stream:
         list(make_reader(stream, validate_crcs=True).iter_messages())
-    assert [p.number for p in pictures_of(path)][: end.pictures] == list(range(end.pictures))
+    assert [p.number for p in recorded_pictures(path)][: end.pictures] == list(range(end.pictures))
 
 
 def test_the_disk_s_last_is_left_to_the_log(tmp_path: Path) -> None:
@@ -279,7 +276,7 @@ def test_frames_before_the_first_tick_are_kept(tmp_path: Path) -> None:
     for frame in flight.frames:
         recorder.frame(frame)
     recorder.close()
-    assert len(list(pictures_of(tmp_path / "f.mcap"))) == 8
+    assert len(list(recorded_pictures(tmp_path / "f.mcap"))) == 8
 
 
 def test_a_repetition_is_told_and_not_kept(tmp_path: Path) -> None:
@@ -305,7 +302,7 @@ def test_a_file_that_was_cut_gives_what_is_whole(tmp_path: Path) -> None:
     for cut in [*range(64, len(data), len(data) // 25), len(data) - 20]:
         path = tmp_path / "cut.mcap"
         path.write_bytes(data[:cut])
-        found = list(pictures_of(path))
+        found = list(recorded_pictures(path))
         assert [p.number for p in found] == list(range(len(found)))
         assert all((p.image == flight.frames[p.number].image).all() for p in found)
         counts.append(len(found))
@@ -334,7 +331,7 @@ def test_a_chunk_that_unfolds_without_bound_is_refused(
     monkeypatch.setattr(walk, "MOST_CHUNK_BYTES", 1_000_000)
     tracemalloc.start()
     with pytest.raises(InvalidValue, match="more than 1 MB"):
-        list(pictures_of(path))
+        list(recorded_pictures(path))
     peak_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak_bytes < 6_000_000
@@ -376,7 +373,7 @@ def test_a_killed_program_leaves_what_is_older_than_a_second(tmp_path: Path) -> 
     path = tmp_path / "f.mcap"
     recorder, flight = recorded.recorder(path), recorded.flown(120)
     recorded.fly(recorder, flight)
-    found = [p.t_s for p in pictures_of(path)]  # as another program sees it now
+    found = [p.t_s for p in recorded_pictures(path)]  # as another program sees it now
     last_s = flight.frames[-1].t_s
     assert last_s - 1.2 < found[-1] < last_s
     assert os.path.getsize(path) > 0
@@ -401,7 +398,7 @@ def test_what_is_wrong_with_it_is_no_problem_of_the_log_s(tmp_path: Path) -> Non
     assert summary is not None
     assert summary.log_problem is None
     assert f"0 pictures in f.mcap ({said})" in summary_text(summary)
-    read = summary_of(read_log(tmp_path / "f.jsonl")).recording
+    read = summarise_flight(read_log(tmp_path / "f.jsonl")).recording
     assert read is not None
     assert (read.pictures, read.problem) == (0, said)
     assert read.path == tmp_path / "f.mcap"

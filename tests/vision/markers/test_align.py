@@ -7,11 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project
+from perchctl.vision import project, square_corners
 from perchctl.vision.markers.align import align
 from perchctl.vision.markers.by_drawing import told_apart, verified
 from perchctl.vision.markers.drawing import Drawing, drawing_of
-from perchctl.vision.pose import square
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 LARGE_BITS, SMALL_BITS = bits_of("DICT_4X4_1000", 997), bits_of("DICT_ARUCO_ORIGINAL", 5)
@@ -28,7 +27,9 @@ def view(name: str, side_px: float, seed: int, **looks: float) -> tuple[NDArray[
     z = 401.0 * SIDES[name] / side_px
     x, y, yaw, roll, pitch = rng.uniform(-1, 1, 5) * (0.3 * z, 0.25 * z, math.pi, 0.12, 0.12)
     rvec, tvec = pose_of(x, y, z, yaw, roll, pitch)
-    return render(rvec, tvec, seed=seed, **looks), project(square(SIDES[name]), rvec, tvec, CAMERA)
+    return render(rvec, tvec, seed=seed, **looks), project(
+        square_corners(SIDES[name]), rvec, tvec, CAMERA
+    )
 
 
 def off(corners: Array, seed: int) -> Array:

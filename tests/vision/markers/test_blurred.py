@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, TargetConfig
+from perchctl.vision import Detection, Detections, detect_markers, make_aruco_detector
 from perchctl.vision.markers import blurred
 from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
-from perchctl.vision.markers.detect import detect, make_detector
-from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import SETUP, blurry, frame
 from tests.helpers.target_picture import CAMERA
 
@@ -22,10 +21,10 @@ def test_blur_that_hides_the_target_from_the_plain_detector(seed: int) -> None:
     assert ids is None or 997 not in ids
     still = hidden_in_blur(image, SETUP, CAMERA)
     assert np.abs(still["large"].corners_px - true).max() < 0.5
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
-    blind = make_detector(DetectorConfig(blurred=False), TargetConfig())
-    assert detect(frame(image), None, blind, CAMERA).large is None
+    blind = make_aruco_detector(DetectorConfig(blurred=False), TargetConfig())
+    assert detect_markers(frame(image), None, blind, CAMERA).large is None
 
 
 def test_fits_to_a_blurred_marker_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,7 +49,7 @@ def test_in_blur_the_target_is_found_beside_where_it_is_expected(seed: int) -> N
     seen = expected_in_blur(image, {"large": true + way}, SETUP.patterns, CAMERA)
     assert np.abs(seen["large"].corners_px - true).max() < 0.5
     before = Detections(0, 0.0, Detection("large", true + way, 0.1, True))
-    found = detect(frame(image, 1), before, SETUP, CAMERA)
+    found = detect_markers(frame(image, 1), before, SETUP, CAMERA)
     assert found.large is not None
     assert np.abs(found.large.corners_px - true).max() < 0.5
 

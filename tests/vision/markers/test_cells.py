@@ -7,10 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array
+from perchctl.vision import CameraModel, detect_markers
 from perchctl.vision.markers.align import Alignment, align
 from perchctl.vision.markers.by_drawing import told_apart
-from perchctl.vision.markers.detect import detect
-from perchctl.vision.types import CameraModel
 from tests.helpers.markers import SETUP, frame
 
 PLAIN = CameraModel((160, 120), np.array([[200.0, 0, 80], [0, 200.0, 60], [0, 0, 1]]), np.zeros(5))
@@ -87,6 +86,6 @@ def test_a_blurred_marker_of_another_codeword_is_not_taken(wrong: list[tuple[int
     for row, column in wrong:
         cells[row, column] = 1.0 - cells[row, column]
     image, _ = picture(cells, 4.0, 2.0, 2.0, seed=1)
-    assert detect(frame(image), None, SETUP, PLAIN).small is None
+    assert detect_markers(frame(image), None, SETUP, PLAIN).small is None
     own, _ = picture(CELLS, 4.0, 2.0, 2.0, seed=1)
-    assert detect(frame(own), None, SETUP, PLAIN).small is not None
+    assert detect_markers(frame(own), None, SETUP, PLAIN).small is not None

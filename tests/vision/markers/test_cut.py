@@ -12,19 +12,27 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import distort, project, undistort, undistort_px
+from perchctl.vision import (
+    Detection,
+    Detections,
+    MarkerName,
+    RigidPose,
+    detect_markers,
+    distort,
+    project,
+    square_corners,
+    undistort,
+    undistort_px,
+)
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut, may_be_whole
-from perchctl.vision.markers.detect import detect
 from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.outline import outline_of
 from perchctl.vision.markers.overview import lattice_of
 from perchctl.vision.markers.search import Found, search
 from perchctl.vision.markers.seen_edges import look as look_for_edges
 from perchctl.vision.markers.square import within
-from perchctl.vision.markers.visible import RigidPose, fitted
-from perchctl.vision.pose import square
-from perchctl.vision.types import Detection, Detections, MarkerName
+from perchctl.vision.markers.visible import fitted
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -63,7 +71,7 @@ def look(
 ) -> Detections:
     expected = both(POSES[name], off_px)
     image = picture(name) if image is None else image
-    return detect(frame(image), seen_before(name, age_s), SETUP, CAMERA, expected)
+    return detect_markers(frame(image), seen_before(name, age_s), SETUP, CAMERA, expected)
 
 
 def nothing(found: Detections) -> bool:
@@ -95,9 +103,9 @@ def test_the_large_marker_stands_for_what_shows_nothing_of_the_small_one() -> No
 
 def test_it_is_never_a_first_sight() -> None:
     image, expected = picture("height"), both(BESIDE_HEIGHT)
-    assert nothing(detect(frame(image), None, SETUP, CAMERA, expected))
+    assert nothing(detect_markers(frame(image), None, SETUP, CAMERA, expected))
     empty = Detections(-1, -1 / 30)
-    assert nothing(detect(frame(image), empty, SETUP, CAMERA, expected))
+    assert nothing(detect_markers(frame(image), empty, SETUP, CAMERA, expected))
     assert not nothing(look("height"))
 
 
@@ -129,7 +137,7 @@ def test_a_target_that_was_whole_is_searched_for_wherever_it_is_expected() -> No
     at = both(whole)
     before = Detections(-1, -1 / 30, *(Detection(n, at[n], 0.1, True) for n in ("large", "small")))
     image = render(*whole, noise=4.0)
-    found = detect(frame(image), before, SETUP, CAMERA, both(POSES["under"]))
+    found = detect_markers(frame(image), before, SETUP, CAMERA, both(POSES["under"]))
     for name, one in (("large", found.large), ("small", found.small)):
         assert one is not None
         assert np.abs(one.corners_px - at[name]).max() < 0.2  # type: ignore[index]
@@ -146,7 +154,7 @@ def test_what_may_be_whole_if_the_prediction_is_a_little_off_is_searched_for() -
 def test_it_can_be_switched_off() -> None:
     setup = replace(SETUP, cut=False)
     expected, before = both(BESIDE_HEIGHT), seen_before("height")
-    assert nothing(detect(frame(picture("height")), before, setup, CAMERA, expected))
+    assert nothing(detect_markers(frame(picture("height")), before, setup, CAMERA, expected))
 
 
 def _bare(kind: str) -> NDArray[np.uint8]:
@@ -185,7 +193,7 @@ def test_a_plain_square_in_the_small_marker_s_place_is_refused(name: str) -> Non
     """All edges but those of its cells are there."""
     image = render(*POSES[name], blur_px=1.0, noise=4.0, markers=("large",))
     rvec, tvec = POSES[name]
-    square_px = project(square(0.025), rvec, tvec, CAMERA)
+    square_px = project(square_corners(0.025), rvec, tvec, CAMERA)
     cv2.fillConvexPoly(image, np.rint(square_px).astype(np.int32), 30)
     assert nothing(look(name, np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.uint8)))
 
@@ -198,7 +206,7 @@ def test_what_leaves_a_direction_open_is_refused() -> None:
     found = fitted(image, _pose("line"), outline, 0.0 * outline.cell, plain)
     assert found is not None
     assert found.shown == found.in_view
-    expected: dict[MarkerName, Array] = {"small": project(square(0.025), *LINE, plain)}
+    expected: dict[MarkerName, Array] = {"small": project(square_corners(0.025), *LINE, plain)}
     assert cut_markers(image, expected, SETUP.patterns, plain) == {}
 
 

@@ -10,32 +10,36 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, TargetConfig
-from perchctl.vision.camera_model import project
+from perchctl.vision import (
+    Detections,
+    Frame,
+    detect_markers,
+    make_aruco_detector,
+    project,
+    square_corners,
+)
 from perchctl.vision.markers.blurred import hidden_in_blur
-from perchctl.vision.markers.detect import detect, make_detector
 from perchctl.vision.markers.search import misfit, search
-from perchctl.vision.pose import square
-from perchctl.vision.types import Detections, Frame
 from tests.helpers.markers import SETUP, blurry, both, box, frame, paste
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 
 def test_finds_both_markers_at_their_corners() -> None:
     rvec, tvec = pose_of(0.03, -0.02, 0.4, 0.7, 0.05, -0.1)
-    found = detect(frame(render(rvec, tvec)), None, SETUP, CAMERA)
+    found = detect_markers(frame(render(rvec, tvec)), None, SETUP, CAMERA)
     assert found.full_frame
     assert not found.mirrored
     for name, side in (("large", 0.150), ("small", 0.025)):
         detection = found.get(name)  # type: ignore[arg-type]
         assert detection is not None
         assert detection.refined
-        true = project(square(side), rvec, tvec, CAMERA)
+        true = project(square_corners(side), rvec, tvec, CAMERA)
         assert np.abs(detection.corners_px - true).max() < 0.15
 
 
 def test_a_picture_without_a_target_gives_nothing() -> None:
     image = np.random.default_rng(0).integers(60, 190, (480, 640)).astype(np.uint8)
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is None
     assert found.small is None
     assert found.velocity_px_s is None
@@ -49,20 +53,20 @@ def test_a_mirrored_picture_is_recognised_and_not_measured(
     """By either marker: far away the small one cannot be read."""
     picture = render(*pose_of(0.0, 0.0, 0.3, 0.4), markers=markers)
     image = np.ascontiguousarray(np.flip(picture, axis=axis))
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.mirrored
     assert found.large is None
     assert found.small is None
 
 
 def test_tracks_in_a_window_and_falls_back_within_the_same_frame() -> None:
-    first = detect(frame(render(*pose_of(0.0, 0.0, 0.5))), None, SETUP, CAMERA)
-    near = detect(frame(render(*pose_of(0.01, 0.0, 0.5)), 1), first, SETUP, CAMERA)
+    first = detect_markers(frame(render(*pose_of(0.0, 0.0, 0.5))), None, SETUP, CAMERA)
+    near = detect_markers(frame(render(*pose_of(0.01, 0.0, 0.5)), 1), first, SETUP, CAMERA)
     assert not near.full_frame
     assert near.large is not None
     assert near.velocity_px_s is not None
     assert near.velocity_px_s[0] == pytest.approx(0.01 / 0.5 * 400 * 30, rel=0.05)
-    far = detect(frame(render(*pose_of(-0.25, 0.15, 0.5)), 2), near, SETUP, CAMERA)
+    far = detect_markers(frame(render(*pose_of(-0.25, 0.15, 0.5)), 2), near, SETUP, CAMERA)
     assert far.full_frame
     assert far.large is not None
     assert far.small is not None
@@ -70,8 +74,8 @@ def test_tracks_in_a_window_and_falls_back_within_the_same_frame() -> None:
 
 def test_window_and_whole_picture_give_the_same_corners() -> None:
     image = render(*pose_of(0.05, 0.02, 0.5, 1.0), noise=5.0)
-    first = detect(frame(image), None, SETUP, CAMERA)
-    again = detect(frame(image, 1), first, SETUP, CAMERA)
+    first = detect_markers(frame(image), None, SETUP, CAMERA)
+    again = detect_markers(frame(image, 1), first, SETUP, CAMERA)
     assert first.full_frame
     assert not again.full_frame
     for name in ("large", "small"):
@@ -83,10 +87,10 @@ def test_window_and_whole_picture_give_the_same_corners() -> None:
 
 def test_a_decoy_of_either_marker_is_dropped() -> None:
     image = render(*pose_of(-0.15, 0.0, 0.5))
-    true_large = project(square(0.150), *pose_of(-0.15, 0.0, 0.5), CAMERA)
+    true_large = project(square_corners(0.150), *pose_of(-0.15, 0.0, 0.5), CAMERA)
     paste(image, "DICT_4X4_1000", 997, (430, 60), 100)
     paste(image, "DICT_ARUCO_ORIGINAL", 5, (450, 300), 60)
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
     assert np.abs(found.large.corners_px - true_large).max() < 0.2
     assert found.small is not None
@@ -97,7 +101,7 @@ def test_foreign_markers_are_not_taken() -> None:
     image = np.full((480, 640), 120, np.uint8)
     paste(image, "DICT_4X4_1000", 314, (60, 60), 120)
     paste(image, "DICT_ARUCO_ORIGINAL", 1, (300, 200), 70)
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is None
     assert found.small is None
 
@@ -121,10 +125,10 @@ def test_a_measured_shift_of_all_edges_holds_for_some_more_pictures(
 ) -> None:
     pose = pose_of(0.02, 0.01, 0.5, 0.6)
     bright = grown(render(*pose, blur_px=0.9).astype(np.float64), clipped)
-    true = project(square(0.150), *pose, CAMERA)
+    true = project(square_corners(0.150), *pose, CAMERA)
     before, ages = None, []
     for k in range(7):
-        before = detect(frame(bright, k), before, SETUP, CAMERA)
+        before = detect_markers(frame(bright, k), before, SETUP, CAMERA)
         assert before.edge_shift is not None
         assert before.edge_shift.shift_px > 0.1
         assert before.large is not None
@@ -164,14 +168,16 @@ def streams() -> list[list[Frame]]:
 
 
 def test_two_streams_through_one_setup_do_not_disturb_each_other() -> None:
-    setup = make_detector(DetectorConfig(), TargetConfig())
+    setup = make_aruco_detector(DetectorConfig(), TargetConfig())
     before = snapshot(setup)
     first, second = streams()
 
     def alone(stream: list[Frame]) -> list[Detections]:
         last, found = None, []
         for each in stream:
-            last = detect(each, last, make_detector(DetectorConfig(), TargetConfig()), CAMERA)
+            last = detect_markers(
+                each, last, make_aruco_detector(DetectorConfig(), TargetConfig()), CAMERA
+            )
             found.append(last)
         return found
 
@@ -179,7 +185,7 @@ def test_two_streams_through_one_setup_do_not_disturb_each_other() -> None:
     interleaved: list[list[Detections]] = [[], []]
     for pair in zip(first, second, strict=True):
         for k, each in enumerate(pair):
-            found = detect(each, lasts[k], setup, CAMERA)
+            found = detect_markers(each, lasts[k], setup, CAMERA)
             interleaved[k].append(found)
             lasts[k] = found
     for results in interleaved:
@@ -189,7 +195,7 @@ def test_two_streams_through_one_setup_do_not_disturb_each_other() -> None:
 
 
 def test_searches_of_every_kind_leave_the_setup_as_it_was() -> None:
-    setup = make_detector(DetectorConfig(), TargetConfig())
+    setup = make_aruco_detector(DetectorConfig(), TargetConfig())
     before = snapshot(setup)
     for image in (render(*pose_of(0.0, 0.0, 0.4)), blurry(26.0, 3.0, 0)[0]):
         search(image, {}, setup)

@@ -3,9 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.profile.dictionaries import predefined
-from perchctl.vision.markers.detect import detect, make_detector
+from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig, aruco_dictionary
+from perchctl.vision import detect_markers, make_aruco_detector
 from perchctl.vision.markers.detector import MIRROR_INDEX
 from tests.helpers.markers import frame
 from tests.helpers.target_picture import CAMERA
@@ -13,10 +12,10 @@ from tests.helpers.target_picture import CAMERA
 
 def test_a_marker_like_its_own_mirror_image_gives_no_hint() -> None:
     target = TargetConfig(small=MarkerConfig(dictionary="DICT_ARUCO_ORIGINAL", id=0, side_m=0.025))
-    usual = make_detector(DetectorConfig(), TargetConfig())
+    usual = make_aruco_detector(DetectorConfig(), TargetConfig())
     assert [len(d.bytesList) for d in usual.dictionaries] == [1 + MIRROR_INDEX, 1 + MIRROR_INDEX]
-    setup = make_detector(DetectorConfig(), target)
-    bits = predefined("DICT_ARUCO_ORIGINAL")
+    setup = make_aruco_detector(DetectorConfig(), target)
+    bits = aruco_dictionary("DICT_ARUCO_ORIGINAL")
     grid = cv2.aruco.Dictionary.getBitsFromByteList(np.ascontiguousarray(bits.bytesList[0:1]), 5)
     symmetric = any(np.array_equal(np.rot90(grid, k), grid[:, ::-1]) for k in range(4))
     assert symmetric
@@ -25,7 +24,7 @@ def test_a_marker_like_its_own_mirror_image_gives_no_hint() -> None:
 
 def test_correction_bits_are_the_profiles() -> None:
     grid = cv2.aruco.Dictionary.getBitsFromByteList(
-        np.ascontiguousarray(predefined("DICT_ARUCO_ORIGINAL").bytesList[5:6]), 5
+        np.ascontiguousarray(aruco_dictionary("DICT_ARUCO_ORIGINAL").bytesList[5:6]), 5
     )
     for wrong in range(4):
         bits = grid.copy()
@@ -34,6 +33,8 @@ def test_correction_bits_are_the_profiles() -> None:
         image = np.full((480, 640), 230, np.uint8)
         image[150:290, 250:390] = np.where(np.kron(cells, np.ones((20, 20))) > 0, 230, 20)
         for allowed in range(4):
-            setup = make_detector(DetectorConfig(correction_bits_small=allowed), TargetConfig())
-            found = detect(frame(image), None, setup, CAMERA)
+            setup = make_aruco_detector(
+                DetectorConfig(correction_bits_small=allowed), TargetConfig()
+            )
+            found = detect_markers(frame(image), None, setup, CAMERA)
             assert (found.small is not None) == (wrong <= allowed), (wrong, allowed)

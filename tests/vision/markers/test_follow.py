@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
+from perchctl.vision import detect_markers, make_aruco_detector
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import detect, make_detector
 from perchctl.vision.markers.follow import around, follow
 from perchctl.vision.markers.partly import seen_partly
 from perchctl.vision.markers.visible_cells import KnownBy
@@ -30,7 +30,7 @@ def test_expected_markers_are_verified_and_refined(shift_px: float) -> None:
 
 def test_other_cells_other_turns_and_mirror_images_are_not_verified() -> None:
     image = render(*POSE)
-    other = make_detector(
+    other = make_aruco_detector(
         DetectorConfig(),
         TargetConfig(
             large=MarkerConfig(dictionary="DICT_4X4_1000", id=16, side_m=0.150),
@@ -72,7 +72,7 @@ def test_a_partly_covered_large_marker_is_measured_by_the_small_one(cover: str) 
         offset = 0.34 * (true[3] - true[0])
         ends = [tuple(np.rint(p + offset).astype(int).tolist()) for p in (a, b)]
         cv2.line(image, ends[0], ends[1], 50, 4)
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
     assert np.abs(found.large.corners_px - true).max() < 0.3
 
@@ -80,7 +80,7 @@ def test_a_partly_covered_large_marker_is_measured_by_the_small_one(cover: str) 
 def test_around_a_lone_small_marker_there_is_no_large_one() -> None:
     pose = pose_of(0.02, 0.0, 0.5, 0.3)
     image = render(*pose, markers=("small",))
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.small is not None
     assert found.large is None
     seen = follow(image, {"small": corners("small", pose)}, SETUP.patterns, CAMERA)
@@ -113,7 +113,7 @@ def test_a_near_target_that_has_moved_on_is_looked_for_nearby_before_parts_of_it
     monkeypatch.setattr("perchctl.vision.markers.follow.seen_partly", noting)
     pose = pose_of(0.0, 0.0, 0.16, 0.4)
     expected = both(pose, shift_px=25.0)
-    found = detect(frame(render(*pose, noise=3.0)), None, SETUP, CAMERA, expected)
+    found = detect_markers(frame(render(*pose, noise=3.0)), None, SETUP, CAMERA, expected)
     for name, one in (("large", found.large), ("small", found.small)):
         assert one is not None
         assert np.abs(one.corners_px - corners(name, pose)).max() < 0.2  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import undistort_px
+from perchctl.vision import undistort_px
 from perchctl.vision.markers.grid import lens_shift_px, make_grid, projected, through_lens
 from perchctl.vision.markers.square import UNIT, corner_jacobian, from_unit, mapped
 from tests.helpers.markers import box, corners

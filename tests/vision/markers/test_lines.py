@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array
-from perchctl.vision.camera_model import project
+from perchctl.vision import project, square_corners
 from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX
 from perchctl.vision.markers.lines import refine
 from perchctl.vision.markers.pattern import rim_of_bits
-from perchctl.vision.pose import square
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 RIMS = {6: bits_of("DICT_4X4_1000", 997), 7: bits_of("DICT_ARUCO_ORIGINAL", 5)}
@@ -26,7 +25,7 @@ POSES = [
 
 
 def true_corners(rvec: Array, tvec: Array, side_m: float) -> Array:
-    return project(square(side_m), rvec, tvec, CAMERA)
+    return project(square_corners(side_m), rvec, tvec, CAMERA)
 
 
 def inwards(corners: Array, amount: float) -> Array:

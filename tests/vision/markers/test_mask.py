@@ -14,11 +14,9 @@ from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
 from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile, load_profile
-from perchctl.vision.fields import field_picture
-from perchctl.vision.markers.detect import detect
-from perchctl.vision.markers.mask import filled, hidden_in, hides, make_mask
+from perchctl.vision import Detections, Frame, MarkerName, detect_markers, field_picture, make_mask
+from perchctl.vision.markers.mask import filled, hidden_in, hides
 from perchctl.vision.markers.square import from_unit, mapped
-from perchctl.vision.types import Detections, Frame, MarkerName
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -60,7 +58,7 @@ def test_behind_a_leg_the_marker_is_measured_by_the_rest(name: str) -> None:
     image = behind(render(*POSE, noise=2.0), covered)
     before: Detections | None = None
     for k in range(2):
-        before = detect(frame(image, k), before, setup, CAMERA)
+        before = detect_markers(frame(image, k), before, setup, CAMERA)
         assert before.large is not None
         assert before.large.cov_px2 is not None
         assert np.abs(before.large.corners_px - TRUE).max() < 0.2
@@ -87,7 +85,7 @@ def test_what_a_leg_covers_counts_for_nothing(name: str) -> None:
     found = []
     for grey in (0, 120, 255):
         image = np.where(covered, grey, render(*POSE, noise=2.0)).astype(np.uint8)
-        large = detect(frame(image), None, setup, CAMERA).large
+        large = detect_markers(frame(image), None, setup, CAMERA).large
         assert large is not None
         found.append(large.corners_px)
     assert np.array_equal(found[0], found[1])
@@ -115,7 +113,7 @@ def test_the_fields_of_a_woven_frame_are_measured_behind_a_leg() -> None:
     woven[1::2] = bottom[1::2]
     setup = replace(SETUP, mask=make_mask(covered))
     seen = Frame(0, 0.0, behind(woven, covered), fields="woven")
-    found = detect(seen, None, setup, CAMERA)
+    found = detect_markers(seen, None, setup, CAMERA)
     assert found.large is not None
     assert np.abs(found.large.corners_px - TRUE).max() < 0.2
 

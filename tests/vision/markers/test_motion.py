@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from perchctl.vision import Detection, Detections
 from perchctl.vision.markers.motion import predicted_corners, with_motion
-from perchctl.vision.types import Detection, Detections
 from tests.helpers.markers import box
 
 

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.pipeline import step
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.vision.markers.detect import detect, make_detector
+from perchctl.vision import (
+    Detections,
+    Frame,
+    MarkerName,
+    PipelineState,
+    detect_markers,
+    make_aruco_detector,
+)
 from perchctl.vision.markers.partly import fit_partly, seen_partly
 from perchctl.vision.markers.search import search
 from perchctl.vision.markers.square import from_unit, mapped
@@ -23,7 +30,6 @@ from perchctl.vision.markers.visible_cells import (
     may_show_enough,
     visible_cells_agree,
 )
-from perchctl.vision.types import Detections, Frame, MarkerName, PipelineState
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -76,7 +82,7 @@ def test_a_marker_that_the_picture_cuts_is_measured_by_what_is_left_of_it(share:
     squares = []
     for seed in range(4):
         pose = cut(share, seed)
-        found = detect(frame(render(*pose, noise=2.0, seed=seed)), None, SETUP, CAMERA)
+        found = detect_markers(frame(render(*pose, noise=2.0, seed=seed)), None, SETUP, CAMERA)
         squares.append(sigmas(found, pose))
         assert found.large is not None
         # A pixel of a corner beyond the picture may be a millimetre of the target.
@@ -87,7 +93,7 @@ def test_a_marker_that_the_picture_cuts_is_measured_by_what_is_left_of_it(share:
 
 def test_corners_out_of_sight_are_claimed_to_be_known_less() -> None:
     pose = cut(0.1, 1)
-    found = detect(frame(render(*pose, noise=2.0)), None, SETUP, CAMERA).large
+    found = detect_markers(frame(render(*pose, noise=2.0)), None, SETUP, CAMERA).large
     assert found is not None
     assert found.cov_px2 is not None
     spread = np.sqrt(np.diagonal(found.cov_px2).reshape(4, 2).sum(axis=1))
@@ -102,7 +108,7 @@ def test_the_edge_of_the_picture_is_taken_for_no_side(share: float) -> None:
     for seed in range(4):
         pose = cut(share, seed)
         image = render(*pose, markers=("large",), noise=2.0, seed=seed)
-        found = detect(frame(image), None, SETUP, CAMERA).large
+        found = detect_markers(frame(image), None, SETUP, CAMERA).large
         if found is not None:
             assert np.abs(found.corners_px - corners("large", pose)).max() < 0.3
         measured += found is not None
@@ -114,8 +120,8 @@ def test_a_side_along_the_edge_of_the_picture_is_not_drawn_inwards(share: float)
     """Blur needs what is beyond the edge: lines alone err by 1 to 2.4 px here."""
     pose = cut(share, 1, yaw=0.0)
     true, image = corners("large", pose), render(*pose, blur_px=2.0)
-    first = detect(frame(image), None, SETUP, CAMERA)
-    for found in (first, detect(frame(image, 1), first, SETUP, CAMERA)):
+    first = detect_markers(frame(image), None, SETUP, CAMERA)
+    for found in (first, detect_markers(frame(image, 1), first, SETUP, CAMERA)):
         assert found.large is not None
         assert np.abs(found.large.corners_px - true).max() < 0.03
     seen = seen_partly(image, true + 1.0, LARGE, CAMERA, "bits")
@@ -129,9 +135,9 @@ def test_what_the_edge_cut_off_is_not_taken_unless_its_cells_are_seen() -> None:
     image = render(*pose, noise=2.0)
     assert set(search(image, {}, SETUP).corners_px) == {"large", "small"}
     large = MarkerConfig(dictionary="DICT_4X4_1000", id=16, side_m=0.150)
-    other = make_detector(DetectorConfig(), TargetConfig(large=large)).patterns["large"]
+    other = make_aruco_detector(DetectorConfig(), TargetConfig(large=large)).patterns["large"]
     setup = replace(SETUP, patterns={**SETUP.patterns, "large": other})
-    found = detect(frame(image), None, setup, CAMERA)
+    found = detect_markers(frame(image), None, setup, CAMERA)
     assert found.large is None
     assert found.small is not None
 
@@ -165,7 +171,7 @@ def test_a_marker_that_leaves_the_picture_is_followed_out_of_it() -> None:
     assert beyond(poses[0]) < 0.0 < beyond(poses[-1]) < 0.15
     before: Detections | None = None
     for k, pose in enumerate(poses):
-        before = detect(frame(render(*pose, noise=2.0), k), before, SETUP, CAMERA)
+        before = detect_markers(frame(render(*pose, noise=2.0), k), before, SETUP, CAMERA)
         assert before.large is not None
         assert np.abs(before.large.corners_px - corners("large", pose)).max() < 0.3
 
@@ -178,12 +184,12 @@ def test_a_highlight_on_a_corner_leaves_three_sides(radius: float, corner: int) 
     side = float(np.linalg.norm(true[0] - true[1]))
     centre = true[corner] + 0.1 * (true.mean(axis=0) - true[corner])
     image = glaring(render(*pose, noise=2.0), centre, radius * side)
-    found = detect(frame(image), None, SETUP, CAMERA)
+    found = detect_markers(frame(image), None, SETUP, CAMERA)
     assert found.large is not None
     assert np.abs(found.large.corners_px - true).max() < 0.3
     if found.large.cov_px2 is not None:
         assert np.abs(sigmas(found, pose)).max() < 4.0
-    again = detect(frame(image, 1), found, SETUP, CAMERA)
+    again = detect_markers(frame(image, 1), found, SETUP, CAMERA)
     assert again.large is not None
     assert np.abs(again.large.corners_px - true).max() < 0.3
 

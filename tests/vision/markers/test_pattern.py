@@ -3,8 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from perchctl.vision import MARKERS
 from perchctl.vision.markers.pattern import cells_agree, cells_mostly_agree, resemblance
-from perchctl.vision.types import MARKERS
 from tests.helpers.markers import POSE, SETUP, corners
 from tests.helpers.target_picture import render
 

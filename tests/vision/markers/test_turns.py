@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from perchctl.pipeline import step
 from perchctl.profile import DetectorConfig
+from perchctl.vision import Frame, PipelineState
 from perchctl.vision.markers import detect as detect_room
 from perchctl.vision.markers import search as search_room
-from perchctl.vision.types import Frame, PipelineState
 from tests.helpers.target_picture import pose_of, render
 
 RATE_HZ = 30.0
