@@ -28,9 +28,16 @@ from common import (
 )
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.pipeline import Pipeline, step
 from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
-from perchctl.vision import CameraModel, Frame, MarkerPose, PipelineOutput, PipelineState
+from perchctl.vision import (
+    CameraModel,
+    Frame,
+    MarkerPose,
+    Pipeline,
+    PipelineOutput,
+    PipelineState,
+    step,
+)
 
 NEAR_M = 0.25
 HEAD = ("", "frames", "x mm", "y mm", "z mm", "yaw deg", "max mm", "max deg", "sq. error/dof",

@@ -27,7 +27,8 @@ from perchctl.flight import FlightResult
 from perchctl.flight.campaign import fly_seed
 from perchctl.geometry import Array
 from perchctl.profile import Profile, load_profile
-from perchctl.vision import MARKERS, Frame, detect_markers
+from perchctl.vision import MARKERS, Frame
+from perchctl.vision.markers.detect import detect_markers
 
 CALIBRATION = "example_aideck_324x244.yaml"
 CORNERS = ((10.0, 0.1), (10.0, 0.25), (20.0, 0.1), (20.0, 0.25))

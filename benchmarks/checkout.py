@@ -88,8 +88,8 @@ class Checkout:
 
 
 def _pipeline(keys: dict[str, dict[str, Any]], camera: Any) -> Any:
-    from perchctl.pipeline import camera_profile, make_pipeline
     from perchctl.profile import Profile
+    from perchctl.vision import camera_profile, make_pipeline
 
     sections = {}
     for name, values in keys.items():
@@ -101,8 +101,8 @@ def _pipeline(keys: dict[str, dict[str, Any]], camera: Any) -> Any:
 
 
 def _seen(frames: list[tuple[float, Picture]], pipeline: Any) -> tuple[Any, ...]:
-    from perchctl import pipeline as room
     from perchctl.vision import Frame, PipelineState
+    from perchctl.vision import pipeline as room
 
     state, output, t_s = PipelineState(), None, 0.0
     fields = room.FieldState() if hasattr(room, "FieldState") else None

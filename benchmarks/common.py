@@ -27,7 +27,6 @@ from perchctl.geometry import (  # noqa: E402
     rot_z,
     rotation_from_rpy,
 )
-from perchctl.pipeline import Pipeline, camera_profile, make_pipeline  # noqa: E402
 from perchctl.profile import (  # noqa: E402
     DetectorConfig,
     KalmanConfig,
@@ -41,8 +40,11 @@ from perchctl.sim import (  # noqa: E402
     Renderer,
     Scenario,
 )
-from perchctl.vision import (  # noqa: E402
+from perchctl.vision import (  # noqa: E402  # noqa: E402
     CameraModel,
+    Pipeline,
+    camera_profile,
+    make_pipeline,
     project,
     square_corners,
 )

@@ -23,7 +23,8 @@ from decoys_tracked import report_tracked
 
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, aruco_dictionary
-from perchctl.vision import Frame, detect_markers
+from perchctl.vision import Frame
+from perchctl.vision.markers.detect import detect_markers
 
 BLURS_PX = (0.6, 1.0, 1.5, 2.0, 2.8, 4.0)
 CELLS_IN_BLURS = (0.7, 3.0)

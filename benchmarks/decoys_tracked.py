@@ -15,8 +15,7 @@ import numpy as np
 from common import Picture, setup_with, table
 
 from perchctl.geometry import R_MARKER_TARGET, Array, invert_T, make_T, rot_z, rotation_from_rpy
-from perchctl.pipeline import step
-from perchctl.vision import Attitude, Frame, PipelineState
+from perchctl.vision import Attitude, Frame, PipelineState, step
 from tests.helpers.target_picture import CAMERA, Drawn, render, side_by_side
 
 RATE_HZ = 30.0

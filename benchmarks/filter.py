@@ -25,18 +25,19 @@ from perchctl.geometry import (
     rotation_from_rpy,
     wrap_rad,
 )
-from perchctl.pipeline import Pipeline, follow
 from perchctl.profile import KalmanConfig
 from perchctl.vision import (
     MARKERS,
     Attitude,
     Detection,
     Detections,
+    Pipeline,
     PipelineOutput,
     PipelineState,
     project,
     square_corners,
 )
+from perchctl.vision.pipeline import follow
 
 RATE_HZ = 30.0
 BINS_M = (0.0, 0.12, 0.25, 0.5, 1.0, 2.0)

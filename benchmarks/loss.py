@@ -27,8 +27,7 @@ from common import (
 )
 
 from perchctl.geometry import Array
-from perchctl.pipeline import step
-from perchctl.vision import Frame, PipelineState
+from perchctl.vision import Frame, PipelineState, step
 
 RATE_HZ, FIRST, LATER, LOCK = 30.0, 30, 30, 12
 HEIGHTS_M = (0.25, 0.5, 1.0, 1.8)

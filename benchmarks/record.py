@@ -43,10 +43,9 @@ from perchctl.mission import (
     TurnInputs,
     TurnTiming,
 )
-from perchctl.pipeline import FieldState, pictures, step
 from perchctl.profile import Profile
 from perchctl.vehicle import PositionSetpoint, Telemetry
-from perchctl.vision import Frame, PipelineOutput, PipelineState
+from perchctl.vision import FieldState, Frame, PipelineOutput, PipelineState, pictures, step
 
 GOAL_MS = 0.3
 BLOCK_S = 1.0

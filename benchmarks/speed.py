@@ -23,15 +23,17 @@ from common import (
 )
 
 from perchctl.geometry import Array
-from perchctl.pipeline import FieldState, pictures, step
 from perchctl.vision import (
     Attitude,
     Detections,
+    FieldState,
     Frame,
     PipelineOutput,
     PipelineState,
-    detect_markers,
+    pictures,
+    step,
 )
+from perchctl.vision.markers.detect import detect_markers
 
 RATE_HZ, PASSES = 30.0, 15
 BASE, WHOLE = "two full-frame detectors", "frame to target pose"

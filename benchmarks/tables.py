@@ -20,10 +20,9 @@ from common import (
 )
 
 from perchctl.geometry import Array, rot_z, wrap_rad
-from perchctl.pipeline import Pipeline, step
 from perchctl.profile import DetectorConfig, MergeConfig, PoseConfig
 from perchctl.sim import Renderer
-from perchctl.vision import Frame, PipelineState
+from perchctl.vision import Frame, Pipeline, PipelineState, step
 
 NOISE_SIGMA, BLUR_PX = 4.0, 0.8
 PLACES_CM = ((0, 0, 24), (4, 6, 16), (5, -7, 11), (-10, 11, 7), (-6, -3, 18))

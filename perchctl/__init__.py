@@ -14,22 +14,21 @@ if TYPE_CHECKING:
     from perchctl.calibration import load_calibration
     from perchctl.flight import fly_lockstep
     from perchctl.log import plot_flight, read_log
-    from perchctl.pipeline import estimate, make_pipeline, step
     from perchctl.profile import load_profile
-    from perchctl.vision import Attitude, Frame, PipelineState
+    from perchctl.vision import Attitude, Frame, PipelineState, estimate, make_pipeline, step
 
 _HOMES = {
     "Attitude": "perchctl.vision.types",
     "Frame": "perchctl.vision.types",
     "PipelineState": "perchctl.vision.types",
-    "estimate": "perchctl.pipeline",
+    "estimate": "perchctl.vision.pipeline",
     "fly_lockstep": "perchctl.flight.lockstep",
     "load_calibration": "perchctl.calibration.files",
     "load_profile": "perchctl.profile",
-    "make_pipeline": "perchctl.pipeline",
+    "make_pipeline": "perchctl.vision.pipeline",
     "plot_flight": "perchctl.log.plot",
     "read_log": "perchctl.log.read",
-    "step": "perchctl.pipeline",
+    "step": "perchctl.vision.pipeline",
 }
 
 __all__ = [

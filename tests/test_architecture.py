@@ -38,7 +38,6 @@ HOMES: dict[str, tuple[str, ...]] = {
 CLOCKLESS = (
     "perchctl.geometry",
     "perchctl.vision",
-    "perchctl.pipeline",
     "perchctl.mission",
 )
 CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
@@ -58,7 +57,6 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.profile",),
     ("perchctl.vision",),
     ("perchctl.mission",),
-    ("perchctl.pipeline",),
     ("perchctl.target",),
     ("perchctl.camera", "perchctl.positioning"),
     ("perchctl.calibration",),
@@ -101,7 +99,7 @@ MOST_NAMES = {
     "sim": 32,
     "target": 49,
     "track": 15,
-    "vision": 72,
+    "vision": 50,
     "weights": 15,
 }
 
@@ -315,7 +313,7 @@ BROKEN = {
     "perchctl.vision.merge": ("from perchctl.mission import state\n", uphill, "mission.state"),
     "perchctl.geometry": ("from .profile import Profile\n", uphill, "profile"),
     "perchctl.log.watch": ("from perchctl.link import uri\n", uphill, "link.uri"),
-    "perchctl.pipeline": (
+    "perchctl.vision.pipeline": (
         "import typing\nif typing.TYPE_CHECKING:\n    from perchctl.link.mock import X\n",
         uphill,
         "link.mock",

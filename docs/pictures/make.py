@@ -51,7 +51,6 @@ from perchctl.log import (  # noqa: E402
     read_log,
 )
 from perchctl.mission import BatteryOutlook  # noqa: E402
-from perchctl.pipeline import make_pipeline, step  # noqa: E402
 from perchctl.plot import (  # noqa: E402
     BLACK,
     BLUE,
@@ -68,7 +67,7 @@ from perchctl.sim import (  # noqa: E402
     Renderer,
     draw_scenario,
 )
-from perchctl.vision import Frame, PipelineState  # noqa: E402
+from perchctl.vision import Frame, PipelineState, make_pipeline, step  # noqa: E402  # noqa: E402
 
 PAGE_PX, REPORT_PX = (1100, 560), (1200, 1250)
 NEAR_WIDTH_M = 0.2

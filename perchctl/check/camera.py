@@ -15,10 +15,9 @@ from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import Row, by_limits, failed, passed, skipped, warned
 from perchctl.errors import PerchError
 from perchctl.flight import MIRRORED_FRAMES, too_near_problem
-from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.target import Optics, TargetDesign, blind_lines, cm_text, design_ranges, make_design
-from perchctl.vision import BLENDED
+from perchctl.vision import BLENDED, Pipeline
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
 """An AI-deck's program as it comes gives 8, and a simulated one perches with 7."""

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.check.rehearsal import Looked
-from perchctl.pipeline import Pipeline
-from perchctl.vision import MARKERS, refine_lines
+from perchctl.vision import MARKERS, Pipeline, refine_lines
 
 Grey = NDArray[np.uint8]
 WHITE, BLACK = 250, 5

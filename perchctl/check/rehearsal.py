@@ -14,12 +14,11 @@ from typing import Protocol
 from perchctl.camera import FrameSource, WrappedSource
 from perchctl.flight import Clock, Senses
 from perchctl.link import Guard, SentCallback, ignore_sent
-from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck, PrintVerdict
 from perchctl.values import replace
 from perchctl.vehicle import Command, ExternalPosition, MeasuredBy, Telemetry
-from perchctl.vision import Detections, Frame, TargetEstimate
+from perchctl.vision import Detections, Frame, Pipeline, TargetEstimate
 
 REHEARSED_S = 3.0
 WARM_FRAMES = 3

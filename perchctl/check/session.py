@@ -37,10 +37,10 @@ from perchctl.flight import (
 )
 from perchctl.link import ProbeLink, ScanResult, address_of, check_uri
 from perchctl.link import find_vehicles as scan_for
-from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.positioning import CaptureSource, open_capture
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.vehicle import Telemetry
+from perchctl.vision import Pipeline, make_pipeline
 
 NO_VEHICLE = "the vehicle does not answer"
 AFTERWARDS = "the motor test ends by itself within 15 s: keep clear of the propellers"

@@ -47,9 +47,9 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import FAST_BLOCKS, MockLink, simulated_radio
 from perchctl.log import LogWatcher, to_exact
 from perchctl.mission import Event, FlightReport, Phase, Tick, Watcher
-from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
 from perchctl.sim import Packet, Port, Scenario, draw_capture, draw_scenario
+from perchctl.vision import make_pipeline
 
 AFTER_S, AFTER_IN_THE_AIR_S = 6.0, 10.0
 END_OF: dict[Phase, End] = {

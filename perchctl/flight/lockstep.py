@@ -13,7 +13,6 @@ from perchctl.flight.loop import FlightParts, fly
 from perchctl.link import MockLink, simulated_radio
 from perchctl.log import LogWatcher
 from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
-from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.sim import (
     CaptureSettings,
@@ -27,7 +26,7 @@ from perchctl.sim import (
 )
 from perchctl.values import replace
 from perchctl.vehicle import LOCKED
-from perchctl.vision import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
 
 MAY_TOUCH_THE_FLOOR = (Phase.APPROACH, Phase.LANDING, Phase.LANDED, Phase.ABORTED)
 _QUEUED = 2

@@ -49,12 +49,11 @@ from perchctl.mission import (
     start_mission,
     step_mission,
 )
-from perchctl.pipeline import Pipeline
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command, Idle
-from perchctl.vision import Consistency
+from perchctl.vision import Consistency, Pipeline
 
 HUNG_S = 0.25
 """A turn that takes longer was hung up somewhere: what it knew of the vehicle is old."""

@@ -33,7 +33,6 @@ from perchctl.mission import (
     VisualInertialWindow,
     estimate_motion,
 )
-from perchctl.pipeline import FieldState, Pipeline, estimate, pictures, step
 from perchctl.profile import Profile, SafetyConfig
 from perchctl.values import replace
 from perchctl.vehicle import SendPosition, Telemetry
@@ -43,11 +42,16 @@ from perchctl.vision import (
     OTHER_TARGET_TEXT,
     Consistency,
     Detections,
+    FieldState,
     Frame,
+    Pipeline,
     PipelineOutput,
     PipelineState,
     TargetEstimate,
+    estimate,
+    pictures,
     solve_consistency,
+    step,
     surest_pose,
 )
 

@@ -32,10 +32,9 @@ from perchctl.flight.positions import (
 )
 from perchctl.link import CflibLink, check_uri
 from perchctl.mission import Event, FlightReport, Watcher
-from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
 from perchctl.values import replace
-from perchctl.vision import CameraModel
+from perchctl.vision import CameraModel, make_pipeline
 
 if TYPE_CHECKING:
     from perchctl.sim import SimProcess

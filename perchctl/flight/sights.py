@@ -8,11 +8,10 @@ is told that it hangs would look as if it hung, so the first sample that says ot
 from __future__ import annotations
 
 from perchctl.flight.history import History, attitude_at, attitude_of
-from perchctl.pipeline import Pipeline
 from perchctl.positioning import FeedStatus, SightFeed
 from perchctl.profile import Profile
 from perchctl.vehicle import SendPosition
-from perchctl.vision import MeasuredMarkers, TargetEstimate, surest_pose
+from perchctl.vision import MeasuredMarkers, Pipeline, TargetEstimate, surest_pose
 
 CARRIED_FOR_S = 0.1
 CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06

@@ -11,7 +11,6 @@ from perchctl.errors import InvalidValue
 from perchctl.flight import SENSED
 from perchctl.log import FlightLog, flown_camera, flown_mask, flown_profile
 from perchctl.mission import Observation, Turn
-from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.replay.compare import Difference, first_differing, same
 from perchctl.replay.decide import Decided, decide, first_of, whole_turns
@@ -26,6 +25,7 @@ from perchctl.replay.sense import (
     sense,
 )
 from perchctl.replay.shown import older, placed_later_s, shown
+from perchctl.vision import Pipeline, make_pipeline
 
 
 @dataclass(frozen=True, eq=False)

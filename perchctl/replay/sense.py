@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.flight import ENDED_TEXT, SENSED, Senses
 from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
-from perchctl.pipeline import Pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
-from perchctl.vision import Frame
+from perchctl.vision import Frame, Pipeline
 
 Picture = tuple[int, float, NDArray[np.uint8]]
 """Of a frame: its number, its time as the source gave it, and the picture that was looked at."""

@@ -26,13 +26,12 @@ from perchctl.calibration import (
 )
 from perchctl.camera import unmirror_frame
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy, rpy_from_rotation
-from perchctl.pipeline import PipelineState, make_pipeline, step
 from perchctl.profile import Profile
 from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
-from perchctl.vision import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame, PipelineState, make_pipeline, step
 
 HAND_STREAM = 430
 SECONDS: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}

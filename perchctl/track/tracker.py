@@ -9,14 +9,6 @@ from dataclasses import dataclass, field
 
 from perchctl.camera import HealthState, HealthVerdict, assess_frame, mirrored_note
 from perchctl.display import PageState, Sketch
-from perchctl.pipeline import (
-    FieldState,
-    Pipeline,
-    camera_profile,
-    make_pipeline,
-    pictures,
-    step,
-)
 from perchctl.profile import CameraConfig, Profile
 from perchctl.track.jumps import JUMPS, jumped, pose_in
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
@@ -25,10 +17,16 @@ from perchctl.vision import (
     INTERLACED,
     MARKERS,
     CameraModel,
+    FieldState,
     Frame,
     MarkerPose,
+    Pipeline,
     PipelineOutput,
     PipelineState,
+    camera_profile,
+    make_pipeline,
+    pictures,
+    step,
 )
 
 MOST_NOTES = 20

@@ -17,7 +17,6 @@ import numpy as np
 from perchctl.errors import InvalidValue
 from perchctl.files import cannot_be_written
 from perchctl.geometry import Array
-from perchctl.pipeline import Pipeline, make_pipeline, step
 from perchctl.profile import Profile
 from perchctl.vision import (
     MARKERS,
@@ -25,8 +24,11 @@ from perchctl.vision import (
     CameraModel,
     Frame,
     MarkerPose,
+    Pipeline,
     PipelineState,
     estimate_pose,
+    make_pipeline,
+    step,
 )
 from perchctl.weights.table import HEADER, row_text
 

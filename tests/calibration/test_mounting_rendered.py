@@ -20,10 +20,9 @@ from perchctl.calibration import (
     solve_carry,
     solve_pivot,
 )
-from perchctl.pipeline import PipelineState, make_pipeline, step
 from perchctl.sim import draw_hand, record_hand
 from perchctl.sim.hand import Hand, T_target_cam_at, pictures
-from perchctl.vision import Frame
+from perchctl.vision import Frame, PipelineState, make_pipeline, step
 from tests.helpers.mounting import profile
 
 SEED = 4

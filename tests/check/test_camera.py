@@ -27,12 +27,12 @@ from perchctl.faults.camera import FaultyCamera
 from perchctl.faults.effects import FOR_EVER, CameraFault
 from perchctl.flight.lockstep import LockstepClock, LockstepSource
 from perchctl.link import MockLink
-from perchctl.pipeline import make_pipeline
 from perchctl.profile import load_profile
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.target import Optics, make_design
 from perchctl.target.blind import Blind, Mounted
 from perchctl.target.design import GearRanges, Ranges
+from perchctl.vision import make_pipeline
 from tests.helpers.mission import target_at
 
 PROFILE = load_profile("sim")

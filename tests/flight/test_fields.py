@@ -11,10 +11,9 @@ from perchctl.flight import Senses
 from perchctl.flight.senses import REMARK_PICTURES
 from perchctl.geometry import rpy_from_rotation
 from perchctl.link import Link
-from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, Telemetry
-from perchctl.vision import Frame
+from perchctl.vision import Frame, make_pipeline
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 

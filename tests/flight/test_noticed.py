@@ -17,7 +17,8 @@ from perchctl.flight.noticed import (
 )
 from perchctl.mission import Context, Phase
 from perchctl.profile import USED_LATENCY_S, CameraConfig
-from perchctl.vision import CameraModel, Consistency, MarkerPose, make_pose_setup
+from perchctl.vision import CameraModel, Consistency, MarkerPose
+from perchctl.vision.pose import make_pose_setup
 from tests.helpers.mission import PROFILE, observation, state_in, telemetry
 
 FRAME_S = 1 / 30

@@ -14,10 +14,9 @@ from perchctl.calibration import profile_camera
 from perchctl.flight import History, Senses, add_samples
 from perchctl.flight.sights import CARRIED_FOR_S, Sights, is_carried
 from perchctl.geometry import Place
-from perchctl.pipeline import make_pipeline
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry
-from perchctl.vision import MarkerPose, MeasuredMarkers
+from perchctl.vision import MarkerPose, MeasuredMarkers, make_pipeline
 from tests.helpers.mission import target_at, telemetry
 from tests.helpers.sights import TARGET_ONLY
 

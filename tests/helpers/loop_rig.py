@@ -15,7 +15,6 @@ from perchctl.flight.loop import Positions
 from perchctl.flight.rescue import Rescued, rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.mission import Event, FlightReport, Observation, Operator, Phase, Tick, planner
-from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
@@ -26,7 +25,7 @@ from perchctl.vehicle import (
     StopMotors,
     Telemetry,
 )
-from perchctl.vision import CameraModel, Frame
+from perchctl.vision import CameraModel, Frame, Pipeline, make_pipeline
 from tests.helpers.mission import AIRBORNE, HOVER_THRUST, READY, telemetry
 
 SIZE_PX = (64, 48)

@@ -7,7 +7,8 @@ import numpy as np
 from perchctl.calibration import profile_camera
 from perchctl.geometry import Array, Place, rot_z, wrap_rad
 from perchctl.profile import Profile, load_profile
-from perchctl.vision import Attitude, MarkerPose, PoseSetup, level_rotation, make_pose_setup
+from perchctl.vision import Attitude, MarkerPose, PoseSetup, level_rotation
+from perchctl.vision.pose import make_pose_setup
 
 TARGET_ONLY: Profile = load_profile("target_only")
 SETUP: PoseSetup = make_pose_setup(

@@ -15,11 +15,10 @@ from perchctl.flight import fly, senses
 from perchctl.log import FlightLog, LogWatcher, read_log
 from perchctl.log.write import FlightLogWriter, make_header
 from perchctl.mission import Operator, Phase, Tick
-from perchctl.pipeline import FieldState, Pipeline
 from perchctl.profile import changed_profile
 from perchctl.replay import Picture, replay, replay_lines, replay_record
 from perchctl.replay.run import Replay
-from perchctl.vision import Frame
+from perchctl.vision import FieldState, Frame, Pipeline
 from tests.helpers.hangs import hang_in_the_camera, hang_in_the_planner
 from tests.helpers.loop_rig import PROFILE, Camera, Rig, SleepyClock, Vehicle
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.pipeline import Pipeline, make_pipeline
 from perchctl.profile import (
     CameraConfig,
     DetectorConfig,
@@ -20,7 +19,7 @@ from perchctl.profile import (
     TargetConfig,
 )
 from perchctl.profile.vision import VehicleConfig
-from perchctl.vision import CameraModel
+from perchctl.vision import CameraModel, Pipeline, make_pipeline
 from tests.helpers.target_picture import CAMERA
 
 SCENES = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "scenes"

@@ -20,11 +20,11 @@ from perchctl.vision import (
     PoseSetup,
     add_moment,
     consistency_moment,
-    make_pose_setup,
     rotation_vector,
     solve_consistency,
 )
 from perchctl.vision.consistency import STAMPS_S, Moment
+from perchctl.vision.pose import make_pose_setup
 
 PROFILE = Profile()
 CAMERA = CameraModel((640, 480), np.diag([380.0, 380.0, 1.0]), np.zeros(5))

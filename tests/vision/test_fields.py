@@ -13,20 +13,21 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array
-from perchctl.pipeline import FieldState, Pipeline, PipelineState, pictures, step
 from perchctl.vision import (
     CameraModel,
-    FieldsMode,
+    FieldState,
     Frame,
     PictureKind,
-    classify_fields,
-    detect_markers,
+    Pipeline,
+    PipelineState,
     estimate_pose,
     field_picture,
     is_combed,
-    separate_fields,
+    pictures,
+    step,
 )
-from perchctl.vision.fields import combing, halves
+from perchctl.vision.fields import FieldsMode, classify_fields, combing, halves, separate_fields
+from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.ghost import with_ghosts
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array
-from perchctl.pipeline import PipelineState, step
 from perchctl.profile import DetectorConfig, Profile
 from perchctl.vision import (
     Attitude,
     Detection,
     Frame,
     PipelineOutput,
+    PipelineState,
     estimate_pose,
-    make_pose_setup,
     project,
     square_corners,
+    step,
 )
+from perchctl.vision.pose import make_pose_setup
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
 # Of the target in the camera: beside the gear along width and height, and under it.

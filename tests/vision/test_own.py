@@ -13,10 +13,20 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.geometry import make_T, rot_z
-from perchctl.pipeline import Pipeline, PipelineOutput, PipelineState, make_pipeline, step
 from perchctl.profile import Profile
 from perchctl.sim import Neighbour, Renderer, Scenario
-from perchctl.vision import Attitude, CameraModel, Detection, Detections, Frame
+from perchctl.vision import (
+    Attitude,
+    CameraModel,
+    Detection,
+    Detections,
+    Frame,
+    Pipeline,
+    PipelineOutput,
+    PipelineState,
+    make_pipeline,
+    step,
+)
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.search import choose
 

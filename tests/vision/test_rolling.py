@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array, yaw_of
-from perchctl.pipeline import FieldState, PipelineState, make_pipeline, pictures, step
 from perchctl.profile import Profile
-from perchctl.vision import Detection, Detections
+from perchctl.vision import (
+    Detection,
+    Detections,
+    FieldState,
+    PipelineState,
+    make_pipeline,
+    pictures,
+    step,
+)
 from perchctl.vision.rolling import UNKNOWN_READOUT_S, seen_at_once
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA

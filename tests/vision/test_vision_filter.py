@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import KalmanConfig
-from perchctl.vision import predict_track
 from perchctl.vision.filter import (
     MAX_PREDICTION_S,
     MEASURED,
@@ -27,6 +26,7 @@ from perchctl.vision.filter import (
     Z,
     foreseen,
     make_filter,
+    predict_track,
     start_track,
     step_track,
     transition,

@@ -12,11 +12,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import make_T, rot_z, rotation_from_rpy
-from perchctl.pipeline import Pipeline, follow
 from perchctl.profile import KalmanConfig, MergeConfig
-from perchctl.vision import Attitude, Detections, MarkerPose, PipelineOutput, PipelineState
+from perchctl.vision import (
+    Attitude,
+    Detections,
+    MarkerPose,
+    Pipeline,
+    PipelineOutput,
+    PipelineState,
+)
 from perchctl.vision.filter import Measurement, make_filter
 from perchctl.vision.gate import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S, Sight, judged
+from perchctl.vision.pipeline import follow
 from perchctl.vision.types import Lock, MarkerTrack, Stranger
 from tests.helpers.seen import seen_from
 

@@ -18,10 +18,10 @@ from perchctl.geometry import (
     rotation_from_rpy,
     wrap_rad,
 )
-from perchctl.pipeline import Pipeline, follow
 from perchctl.profile import KalmanConfig, TargetConfig
-from perchctl.vision import Attitude, MarkerPose, PipelineState
+from perchctl.vision import Attitude, MarkerPose, Pipeline, PipelineState
 from perchctl.vision.filter import TILTS, X, Y, Z, make_filter, process_noise
+from perchctl.vision.pipeline import follow
 from perchctl.vision.places import measurement
 from tests.helpers.seen import seen_from
 

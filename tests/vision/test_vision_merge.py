@@ -9,13 +9,14 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import wrap_rad
 from perchctl.profile import MergeConfig, WeightsConfig
-from perchctl.vision import MarkerPose, Stage, better_conditioned, stage_of
+from perchctl.vision import MarkerPose, Stage, better_conditioned
 from perchctl.vision.merge import (
     choose_stage,
     disagree,
     merge_pair,
     merge_variance,
     stage_by_range,
+    stage_of,
     weight_matrix,
 )
 

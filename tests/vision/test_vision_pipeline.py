@@ -20,7 +20,6 @@ from perchctl.geometry import (
     rotation_from_rpy,
     wrap_rad,
 )
-from perchctl.pipeline import Pipeline, estimate, step
 from perchctl.profile import (
     DetectorConfig,
     KalmanConfig,
@@ -33,13 +32,16 @@ from perchctl.profile import (
 from perchctl.vision import (
     Attitude,
     Frame,
+    Pipeline,
     PipelineOutput,
     PipelineState,
-    PoseCandidate,
     Stage,
+    estimate,
     estimate_pose,
-    expected_corners,
+    step,
 )
+from perchctl.vision.predict import expected_corners
+from perchctl.vision.solve import PoseCandidate
 from perchctl.vision.types import Sighting
 from tests.helpers.target_picture import pose_of, render
 

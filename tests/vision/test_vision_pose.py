@@ -22,15 +22,13 @@ from perchctl.vision import (
     Attitude,
     Detection,
     MarkerPose,
-    PoseCandidate,
     PoseSetup,
     estimate_pose,
-    make_pose_setup,
-    normal_cam,
     project,
     square_corners,
 )
-from perchctl.vision.pose import mirror_solution
+from perchctl.vision.pose import make_pose_setup, mirror_solution, normal_cam
+from perchctl.vision.solve import PoseCandidate
 from tests.helpers.target_picture import CAMERA, pose_of
 
 SIDES = {"large": 0.150, "small": 0.025}

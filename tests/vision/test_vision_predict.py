@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.profile import CameraConfig, PoseConfig, TargetConfig
-from perchctl.vision import Attitude, MarkerPose, expected_corners, make_pose_setup, update_sight
+from perchctl.vision import Attitude, MarkerPose
+from perchctl.vision.pose import make_pose_setup
+from perchctl.vision.predict import expected_corners, update_sight
 from perchctl.vision.types import Sighting
 from tests.helpers.target_picture import CAMERA
 

@@ -13,13 +13,13 @@ from perchctl.vision import (
     MarkerPose,
     PoseSetup,
     estimate_pose,
-    make_pose_setup,
     project,
     square_corners,
 )
 from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import disagree
 from perchctl.vision.places import measurement
+from perchctl.vision.pose import make_pose_setup
 from tests.helpers.target_picture import CAMERA, pose_of
 
 SIDES = {"large": 0.150, "small": 0.025}

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.pipeline import step
 from perchctl.profile import PoseConfig
-from perchctl.vision import Frame, PipelineOutput, PipelineState
+from perchctl.vision import Frame, PipelineOutput, PipelineState, step
 
 
 def look(truth: dict[str, Any], build: Any, entry: dict[str, Any], **config: Any) -> PipelineOutput:

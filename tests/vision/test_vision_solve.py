@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array
-from perchctl.vision import Detection, PoseCandidate, project, square_corners, undistort_px
+from perchctl.vision import Detection, project, square_corners, undistort_px
 from perchctl.vision.points import Points, make_points
 from perchctl.vision.pose import rotation_matrix
-from perchctl.vision.solve import Scored, TiltPrior, gauss_newton, mirror_solution
+from perchctl.vision.solve import PoseCandidate, Scored, TiltPrior, gauss_newton, mirror_solution
 from tests.helpers.target_picture import CAMERA, pose_of
 
 TRUE = PoseCandidate(*pose_of(0.03, -0.02, 0.5, 0.4, 0.15, -0.1))

@@ -11,10 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array, wrap_rad
-from perchctl.pipeline import Pipeline, step
 from perchctl.profile import TargetConfig
 from perchctl.sim.analogue import spoil
-from perchctl.vision import Frame, MarkerPose, PipelineState
+from perchctl.vision import Frame, MarkerPose, Pipeline, PipelineState, step
 from tests.helpers.target_picture import pose_of, render
 
 pytestmark = pytest.mark.long

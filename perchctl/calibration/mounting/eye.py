@@ -6,9 +6,18 @@ from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.calibration.mounting.seen import best_pose, camera_only_profile, is_seen_mirrored
 from perchctl.camera import HealthState, assess_frame
 from perchctl.geometry import Array
-from perchctl.pipeline import FieldState, make_pipeline, pictures, step
 from perchctl.profile import Profile
-from perchctl.vision import MARKERS, CameraModel, Frame, PipelineOutput, PipelineState
+from perchctl.vision import (
+    MARKERS,
+    CameraModel,
+    FieldState,
+    Frame,
+    PipelineOutput,
+    PipelineState,
+    make_pipeline,
+    pictures,
+    step,
+)
 
 
 class Eye:

@@ -9,9 +9,8 @@ import numpy as np
 from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.calibration.mounting.turns import cross_matrix, rotation_matrices
 from perchctl.geometry import R_MARKER_TARGET, Array
-from perchctl.pipeline import camera_profile
 from perchctl.profile import Profile
-from perchctl.vision import CameraModel, MarkerPose, PipelineOutput
+from perchctl.vision import CameraModel, MarkerPose, PipelineOutput, camera_profile
 
 
 def camera_only_profile(profile: Profile) -> Profile:

@@ -17,7 +17,6 @@ from perchctl.vision import (
     Detections,
     MarkerName,
     RigidPose,
-    detect_markers,
     distort,
     project,
     square_corners,
@@ -26,6 +25,7 @@ from perchctl.vision import (
 )
 from perchctl.vision.markers.between import between
 from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut, may_be_whole
+from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.ghost import with_ghosts
 from perchctl.vision.markers.outline import outline_of
 from perchctl.vision.markers.overview import lattice_of

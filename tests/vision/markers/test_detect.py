@@ -10,15 +10,9 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, TargetConfig
-from perchctl.vision import (
-    Detections,
-    Frame,
-    detect_markers,
-    make_aruco_detector,
-    project,
-    square_corners,
-)
+from perchctl.vision import Detections, Frame, make_aruco_detector, project, square_corners
 from perchctl.vision.markers.blurred import hidden_in_blur
+from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.search import misfit, search
 from tests.helpers.markers import SETUP, blurry, both, box, frame, paste
 from tests.helpers.target_picture import CAMERA, pose_of, render

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.vision import detect_markers, make_aruco_detector
+from perchctl.vision import make_aruco_detector
 from perchctl.vision.markers.corners import RefinedCorners
+from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.follow import around, follow
 from perchctl.vision.markers.partly import seen_partly
 from perchctl.vision.markers.visible_cells import KnownBy

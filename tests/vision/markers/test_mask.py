@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
-from perchctl.pipeline import make_pipeline
 from perchctl.profile import Profile, load_profile
-from perchctl.vision import Detections, Frame, MarkerName, detect_markers, field_picture, make_mask
-from perchctl.vision.markers.mask import filled, hidden_in, hides
+from perchctl.vision import Detections, Frame, MarkerName, field_picture, make_pipeline
+from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.mask import filled, hidden_in, hides, make_mask
 from perchctl.vision.markers.square import from_unit, mapped
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render

@@ -12,16 +12,9 @@ import pytest
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.pipeline import step
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
-from perchctl.vision import (
-    Detections,
-    Frame,
-    MarkerName,
-    PipelineState,
-    detect_markers,
-    make_aruco_detector,
-)
+from perchctl.vision import Detections, Frame, MarkerName, PipelineState, make_aruco_detector, step
+from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.partly import fit_partly, seen_partly
 from perchctl.vision.markers.search import search
 from perchctl.vision.markers.square import from_unit, mapped

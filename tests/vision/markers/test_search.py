@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.vision import DetectorSetup
-from perchctl.vision.markers.detector import Thresholds, strict_detector
+from perchctl.vision.markers.detector import DetectorSetup, Thresholds, strict_detector
 from perchctl.vision.markers.search import choose, search, search_window
 from tests.helpers.markers import SETUP, both, box
 from tests.helpers.markers import corners as corners_of

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from perchctl.pipeline import step
 from perchctl.profile import DetectorConfig
-from perchctl.vision import Frame, PipelineState
+from perchctl.vision import Frame, PipelineState, step
 from perchctl.vision.markers import detect as detect_room
 from perchctl.vision.markers import search as search_room
 from tests.helpers.target_picture import pose_of, render

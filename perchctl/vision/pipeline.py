@@ -15,64 +15,38 @@ from numpy.typing import NDArray
 
 from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
-from perchctl.vision import (
-    MAX_TRACK_GAP_S,
+from perchctl.vision.fields import FieldsMode, FieldState, classify_fields, separate_fields
+from perchctl.vision.filter import MAX_TRACK_GAP_S, predict_track
+from perchctl.vision.markers.cut import prepare_cut_markers
+from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
+from perchctl.vision.markers.mask import GearMask, make_mask
+from perchctl.vision.merge import stage_of
+from perchctl.vision.merged_target import estimate_in_level, estimate_in_world, spread_in_world
+from perchctl.vision.own import OwnTargetPlace, TargetSelector
+from perchctl.vision.places import to_level
+from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
+from perchctl.vision.predict import expected_corners, update_sight
+from perchctl.vision.solve import PoseCandidate
+from perchctl.vision.strategies import MergePrior, MergeStrategy, make_strategy
+from perchctl.vision.tracks import (
+    TrackedFrame,
+    TrackSetup,
+    make_track_setup,
+    surest_pose,
+    update_tracks,
+)
+from perchctl.vision.types import (
     Attitude,
     CameraModel,
     Detections,
-    DetectorSetup,
-    FieldsMode,
-    FieldState,
     Frame,
-    GearMask,
-    MergePrior,
-    MergeStrategy,
-    OwnTargetPlace,
     PictureKind,
     PipelineOutput,
     PipelineState,
-    PoseCandidate,
-    PoseSetup,
     Stage,
     TargetEstimate,
-    TargetSelector,
-    TrackedFrame,
-    TrackSetup,
-    classify_fields,
-    detect_markers,
-    estimate_in_level,
-    estimate_in_world,
-    expected_corners,
-    make_aruco_detector,
-    make_mask,
-    make_pose_setup,
-    make_strategy,
-    make_track_setup,
-    normal_cam,
-    predict_track,
-    prepare_cut_markers,
-    separate_fields,
-    spread_in_world,
-    stage_of,
-    surest_pose,
-    to_level,
-    update_sight,
-    update_tracks,
 )
-
-__all__ = [
-    "FieldState",
-    "Pipeline",
-    "PipelineOutput",
-    "PipelineState",
-    "camera_profile",
-    "estimate",
-    "follow",
-    "make_pipeline",
-    "pictures",
-    "step",
-]
-
 
 SEVERAL = "more than one target in view: the one that was tracked is followed"
 
