@@ -98,8 +98,8 @@ def cheap(line: str) -> list[str]:
             words.append("--help")
         case ["perchctl", "new-profile"]:  # without a dialogue, over what is there
             words += ["--defaults", "--force"]
-        case ["perchctl", "simulate"] if "--minimise" in words or words.count("--sweep") > 1:
-            words.append("--help")  # a seed that fails, and many flights; tests have both
+        case ["perchctl", "simulate"] if words.count("--sweep") > 1:
+            words.append("--help")  # many flights
         case ["perchctl", "simulate"]:
             if "--cluster" in words:  # the form is looked at; a cluster of one is this computer's
                 at = words.index("--cluster")

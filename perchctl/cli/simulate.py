@@ -54,10 +54,6 @@ def simulate(
             help="Lay a fault into each flight, and judge by the world's truth.",
         ),
     ] = None,
-    heat_map: Annotated[
-        Path | None,
-        typer.Option("--heat-map", help="PNG of faults against phases, or of two swept keys."),
-    ] = None,
     log_dir: Annotated[
         Path | None, typer.Option("--log-dir", help="Log the flights, into this folder.")
     ] = None,
@@ -95,29 +91,6 @@ def simulate(
             "with each.",
         ),
     ] = None,
-    until: Annotated[
-        str | None,
-        typer.Option(
-            "--until",
-            metavar="WIDTH%",
-            help="Fly until the 95 % interval of the success rate, from its lower to its upper "
-            "end, is narrower, as 0.5%; -n is the most then, 10000 by default.",
-        ),
-    ] = None,
-    minimise: Annotated[
-        int | None,
-        typer.Option(
-            "--minimise",
-            metavar="SEED",
-            min=0,
-            help="Tone a failing seed's conditions down to those that make it fail, and print "
-            "them as a profile.",
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="YAML file for the profile of --minimise."),
-    ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -137,15 +110,11 @@ def simulate(
             record=record,
             as_json=as_json,
             faults=faults,
-            heat_map=heat_map,
             force=force,
             out=out,
             resume=resume,
             keep=keep,
             compare=compare,
             sweep=tuple(sweep or ()),
-            until=until,
-            minimise=minimise,
-            output=output,
         )
         perform(run, request)

@@ -58,10 +58,8 @@ class _Count:
         total: int,
         earlier: Iterable[Ended],
         clock: Callable[[], float],
-        expected: Callable[[], int] | None = None,
     ) -> None:
         self.total, self._clock = total, clock
-        self._expected = expected or (lambda: total)
         self._ends = Counter(result.outcome for result in earlier)
         self._before, self._began_s = self._ends.total(), clock()
         self.said_s = self._began_s
@@ -83,7 +81,7 @@ class _Count:
         elapsed_s, now = self._clock() - self._began_s, self.flown - self._before
         if not now or elapsed_s <= 0.0:
             return ""
-        left_s = elapsed_s / now * max(0, self._expected() - self.flown)
+        left_s = elapsed_s / now * max(0, self.total - self.flown)
         return f"{60.0 * now / elapsed_s:.1f}/min {_clock_text(left_s)} left"
 
     def line(self) -> str | None:
@@ -100,12 +98,10 @@ def progress_bar(
     stream: TextIO | None = None,
     earlier: Iterable[Ended] = (),
     clock: Callable[[], float] = time.monotonic,
-    expected: Callable[[], int] | None = None,
 ) -> Iterator[Callable[[Ended], None]]:
     """Yields the function to call with each finished flight: a line of 80 columns that changes
-    on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before;
-    `expected`: how many it may come to, where that is less than `total`."""
-    count = _Count(total, earlier, clock, expected)
+    on a terminal, elsewhere a new one each `LINE_S` at most. `earlier`: flown before."""
+    count = _Count(total, earlier, clock)
     stream = stream or sys.stderr
     text = TextColumn("{task.description}")
     with _bar("flights", text, total=total, stream=stream, width=8) as update:

@@ -70,14 +70,6 @@ def _answer(request: SimulateRequest) -> Callable[[SimulateRequest], int] | None
             from perchctl.commands.simulate_sweep import run_sweep
 
             return run_sweep
-        if request.until is not None:
-            from perchctl.commands.simulate_until import run_until
-
-            return run_until
-        if request.minimise is not None:
-            from perchctl.commands.simulate_minimise import run_minimise
-
-            return run_minimise
     return None
 
 

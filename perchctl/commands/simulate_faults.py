@@ -6,7 +6,7 @@ import contextlib
 from dataclasses import asdict, replace
 
 from perchctl.commands.flight_plot import plot_of
-from perchctl.commands.output import print_record, say
+from perchctl.commands.output import print_record
 from perchctl.commands.simulate_request import SimulateRequest, and_problem, fly_each, tell_logs
 from perchctl.errors import PerchError
 from perchctl.faults import (
@@ -42,11 +42,6 @@ def run_faults(request: SimulateRequest) -> int:
         else:
             print(fault_table(results), flush=True)
         tell_logs(results, request.log_dir, request.keep)
-        if request.heat_map is not None:
-            from perchctl.faults import plot_heat_map
-
-            plot_heat_map(results, request.heat_map)
-            say(f"{request.heat_map} is drawn")
 
     with request.results(profile, FaultResult, names) as kept:
         return fly_each(

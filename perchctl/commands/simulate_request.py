@@ -16,9 +16,7 @@ from perchctl.cluster import parse_address
 from perchctl.commands.output import say
 from perchctl.commands.positioning import positioned
 from perchctl.commands.progress import Ended, progress_bar
-from perchctl.commands.simulate_modes import MOST_UNTIL, check_modes
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
-from perchctl.files import check_output
 from perchctl.flight import (
     CampaignResults,
     JudgedFlight,
@@ -33,8 +31,12 @@ AGAIN_S = 0.5
 """A second Ctrl-C counts from here on: a key held down is one press, as in a flight."""
 
 
-class EnoughFlown(Exception):
-    """Raised where a result is noted: the flights that are left are not needed."""
+_LOGS = ("--log-dir", "--record", "--keep", "--out", "--resume")
+_NOT_WITH = {
+    "--compare": "flies each seed by two profiles, and prints a table",
+    "--sweep": "flies each seed by many profiles, and keeps no logs",
+}
+"""What answers a question, and does without a campaign's files."""
 
 
 class Seeded(Ended, JudgedFlight, Protocol):
@@ -59,7 +61,6 @@ class SimulateRequest:
     log_dir: Path | None = None
     as_json: bool = False
     faults: str | None = None
-    heat_map: Path | None = None
     force: bool = False
     positioning: str | None = None
     record: bool = False
@@ -68,9 +69,6 @@ class SimulateRequest:
     keep: str | None = None
     compare: str | None = None
     sweep: tuple[str, ...] = ()
-    until: str | None = None
-    minimise: int | None = None
-    output: Path | None = None
     cluster: str | None = None
 
     def loaded(self) -> Profile:
@@ -82,8 +80,7 @@ class SimulateRequest:
         if self.only is not None:
             return [self.only]
         first = self.seed or 0
-        flights = 10 if self.until is None else MOST_UNTIL
-        return list(range(first, first + (flights if self.flights is None else self.flights)))
+        return list(range(first, first + (10 if self.flights is None else self.flights)))
 
     def log_folder(self, profile: Profile) -> Path:
         """Of one flight, which is always logged."""
@@ -94,16 +91,12 @@ class SimulateRequest:
         return {
             "--compare": self.compare,
             "--sweep": self.sweep,
-            "--until": self.until,
-            "--minimise": self.minimise,
             "--faults": self.faults,
             "--only": self.only,
             "-n": self.flights,
             "--seed": self.seed,
-            "--heat-map": self.heat_map,
             "--log-dir": self.log_dir,
             "--record": self.record or None,
-            "--output": self.output,
             "--out": self.out,
             "--resume": self.resume or None,
             "--keep": self.keep,
@@ -112,11 +105,7 @@ class SimulateRequest:
     def check(self) -> None:
         """Errors: UsageError for an option that does not apply to what is asked for,
         InvalidValue for a place that nothing can be written to."""
-        check_modes(self._options)
-        if self.heat_map is not None and self.faults is None and not self.sweep:
-            raise UsageError(
-                "--heat-map is drawn of faults, or of two keys: name them with --faults or --sweep"
-            )
+        _check_question(self._options)
         if self.record and self.only is None and self.log_dir is None:
             raise UsageError("--record writes beside the logs: name their folder with --log-dir")
         many: dict[str, int | str | Path | None] = {
@@ -124,7 +113,6 @@ class SimulateRequest:
             "--seed": self.seed,
             "--jobs": self.jobs,
             "--cluster": self.cluster,
-            "--heat-map": self.heat_map,
             "--out": self.out,
         }
         if self.resume and self.out is None:
@@ -146,12 +134,8 @@ class SimulateRequest:
                     f"--cluster {self.cluster} flies as many at a time as it has workers: "
                     f"--jobs {self.jobs} does not apply; leave it out, or --cluster"
                 )
-        if self.heat_map is not None:
-            check_output(self.heat_map, (".png",), self.force)
         if self.out is not None and self.out.suffix != ".jsonl":
             raise InvalidValue(f"{self.out} must end in .jsonl: a result is one line of JSON")
-        if self.output is not None:
-            check_output(self.output, (".yaml", ".yml"), self.force)
 
     @contextlib.contextmanager
     def results(
@@ -175,8 +159,24 @@ class SimulateRequest:
             yield kept
 
 
+def _check_question(options: Mapping[str, Any]) -> None:
+    """By the options' names; None or an empty tuple was not given. Errors: UsageError for options
+    that do not go together."""
+    given = {name: value for name, value in options.items() if value is not None and value != ()}
+    asked = [name for name in (*_NOT_WITH, "--faults", "--only") if name in given]
+    questions = [name for name in asked if name in _NOT_WITH]
+    if questions and len(asked) > 1:
+        raise UsageError(
+            f"{' and '.join(asked)} do not go together: each flies its own seeds; ask for one "
+            f"after the other"
+        )
+    for question in questions:
+        asks = f"{question} {_NOT_WITH[question]}"
+        _refuse(asks, {name: "" for name in _LOGS if name in given}, "")
+
+
 def _refuse(asked: str, options: Mapping[str, int | str | Path | None], instead: str) -> None:
-    given = [f"{name} {value}" for name, value in options.items() if value is not None]
+    given = [f"{name} {value}".strip() for name, value in options.items() if value is not None]
     if given:
         does, it = ("does", "it") if len(given) == 1 else ("do", "them")
         raise UsageError(
@@ -191,7 +191,6 @@ def fly_each(
     kept: CampaignResults[R] | None = None,
     flights: int | None = None,
     profiles: Sequence[Profile] = (),
-    expected: Callable[[], int] | None = None,
     objection: Callable[[list[R]], PerchError | None] = lambda results: None,
 ) -> int:
     """Flies the request's seeds in processes of their own or on its cluster, and reports those that
@@ -199,9 +198,8 @@ def fly_each(
 
     `campaign` is given who flies, and whom to tell of each result; `report` also why not all
     were flown. `kept`: those that were flown before, which count, too, and where each goes.
-    `flights`: how many it flies, by default one a seed; `profiles`: by which; `expected`: how many
-    of them it may come to; `objection`: what all of them together amount to. Errors: PerchError
-    where none was.
+    `flights`: how many it flies, by default one a seed; `profiles`: by which; `objection`:
+    what all of them together amount to. Errors: PerchError where none was.
     """
     from perchctl.commands.simulate_hands import hands_of
 
@@ -212,12 +210,12 @@ def fly_each(
     jobs = max(1, min(request.jobs or 1, left))
     cluster = request.cluster if left > 0 else None
     problem: PerchError | None = None
-    begun = enough = False
+    begun = False
     try:
         with (
             contextlib.suppress(KeyboardInterrupt),
             hands_of(cluster, jobs, profiles, request.log_dir) as (executor, _),
-            progress_bar(total, earlier=kept.earlier, expected=expected) as advance,
+            progress_bar(total, earlier=kept.earlier) as advance,
         ):
             begun = True
             campaign(executor, noting(results, kept.note, advance))
@@ -225,10 +223,8 @@ def fly_each(
         if not begun:
             raise
         problem = error
-    except EnoughFlown:
-        enough = True
     flown = f"{len(results)} of {total} flights were flown"
-    if problem is None and len(results) < total and not enough:
+    if problem is None and len(results) < total:
         problem = Interrupted(f"stopped: {flown}")
     elif problem is not None:
         problem.args = (f"{problem}; {flown}",)

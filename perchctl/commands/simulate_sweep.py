@@ -1,4 +1,4 @@
-"""The work behind `perchctl simulate --sweep`: a table of cells, and a heat map of two keys."""
+"""The work behind `perchctl simulate --sweep`: a table of cells."""
 
 from __future__ import annotations
 
@@ -29,11 +29,6 @@ def run_sweep(request: SimulateRequest) -> int:
             print_record(and_problem(sweep_record(found), problem))
         else:
             print(sweep_text(found), flush=True)
-        if request.heat_map is not None:
-            from perchctl.flight import plot_sweep
-
-            plot_sweep(found, request.heat_map)
-            say(f"{request.heat_map} is drawn")
 
     return fly_each(
         lambda executor, note: fly_variants(profiles, request.seeds, executor, note),

@@ -9,9 +9,6 @@ from .clock import wall_date as wall_date
 from .compared import compare_variants as compare_variants
 from .compared import variants_record as variants_record
 from .compared import variants_text as variants_text
-from .conditions import ScenarioCondition as ScenarioCondition
-from .conditions import ScenarioConditions as ScenarioConditions
-from .conditions import scenario_conditions as scenario_conditions
 from .criteria import Problem as Problem
 from .criteria import battery_problem as battery_problem
 from .criteria import forbidden_problem as forbidden_problem
@@ -23,9 +20,6 @@ from .criteria import tilt_problem as tilt_problem
 from .criteria import too_near_problem as too_near_problem
 from .criteria import unmeasured_problem as unmeasured_problem
 from .criteria import unsettled_problem as unsettled_problem
-from .failure import EndedFlight as EndedFlight
-from .failure import fly_to_its_end as fly_to_its_end
-from .failure import minimised_failure as minimised_failure
 from .hands import flight_order as flight_order
 from .hands import flight_processes as flight_processes
 from .hands import run_order as run_order
@@ -51,7 +45,6 @@ from .outside import external_height_problem as external_height_problem
 from .outside import millimetres_problem as millimetres_problem
 from .outside import nearest_axis as nearest_axis
 from .outside import world_problem as world_problem
-from .plot import plot_sweep as plot_sweep
 from .positions import capture_for_vehicle as capture_for_vehicle
 from .positions import require_comparison as require_comparison
 from .rates import rate_record as rate_record
@@ -82,7 +75,6 @@ from .sweep import sweep_record as sweep_record
 from .sweep import sweep_results as sweep_results
 from .sweep import sweep_text as sweep_text
 from .uninterrupted import defer_interrupts as defer_interrupts
-from .until import StopRule as StopRule
 from .variants import VariantResult as VariantResult
 from .variants import fly_variants as fly_variants
 from .variants import whole_seeds as whole_seeds

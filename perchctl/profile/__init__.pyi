@@ -14,7 +14,6 @@ from .load import find_calibration as find_calibration
 from .load import find_profile as find_profile
 from .load import find_weights as find_weights
 from .load import first_invalid_key as first_invalid_key
-from .load import is_profile_path as is_profile_path
 from .load import load_profile as load_profile
 from .load import read_weights as read_weights
 from .mask import find_mask as find_mask

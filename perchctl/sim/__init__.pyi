@@ -12,7 +12,6 @@ from .crtp.codec import Port as Port
 from .crtp.commands import CommandService as CommandService
 from .crtp.server import PROTOCOL_VERSION as PROTOCOL_VERSION
 from .draw import draw_capture as draw_capture
-from .draw import draw_points as draw_points
 from .draw import draw_scenario as draw_scenario
 from .firmware import Firmware as Firmware
 from .firmware.controller import Estimate as Estimate

@@ -20,26 +20,11 @@ def draw_scenario(profile: Profile, seed: int) -> Scenario:
     """The scenario of that seed. Every value is drawn in a fixed order, so adding a
     range at the end leaves the earlier ones of a seed as they were; harder worlds draw theirs
     from other streams (`perchctl.sim.draw_more`)."""
-    return _drawn(profile, seed)[0]
-
-
-def draw_points(profile: Profile, seed: int) -> dict[str, Any]:
-    """What that seed draws from each of the `simulation`'s ranges and shares, as values of the
-    same keys from which every seed draws just that; the seed's scenario with them is the same
-    to the bit. What a seed turns by a direction of its own (a drift, a wrong mount) stays, and so
-    does what comes from streams of its own, as in harder worlds."""
-    return _drawn(profile, seed)[1]
-
-
-def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
     sim = profile.simulation
     rng = np.random.default_rng([seed, _STREAM])
-    points: dict[str, Any] = {}
 
     def between(key: str) -> float:
-        value = float(rng.uniform(*getattr(sim, key)))
-        points[key] = (value, value)
-        return value
+        return float(rng.uniform(*getattr(sim, key)))
 
     def direction() -> Array:
         vector = rng.normal(size=3)
@@ -62,10 +47,7 @@ def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
     tilt_bias = rng.uniform(-1, 1, size=2) * math.radians(sim.estimate_tilt_bias_deg)
     fails = rng.uniform() < sim.first_contact_fails
     weak_part = between("first_contact_share")
-    points["first_contact_fails"] = float(fails)
-    if burst is not None:
-        points["camera_burst_frames"] = (burst[1], burst[1])
-    scenario = Scenario(
+    return Scenario(
         seed=seed,
         mass_kg=mass_kg,
         battery_rest_v=battery_v,
@@ -90,7 +72,6 @@ def _drawn(profile: Profile, seed: int) -> tuple[Scenario, dict[str, Any]]:
         neighbours=_neighbours(sim),
         **beyond(sim, seed, target_xy_m),
     )
-    return scenario, points
 
 
 def _burst(

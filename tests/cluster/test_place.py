@@ -53,7 +53,7 @@ def test_what_is_none_is_refused(text: str) -> None:
         ({"jobs": 2}, "--jobs 2 does not apply"),
         ({"only": 3}, "--cluster local:2 does not apply; leave it out, or --only"),
         ({"faults": "list"}, "--cluster local:2 does not apply"),
-        ({"minimise": 3, "jobs": 1}, "--jobs 1 does not apply"),
+        ({"sweep": ("a.b=1",), "jobs": 1}, "--jobs 1 does not apply"),
     ],
 )
 def test_what_does_not_go_with_it_is_refused(options: dict[str, Any], words: str) -> None:

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 from perchctl.cli import app
 from perchctl.commands.positioning import POSITIONINGS, positioned
 from perchctl.errors import SafetyAbort
-from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table, plot_heat_map
+from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table
 from perchctl.faults import flight as faulty
 from perchctl.faults.catalogue import BY_NAME, case_of
 from perchctl.faults.claims import NOT_KNOWN, UNCONFIRMED
@@ -345,13 +345,6 @@ def test_the_table_fits_the_terminal() -> None:
     assert re.search(r"^ +1 of 5 .* let go after the flight$", shown, re.MULTILINE)
 
 
-def test_the_heat_map_is_drawn(tmp_path: Path) -> None:
-    plot_heat_map(RESULTS, tmp_path / "map.png")
-    picture = cv2.imread(str(tmp_path / "map.png"))
-    assert picture is not None
-    assert min(picture.shape[:2]) > 200
-
-
 # --- the command ----------------------------------------------------------------------
 
 
@@ -363,15 +356,14 @@ LOW = ("--faults", "low-bare-ceiling,hang-up")
 
 
 @pytest.mark.long
-def test_the_command_prints_one_object_and_draws(tmp_path: Path) -> None:
+def test_the_command_prints_one_object(tmp_path: Path) -> None:
     options = (*LOW, "-n", "1", "--seed", str(SEED), "--json", "--log-dir", str(tmp_path))
-    done = simulate(*options, "--heat-map", str(tmp_path / "map.png"))
+    done = simulate(*options)
     assert done.exit_code == 0
     said = json.loads(done.stdout)
     keys = {"flights", "perched", "landed", "aborted", "unavoidable", "worst_seeds"}
     assert keys | {"expected_outcomes", "not_known", "touchdown", *FLAGS} <= set(said)
     assert said["flights"] == 1
-    assert (tmp_path / "map.png").exists()
     assert (tmp_path / f"flight_seed{SEED}.jsonl").exists()
 
 
@@ -410,14 +402,3 @@ def test_the_command_lists_and_refuses() -> None:
     refused = simulate("--faults", "hanged")
     assert refused.exit_code == 2
     assert "--faults list" in refused.stderr
-
-
-@pytest.mark.parametrize(("name", "words"), [("map.png", "add --force"), ("m.txt", ".png")])
-def test_a_heat_map_is_refused_before_anything_is_flown(
-    name: str, words: str, tmp_path: Path
-) -> None:
-    (tmp_path / "map.png").write_text("mine")
-    refused = simulate("--faults", "all", "--heat-map", str(tmp_path / name))
-    assert refused.exit_code == 30
-    assert words in refused.stderr
-    assert (tmp_path / "map.png").read_text() == "mine"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +13,6 @@ from perchctl.errors import InvalidValue, UsageError
 from perchctl.flight import (
     FlightResult,
     VariantResult,
-    plot_sweep,
     sweep_grid,
     sweep_record,
     sweep_results,
@@ -133,16 +131,6 @@ def test_seeds_count_that_every_cell_has_flown() -> None:
     assert [(row[0].seed, row[0].attempts, row[1].attempts) for row in seeds] == [
         (3, 0, 1), (4, 0, 1),
     ]  # fmt: skip
-
-
-@pytest.mark.parametrize("second", ["0.02,0.04", "0.02,0.03,0.05"])
-@pytest.mark.long
-def test_two_keys_are_a_heat_map(tmp_path: Path, second: str) -> None:
-    """With the profile's own on it and beside it, and with a cell in which nothing perched."""
-    grid = sweep_grid(SIM, [f"{OTHER}=raw,position", f"{KEY}={second}"])
-    found = sweep_results(grid, flights(3, None, *([0.002] * (len(grid.cells) - 1))))
-    plot_sweep(found, tmp_path / "map.png")
-    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_swept_worlds_are_other_worlds() -> None:
