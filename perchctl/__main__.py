@@ -8,7 +8,7 @@ from perchctl.startup import leave_at_ctrl_c
 def main() -> int | str | None:
     """Run the command line; returns the exit code, or leaves with it."""
     leave_at_ctrl_c()
-    from perchctl.cli import main as run  # takes a while
+    from perchctl.commands import main as run  # takes a while
 
     code: int | str | None = run()
     return code

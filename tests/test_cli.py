@@ -20,8 +20,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import __version__
 from perchctl.calibration import load_calibration
-from perchctl.cli import app
-from perchctl.cli.app import reported
+from perchctl.commands.cli import app
+from perchctl.commands.cli.app import reported
 from perchctl.commands.output import confirmed
 from perchctl.errors import EXIT_CODES, Interrupted
 from perchctl.flight import PLAIN_SEED
@@ -59,7 +59,7 @@ def test_help_loads_nothing_heavy() -> None:
     """It answers in under 0.3 s because of what it does not import."""
     code = (
         "import sys\nsys.argv = ['perchctl', '--help']\n"
-        "from perchctl.cli import main\n"
+        "from perchctl.commands.cli import main\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration, write_recordings
-from perchctl.cli import app
 from perchctl.cluster import parse_address
+from perchctl.commands.cli import app
 from perchctl.flight import fly_lockstep
 from perchctl.log import decode_line
 from perchctl.mission.table import TABLE

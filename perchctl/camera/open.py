@@ -69,7 +69,7 @@ def is_pictures(spec: str) -> bool:
 
 
 def note(sentence: str) -> None:
-    """As warning: `perchctl.cli` prints it, and a program that uses the package may catch it."""
+    """Warn: the command line prints it, and a program that uses the package may catch it."""
     warnings.warn(sentence, CameraNote, stacklevel=3)
 
 

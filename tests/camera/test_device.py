@@ -26,9 +26,9 @@ from perchctl.camera.v4l2 import (
     open_driver,
     value_of,
 )
-from perchctl.cli import app
 from perchctl.commands import check_cameras
 from perchctl.commands.check_cameras import camera_lines, list_cameras
+from perchctl.commands.cli import app
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
 from tests.helpers.live import wait_for

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from typer.testing import CliRunner, Result
 
-from perchctl.cli import app
+from perchctl.commands.cli import app
 from perchctl.weights.table import NEEDED
 
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, JsonOption, ProfileOption, perform, reported
-from perchctl.cli.complete import complete_source
+from perchctl.commands.cli.app import ForceOption, JsonOption, ProfileOption, perform, reported
+from perchctl.commands.cli.complete import complete_source
 
 
 def fit_weights(

@@ -3,18 +3,18 @@
 Nothing here loads a library before a command runs, so that the help is quick.
 """
 
-from perchctl.cli.app import EXIT_TABLE, app, main
-from perchctl.cli.calibrate import calibrate
-from perchctl.cli.check import check
-from perchctl.cli.fit_weights import fit_weights
-from perchctl.cli.fly import fly
-from perchctl.cli.log import SUMMARY as LOG_SUMMARY
-from perchctl.cli.log import log
-from perchctl.cli.make_target import make_target
-from perchctl.cli.new_profile import new_profile
-from perchctl.cli.profile import profile
-from perchctl.cli.simulate import simulate
-from perchctl.cli.track import track
+from perchctl.commands.cli.app import EXIT_TABLE, app, main
+from perchctl.commands.cli.calibrate import calibrate
+from perchctl.commands.cli.check import check
+from perchctl.commands.cli.fit_weights import fit_weights
+from perchctl.commands.cli.fly import fly
+from perchctl.commands.cli.log import SUMMARY as LOG_SUMMARY
+from perchctl.commands.cli.log import log
+from perchctl.commands.cli.make_target import make_target
+from perchctl.commands.cli.new_profile import new_profile
+from perchctl.commands.cli.profile import profile
+from perchctl.commands.cli.simulate import simulate
+from perchctl.commands.cli.track import track
 
 __all__ = ["app", "main"]
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ProfileOption, SourceOption, UriOption, perform, reported
+from perchctl.commands.cli.app import ProfileOption, SourceOption, UriOption, perform, reported
 
 
 def check(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import (
+from perchctl.commands.cli.app import (
     PositioningOption,
     ProfileOption,
     SourceOption,

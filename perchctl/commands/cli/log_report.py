@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import (
+from perchctl.commands.cli.app import (
     ForceOption,
     JsonOption,
     LogDirOption,
@@ -15,7 +15,7 @@ from perchctl.cli.app import (
     perform,
     reported,
 )
-from perchctl.cli.complete import complete_log
+from perchctl.commands.cli.complete import complete_log
 
 
 def report(

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import CamOption, ForceOption, JsonOption, perform, reported
-from perchctl.cli.complete import complete_profile
+from perchctl.commands.cli.app import CamOption, ForceOption, JsonOption, perform, reported
+from perchctl.commands.cli.complete import complete_profile
 
 
 def make_target(

@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from perchctl import __version__
-from perchctl.cli.complete import (
+from perchctl.commands.cli.complete import (
     complete_log,
     complete_positioning,
     complete_profile,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import (
+from perchctl.commands.cli.app import (
     CamOption,
     ForceOption,
     ProfileOption,
@@ -16,7 +16,7 @@ from perchctl.cli.app import (
     perform,
     reported,
 )
-from perchctl.cli.complete import complete_source
+from perchctl.commands.cli.complete import complete_source
 
 
 def track(

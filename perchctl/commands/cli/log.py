@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import typer
 
-from perchctl.cli.log_compare import compare
-from perchctl.cli.log_export import export
-from perchctl.cli.log_plot import plot
-from perchctl.cli.log_replay import replay
-from perchctl.cli.log_report import report
-from perchctl.cli.log_show import show
+from perchctl.commands.cli.log_compare import compare
+from perchctl.commands.cli.log_export import export
+from perchctl.commands.cli.log_plot import plot
+from perchctl.commands.cli.log_replay import replay
+from perchctl.commands.cli.log_report import report
+from perchctl.commands.cli.log_show import show
 
 SUMMARY = "After a flight: its log shown, drawn, compared, exported, replayed, told."
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from perchctl.cli.app import ForceOption, JsonOption, perform, reported
-from perchctl.cli.complete import complete_log
+from perchctl.commands.cli.app import ForceOption, JsonOption, perform, reported
+from perchctl.commands.cli.complete import complete_log
 
 
 def compare(
