@@ -90,7 +90,7 @@ MOST_NAMES = {
     "faults": 15,
     "flight": 83,
     "link": 31,
-    "log": 44,
+    "log": 42,
     "mission": 60,
     "positioning": 15,
     "profile": 55,

@@ -4,8 +4,6 @@ from .compare.table import compare_flights as compare_flights
 from .compare.table import comparison_record as comparison_record
 from .compare.table import comparison_text as comparison_text
 from .compare.table import profile_differences as profile_differences
-from .energy import EnergyHistory as EnergyHistory
-from .energy import energy_history as energy_history
 from .exact import from_exact as from_exact
 from .exact import to_exact as to_exact
 from .export.as_csv import csv_text as csv_text

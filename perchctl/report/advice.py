@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.log import EnergyHistory, shows_target
+from perchctl.log import shows_target
 from perchctl.report.edges import LinkHealth, OutsideHealth
+from perchctl.report.energy import EnergyHistory
 from perchctl.report.findings import findings_in
 from perchctl.report.sight import Sight, part_of
 from perchctl.report.track import Track

@@ -7,10 +7,11 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from perchctl.log import EnergyHistory, FlightLog, FlightSummary, energy_history, summarise_flight
+from perchctl.log import FlightLog, FlightSummary, summarise_flight
 from perchctl.mission import Findings
 from perchctl.report.advice import Advice, advice_of
 from perchctl.report.edges import LinkHealth, OutsideHealth, link_of, outside_of
+from perchctl.report.energy import EnergyHistory, energy_history
 from perchctl.report.findings import findings_in
 from perchctl.report.pictures import Recorded, Shown, decisions_of, shown_of
 from perchctl.report.sight import Sight, sight_of

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.log.read import FlightLog
+from perchctl.log import FlightLog
 from perchctl.mission import (
     BatteryFit,
     EnergyState,

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from perchctl.log import energy_history
-from perchctl.log.energy import USUAL_MAH
 from perchctl.mission.energy import FULL_A
+from perchctl.report.energy import USUAL_MAH, energy_history
 from perchctl.vehicle import FULL_THRUST
 from tests.helpers.log import PLAN
 from tests.helpers.told import made
