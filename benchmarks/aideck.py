@@ -22,7 +22,7 @@ import numpy as np
 from common import Picture, camera_pose, in_view, renderer, rms, setup_with, table, true_corners
 
 from perchctl.calibration import load_calibration
-from perchctl.camera.mosaic import without_mosaic
+from perchctl.camera.aideck import without_mosaic
 from perchctl.flight import FlightResult
 from perchctl.flight.campaign import fly_seed
 from perchctl.geometry import Array

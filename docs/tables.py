@@ -29,7 +29,7 @@ from perchctl.mission.diagram import diagram, rows_table  # noqa: E402
 from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
 from perchctl.profile import Profile, SimulationConfig  # noqa: E402
 from perchctl.profile.keys import UNITS, allowed, keys  # noqa: E402
-from perchctl.profile.worlds import WORLDS  # noqa: E402
+from perchctl.profile.simulation import WORLDS  # noqa: E402
 
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 PART = re.compile(r"(<!-- begin ([\w-]+) -->\n).*?(<!-- end \2 -->)", re.DOTALL)

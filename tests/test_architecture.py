@@ -31,7 +31,7 @@ HOMES: dict[str, tuple[str, ...]] = {
     "distributed": ("perchctl.cluster",),
     "dask": ("perchctl.cluster",),
     "pyarrow": ("perchctl.log.export.as_parquet",),
-    "av": ("perchctl.track.files", "perchctl.camera.rtsp"),
+    "av": ("perchctl.track.outputs", "perchctl.camera.rtsp"),
 }
 
 # Time is an argument here.

@@ -14,6 +14,10 @@ from .mounting.capture import MountingTape as MountingTape
 from .mounting.capture import VehicleSensors as VehicleSensors
 from .mounting.capture import capture as capture
 from .mounting.eye import Eye as Eye
+from .mounting.eye import best_pose as best_pose
+from .mounting.eye import camera_only_profile as camera_only_profile
+from .mounting.eye import is_seen_mirrored as is_seen_mirrored
+from .mounting.eye import pose_basis as pose_basis
 from .mounting.plot import draw_mounting as draw_mounting
 from .mounting.recording import AttitudeSample as AttitudeSample
 from .mounting.recording import MountingPart as MountingPart
@@ -24,10 +28,6 @@ from .mounting.report import MountingReport as MountingReport
 from .mounting.report import keys_text as keys_text
 from .mounting.report import mounting_lines as mounting_lines
 from .mounting.report import mounting_record as mounting_record
-from .mounting.seen import best_pose as best_pose
-from .mounting.seen import camera_only_profile as camera_only_profile
-from .mounting.seen import is_seen_mirrored as is_seen_mirrored
-from .mounting.seen import pose_basis as pose_basis
 from .mounting.solve import solve_carry as solve_carry
 from .mounting.solve import solve_pivot as solve_pivot
 from .mounting.turns import rotation_matrices as rotation_matrices

@@ -19,11 +19,6 @@ from .health import VERDICT_TEXTS as VERDICT_TEXTS
 from .health import HealthState as HealthState
 from .health import HealthVerdict as HealthVerdict
 from .health import assess_frame as assess_frame
-from .mirror import MIRRORED_TEXT as MIRRORED_TEXT
-from .mirror import UnmirroredSource as UnmirroredSource
-from .mirror import mirrored_as_profiled as mirrored_as_profiled
-from .mirror import mirrored_note as mirrored_note
-from .mirror import unmirror_frame as unmirror_frame
 from .open import ALLOWED_SOURCES as ALLOWED_SOURCES
 from .open import SCHEMES as SCHEMES
 from .open import is_live as is_live
@@ -32,9 +27,14 @@ from .open import open_source as open_source
 from .open import scheme_of as scheme_of
 from .open import source_spec as source_spec
 from .slot import NewestSlot as NewestSlot
+from .source import MIRRORED_TEXT as MIRRORED_TEXT
 from .source import FrameSource as FrameSource
 from .source import Grey as Grey
+from .source import UnmirroredSource as UnmirroredSource
 from .source import WatchedSource as WatchedSource
 from .source import WrappedSource as WrappedSource
 from .source import check_size as check_size
+from .source import mirrored_as_profiled as mirrored_as_profiled
+from .source import mirrored_note as mirrored_note
+from .source import unmirror_frame as unmirror_frame
 from .v4l2 import CameraControl as CameraControl

@@ -1,7 +1,7 @@
 from .compared import comparison_rows as comparison_rows
-from .limits import OVERDUE as OVERDUE
+from .profile import OVERDUE as OVERDUE
 from .profile import profile_rows as profile_rows
-from .quick import warnings_before_flight as warnings_before_flight
+from .profile import warnings_before_flight as warnings_before_flight
 from .row import Row as Row
 from .row import Verdict as Verdict
 from .session import CheckScope as CheckScope

@@ -19,11 +19,11 @@ from perchctl.check import (
     health,
     lift,
     link,
-    quick,
     scan,
     sight,
 )
 from perchctl.check.lift import WITHIN_S as LIFT_S
+from perchctl.check.profile import quick_rows
 from perchctl.check.rehearsal import REHEARSED_S, Listened, Rehearsal, Silent, rehearse
 from perchctl.check.row import Row, failed, passed, skipped
 from perchctl.errors import ConnectionFailed, PerchError, UsageError
@@ -110,7 +110,7 @@ def check(options: FlyOptions, wanted: CheckScope) -> Iterator[Row]:
             rehearsal = yield from _camera(heard, source, pipeline, options, wanted)
     yield computer.loop_row(rehearsal, profile)
     yield computer.log_folder_row(options.log_dir)
-    yield from quick.rows(options)
+    yield from quick_rows(options)
 
 
 def scan_rows(uri: str | None) -> list[Row]:

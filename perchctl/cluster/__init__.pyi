@@ -1,2 +1,2 @@
 from .hands import cluster_hands as cluster_hands
-from .place import parse_address as parse_address
+from .hands import parse_address as parse_address

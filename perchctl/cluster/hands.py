@@ -11,11 +11,13 @@ import contextlib
 import logging
 import os
 import pickle
+import re
 import threading
 import warnings
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,10 +27,9 @@ from distributed.versions import VersionMismatchWarning
 
 from perchctl.cluster.asking import ask_all, ask_scheduler, cannot_load
 from perchctl.cluster.local import LocalWorkers, local_scheduler
-from perchctl.cluster.place import Place
 from perchctl.cluster.wanted import Wanted, wanted
 from perchctl.cluster.worker import fly_order
-from perchctl.errors import ConnectionFailed, InvalidValue, PerchError
+from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.flight import defer_interrupts, flight_order
 from perchctl.profile import Profile
 
@@ -286,3 +287,40 @@ def cluster_hands(
             yield hands
         finally:
             hands.shutdown()
+
+
+# --- Where the flights of a campaign go: the ADDRESS of `--cluster` ----------------------------
+
+
+MOST_LOCAL = 1024
+_FORM = re.compile(r"(tcp|tls|ws|wss)://([^\s/:]+|\[[0-9a-fA-F:.]+\]):([0-9]{1,5})")
+
+
+@dataclass(frozen=True)
+class Place:
+    """`address`: of a scheduler that runs; None where `workers` are started here with one."""
+
+    address: str | None
+    workers: int = 0
+
+    def __str__(self) -> str:
+        return self.address or f"local:{self.workers}"
+
+
+def parse_address(text: str) -> Place:
+    """Of ``local:N``, ``HOST:PORT`` or ``tcp://HOST:PORT``. Errors: UsageError."""
+    kind, _, number = text.partition(":")
+    if kind == "local":
+        if number.isascii() and number.isdigit() and 1 <= int(number[:9]) <= MOST_LOCAL:
+            return Place(None, int(number))
+        raise UsageError(
+            f"--cluster {text} must be local:N with N from 1 to {MOST_LOCAL} workers, as in "
+            f"--cluster local:4"
+        )
+    found = _FORM.fullmatch(text if "://" in text else f"tcp://{text}")
+    if found is None or not 1 <= int(found[3]) <= 65535:
+        raise UsageError(
+            f"--cluster {text} must be the address of a dask scheduler, as in "
+            f"--cluster tcp://10.0.0.5:8786, or local:N"
+        )
+    return Place(found[0])

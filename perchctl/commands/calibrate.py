@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import itertools
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
@@ -12,6 +15,7 @@ from perchctl.calibration import (
     MODEL_NAMES,
     BoardView,
     Calibration,
+    Grey,
     Rejection,
     assumed_size_warning,
     board_seen_instead,
@@ -24,24 +28,24 @@ from perchctl.calibration import (
     check_calibration,
     check_record,
     larger_board,
+    learn_gear,
     load_calibration,
     load_sized,
+    mask_png,
     views_of_images,
     views_of_video,
 )
-from perchctl.camera import check_size, is_live
-from perchctl.commands.calibrate_board import board_of
+from perchctl.camera import FrameSource, check_size, is_live
 from perchctl.commands.calibrate_live import captured_views
-from perchctl.commands.calibrate_mask import write_mask
 from perchctl.commands.calibrate_mount_request import MountRequest
 from perchctl.commands.calibrate_source import Source, sized, source_of
-from perchctl.commands.interrupt import drawn
+from perchctl.commands.interrupt import Stopper, drawn
 from perchctl.commands.output import print_record, say
 from perchctl.commands.page import page_port
 from perchctl.commands.progress import search_bar
-from perchctl.errors import InvalidValue, PerchError, UsageError
+from perchctl.errors import InvalidValue, PerchError, TimedOut, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
-from perchctl.target import Board
+from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board, parse_length
 
 FOLDER = Path("calib")
 _TYPED = {"reject": "no-reject"}
@@ -316,3 +320,87 @@ def _live_views(request: CalibrateRequest, source: Source, board: Board) -> list
         return captured_views(frames, board, pictures, port)
     finally:
         frames.close()
+
+
+# --- The board that `perchctl calibrate` looks for: its notation, and what its print measures ---
+
+
+def board_of(notation: str, width: str | None, height: str | None) -> tuple[Board, list[str]]:
+    """The board, and what its measured sides (of the black area, mm) say of the print.
+
+    Raises NotFound, InvalidValue, UsageError.
+    """
+    board = parse_board(notation)
+    if width is None and height is None:
+        return board, []
+    if width is None or height is None:
+        raise UsageError(
+            "--measured-width and --measured-height go together: a lens is told from the "
+            "print's proportions, which one of them leaves open"
+        )
+    sides_m = (
+        parse_length(width, "--measured-width", bare_unit="mm"),
+        parse_length(height, "--measured-height", bare_unit="mm"),
+    )
+    board = board.measured(*sides_m)
+    notes = []
+    for name, meant_m, is_m, scale in zip(
+        ("width", "height"), board.size_m, sides_m, board.scale, strict=True
+    ):
+        off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
+        notes.append(f"{name}: {mm_text(is_m)} mm, {off}")
+        if abs(scale - 1) > NOTABLE_SCALE_ERROR:
+            notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+    return board, notes
+
+
+# --- `perchctl calibrate --mask`: what the vehicle's own gear covers, learned from any source ---
+
+
+LIVE_S = 20.0
+"""For which a live camera is looked at."""
+_PAUSE_S = 0.005
+
+
+def write_mask(source: Source, output: Path, force: bool, as_json: bool) -> int:
+    """Learn the mask and write it; returns the exit code.
+
+    Errors: NotFound, InvalidValue, TimedOut (a silent camera).
+    """
+    check_output(output, (".png",), force, "a mask's format")
+    with contextlib.ExitStack() as stack:
+        frames = source.open()
+        stack.callback(frames.close)
+        stop = stack.enter_context(Stopper().installed())
+        if frames.live:
+            say(f"turn the vehicle about for {LIVE_S:g} s (Ctrl-C ends and writes the mask)")
+        gear = learn_gear(_pictures(frames, stop.requested.is_set))
+    write_files({output: mask_png(gear)})
+    say(
+        f"wrote {output}: the vehicle covers {100 * gear.share:.1f} % of the picture, by "
+        f"{gear.pictures} pictures; set camera.mask to it"
+    )
+    if as_json:
+        height, width = gear.covered.shape
+        record = {"file": str(output), "covered": round(gear.share, 4)}
+        print_record(record | {"pictures": gear.pictures, "size_px": [width, height]})
+    else:
+        print(output)
+    return 0
+
+
+def _pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
+    """Those of a recording, or of a camera for some seconds."""
+    start_s = time.monotonic()
+    while not (stopped() or source.finished):
+        now_s = time.monotonic()
+        frame = source.poll(now_s)
+        if frame is not None:
+            yield frame.image
+        elif source.live:
+            problem = source.problem(now_s)
+            if problem is not None:
+                raise TimedOut(problem)
+            time.sleep(_PAUSE_S)
+        if source.live and now_s - start_s > LIVE_S:
+            return

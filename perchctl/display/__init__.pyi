@@ -1,12 +1,12 @@
 from .page.flight import AXES_OF_SIDE as AXES_OF_SIDE
 from .page.flight import FlightPage as FlightPage
+from .page.flight import failed_card as failed_card
 from .page.flight import flight_page as flight_page
+from .page.flight import summary_card as summary_card
 from .page.live import LivePage as LivePage
 from .page.live import PageState as PageState
 from .page.sketch import Sketch as Sketch
 from .page.sketch import draw_sketch as draw_sketch
-from .page.told import failed_card as failed_card
-from .page.told import summary_card as summary_card
-from .panel import make_reporter as make_reporter
 from .status import timed_event_text as timed_event_text
 from .watch import DisplayWatcher as DisplayWatcher
+from .watch import make_reporter as make_reporter

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
+import sys
+import threading
+from collections import deque
+from typing import Protocol, TextIO
 
-from perchctl.display.panel import Reporter
-from perchctl.display.status import FlightStatus
-from perchctl.mission import BEFORE_CONTACT, Event, Tick
+from rich.console import Console
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from perchctl.display.status import FlightStatus, event_text, status_rows
+from perchctl.mission import BEFORE_CONTACT, Event, EventKind, Tick
 
 
 class DisplayWatcher:
@@ -54,3 +64,183 @@ def status_of(tick: Tick) -> FlightStatus:
         outside=tick.outside,
         battery=state.battery if state.phase in BEFORE_CONTACT else None,
     )
+
+
+# --- The live display: a panel on a terminal, one plain line an event elsewhere ----------------
+# The flight loop only leaves its newest status and its events here; a thread of
+# the display's own draws them. So neither an exception nor a terminal that stands
+# still (Ctrl-S, a stalled ssh) reaches the loop.
+
+
+PERIOD_S = 0.1
+CLOSE_TIMEOUT_S = 1.0
+EVENTS_KEPT = 1000
+WIDTH = 78
+"""Of 80: a terminal echoes ^C behind the panel, and where that wraps, the next picture of the
+panel is drawn a line too low, with a piece of the last one left above it."""
+
+_STYLES = {"PERCHED": "bold green", "LANDING": "bold yellow", "ABORTED": "bold red"}
+
+
+class Surface(Protocol):
+    """Where the display draws; called from its thread only. May raise."""
+
+    def line(self, text: str) -> None: ...
+
+    def show(self, status: FlightStatus) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class PlainSurface:
+    """One line an event, nothing else."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def line(self, text: str) -> None:
+        self._stream.write(text + "\n")
+        self._stream.flush()
+
+    def show(self, status: FlightStatus) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class PanelSurface:
+    """A panel that stays at the bottom of the terminal; events scroll above it."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        # stdout is for data and is left alone; what others write on stderr goes above the panel.
+        self._live = Live(
+            console=console, auto_refresh=False, redirect_stdout=False, redirect_stderr=True
+        )
+        self._live.start()
+
+    def line(self, text: str) -> None:
+        self._console.print(Text(text), soft_wrap=True)
+
+    def show(self, status: FlightStatus) -> None:
+        self._live.update(panel(status), refresh=True)
+
+    def close(self) -> None:
+        self._live.stop()
+
+
+class Reporter:
+    """The display, as the loop sees it. No method raises or waits, but `close` (bounded).
+
+    Attributes:
+        problem: None, or why the display fell silent.
+    """
+
+    def __init__(self, surface: Surface) -> None:
+        self.problem: str | None = None
+        self._surface = surface
+        self._wake = threading.Event()
+        self._closing = threading.Event()
+        self._lines: deque[str] = deque(maxlen=EVENTS_KEPT)
+        self._status: FlightStatus | None = None
+        self._drawn: FlightStatus | None = None
+        self._start_s: float | None = None
+        self._next_s = -float("inf")
+        self._phase = self._shown = ""  # as a line told it, and as the panel has it
+        self._thread = threading.Thread(target=self._draw, name="display", daemon=True)
+        self._thread.start()
+
+    def update(self, status: FlightStatus) -> None:
+        """Show this moment: at once if the phase is a new one, or 0.1 s after the last one that
+        was shown, or as the last one of all."""
+        if self.problem is not None:
+            return
+        self._status = status
+        if status.phase != self._phase:  # a change without an event
+            self._line(status.t_s, f"{status.phase}: {status.reason}")
+            self._phase = status.phase
+        elif status.phase == self._shown and status.t_s < self._next_s:
+            return
+        self._shown = status.phase
+        self._next_s = status.t_s + PERIOD_S
+        self._wake.set()
+
+    def event(self, event: Event) -> None:
+        """One line, at once."""
+        if self.problem is not None:
+            return
+        if event.kind is EventKind.PHASE and event.phase is not None:
+            self._phase = event.phase.value
+        self._line(event.t_s, event_text(event))
+        self._wake.set()
+
+    def close(self) -> None:
+        """Draw what is left and give the terminal back; waits at most a second."""
+        self._closing.set()
+        self._wake.set()
+        self._thread.join(CLOSE_TIMEOUT_S)
+
+    def _line(self, t_s: float, text: str) -> None:
+        if self._start_s is None:
+            self._start_s = t_s
+        self._lines.append(f"[{t_s - self._start_s:7.2f} s] {text}")
+
+    def _draw(self) -> None:
+        try:
+            while True:
+                self._wake.wait()
+                self._wake.clear()
+                closing = self._closing.is_set()  # before the last look, so that it is the last
+                self._draw_once()
+                if closing:
+                    break
+                self._closing.wait(PERIOD_S)  # in lockstep the loop's time runs faster
+            self._surface.close()
+        except Exception as error:
+            self.problem = f"the display fell silent: {error.__class__.__name__}: {error}"
+            try:
+                self._surface.close()
+            except Exception:
+                return
+
+    def _draw_once(self) -> None:
+        while self._lines:
+            self._surface.line(self._lines.popleft())
+        status = self._status
+        if status is not None and status is not self._drawn:
+            self._drawn = status
+            self._surface.show(status)
+
+
+def make_reporter(interactive: bool | None = None, stream: TextIO | None = None) -> Reporter:
+    """A panel when `interactive`, plain lines when not; None: as the stream is.
+
+    `stream` defaults to stderr. NO_COLOR takes the colours away.
+    """
+    stream = sys.stderr if stream is None else stream
+    if interactive is None:
+        interactive = stream.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+    if not interactive:
+        return Reporter(PlainSurface(stream))
+    console = Console(
+        file=stream,
+        force_terminal=True,
+        highlight=False,  # no colours in URIs and paths
+        markup=False,
+        emoji=False,
+    )
+    return Reporter(PanelSurface(console))
+
+
+def panel(status: FlightStatus) -> Panel:
+    """The status as a panel of at most `WIDTH` columns and eight lines; nine with positions from
+    outside."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True, min_width=7)
+    table.add_column(no_wrap=True, overflow="ellipsis")
+    for name, text in status_rows(status):
+        style = _STYLES.get(status.phase, "bold") if name == "phase" else ""
+        style = "bold yellow" if name == "held" else style
+        table.add_row(Text(name, style="dim"), Text(text, style=style))
+    return Panel(table, title="perchctl", title_align="left", width=WIDTH)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +40,11 @@ from perchctl.flight import (
     OperatorSwitch,
     feed_lockstep,
     fly,
+    fly_all,
     give_back_memory,
     lockstep_source,
     peak_memory_mb,
+    seed_log_path,
     with_positioning,
 )
 from perchctl.geometry import GRAVITY_MPS2
@@ -346,3 +350,28 @@ def _parameters(case: Case) -> dict[str, Any]:
 
 def _cut(radio: FaultyRadio) -> None:
     radio.cut = True
+
+
+# --- Seeded flights, each with a fault out of a selection --------------------------------------
+
+
+def run_fault_campaign(
+    profile: Profile,
+    seeds: Iterable[int],
+    faults: tuple[str, ...],
+    executor: Executor | None = None,
+    on_result: Callable[[FaultResult], None] = lambda result: None,
+    log_dir: Path | None = None,
+    record: bool = False,
+) -> list[FaultResult]:
+    """Fly all seeds, as `perchctl.flight.campaign.run_campaign` does."""
+    return fly_all(
+        partial(_fly_logged, profile, faults, log_dir, record), seeds, executor, on_result
+    )
+
+
+def _fly_logged(
+    profile: Profile, faults: tuple[str, ...], log_dir: Path | None, record: bool, seed: int
+) -> FaultResult:
+    log = None if log_dir is None else seed_log_path(seed, log_dir)
+    return fly_fault_seed(profile, seed, faults, log, record)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from perchctl.errors import SafetyAbort, TimedOut
+import math
+
+import numpy as np
+
+from perchctl.errors import SafetyAbort, TimedOut, distinct_figures
 from perchctl.flight.criteria import (
     Problem,
     battery_problem,
@@ -16,11 +20,19 @@ from perchctl.flight.criteria import (
     unsettled_problem,
 )
 from perchctl.flight.outside import AtRest, apart, measurer, missing, world_problem
-from perchctl.flight.view import not_in_view, out_of_view
-from perchctl.geometry import Place
+from perchctl.geometry import Place, rot_z
 from perchctl.link import Link
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
+from perchctl.target import (
+    FieldOfView,
+    TargetFromBody,
+    offset_text,
+    overhead_view,
+    reach_at,
+    sight_from,
+)
+from perchctl.values import replace
 from perchctl.vehicle import Telemetry
 from perchctl.vision import CameraModel, TargetEstimate
 
@@ -133,3 +145,119 @@ def _bounded(what: str, waited_s: float, limit_s: float) -> str:
     if waited_s > limit_s:
         raise TimedOut(f"waited {limit_s:.0f} s for {what}: not flying")
     return what
+
+
+# --- Whether the target stays in view on the way up, where it is the positioning system. Pure ---
+# On the ground the way up is known: straight, then to `planner.approach_xy_m`. The higher the
+# vehicle, the less of the ceiling is in its picture; without the target it has no position.
+
+
+LEAN_DEG = 5.0
+"""On its way up, and against a draught: nearer to the picture's edge, the target would leave it."""
+Start = tuple[float, float, float]
+"""Where it stands, in the world that the target's place is in."""
+
+
+def out_of_view(
+    target: Place, start_m: Start, yaw_rad: float, profile: Profile, camera: CameraModel
+) -> Problem | None:
+    """From the take-off height over the start, or from `planner.approach_xy_m`, no marker would be
+    wholly in the picture of a vehicle that leans a little. `yaw_rad`: its heading at the start."""
+    planner, (x, y, z) = profile.planner, start_m
+    top_m = z + planner.takeoff_height_m
+    over = _seen_leaning((x, y, top_m), yaw_rad, target, profile, camera)
+    if not over.whole:
+        return Problem(
+            f"the target is the positioning system, and would leave the picture as the vehicle "
+            f"takes off: {_too_far(over, profile, camera)} at {planner.takeoff_height_m:g} m of "
+            f"height",
+            f"put the vehicle {offset_text(over.aside_m)} from where it stands, or lower "
+            f"planner.takeoff_height_m",
+        )
+    if planner.approach_xy_m is None:
+        return None
+    there = _seen_leaning((*planner.approach_xy_m, top_m), yaw_rad, target, profile, camera)
+    if there.whole:
+        return None
+    to_x, to_y = planner.approach_xy_m
+    u, v = (float(part) for part in target.position_m[:2])
+    return Problem(
+        f"the target is the positioning system, and from planner.approach_xy_m (x {to_x:g}, "
+        f"y {to_y:g} m) the vehicle would not see it: {_too_far(there, profile, camera)}, and "
+        f"without it nothing brings the vehicle back",
+        f"leave planner.approach_xy_m out, since the target is in view from where it stands, or "
+        f"set it near the target's x {u:.2f}, y {v:.2f} m",
+    )
+
+
+def target_from(
+    body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
+) -> TargetFromBody:
+    """The target from a place in its world, the vehicle level."""
+    return sight_from(
+        np.array(body_m), yaw_rad, target.position_m, target.yaw_rad,
+        profile.target, camera, profile.camera.mount,
+    )  # fmt: skip
+
+
+def _seen_leaning(
+    body_m: Start, yaw_rad: float, target: Place, profile: Profile, camera: CameraModel
+) -> TargetFromBody:
+    """`target_from` of a vehicle that leans so that the target goes towards the picture's edge: as
+    if it stood farther away."""
+    level = target_from(body_m, yaw_rad, target, profile, camera)
+    aside_m = math.hypot(*level.aside_m)
+    if not (level.whole and aside_m > 1e-9):
+        return level
+    away = -rot_z(yaw_rad)[:2, :2] @ np.array(level.aside_m) / aside_m
+    x, y = np.array(body_m[:2]) + _leant_m(level) * away
+    leaning = target_from((float(x), float(y), body_m[2]), yaw_rad, target, profile, camera)
+    return replace(level, whole=leaning.whole)
+
+
+def _leant_m(sight: TargetFromBody) -> float:
+    return sight.height_m * math.tan(math.radians(LEAN_DEG))
+
+
+def place_seen(target: TargetEstimate, profile: Profile) -> Place:
+    """Of a target that a level vehicle sees: in the world in which it stands at the origin, at the
+    ground's height, with its front along x."""
+    feet_m = np.array([0.0, 0.0, profile.safety.ground_z_m])
+    return Place(feet_m + target.e_m + np.asarray(profile.vehicle.gear_body_m), target.e_yaw_rad)
+
+
+def _too_far(sight: TargetFromBody, profile: Profile, camera: CameraModel) -> str:
+    """How far aside it would be, and how far it might be."""
+    if not sight.height_m > 0.0:
+        return "it would be no higher than the camera"
+    aside_m, most = math.hypot(*sight.aside_m), ""
+    aside = f"{aside_m:.2f}"
+    side_m, mount = profile.target.large.side_m, profile.camera.mount
+    reach = reach_at(side_m, FieldOfView(camera), mount, sight.height_m)
+    if reach is not None:
+        room_m = math.floor(100.0 * max(0.0, reach.radius_m - _leant_m(sight))) / 100.0
+        aside, room = distinct_figures(aside_m, room_m, 2)
+        most = f", {room} m at most,"
+    return f"{aside} m aside of the camera's axis{most} {sight.height_m:.2f} m over the camera"
+
+
+def not_in_view(
+    seen: TargetEstimate | None,
+    note: str | None,
+    telemetry: Telemetry,
+    profile: Profile,
+    camera: CameraModel | None,
+) -> Problem:
+    """What is said of a target that has not been measured from the ground. `note`: what is
+    remarkable about the pictures."""
+    if seen is not None and seen.tracked:
+        return Problem(
+            f"it is seen, and was not measured at rest yet (the accelerometer reads "
+            f"{telemetry.acc_z_g:.2f} g)",
+            "let the vehicle stand still, and the target hang still",
+        )
+    found = "it is not in view" if note is None else f"it is not in view; {note}"
+    if camera is None:
+        return Problem(found, "put the vehicle under it")
+    where = overhead_view(profile.target, camera, profile.camera.mount)
+    return Problem(found, f"put the vehicle under it: {where.words}")

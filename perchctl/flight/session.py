@@ -22,14 +22,6 @@ from perchctl.camera import (
 from perchctl.errors import ConnectionFailed, InvalidValue, TimedOut, UsageError, no_simulator
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
 from perchctl.flight.loop import FlightParts, fly
-from perchctl.flight.operator import OperatorSwitch
-from perchctl.flight.positions import (
-    capture_for_vehicle,
-    check_positioning,
-    opened_capture,
-    require_comparison,
-    started_feed,
-)
 from perchctl.link import CflibLink, check_uri
 from perchctl.mission import Event, FlightReport, Watcher
 from perchctl.profile import Profile
@@ -38,7 +30,26 @@ from perchctl.vision import CameraModel, make_pipeline
 
 if TYPE_CHECKING:
     from perchctl.sim import SimProcess
+import threading
+import time
+from dataclasses import field
 
+from perchctl.errors import Interrupted, SafetyAbort, no_motion_capture
+from perchctl.flight.clock import wall_date
+from perchctl.flight.outside import AtRest
+from perchctl.flight.preflight import refuse_strange
+from perchctl.link import check_estimator_parameters, vehicle_uri
+from perchctl.mission import Operator
+from perchctl.positioning import (
+    CaptureSource,
+    FeedThread,
+    PositionFeed,
+    StandingFeed,
+    check_reachable,
+    load_comparison,
+    open_capture,
+)
+from perchctl.profile import PositioningConfig
 
 PLAIN_SEED = 11
 """Of the first flight that a newcomer sees: nothing goes wrong in it that would need words."""
@@ -181,3 +192,178 @@ def simulated_vehicle(options: FlyOptions, camera: CameraModel) -> SimProcess:
         target=options.profile.target,
         capture=draw_capture(options.profile, options.seed),
     )
+
+
+# --- The operator's commands: Ctrl-C, the other signals, and the live page's STOP button -------
+
+
+AGAIN_S = 0.5
+"""A second press counts this long after the first."""
+HELD_S = 0.3
+"""Presses that follow each other faster are one: a key held down repeats at 5 to 33 Hz."""
+DELAY_S = 1.0
+"""A keyboard waits at most this long before it repeats a key that is held down; 0.25 to 0.66 s are
+usual."""
+INSIST_S = 2.0
+"""Who presses on for so long wants the motors stopped, by a key held down or by hammering."""
+_EPS_S = 1e-9
+
+
+@dataclass
+class OperatorSwitch:
+    """Ctrl-C as the planner understands it: once lands, twice stops.
+
+    `press` is Ctrl-C. A second press is one after at least `HELD_S` of silence and `AGAIN_S` after
+    the first. The first repetition of a key held down looks like that, too, so after a silence of
+    up to `DELAY_S` it counts once no other has followed it for `HELD_S`. Presses that still follow
+    each other `INSIST_S` after the first are a stop as well. `land` is for STOP on the live page
+    and for the signals that ask a program to end: it lands as one Ctrl-C does, however often it
+    comes, and never adds up to a stop of the motors. All methods may be called from any thread.
+
+    Until the flight loop listens there is nothing to land: `leave` raises `Interrupted`.
+    """
+
+    listening: bool = False
+    landing_requested: bool = False
+    clock: Callable[[], float] = time.monotonic
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+    _first_s: float | None = None
+    _last_s: float = 0.0
+    _second_s: float | None = None
+    _stopped: bool = False
+
+    def read(self) -> Operator:
+        with self._lock:
+            self._confirm(self.clock())
+            if self._stopped:
+                return Operator.STOP
+            pressed = self._first_s is not None or self.landing_requested
+            return Operator.LAND if pressed else Operator.NONE
+
+    def land(self) -> None:
+        self.landing_requested = True
+
+    def press(self) -> None:
+        with self._lock:
+            now_s = self.clock()
+            self._confirm(now_s)
+            silent_s = now_s - self._last_s
+            if self._first_s is None:
+                self._first_s = now_s
+            elif silent_s < HELD_S - _EPS_S:  # a key has begun to repeat, or it is hammered
+                self._second_s = None
+                self._stopped |= now_s - self._first_s >= INSIST_S - _EPS_S
+            elif now_s - self._first_s >= AGAIN_S - _EPS_S:
+                self._second_s = now_s
+                self._stopped |= silent_s > DELAY_S + _EPS_S
+            self._last_s = now_s
+
+    def leave(self) -> None:
+        """On a signal, in the main thread."""
+        if not self.listening:
+            raise Interrupted("interrupted before take-off: nothing was started")
+
+    def _confirm(self, now_s: float) -> None:
+        second_s = self._second_s
+        if second_s is not None and now_s - second_s >= HELD_S - _EPS_S:
+            self._stopped = True
+
+
+# --- Positions from outside for one flight in real time: capture, feed, and the thread between ---
+
+
+STRANGE_S = 0.5
+"""For so long it is looked whether positions are of another world, before they are used."""
+
+
+def check_positioning(profile: Profile, *, simulated: bool) -> None:
+    """What can be refused before anything is opened. Errors: InvalidValue, UsageError."""
+    config = profile.positioning
+    check_estimator_parameters(profile.link.parameters, config)
+    if config.by != "mocap":
+        return
+    if not simulated:
+        check_reachable(config)
+    elif find_spec("motioncapture") is None:  # its room has a capture of its own
+        raise no_motion_capture()
+
+
+def require_comparison(config: PositioningConfig, uri: str, *, simulated: bool) -> None:
+    """Raises SafetyAbort for a capture that no hand has compared of late with this vehicle:
+    that its axes are swapped does not show at rest. The simulator's own room is right as it is
+    built."""
+    if config.by != "mocap" or simulated:
+        return
+    objected = load_comparison(config, vehicle_uri(uri)).objection(wall_date())
+    if objected is not None:
+        raise SafetyAbort(": ".join(objected))
+
+
+def opened_capture(
+    stack: contextlib.ExitStack, config: PositioningConfig, clock: Clock
+) -> CaptureSource | None:
+    """The capture, None with decks. Errors: InvalidValue, UsageError, ConnectionFailed."""
+    if config.by != "mocap":
+        return None
+    capture = open_capture(config, clock.now)
+    stack.callback(capture.close)
+    return capture
+
+
+def capture_for_vehicle(
+    config: PositioningConfig, simulated: tuple[str, str] | None
+) -> PositioningConfig:
+    """With the capture that measures this vehicle: a simulated one's is at `simulated`, its kind
+    and address, and in no lab."""
+    if simulated is None:
+        return config
+    system, host = simulated
+    return config.model_copy(update={"system": system, "host": host})
+
+
+def started_feed(
+    stack: contextlib.ExitStack,
+    capture: CaptureSource | None,
+    link: CflibLink,
+    config: PositioningConfig,
+    clock: Clock,
+    profile: Profile,
+) -> PositionFeed | None:
+    """The vehicle's estimate settled on what the capture says, and positions on their way until
+    `stack` ends: the link is closed before that, since a vehicle that lands still needs them.
+    None with decks, and where the target is the positioning system.
+
+    Errors: those of `CflibLink.settle`, and SafetyAbort for positions of another world."""
+    if config.by == "target":
+        _settle_standing(link, clock, profile)
+        return None  # what follows is seen, and sent, by the loop
+    if capture is None:
+        return None
+    feed = PositionFeed(capture, link.external, config)
+    thread = FeedThread(feed, clock.now)
+    stack.callback(thread.close)
+    thread.start()
+    _refuse_strange(feed, link, clock, profile)
+    link.settle(feed)
+    return feed
+
+
+def _settle_standing(link: CflibLink, clock: Clock, profile: Profile) -> None:
+    """On the ground, which is the world's origin: the estimate is settled there."""
+    feed = StandingFeed(link.external, profile.safety.ground_z_m)
+    thread = FeedThread(feed, clock.now, 1.0 / profile.positioning.rate_hz)
+    thread.start()
+    try:
+        link.settle(feed)
+    finally:
+        thread.close()
+
+
+def _refuse_strange(feed: PositionFeed, link: CflibLink, clock: Clock, profile: Profile) -> None:
+    """Before an estimate is set to them, and before their scatter or their place is taken for
+    something else. What is late is left to those who wait for it."""
+    end_s, newest, at_rest = clock.now() + STRANGE_S, None, AtRest()
+    while (now_s := clock.now()) < end_s:
+        newest = next(reversed(link.telemetry()), newest)
+        refuse_strange(feed.status(now_s), newest, profile, now_s, at_rest)
+        clock.wait_until(now_s + 0.02)

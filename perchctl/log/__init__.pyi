@@ -1,4 +1,3 @@
-from .arithmetic import arithmetic_fingerprint as arithmetic_fingerprint
 from .compare.plot import plot_comparison as plot_comparison
 from .compare.table import compare_flights as compare_flights
 from .compare.table import comparison_record as comparison_record
@@ -15,8 +14,6 @@ from .frames import shows_target as shows_target
 from .jsonl import decode_line as decode_line
 from .jsonl import json_line as json_line
 from .jsonl import to_plain as to_plain
-from .newest import list_log as list_log
-from .newest import newest_logs as newest_logs
 from .place import make_log_folder as make_log_folder
 from .place import path_beside as path_beside
 from .plot import plot_flight as plot_flight
@@ -27,13 +24,16 @@ from .read import read_log as read_log
 from .recording import export_mcap as export_mcap
 from .recording import recorded_pictures as recorded_pictures
 from .recording import recording_path as recording_path
+from .setup import arithmetic_fingerprint as arithmetic_fingerprint
 from .setup import camera_record as camera_record
 from .setup import computer_differences as computer_differences
 from .setup import flown_camera as flown_camera
 from .setup import flown_mask as flown_mask
 from .setup import flown_profile as flown_profile
 from .shown import list_lines as list_lines
+from .shown import list_log as list_log
 from .shown import list_record as list_record
+from .shown import newest_logs as newest_logs
 from .shown import show_record as show_record
 from .shown import show_text as show_text
 from .summary import FlightSummary as FlightSummary

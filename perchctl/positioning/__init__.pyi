@@ -6,9 +6,9 @@ from .compared import load_comparison as load_comparison
 from .compared import save_comparison as save_comparison
 from .feed import FeedStatus as FeedStatus
 from .feed import FeedThread as FeedThread
+from .feed import Placed as Placed
 from .feed import PositionFeed as PositionFeed
 from .feed import StandingFeed as StandingFeed
-from .judge import Placed as Placed
 from .sight import SightFeed as SightFeed
 from .types import BodyPose as BodyPose
 from .types import CaptureFrame as CaptureFrame

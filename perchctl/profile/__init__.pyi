@@ -8,8 +8,6 @@ from .dictionaries import dictionary_size as dictionary_size
 from .edit import writable_profile as writable_profile
 from .edit import write_profile_values as write_profile_values
 from .keys import key_unit as key_unit
-from .limits import REACHED_SHARE as REACHED_SHARE
-from .limits import Limit as Limit
 from .load import find_calibration as find_calibration
 from .load import find_profile as find_profile
 from .load import find_weights as find_weights
@@ -39,6 +37,8 @@ from .plain_yaml import split_values as split_values
 from .positioning import CAPTURE_SYSTEMS as CAPTURE_SYSTEMS
 from .positioning import PositioningConfig as PositioningConfig
 from .positioning import host_fault as host_fault
+from .schema import REACHED_SHARE as REACHED_SHARE
+from .schema import Limit as Limit
 from .schema import LinkConfig as LinkConfig
 from .schema import Profile as Profile
 from .simulation import SimulationConfig as SimulationConfig

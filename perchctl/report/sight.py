@@ -26,7 +26,7 @@ class Seen:
         rate_hz: by the median time between two frames, as `perchctl log show` has it.
         age_s, age_most_s: of the picture when it was used: median, and 95 of 100 are below.
         rms_px: what the corners miss the pose by, median.
-        blur_px, blur_most_px: as `perchctl.report.motion`: median, and 95 of 100 are below.
+        blur_px, blur_most_px: as `perchctl.report.track`: median, and 95 of 100 are below.
         strangers: frames whose pose was not taken for the target's.
     """
 

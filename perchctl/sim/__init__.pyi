@@ -1,6 +1,6 @@
-from .body import REST_HEIGHT_M as REST_HEIGHT_M
 from .bursts import Bursts as Bursts
 from .bursts import radio_bursts as radio_bursts
+from .camera import DeliveredFrame as DeliveredFrame
 from .camera import SimCamera as SimCamera
 from .capture.server import SIMULATED_SYSTEM as SIMULATED_SYSTEM
 from .capture.settings import MILLIMETRES_PER_M as MILLIMETRES_PER_M
@@ -21,7 +21,6 @@ from .powertrain import most_thrust_n as most_thrust_n
 from .process.handle import SimProcess as SimProcess
 from .process.shared import CLOCK_MARGIN_S as CLOCK_MARGIN_S
 from .process.shared import SharedTime as SharedTime
-from .receiver import DeliveredFrame as DeliveredFrame
 from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
 from .scenario import Neighbour as Neighbour
@@ -29,3 +28,4 @@ from .scenario import Scenario as Scenario
 from .thrust_curve import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .told import EventExplainer as EventExplainer
 from .vehicle import SimulatedVehicle as SimulatedVehicle
+from .world import REST_HEIGHT_M as REST_HEIGHT_M

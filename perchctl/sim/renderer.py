@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any
 
 import cv2
@@ -22,20 +23,19 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim.analogue import spoil
-from perchctl.sim.exposure import SHARP_MOTION_PX, line_kernel, path_length_px, sample_count, spread
 from perchctl.sim.gloss import shone_upon
-from perchctl.sim.lens import lens_of
-from perchctl.sim.pixels import Mean, defocused, lit, sample
-from perchctl.sim.placed import Placed, View, beside, printed_sheet
+from perchctl.sim.pixels import Mean, defocused, lit, sample, vignetting
 from perchctl.sim.rays import (
     COARSE_PX,
+    FINE_PX,
     LEAST_RISE,
+    RayGrid,
     local_px_per_m,
     plane_map,
+    ray_grid,
     trace,
 )
-from perchctl.sim.scenario import Scenario
+from perchctl.sim.scenario import Neighbour, Scenario
 from perchctl.sim.shutter import Shot, blended, woven
 from perchctl.sim.still import STILL_PX, Stills, rounded
 from perchctl.sim.surfaces import (
@@ -44,8 +44,22 @@ from perchctl.sim.surfaces import (
     TILE_M,
     Ceiling,
     Picture,
+    Sheet,
+    SheetTexture,
 )
-from perchctl.sim.tiles import Box, box_around, by_tile, fill
+from perchctl.sim.tiles import (
+    Box,
+    TileRays,
+    Tiles,
+    box_around,
+    box_of,
+    by_tile,
+    fill,
+    reach_of,
+    tile_rays,
+    tiles_of,
+)
+from perchctl.target import draw_target
 from perchctl.vision import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
@@ -311,3 +325,201 @@ class Renderer:
 
 def _bytes(grey: NDArray[np.float32]) -> Picture:
     return np.clip(grey, 0.0, 255.0).astype(np.uint8)
+
+
+# --- What a camera's lens makes of its pixels, for all pictures and all flights alike; pure ----
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """`coarse` the rays of every eighth pixel, `tiles` of all of them; `shade` the relative light
+    (height, width), 255 for all of it; `places` rays (3, 5) to the picture's middle and into its
+    quarters; `focal_px` the mean of both directions."""
+
+    coarse: RayGrid
+    tiles: TileRays
+    shade: Picture
+    places: Array
+    focal_px: float
+
+
+def lens_of(camera: CameraModel) -> Lens:
+    """The camera's; flights share it, since its rays take longer than 20 pictures."""
+    return _lens(*camera.contents)
+
+
+@lru_cache(maxsize=2)
+def _lens(size_px: tuple[int, int], model: str, K: bytes, dist: bytes) -> Lens:
+    camera = CameraModel(size_px, np.frombuffer(K).reshape(3, 3), np.frombuffer(dist), model)
+    fine, coarse = ray_grid(camera, FINE_PX), ray_grid(camera, COARSE_PX)
+    focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
+    shade = vignetting(fine, size_px)
+    return Lens(coarse, tile_rays(fine), shade, _five_places(coarse), focal_px)
+
+
+def _five_places(coarse: RayGrid) -> Array:
+    rows, cols = coarse.xy.shape[:2]
+    places = [(rows // 2, cols // 2)] + [
+        (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
+    ]
+    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
+
+
+# --- Sheets on the ceiling, and where each is seen in one exposure -----------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
+
+    sheet: Sheet
+    plane: Array | None = None
+
+    def seen_from(self, nodes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The coarse nodes (rows, columns, 2) in this sheet's axes, m."""
+        if self.plane is None:
+            return nodes
+        turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
+        return np.asarray(nodes @ turn.astype(np.float32) + shift.astype(np.float32))
+
+    def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
+        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
+        longest way of the picture within the exposure. None where the sheet is out of view."""
+        moved = self.seen_from(nodes)
+        side_m = self.sheet.drawing.sheet_side_m
+        reach = reach_of(moved, length_px)
+        box = box_of(reach.near(side_m))
+        if box is None:
+            return None
+        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in box)
+        texture = self.sheet.texture(local_px_per_m(moved, j, i, COARSE_PX))
+        return View(self, texture, box, tiles_of(reach.within(box), texture, side_m))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A sheet in one exposure, in the picture's `box` of tiles."""
+
+    placed: Placed
+    texture: SheetTexture
+    box: Box
+    tiles: Tiles
+
+    def hides(self, tiles: int) -> bool:
+        """Whether nothing else is seen in a picture of so many."""
+        return self.tiles.inner.size == tiles and bool(self.tiles.inner.all())
+
+
+def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
+    """Another vehicle's target; what the neighbour leaves open is as on the own."""
+    large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
+    small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
+    target = TargetConfig(
+        large=own.large.model_copy(update=large), small=own.small.model_copy(update=small)
+    )
+    to_own = make_T(rot_z(neighbour.yaw_rad), (*neighbour.xy_m, 0.0))
+    plane = np.delete(np.delete(invert_T(to_own), 2, axis=0), 2, axis=1)
+    return Placed(printed_sheet(target.model_dump_json()), plane)
+
+
+@lru_cache(maxsize=4)
+def printed_sheet(target_json: str) -> Sheet:
+    """The sheet of a target; its textures cost more than a second, and flights share them."""
+    return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))
+
+
+# --- Faults of an analogue video link: lines that tremble, hum bars, torn and lost lines -------
+
+
+LINE_JITTER_PX = 1.2
+HUM_GREY = 18.0
+TEAR_PX = 30.0
+TEARS_PER_FRAME = 1.5
+SNOW_LINES_PER_FRAME = 12.0
+"""Means at full strength."""
+
+
+def spoil(image: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
+    height, width = image.shape
+    shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)
+    for _ in range(rng.poisson(TEARS_PER_FRAME * strength)):
+        start, length = int(rng.integers(height)), int(rng.integers(4, 40))
+        # A torn band comes back to its place over its length, as the receiver's line lock does.
+        band = slice(start, min(start + length, height))
+        fade = np.linspace(1.0, 0.0, length)[: band.stop - band.start]
+        shift[band] += rng.normal(0.0, TEAR_PX * strength) * fade
+    cols, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
+    cols = cols + shift[:, None].astype(np.float32)
+    out = cv2.remap(image, cols, rows.astype(np.float32), cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_REPLICATE).astype(np.float32)  # fmt: skip
+    phase, bars = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.7, 2.5)
+    hum = np.sin(2.0 * np.pi * bars * np.arange(height) / height + phase)
+    out += (HUM_GREY * strength * hum)[:, None].astype(np.float32)
+    for _ in range(rng.poisson(SNOW_LINES_PER_FRAME * strength)):
+        row, left = int(rng.integers(height)), int(rng.integers(width))
+        length = int(min(rng.exponential(0.3 * width) + 1.0, width - float(left)))
+        out[row, left : left + length] = rng.uniform(0.0, 255.0, size=length)
+    return np.clip(np.rint(out), 0.0, 255.0).astype(np.uint8)
+
+
+# --- Motion within one exposure: how many poses it needs, and its blur as a kernel; pure -------
+
+
+SHARP_MOTION_PX = 0.25
+"""Motion in one exposure below which one pose is enough (its blur has sigma 0.07 px)."""
+SAMPLE_SPACING_PX = 1.3
+"""Distance of the poses averaged for motion blur: the ripple this leaves lies above
+the pixels' own resolution."""
+MAX_SAMPLES = 16
+MAX_KERNEL_REACH_PX = 12
+
+
+def path_length_px(motion_px: Array) -> float:
+    """Longest path of any of the places, `motion_px` (places, times, 2)."""
+    steps = motion_px[:, 1:] - motion_px[:, :-1]
+    return float(np.sqrt((steps * steps).sum(axis=2)).sum(axis=1).max())
+
+
+def sample_count(length_px: float) -> int:
+    """How many poses the blur of a path of that length needs; 1 for a sharp frame."""
+    if length_px < SHARP_MOTION_PX:
+        return 1
+    return min(max(math.ceil(length_px / SAMPLE_SPACING_PX), 2), MAX_SAMPLES)
+
+
+def spread(poses: Array, count: int) -> Array:
+    """`count` poses (count, 4, 4) at the middles of equal parts of the exposure.
+
+    Linear in the matrices of `poses` (n, 4, 4): within an exposure the turn is so small
+    (< 0.05 rad) that the loss of orthogonality is below 1e-3 of a pixel.
+    """
+    if len(poses) == 1:
+        return np.broadcast_to(poses, (count, 4, 4))
+    last = len(poses) - 1
+    places = [(i + 0.5) / count * last for i in range(count)]
+    low = [min(int(place), last - 1) for place in places]
+    part = np.array([p - i for p, i in zip(places, low, strict=True)])[:, None, None]
+    return np.asarray((1.0 - part) * poses[low] + part * poses[[i + 1 for i in low]])
+
+
+def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:
+    """Blur kernel of the path at the image's middle, or None if it is too short to see."""
+    path = motion_px[0] - motion_px[0].mean(axis=0)
+    reach = float(np.abs(path).max())
+    if reach < SHARP_MOTION_PX / 2.0:
+        return None
+    count = min(2 * math.ceil(reach) + 1, MAX_SAMPLES)
+    at = (np.arange(count) + 0.5) / count * (len(path) - 1)
+    steps = np.arange(len(path))
+    half = min(math.ceil(reach) + 1, 12)
+    kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
+    for x, y in zip(
+        np.interp(at, steps, path[:, 0]), np.interp(at, steps, path[:, 1]), strict=True
+    ):
+        x, y = np.clip(x, -half, half - 1e-6), np.clip(y, -half, half - 1e-6)
+        i, j = math.floor(x), math.floor(y)
+        fx, fy = x - i, y - j
+        weights = np.outer([1.0 - fy, fy], [1.0 - fx, fx])
+        kernel[j + half : j + half + 2, i + half : i + half + 2] += weights.astype(np.float32)
+    return np.asarray(kernel / kernel.sum(), np.float32)

@@ -13,12 +13,12 @@ Assumptions of the model, each with its source:
   each), which makes 0.007 and 0.008. The camera, its board and the gear are some
   10 cm^2 of bluff body (c_d 1.2): 0.0015 more at 1 m/s. The rounded sums are `DRAG_*`.
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
-  standard deviations of the gusts (`perchctl.sim.wind`).
+  standard deviations of the gusts (`perchctl.sim.world`).
 - Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
   thrust at the ceiling itself. With 0.1 it is within 0.6 per cent of the thrust what momentum
   theory with a ceiling gives, and benches with rotors of this size (23 mm) measured (Hsiao and
   Chirarattananon, arXiv 1905.04632), for gears of 3 cm and more: 2 per cent in contact.
-- The magnet: `perchctl.sim.magnet`. The gear's tip is a flat disc, so a held vehicle
+- The magnet: `perchctl.sim.world`. The gear's tip is a flat disc, so a held vehicle
   hangs level and friction keeps the tip in its place.
 """
 
@@ -28,6 +28,7 @@ import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -39,13 +40,11 @@ from perchctl.geometry import (
     rotation_from_rpy,
     rpy_from_rotation,
 )
-from perchctl.sim.body import build_model, extent_m
 from perchctl.sim.carried import Stop, Way
 from perchctl.sim.cell import RESISTANCE_OHM, CellKind
-from perchctl.sim.magnet import MAGNET_RANGE_M, Magnet
+from perchctl.sim.gusts import blown
 from perchctl.sim.powertrain import Powertrain
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.wind import Wind
 
 ARM_M = 0.046  # hub to motor axis, X configuration
 YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
@@ -336,3 +335,171 @@ def _cell_of(scenario: Scenario) -> CellKind:
         scenario.cell_charge,
         scenario.cell_knee,
     )
+
+
+# --- The rigid bodies as a MuJoCo model: floor, ceiling, and the vehicle with its gear ---------
+
+
+FRAME_HALF_M = (0.035, 0.035, 0.012)
+REST_HEIGHT_M = FRAME_HALF_M[2]
+GEAR_RADIUS_M = 0.006
+# Crazyflie 2.1 at 27 g; scaled by mass.
+INERTIA_REFERENCE_KG = 0.027
+INERTIA_REFERENCE_KGM2 = (1.66e-5, 1.67e-5, 2.93e-5)
+
+_MODEL = """
+<mujoco>
+  <option timestep="{dt}" gravity="0 0 -{g}" cone="elliptic" impratio="10" iterations="30"/>
+  <default><geom solref="0.006 1" solimp="0.95 0.99 0.0005" friction="1 0.003 0.0005"
+    condim="4"/></default>
+  <worldbody>
+    <geom name="floor" type="plane" size="30 30 1"/>
+    <geom name="ceiling" type="plane" size="30 30 1" pos="0 0 {ceiling}" quat="0 1 0 0"/>
+    <body name="vehicle" pos="0 0 {rest}">
+      <freejoint/>
+      <inertial pos="0 0 0" mass="{mass}" diaginertia="{inertia}"/>
+      <geom name="frame" type="box" size="{frame}"/>
+      <geom name="gear" type="cylinder" size="{radius} 0.002" pos="{gear}"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def extent_m(scenario: Scenario) -> float:
+    """How far from its centre any part of the vehicle is, at most."""
+    gear = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + math.hypot(GEAR_RADIUS_M, 0.004)
+    return max(math.hypot(*FRAME_HALF_M), gear)
+
+
+def build_model(scenario: Scenario) -> Any:
+    """A `mujoco.MjModel` with the geoms "floor", "ceiling", "frame" and "gear".
+
+    The inertia is the Crazyflie 2.1's, scaled by mass; the gear's cylinder ends at its tip.
+    """
+    mass = scenario.mass_kg
+    scale = mass / INERTIA_REFERENCE_KG
+    gear = scenario.gear_body_m
+    return mujoco.MjModel.from_xml_string(
+        _MODEL.format(
+            dt=CONTROL_PERIOD_S,
+            g=GRAVITY_MPS2,
+            ceiling=scenario.ceiling_z_m,
+            rest=REST_HEIGHT_M,
+            mass=mass,
+            inertia=" ".join(repr(i * scale) for i in INERTIA_REFERENCE_KGM2),
+            frame=" ".join(map(repr, FRAME_HALF_M)),
+            radius=GEAR_RADIUS_M,
+            gear=f"{gear[0]!r} {gear[1]!r} {gear[2] - 0.002!r}",
+        )
+    )
+
+
+# --- The magnet: what pulls the gear's tip towards the ceiling, and whether it holds -----------
+# It acts within `MAGNET_RADIUS_M` of the target's centre on an upright vehicle, fully at
+# contact, and falls to zero over `MAGNET_RANGE_M` of gap. The first contact may be weaker
+# than the later ones (`Scenario.first_contact_force_n`); it is over when the tip has
+# engaged and come off again.
+
+
+MAGNET_RADIUS_M = 0.025
+MAGNET_RANGE_M = 0.003
+MAGNET_TOUCH_M = 0.001
+
+
+class Magnet:
+    """One magnet gear under one ceiling; evaluated once a control period."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._came_off = False
+        self.engaged = False
+        self.target_xy_m = scenario.target_xy_m
+        self.let_go = False  # for good: it pulls no more
+
+    def pull_n(self, tip_m: tuple[float, float, float], *, upright: bool) -> float:
+        """The pull on the gear's tip at `tip_m`, world axes."""
+        scenario = self._scenario
+        gap_m = max(0.0, scenario.ceiling_z_m - tip_m[2])
+        target_x, target_y = self.target_xy_m
+        miss_m = math.hypot(tip_m[0] - target_x, tip_m[1] - target_y)
+        if scenario.no_target or not upright or gap_m >= MAGNET_RANGE_M or miss_m > MAGNET_RADIUS_M:
+            return self.out_of_reach()
+        self._note(gap_m)
+        return 0.0 if self.let_go else self.hold_n * (1.0 - gap_m / MAGNET_RANGE_M) ** 2
+
+    @property
+    def hold_n(self) -> float:
+        """What it holds at contact, unless it has let go."""
+        scenario = self._scenario
+        if scenario.first_contact_force_n is not None and not self._came_off:
+            return scenario.first_contact_force_n
+        return scenario.magnet_force_n
+
+    def out_of_reach(self) -> float:
+        """No pull, and none held."""
+        self._note(MAGNET_RANGE_M)
+        return 0.0
+
+    def _note(self, gap_m: float) -> None:
+        if gap_m < MAGNET_TOUCH_M:
+            self.engaged = True
+        elif self.engaged and gap_m > 2 * MAGNET_TOUCH_M:
+            self.engaged = False
+            self._came_off = True
+
+
+# --- The draught in the room: a steady part with smooth gusts, together up to a given speed ----
+
+
+_TERMS = 5
+_SLOWEST_HZ, _FASTEST_HZ = 0.05, 1.0
+_STEADY = 0.7  # the steady part of the draught's speed
+_SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts over that speed: x, y, z
+_STREAM = 1
+
+_Terms = tuple[tuple[float, float, float], ...]
+
+
+class Wind:
+    """`Scenario.draught_mps` is the speed that the smooth gusts reach at two standard deviations;
+    single ones (`Scenario.gusts`) are added."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        draught = scenario.draught_mps
+        x, y, z = draught
+        self._mean = (_STEADY * x, _STEADY * y, _STEADY * z)
+        speed_mps = math.hypot(*draught)
+        rng = np.random.default_rng([scenario.seed, _STREAM])
+        self._still = speed_mps == 0.0
+        self._single = scenario.gusts
+        self._gusts = tuple(_draw(rng, share * speed_mps) for share in _SHARES)
+
+    def at(self, t_s: float) -> tuple[float, float, float]:
+        """The wind at t, m/s, world axes; exactly zero in still air."""
+        if self._single:
+            steady, more = self._smooth(t_s), blown(self._single, t_s)
+            return (steady[0] + more[0], steady[1] + more[1], steady[2] + more[2])
+        return self._smooth(t_s)
+
+    def _smooth(self, t_s: float) -> tuple[float, float, float]:
+        if self._still:
+            return (0.0, 0.0, 0.0)
+        x, y, z = self._mean
+        gust_x, gust_y, gust_z = self._gusts
+        return (x + _sum(gust_x, t_s), y + _sum(gust_y, t_s), z + _sum(gust_z, t_s))
+
+
+def _draw(rng: np.random.Generator, sigma_mps: float) -> _Terms:
+    """(amplitude m/s, pulsation rad/s, phase) of each sine."""
+    amplitude = sigma_mps * math.sqrt(2.0 / _TERMS)
+    hz = np.exp(rng.uniform(math.log(_SLOWEST_HZ), math.log(_FASTEST_HZ), _TERMS))
+    phases = rng.uniform(0.0, 2.0 * math.pi, _TERMS)
+    return tuple(
+        (amplitude, 2.0 * math.pi * float(f), float(phase))
+        for f, phase in zip(hz, phases, strict=True)
+    )
+
+
+def _sum(terms: _Terms, t_s: float) -> float:
+    return sum(a * math.sin(w * t_s + phase) for a, w, phase in terms)

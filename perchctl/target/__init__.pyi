@@ -1,8 +1,6 @@
 from .blind import blind_lines as blind_lines
 from .blind import mounted_camera as mounted_camera
 from .blind import sees_small_marker as sees_small_marker
-from .board_drawing import TAG_BORDER_CELLS as TAG_BORDER_CELLS
-from .board_drawing import tag_cells as tag_cells
 from .boards import TAG_DICTIONARY as TAG_DICTIONARY
 from .boards import Board as Board
 from .boards import BoardKind as BoardKind
@@ -41,7 +39,9 @@ from .plot import draw_design as draw_design
 from .png import png_bytes as png_bytes
 from .print_check import PrintCheck as PrintCheck
 from .print_check import PrintVerdict as PrintVerdict
+from .sheets import TAG_BORDER_CELLS as TAG_BORDER_CELLS
 from .sheets import board_page as board_page
+from .sheets import tag_cells as tag_cells
 from .sheets import target_pages as target_pages
 from .suggest import suggest_target as suggest_target
 from .svg import svg_bytes as svg_bytes

@@ -8,27 +8,29 @@ goes in and comes out.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.geometry import Array
 from perchctl.profile import KalmanConfig, Mounting, Profile, read_mask
 from perchctl.values import replace
 from perchctl.vision.fields import FieldsMode, FieldState, classify_fields, separate_fields
-from perchctl.vision.filter import MAX_TRACK_GAP_S, predict_track
+from perchctl.vision.filter import MAX_TRACK_GAP_S, FilterSetup, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
 from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
 from perchctl.vision.markers.mask import GearMask, make_mask
 from perchctl.vision.merge import stage_of
-from perchctl.vision.merged_target import estimate_in_level, estimate_in_world, spread_in_world
 from perchctl.vision.own import OwnTargetPlace, TargetSelector
-from perchctl.vision.places import to_level
+from perchctl.vision.places import seen_from, to_level, to_world
 from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
 from perchctl.vision.predict import expected_corners, update_sight
 from perchctl.vision.solve import PoseCandidate
-from perchctl.vision.strategies import MergePrior, MergeStrategy, make_strategy
+from perchctl.vision.strategies import Merged, MergePrior, MergeStrategy, make_strategy
 from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
@@ -302,3 +304,60 @@ def _carried(
     assert target.world_yaw_rad is not None
     e_m, e_yaw_rad = to_level(target.world_m, target.world_yaw_rad, attitude, pipeline.pose)
     return replace(target, t_s=t_s, e_m=e_m, e_yaw_rad=e_yaw_rad)
+
+
+# --- What merged tracks say of the target, as a `TargetEstimate` has it ------------------------
+
+
+def estimate_in_level(
+    merged: Merged, attitude: Attitude | None, setup: PoseSetup
+) -> dict[str, Any]:
+    """Place and motion of tracks in the level frame, as a `TargetEstimate` has them."""
+    e_m, e_yaw_rad = merged.vector[:3], float(merged.vector[3])
+    world_m, world_yaw_rad = None, None
+    if attitude is not None:
+        world_m, world_yaw_rad = to_world(e_m, e_yaw_rad, attitude, setup)
+    return {
+        "e_m": e_m,
+        "e_yaw_rad": e_yaw_rad,
+        "velocity_mps": merged.velocity_mps,
+        "sigma_m": _sigma(merged.cov_m2, merged.bias_m),
+        "sigma_yaw_rad": _sigma_yaw(merged),
+        "world_m": world_m,
+        "world_yaw_rad": world_yaw_rad,
+    }
+
+
+def estimate_in_world(merged: Merged, attitude: Attitude, setup: PoseSetup) -> dict[str, Any]:
+    """The same of tracks in the world, as seen from the vehicle at `attitude`, but the spread."""
+    world_m, world_yaw_rad = merged.vector[:3], float(merged.vector[3])
+    e_m, e_yaw_rad = to_level(world_m, world_yaw_rad, attitude, setup)
+    return {
+        "e_m": e_m,
+        "e_yaw_rad": e_yaw_rad,
+        "velocity_mps": attitude.R_world_level.T.dot(merged.velocity_mps),
+        "world_m": world_m,
+        "world_yaw_rad": world_yaw_rad,
+        "world_velocity_mps": merged.velocity_mps,
+    }
+
+
+def spread_in_world(
+    merged: Merged, attitude: Attitude, constants: FilterSetup, setup: PoseSetup
+) -> dict[str, Any]:
+    """The spread of tracks in the world, as seen from the vehicle at `attitude`."""
+    turn = attitude.R_world_level.T
+    bias_m = seen_from(merged.bias_m, attitude, constants, setup)
+    return {
+        "sigma_m": _sigma(turn.dot(merged.cov_m2).dot(turn.T), bias_m),
+        "sigma_yaw_rad": _sigma_yaw(merged),
+    }
+
+
+def _sigma_yaw(merged: Merged) -> float:
+    return math.sqrt(max(merged.var_yaw_rad2, 0.0))
+
+
+def _sigma(cov_m2: Array, bias_m: Array) -> Array:
+    variance = cov_m2.diagonal() + (bias_m * bias_m).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

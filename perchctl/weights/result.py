@@ -3,6 +3,7 @@ file that a profile names (`merge.weights_file`)."""
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -12,9 +13,15 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
+from pydantic import ValidationError
 
+from perchctl.errors import InvalidValue
 from perchctl.files import write_files
-from perchctl.geometry import Array
+from perchctl.geometry import Array, rotation_from_rpy
+from perchctl.log import FlightLog, read_log
+from perchctl.profile import Profile
+from perchctl.sim import Scenario, draw_scenario
 from perchctl.weights.check import check
 from perchctl.weights.evidence import (
     FITTED,
@@ -35,11 +42,9 @@ from perchctl.weights.fit import (
     odd_positions,
     sums_of,
 )
-from perchctl.weights.flight_logs import read_flight_log
 from perchctl.weights.lms import LmsOptions, LmsRun
-from perchctl.weights.repeated import refuse_repeated
 from perchctl.weights.table import chunks_of, read_csv
-from perchctl.weights.types import AXES, PAPER_WEIGHTS, UNITS, Measurements, joined
+from perchctl.weights.types import AXES, PAPER_WEIGHTS, SOURCES, UNITS, Measurements, joined, wrap
 
 FORMAT = "perchctl-merge-weights"
 _HEAD = """\
@@ -245,3 +250,188 @@ def _file_content(result: Result, date: str) -> dict[str, Any]:
             for name, method in result.evidence.methods.items()
         },
     }
+
+
+# --- Rows that are there twice: they would narrow the intervals, and are no more evidence ------
+
+
+_MIX = 0x9E3779B97F4A7C15  # odd: its powers mix all bits
+
+
+def refuse_repeated(parts: Sequence[Measurements], test: Measurements | None = None) -> None:
+    """Raises InvalidValue where a file, or a row, is named twice; `test` is the data that the
+    fit is judged by, and must hold none of the others' rows."""
+    files = [*parts, test] if test is not None else list(parts)
+    why = "the same rows twice are no more evidence"
+    for number, part in enumerate(files):
+        if part is test:
+            why = "--test judges by other data than was fitted to"
+        for before in files[:number]:
+            if part.sha256 == before.sha256:
+                both = f"{before.name} and {part.name} hold the same data"
+                same = f"{part.name} is named twice" if part.name == before.name else both
+                raise InvalidValue(f"{same}: {why}; name it once")
+    found = _first_again(files)
+    if found is not None:
+        (file, row), (old_file, old_row), count = found
+        part, before = files[file], files[old_file]
+        others = f" and {count - 1} more likewise" if count > 1 else ""
+        raise InvalidValue(
+            f"{part.name}: line {int(part.line[row])}: this row stands in line "
+            f"{int(before.line[old_row])} of {before.name} too{others}: "
+            f"{why}; take out what is there twice"
+        )
+
+
+def _first_again(
+    files: Sequence[Measurements],
+) -> tuple[tuple[int, int], tuple[int, int], int] | None:
+    """(file, row) of the first row that was there before, where it was, and how many such
+    rows there are."""
+    values = np.concatenate([_values(part) for part in files])
+    rows = np.arange(len(values))
+    _, first, group = np.unique(_hashes(values), return_index=True, return_inverse=True)
+    before = first[group]
+    again = (before != rows) & (values == values[before]).all(axis=1)
+    lengths = [len(part) for part in files]
+    file = np.repeat(np.arange(len(files)), lengths)
+    # Without times, rows of one position may well come out equal: rounded, of a camera at rest.
+    timeless = np.array([float(np.ptp(part.t_s)) == 0.0 for part in files])
+    position = np.concatenate([part.position for part in files])
+    alike = (file == file[before]) & (position == position[before]) & timeless[file]
+    again &= ~alike
+    if not again.any():
+        return None
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    row = int(np.argmax(again))
+    there, old = int(file[row]), int(file[before[row]])
+    return (
+        (there, row - int(starts[there])),
+        (old, int(before[row] - starts[old])),
+        int(again.sum()),
+    )
+
+
+def _values(part: Measurements) -> Array:
+    """Time and poses of each row, (n, 13); what was not seen is 0."""
+    poses = [np.nan_to_num(getattr(part, source)) for source in SOURCES]
+    return np.ascontiguousarray(np.column_stack([part.t_s, *poses]) + 0.0)
+
+
+def _hashes(values: Array) -> NDArray[np.uint64]:
+    factors = np.array(
+        [pow(_MIX, k, 1 << 64) for k in range(1, values.shape[1] + 1)], dtype=np.uint64
+    )
+    bits = values.view(np.uint64)
+    mixed: NDArray[np.uint64] = (bits ^ (bits >> np.uint64(29))) * factors
+    sums: NDArray[np.uint64] = mixed.sum(axis=1, dtype=np.uint64)
+    return sums
+
+
+# --- Flight logs with truth as data: the simulator's, flown in lockstep ------------------------
+# Such a log holds the true position of the body; the target's true place follows from the
+# profile and seed in its header. Each stretch of `STRETCH_S` with both markers in sight
+# counts as one position. The heading's truth is the vehicle's own estimate, which does not
+# drift in the simulator; roll and pitch are the estimate's too.
+
+
+STRETCH_S = 1.0
+LEAST_ROWS = 5
+"""A stretch with fewer frames of both markers is too little evidence."""
+
+
+def read_flight_log(path: Path) -> Measurements:
+    """The frames with both markers. Errors: NotFound, InvalidValue (no log, no truth)."""
+    log = read_log(path)
+    scenario, later_s = _truth_of(log)
+    # With `camera.latency_s: measured` the flight has taken some of it off already.
+    ahead_s = later_s + np.nan_to_num(log.column("delay_used_s"))
+    t_s = log.column("t_s")
+    frame_s = log.column("frame_t_s")
+    poses = {name: _poses(log, name[0]) for name in ("large", "small", "joint")}
+    both = np.isfinite(poses["large"]).all(axis=1) & np.isfinite(poses["small"]).all(axis=1)
+    actual = _actual(log, scenario, t_s, frame_s + ahead_s)
+    rows = np.flatnonzero(both & np.isfinite(actual).all(axis=1))
+    if not len(rows) and np.isfinite(poses["joint"]).any():
+        raise InvalidValue(
+            f"{path}: line 1: both markers were only solved jointly in this flight; fly it with "
+            f"pose.each_marker: true (or merge.method: weights) in the profile"
+        )
+    if not len(rows):
+        raise InvalidValue(
+            f"{path}: lines 2 to {len(log.records) + 1}: no tick with the truth holds both markers"
+        )
+    position = np.floor((frame_s[rows] - frame_s[rows][0]) / STRETCH_S).astype(np.int64)
+    numbers, counts = np.unique(position, return_counts=True)
+    kept = np.isin(position, numbers[counts >= LEAST_ROWS])
+    rows, position = rows[kept], position[kept]
+    if not len(rows):
+        raise InvalidValue(
+            f"{path}: line 2: no stretch of {STRETCH_S:g} s holds {LEAST_ROWS} frames with both "
+            f"markers"
+        )
+    joint = poses["joint"][rows]
+    return Measurements(
+        name=str(path),
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        position=position,
+        t_s=frame_s[rows],
+        large=poses["large"][rows],
+        small=poses["small"][rows],
+        actual=actual[rows],
+        joint=None if np.isnan(joint).all() else joint,
+        line=rows.astype(np.int64) + 2,
+        notes=(f"{path}: heading and tilt of the truth are the vehicle's own estimate",),
+    )
+
+
+def _truth_of(log: FlightLog) -> tuple[Scenario, float]:
+    """The scenario that was flown, and how much later than logged the frames were taken."""
+    if not np.isfinite(log.column("true_x_m")).any():
+        raise InvalidValue(
+            f"{log.path}: line 2: no truth in this log (true_x_m is missing): only logs of "
+            f"lockstep flights hold it (perchctl simulate --only SEED --log-dir DIR); --collect a "
+            f"session of a real vehicle"
+        )
+    header: dict[str, Any] = log.header
+    try:
+        profile = Profile.model_validate(header["profile"])
+        scenario = draw_scenario(profile, int(header["seed"]))
+    except (KeyError, TypeError, ValueError, ValidationError):
+        raise InvalidValue(
+            f"{log.path}: line 1: the profile and seed of the header do not give the scenario"
+        ) from None
+    return scenario, profile.camera.start_latency_s - scenario.camera_latency_s
+
+
+def _poses(log: FlightLog, short: str) -> Array:
+    return np.stack(
+        [log.column(f"{short}{axis}_{unit}") for axis, unit in zip(AXES, UNITS, strict=True)],
+        axis=1,
+    )
+
+
+def _actual(log: FlightLog, scenario: Scenario, t_s: Array, at_s: Array) -> Array:
+    """The target relative to the gear in the level frame at the frames' times, (n, 4)."""
+    known = np.isfinite(log.column("true_x_m")) & np.isfinite(log.column("roll_rad"))
+    when = np.where(np.isfinite(at_s), at_s, t_s)
+
+    def at_frame(key: str) -> Array:
+        values = log.column(key)[known]
+        if key == "yaw_rad":
+            values = np.unwrap(values)
+        return np.interp(when, t_s[known], values, left=math.nan, right=math.nan)
+
+    body = np.stack([at_frame(f"true_{axis}_m") for axis in "xyz"], axis=1)
+    roll, pitch, yaw = (at_frame(key) for key in ("roll_rad", "pitch_rad", "yaw_rad"))
+    target = np.array([*scenario.target_xy_m, scenario.ceiling_z_m])
+    gear = np.asarray(scenario.gear_body_m)
+    actual = np.full((len(t_s), 4), math.nan)
+    for row in np.flatnonzero(np.isfinite(at_s) & np.isfinite(body).all(axis=1)):
+        c, s = math.cos(yaw[row]), math.sin(yaw[row])
+        x, y, z = target - body[row]
+        level = np.array([c * x + s * y, -s * x + c * y, z])
+        tilt = rotation_from_rpy(float(roll[row]), float(pitch[row]), 0.0)
+        actual[row, :3] = level - tilt @ gear
+        actual[row, 3] = wrap(scenario.target_yaw_rad - yaw[row])
+    return actual

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from perchctl.camera import find_cameras
 from perchctl.camera.computer import camera_number, finder_of
-from perchctl.camera.controls import set_controls
-from perchctl.camera.device import Asked, DeviceSource, asked_of, differences, set_up
+from perchctl.camera.device import Asked, DeviceSource, asked_of, differences, set_controls, set_up
 from perchctl.camera.v4l2 import (
     Call,
     Delivered,
@@ -26,8 +25,8 @@ from perchctl.camera.v4l2 import (
     open_driver,
     value_of,
 )
-from perchctl.commands import check_cameras
-from perchctl.commands.check_cameras import camera_lines, list_cameras
+from perchctl.commands import check
+from perchctl.commands.check import camera_lines, list_cameras
 from perchctl.commands.cli import app
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
@@ -125,7 +124,7 @@ def test_no_camera_at_all(dev: Callable[..., Path], monkeypatch: pytest.MonkeyPa
         camera_number("USB", Opener({}), dev(), dev)  # type: ignore[arg-type]
     with pytest.raises(NotFound, match="this computer has no camera"):
         list_cameras(False, ())
-    monkeypatch.setattr(check_cameras, "find_cameras", lambda asked: [])
+    monkeypatch.setattr(check, "find_cameras", lambda asked: [])
     done = CliRunner().invoke(app, ["check", "--cameras", "--json"])
     assert done.exit_code == NotFound.exit_code
     said = json.loads(done.stdout)  # an object, as of every failure

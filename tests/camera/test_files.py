@@ -310,10 +310,10 @@ def test_a_port_that_is_none_is_named(url: str, found: str) -> None:
 
 
 def test_gst_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("perchctl.camera.gst.has_gstreamer", lambda: False)
+    monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: False)
     with pytest.raises(InvalidValue, match=r"^gst: needs an OpenCV .* GStreamer.*rtsp://"):
         open_source("gst:videotestsrc ! appsink", 0.0, None, clock)
-    monkeypatch.setattr("perchctl.camera.gst.has_gstreamer", lambda: True)
+    monkeypatch.setattr("perchctl.camera.open.has_gstreamer", lambda: True)
     with pytest.raises(NotFound, match="does not run; try it with gst-launch"):
         open_source("gst:nonsense", 0.0, None, clock)
 

@@ -15,7 +15,7 @@ from perchctl.camera.device import DeviceSource
 from perchctl.camera.mjpeg import MjpegSource
 from perchctl.camera.repeats import MOST_AGAIN, RepeatState, repeated
 from perchctl.camera.rtsp import RtspSource
-from perchctl.sim.receiver import BLUE_GREY
+from perchctl.sim.camera import BLUE_GREY
 from perchctl.vision import Frame
 from tests.helpers.interlaced import Pass
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from perchctl.check import Row, Verdict, profile_rows
-from perchctl.check.limits import DOUBTFUL
+from perchctl.check.profile import DOUBTFUL
 from perchctl.profile import Profile, data_folder, load_profile
 from tests.helpers.flights import short_profile
 

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.cluster import parse_address
-from perchctl.cluster.place import Place
+from perchctl.cluster.hands import Place
 from perchctl.commands.simulate_request import SimulateRequest
 from perchctl.errors import UsageError
 from tests.helpers.commands import elsewhere, run  # noqa: F401

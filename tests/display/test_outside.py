@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from perchctl.display.panel import WIDTH
 from perchctl.display.status import status_rows
-from perchctl.display.watch import status_of
+from perchctl.display.watch import WIDTH, status_of
 from perchctl.log.watch import flight_record
 from perchctl.mission import ExternalPositions
 from perchctl.vehicle import ExternalPosition

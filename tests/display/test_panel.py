@@ -15,9 +15,8 @@ from rich.console import Console
 from rich.text import Text
 
 from perchctl.display import DisplayWatcher, make_reporter
-from perchctl.display.panel import Reporter, panel
 from perchctl.display.status import FlightStatus, status_rows
-from perchctl.display.watch import status_of
+from perchctl.display.watch import Reporter, panel, status_of
 from perchctl.log import LogWatcher, read_log
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import BatteryOutlook, Observation, Phase, Tick, start_mission

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.flight import History, add_samples
-from perchctl.flight.told import events_of
+from perchctl.flight.loop import events_of
 from perchctl.mission import Outcome, planner
 from perchctl.vehicle import Telemetry
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle

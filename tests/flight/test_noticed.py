@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from perchctl.flight import History
-from perchctl.flight.noticed import (
+from perchctl.flight.senses import (
     SLEW,
     USED_SIGMA_S,
     Noticed,

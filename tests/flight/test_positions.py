@@ -23,8 +23,8 @@ from perchctl.errors import (
     TimedOut,
     UsageError,
 )
-from perchctl.flight import FlyOptions, WallClock, capture_for_vehicle, check_options, positions
-from perchctl.flight.positions import opened_capture, started_feed
+from perchctl.flight import FlyOptions, WallClock, capture_for_vehicle, check_options, session
+from perchctl.flight.session import opened_capture, started_feed
 from perchctl.link import CflibLink
 from perchctl.positioning import FeedStatus
 from perchctl.profile import LinkConfig, PositioningConfig, Profile, find_profile, load_profile
@@ -77,7 +77,7 @@ def test_a_body_that_moves_while_the_vehicle_stands_is_refused_before_it_is_used
             SafetyAbort, match=r"moved by 0\.1\d m in the motion capture, and th"
         )
     with refused:
-        positions._refuse_strange(it, it, it, load_profile("sim"))
+        session._refuse_strange(it, it, it, load_profile("sim"))
     assert (it.t_s - 100.0 > 0.4) is (speed_mps == 0.0)
 
 
@@ -177,7 +177,7 @@ def test_what_cannot_be_flown_is_refused_before_anything_is_opened(
     link = profile.link.model_copy(update={"parameters": {"stabilizer.estimator": 1}})
     with pytest.raises(InvalidValue, match=r"stabilizer\.estimator to 1"):
         check_options(options(profile.model_copy(update={"link": link})))
-    monkeypatch.setattr(positions, "find_spec", lambda name: None)
+    monkeypatch.setattr(session, "find_spec", lambda name: None)
     with pytest.raises(UsageError, match=r"pip install 'perchctl\[mocap\]'"):
         check_options(options(mocap(), uri="sim://"))
 

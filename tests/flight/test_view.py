@@ -17,8 +17,12 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.errors import SafetyAbort, TimedOut
 from perchctl.flight import out_of_view, place_seen, target_from, world_problem
 from perchctl.flight.outside import AtRest
-from perchctl.flight.preflight import refuse_out_of_view, refuse_strange, still_waiting_for
-from perchctl.flight.view import LEAN_DEG
+from perchctl.flight.preflight import (
+    LEAN_DEG,
+    refuse_out_of_view,
+    refuse_strange,
+    still_waiting_for,
+)
 from perchctl.geometry import Place, rot_z
 from perchctl.positioning import FeedStatus
 from perchctl.positioning.feed import UNSEEN

@@ -17,7 +17,7 @@ from perchctl.check import compared as check_compared
 from perchctl.check.row import failed, passed, skipped, warned
 from perchctl.commands.cli import app
 from perchctl.errors import SafetyAbort
-from perchctl.flight import positions
+from perchctl.flight import session
 from perchctl.positioning import compared
 from perchctl.positioning.compared import (
     Comparison,
@@ -119,11 +119,11 @@ def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
     """Two vehicles with the same body's name by turns."""
     was_compared(CONFIG, OTHER_URI)
     with pytest.raises(SafetyAbort) as refused:
-        positions.require_comparison(CONFIG, URI, simulated=False)
+        session.require_comparison(CONFIG, URI, simulated=False)
     said = str(refused.value)
     assert f"compared with another vehicle ({OTHER}), and never with this one ({VEHICLE})" in said
     assert "run perchctl check --lift" in said
-    positions.require_comparison(CONFIG, OTHER_URI, simulated=False)
+    session.require_comparison(CONFIG, OTHER_URI, simulated=False)
     # Nor by a file that was copied to its place; what is damaged beside it is no vehicle.
     (mine, theirs) = (compared.path_of(compared.set_up_of(CONFIG, v)) for v in (VEHICLE, OTHER))
     mine.write_bytes(theirs.read_bytes())
@@ -137,9 +137,9 @@ def test_another_vehicle_s_record_lets_none_fly_and_is_named() -> None:
 
 def test_a_vehicle_found_by_another_dongle_is_the_same() -> None:
     was_compared(CONFIG, "radio://0/80/2M/E7E7E7E701")
-    positions.require_comparison(CONFIG, "radio://1/80/2M/e7e7e7e701", simulated=False)
+    session.require_comparison(CONFIG, "radio://1/80/2M/e7e7e7e701", simulated=False)
     with pytest.raises(SafetyAbort, match="another vehicle"):
-        positions.require_comparison(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
+        session.require_comparison(CONFIG, "radio://0/80/2M/E7E7E7E702", simulated=False)
 
 
 def test_what_says_nothing_of_the_axes_is_no_other_set_up() -> None:
@@ -165,10 +165,10 @@ def spoil(how: str) -> None:
 @pytest.mark.parametrize("how", ["empty", "cut", "huge", "no zone", "deep", "folder", "of old"])
 def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
     was_compared(CONFIG, URI)
-    positions.require_comparison(CONFIG, URI, simulated=False)
+    session.require_comparison(CONFIG, URI, simulated=False)
     spoil(how)
     with pytest.raises(SafetyAbort, match=r"is not known: .*remove that file") as refused:
-        positions.require_comparison(CONFIG, URI, simulated=False)
+        session.require_comparison(CONFIG, URI, simulated=False)
     assert "\n" not in str(refused.value)
 
 
@@ -180,30 +180,30 @@ def test_a_damaged_record_refuses_in_one_sentence(how: str) -> None:
 ])  # fmt: skip
 def test_what_did_not_pass_ends_an_older_pass(lifted: Any) -> None:
     was_compared(CONFIG, URI)
-    row = check_compared.kept(lifted, CONFIG, URI, positions.wall_date())
+    row = check_compared.kept(lifted, CONFIG, URI, session.wall_date())
     assert row.verdict is Verdict.WARN
     with pytest.raises(SafetyAbort, match=lifted.found):
-        positions.require_comparison(CONFIG, URI, simulated=False)
-    again = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, positions.wall_date())
+        session.require_comparison(CONFIG, URI, simulated=False)
+    again = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, session.wall_date())
     assert again.verdict is Verdict.PASS
-    positions.require_comparison(CONFIG, URI, simulated=False)
+    session.require_comparison(CONFIG, URI, simulated=False)
 
 
 def test_a_lift_that_told_nothing_leaves_the_record_as_it_is() -> None:
-    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, positions.wall_date())
+    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, session.wall_date())
     assert "was never compared" in row.found
     was_compared(CONFIG, URI)
-    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, positions.wall_date())
+    row = check_compared.kept(skipped("lifted", "not moved"), CONFIG, URI, session.wall_date())
     assert row.verdict is Verdict.PASS
 
 
 def test_a_record_that_cannot_be_written_warns(folder: Path) -> None:
     folder.write_text("in the way", encoding="utf-8")
-    row = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, positions.wall_date())
+    row = check_compared.kept(passed("lifted", "fine"), CONFIG, URI, session.wall_date())
     assert row.verdict is Verdict.WARN
     assert "not written" in row.found
     with pytest.raises(SafetyAbort):
-        positions.require_comparison(CONFIG, URI, simulated=False)
+        session.require_comparison(CONFIG, URI, simulated=False)
 
 
 @pytest.mark.parametrize("removable", [True, False])
@@ -217,18 +217,18 @@ def test_an_unwritten_finding_leaves_no_older_pass_unsaid(
     monkeypatch.setattr(compared, "write_files", full)
     if not removable:
         monkeypatch.setattr(Path, "unlink", full)
-    row = check_compared.kept(failed("lifted", SWAPPED, ""), CONFIG, URI, positions.wall_date())
+    row = check_compared.kept(failed("lifted", SWAPPED, ""), CONFIG, URI, session.wall_date())
     assert row.verdict is (Verdict.WARN if removable else Verdict.FAIL)
     assert "No space left" in row.found
     if removable:
         with pytest.raises(SafetyAbort, match="never compared"):
-            positions.require_comparison(CONFIG, URI, simulated=False)
+            session.require_comparison(CONFIG, URI, simulated=False)
 
 
 def test_decks_and_the_simulator_s_own_room_ask_for_none() -> None:
     deck = CONFIG.model_copy(update={"by": "deck"})
     for config, simulated in ((deck, False), (CONFIG, True)):
-        positions.require_comparison(config, URI, simulated=simulated)
+        session.require_comparison(config, URI, simulated=simulated)
         assert check_compared.comparison_rows(config, URI, NOW, simulated=simulated) == []
 
 

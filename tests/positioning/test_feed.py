@@ -29,8 +29,7 @@ from perchctl.positioning import (
     PositionFeed,
 )
 from perchctl.positioning import feed as feeding
-from perchctl.positioning.feed import QUIET_S
-from perchctl.positioning.judge import STALE_S
+from perchctl.positioning.feed import QUIET_S, STALE_S
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 

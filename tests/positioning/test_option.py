@@ -132,9 +132,9 @@ def test_a_flight_that_is_refused_on_the_ground_is_one_of_the_benchmark_s(
 
 
 def test_the_library_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    from perchctl.flight import positions
+    from perchctl.flight import session
 
-    monkeypatch.setattr(positions, "find_spec", lambda name: None)
+    monkeypatch.setattr(session, "find_spec", lambda name: None)
     done = fly("--positioning", "mocap")
     assert done.exit_code == 2
     assert "-m pip install 'perchctl[mocap]'" in done.stderr

@@ -10,8 +10,7 @@ from pydantic import ValidationError
 
 from perchctl.errors import InvalidValue
 from perchctl.profile import Profile, SimulationConfig, load_profile
-from perchctl.profile.simulation import in_world
-from perchctl.profile.worlds import NOMINAL, WORLDS
+from perchctl.profile.simulation import NOMINAL, WORLDS, in_world
 
 
 def simulated(**keys: Any) -> SimulationConfig:

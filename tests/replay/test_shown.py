@@ -21,8 +21,7 @@ from perchctl.mission import Turn
 from perchctl.profile import PositioningConfig, Profile, SafetyConfig, changed_profile
 from perchctl.replay import replay, replay_lines, replay_record
 from perchctl.replay.compare import first_differing, same
-from perchctl.replay.run import Replay
-from perchctl.replay.shown import shown
+from perchctl.replay.run import Replay, shown
 from perchctl.vehicle import Telemetry
 from perchctl.vision import Frame
 from tests.helpers.loop_rig import PROFILE, Camera, Rig
@@ -248,7 +247,7 @@ def test_each_key_is_judged_or_said() -> None:
 
 
 def said_of(log: FlightLog, key: str) -> bool:
-    from perchctl.replay.notes import notes_of
+    from perchctl.replay.run import notes_of
 
     notes = notes_of(log, "", "", [key], pictures=False)
     return any(note.startswith(f"{key}: ") for note in notes)

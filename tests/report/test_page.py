@@ -14,10 +14,10 @@ import pytest
 
 from perchctl.errors import InvalidValue
 from perchctl.report import ReportedFlight, report_path_of
-from perchctl.report.page import page_of
 from perchctl.report.plot import flight_plots
 from perchctl.report.told import tell
 from perchctl.report.track import Track
+from perchctl.report.write import page_of
 from tests.helpers.commands import elsewhere, run  # noqa: F401 - a fixture
 from tests.helpers.told import Change, flown_s, made, written
 
@@ -77,7 +77,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the flight's plots, which take most of a page's time."""
     monkeypatch.setattr("perchctl.report.sections.flight_plots", lambda track: [])
     monkeypatch.setattr("perchctl.report.sections.battery_plot", lambda track, rest_v: None)
-    monkeypatch.setattr("perchctl.report.page.trend", lambda label, values, names: None)
+    monkeypatch.setattr("perchctl.report.write.trend", lambda label, values, names: None)
 
 
 words_only = pytest.mark.usefixtures("undrawn")

@@ -12,7 +12,7 @@ import pytest
 from perchctl.log import recorded_pictures
 from perchctl.log.recording.recorder import Recorder
 from perchctl.profile import Profile
-from perchctl.report.pictures import decisions_of
+from perchctl.report.told import decisions_of
 from perchctl.report.track import Track
 from perchctl.report.write import told_of
 from perchctl.vision import Frame

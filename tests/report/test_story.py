@@ -9,9 +9,8 @@ import pytest
 
 from perchctl.mission import Phase
 from perchctl.report.losses import losses_of
-from perchctl.report.motion import exposure_s_of, focal_px_of, motion_of
 from perchctl.report.story import Sentence, story_of
-from perchctl.report.track import Track
+from perchctl.report.track import Track, exposure_s_of, focal_px_of, motion_of
 from tests.helpers.log import GONE_S, PLAN
 from tests.helpers.mission import note
 from tests.helpers.told import START_S, Change, entered, flown_s, made

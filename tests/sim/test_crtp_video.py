@@ -14,7 +14,7 @@ from perchctl.calibration import load_calibration
 from perchctl.errors import ConnectionFailed, NotFound
 from perchctl.profile import data_file
 from perchctl.sim import Scenario, SimProcess
-from perchctl.sim.process.mjpeg import MjpegServer
+from perchctl.sim.process.host import MjpegServer
 from perchctl.vision import CameraModel
 from tests.helpers.crtp_process import WAIT_S, _parts
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import perchctl.sim.placed as placed
+import perchctl.sim.renderer as placed
 import perchctl.sim.renderer as rendering
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig

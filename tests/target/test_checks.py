@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target import Board, check_target, parse_board, parse_length, parse_page, tag_cells
-from perchctl.target.board_drawing import black_squares, board_rectangles
 from perchctl.target.checks import white_centre_ids
+from perchctl.target.sheets import black_squares, board_rectangles
 
 
 def target_of(

@@ -28,8 +28,7 @@ from perchctl.target import (
     make_design,
     suggest_target,
 )
-from perchctl.target.bound import pose_bound
-from perchctl.target.design import Ranges
+from perchctl.target.design import Ranges, pose_bound
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.visible import square_outline, turned_outline
 from perchctl.vision import CameraModel

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from perchctl.track import Notes, Tally, Tracked
-from perchctl.track.jumps import jumped
+from perchctl.track.tracker import jumped
 from perchctl.vision import MarkerPose
 
 FRAME_S = 1.0 / 30.0

@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.display import Sketch
 from perchctl.errors import InvalidValue
-from perchctl.track.files import OverlayFile
+from perchctl.track.outputs import OverlayFile
 from perchctl.vision import CameraModel
 from tests.helpers.disk import full_disk
 

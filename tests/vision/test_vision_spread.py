@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array, wrap_rad
 from perchctl.profile import TargetConfig
-from perchctl.sim.analogue import spoil
+from perchctl.sim.renderer import spoil
 from perchctl.vision import Frame, MarkerPose, Pipeline, PipelineState, step
 from tests.helpers.target_picture import pose_of, render
 

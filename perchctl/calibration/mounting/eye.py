@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import zlib
+
+import numpy as np
+
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.seen import best_pose, camera_only_profile, is_seen_mirrored
+from perchctl.calibration.mounting.turns import cross_matrix, rotation_matrices
 from perchctl.camera import HealthState, assess_frame
-from perchctl.geometry import Array
+from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.profile import Profile
 from perchctl.vision import (
     MARKERS,
     CameraModel,
     FieldState,
     Frame,
+    MarkerPose,
     PipelineOutput,
     PipelineState,
+    camera_profile,
     make_pipeline,
     pictures,
     step,
@@ -62,3 +68,66 @@ class Eye:
         self.mirrored += is_seen_mirrored(output)
         found = ((name, output.detections.get(name)) for name in MARKERS)
         self.outlines = tuple((name, d.corners_px) for name, d in found if d is not None)
+
+
+# --- From what the pipeline saw in a picture to a recording's pose -----------------------------
+
+
+def camera_only_profile(profile: Profile) -> Profile:
+    """The profile with the camera in the place of vehicle and gear: for a pipeline that knows
+    nothing of how the camera is mounted."""
+    bare = camera_profile(profile)
+    return bare.model_copy(update={"pose": profile.pose})
+
+
+def pose_basis(profile: Profile, camera: CameraModel) -> str:
+    """What poses rest on beside the pictures, in words: the printed sizes and the lens."""
+    sides_mm = [f"{1e3 * m.side_m:g}" for m in (profile.target.large, profile.target.small)]
+    K = camera.K
+    lens = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(camera.dist)]
+    number = zlib.crc32(np.round(np.array(lens, dtype=np.float64), 6).tobytes())
+    return f"markers of {' and '.join(sides_mm)} mm, calibration {number:08x}"
+
+
+def best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
+    """The surest of a picture's poses, None without one.
+
+    Args:
+        t_s: the camera's own timestamp of the picture.
+    """
+    joint = output.poses.get("joint")
+    single = [pose for pose in output.poses.values() if pose.camera_cov is not None]
+    pose = joint or min(single, key=_uncertainty, default=None)
+    if pose is None:
+        return None
+    cov = pose.camera_cov
+    if cov is not None:
+        J = np.eye(6)
+        J[:3, :3] = _left_jacobian(pose.rvec_rad)
+        cov = J @ cov @ J.T
+    return SeenPose(
+        t_s=t_s,
+        rotation_cam_target=rotation_matrices(pose.rvec_rad) @ R_MARKER_TARGET,
+        position_cam_target_m=pose.tvec_m,
+        covariance=cov if cov is not None and np.isfinite(cov).all() else None,
+    )
+
+
+def is_seen_mirrored(output: PipelineOutput) -> bool:
+    """Whether the target was seen in the mirror only."""
+    return output.detections.mirrored and not output.poses
+
+
+def _uncertainty(pose: MarkerPose) -> float:
+    return float("inf") if pose.camera_cov is None else float(np.trace(pose.camera_cov[:3, :3]))
+
+
+def _left_jacobian(v: Array) -> Array:
+    """Change (3, 3) of a small turn on the left of the rotation with its vector v (3,)."""
+    angle = float(np.linalg.norm(v))
+    K = cross_matrix(v)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * K)
+    a = (1.0 - np.cos(angle)) / angle**2
+    b = (angle - np.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + a * K + b * (K @ K))

@@ -60,7 +60,7 @@ class SeenPose:
 @dataclass(frozen=True, eq=False)
 class MountingRecording:
     """One part. `mirrored_pictures` counts those in which the target was seen mirrored only;
-    `seen_by` says what else the poses rest on (see `perchctl.calibration.mounting.seen`), empty
+    `seen_by` says what else the poses rest on (see `perchctl.calibration.mounting.eye`), empty
     where that is not known."""
 
     part: MountingPart

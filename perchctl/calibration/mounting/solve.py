@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from perchctl.calibration.mounting import carry, pivot
-from perchctl.calibration.mounting.felt import felt, sum_up
-from perchctl.calibration.mounting.motion import missing, tilts_rad
+from perchctl.calibration.mounting.felt import Turned, felt, sum_up, turned_at
 from perchctl.calibration.mounting.place import camera_place
-from perchctl.calibration.mounting.recording import MountingPart, MountingRecording, SeenPose
+from perchctl.calibration.mounting.recording import (
+    AttitudeSample,
+    MountingPart,
+    MountingRecording,
+    SeenPose,
+)
 from perchctl.calibration.mounting.result import Carried, Measured, Pivoted, measured
-from perchctl.calibration.mounting.start import LATENCIES_S, first_guess
-from perchctl.calibration.mounting.turns import rotation_matrices
+from perchctl.calibration.mounting.turns import nearest_turn, rotation_matrices, rotation_vectors
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, rpy_from_rotation
 
@@ -221,3 +227,163 @@ def _degrees(angles_rad: Array | tuple[float, float, float]) -> tuple[float, flo
 
 def _three(values: Array) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])
+
+
+# --- Whether there was enough motion, and which is missing: while recording and before a solve ---
+
+
+CARRY_S, PIVOT_S = 20.0, 12.0
+LEAST_POSES = {"carry": 150, "pivot": 100}
+LEAST_ATTITUDES = 500
+ROLL_PITCH_DEG, YAW_DEG = 30.0, 90.0
+"""From one side to the other, while the target is seen."""
+LEAST_RATE_DPS = 15.0
+TILT_DEG = 25.0
+_MOST_LATE_S = 1.0
+
+
+def missing(recording: MountingRecording) -> tuple[str, ...]:
+    """Which motion is still lacking, in a few words each; nothing: it is enough."""
+    lacking = _carry(recording) if recording.part == "carry" else _pivot(recording)
+    return tuple(lacking)
+
+
+def _carry(recording: MountingRecording) -> list[str]:
+    attitudes, poses = recording.attitudes, recording.poses
+    if len(attitudes) < 2 or len(poses) < 2:
+        return ["bring the target into view"] if len(attitudes) >= 2 else ["wait for the vehicle"]
+    lacking = []
+    rpy = seen_rpy_deg(attitudes, poses)
+    for name, axis, least, how in (
+        ("roll", 0, ROLL_PITCH_DEG, "tip it from side to side"),
+        ("pitch", 1, ROLL_PITCH_DEG, "tip it forwards and back"),
+        ("yaw", 2, YAW_DEG, "turn it about the vertical"),
+    ):
+        span = extent(rpy[:, axis])
+        if span < least:
+            lacking.append(f"{name}: {how} ({span:.0f} of {least:.0f} deg)")
+    rate_dps = math.degrees(
+        math.sqrt(float(np.mean([a.gyro_radps @ a.gyro_radps for a in attitudes])))
+    )
+    if rate_dps < LEAST_RATE_DPS:
+        lacking.append(f"faster: {rate_dps:.0f} of {LEAST_RATE_DPS:.0f} deg/s")
+    lacking += _length(recording, CARRY_S)
+    if len(attitudes) < LEAST_ATTITUDES and not lacking:
+        lacking.append(f"telemetry: {len(attitudes)} of {LEAST_ATTITUDES} samples")
+    return lacking
+
+
+def _pivot(recording: MountingRecording) -> list[str]:
+    if len(recording.poses) < 2:
+        return ["bring the target into view"]
+    lacking = []
+    least, most = tilt_extents_deg(tilts_rad(recording.poses))
+    if most < TILT_DEG:
+        lacking.append(f"tilt: around the tip, to all sides ({most:.0f} of {TILT_DEG:.0f} deg)")
+    elif least < TILT_DEG:
+        lacking.append(
+            f"tilt: also at right angles to the tilts so far ({least:.0f} of {TILT_DEG:.0f} deg)"
+        )
+    return lacking + _length(recording, PIVOT_S)
+
+
+def _length(recording: MountingRecording, least_s: float) -> list[str]:
+    t_s = [p.t_s for p in recording.poses]
+    # Time in which the target is seen.
+    seen_s = float(np.minimum(np.diff(np.sort(t_s)), 0.2).sum())
+    if seen_s < least_s:
+        return [f"longer: {seen_s:.0f} of {least_s:.0f} s in view"]
+    if len(t_s) < LEAST_POSES[recording.part]:
+        return [f"more pictures: {len(t_s)} of {LEAST_POSES[recording.part]}"]
+    return []
+
+
+def extent(values: Array) -> float:
+    """From one side to the other, without the outermost hundredths."""
+    return float(np.ptp(np.percentile(values, (2.0, 98.0)))) if len(values) else 0.0
+
+
+def seen_rpy_deg(attitudes: Sequence[AttitudeSample], poses: Sequence[SeenPose]) -> Array:
+    """The vehicle's attitude at each picture (n, 3), latency left out of account; heading
+    unwrapped."""
+    t_s = np.array([a.t_s for a in attitudes])
+    rpy = np.unwrap([(a.roll_rad, a.pitch_rad, a.yaw_rad) for a in attitudes], axis=0)
+    at_s = np.array([p.t_s for p in poses])
+    at_s = at_s[(at_s >= t_s[0]) & (at_s <= t_s[-1] + _MOST_LATE_S)]
+    rpy_deg: Array = np.degrees(np.stack([np.interp(at_s, t_s, angle) for angle in rpy.T], axis=1))
+    return rpy_deg
+
+
+def tilts_rad(poses: Sequence[SeenPose]) -> Array:
+    """Of the camera to the target's x and y, (n, 2): its view in the target's axes."""
+    view = np.array([p.rotation_cam_target[2] for p in poses])
+    return np.asarray(np.arctan2(view[:, :2], view[:, 2:]))
+
+
+def tilt_extents_deg(tilts: Array) -> tuple[float, float]:
+    """The least and the most extent of tilts (n, 2) over all directions."""
+    angles = np.radians(np.arange(0.0, 180.0, 15.0))
+    along = np.degrees(tilts) @ np.stack([np.cos(angles), np.sin(angles)])
+    extents = [extent(column) for column in along.T]
+    return min(extents), max(extents)
+
+
+# --- Turn of the camera and latency from nothing: no start is needed, whatever the camera's turn
+# Between two pictures the camera turns by the same rotation as the body, seen in its own axes:
+# ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid the R_body_cam
+# that fits best follows in closed form; the latency with the least misfit wins.
+
+
+LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
+"""Also such as cannot be: a clock that is wrong is to be named, not hidden at the grid's end."""
+_SPAN_S = (0.2, 0.5)
+_MOST_PAIRS = 400
+_ROUNDS = 3
+_SCALE_RAD = 0.02  # of a misfit that counts half
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """misfit (m,): of each latency of the grid, 0 to 1."""
+
+    R_body_cam: Array
+    latency_s: float
+    misfit: Array
+
+
+def first_guess(turned: Turned, t_s: Array, R_cam_target: Array) -> Start | None:
+    """From poses at t_s (n,), (n, 3, 3); None without pairs of pictures some tenths apart."""
+    first, second = _pairs(t_s)
+    if len(first) < 3:
+        return None
+    seen = rotation_vectors(R_cam_target[first] @ R_cam_target[second].transpose(0, 2, 1))
+    guesses = []
+    for latency_s in LATENCIES_S:
+        a = turned_at(turned, t_s[first] - latency_s).R_world_body
+        b = turned_at(turned, t_s[second] - latency_s).R_world_body
+        guesses.append(_fit(rotation_vectors(a.transpose(0, 2, 1) @ b), seen))
+    misfit = np.array([m for _, m in guesses])
+    best = int(np.argmin(misfit))
+    return Start(guesses[best][0], float(LATENCIES_S[best]), misfit)
+
+
+def _pairs(t_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Each picture and the first one that is `_SPAN_S` later."""
+    second = np.searchsorted(t_s, t_s + _SPAN_S[0])
+    first = np.flatnonzero(second < len(t_s))
+    second = second[first]
+    near = t_s[second] - t_s[first] <= _SPAN_S[1]
+    first, second = first[near], second[near]
+    thinned = slice(None, None, 1 + len(first) // _MOST_PAIRS)
+    return first[thinned], second[thinned]
+
+
+def _fit(body: Array, seen: Array) -> tuple[Array, float]:
+    """R with body = R seen, by least squares in which what fits badly counts less."""
+    weight = np.ones(len(body))
+    R = np.eye(3)
+    for _ in range(_ROUNDS):
+        R = nearest_turn((weight[:, None] * body).T @ seen)
+        miss = ((body - seen @ R.T) ** 2).sum(axis=1) / _SCALE_RAD**2
+        weight = 1.0 / (1.0 + miss)
+    return R, float((miss * weight).mean())

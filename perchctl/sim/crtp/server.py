@@ -1,6 +1,6 @@
 """A Crazyflie's end of the link: packets in, firmware calls, packets out.
 
-Uses no socket and no clock; `perchctl.sim.crtp.udp` carries the packets. Everything
+Uses no socket and no clock; `perchctl.sim.process.host` carries the packets. Everything
 an unmodified cflib sends is answered as in docs/firmware.md, "Connect sequence".
 """
 

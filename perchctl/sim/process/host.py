@@ -4,19 +4,27 @@ process of its own."""
 from __future__ import annotations
 
 import json
+import socket
+import sys
 import threading
 from collections import deque
+from collections.abc import Callable, Iterable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, TextIO
 
+import cv2
+import numpy as np
+
+from perchctl.errors import ConnectionFailed
 from perchctl.geometry import rpy_from_rotation
-from perchctl.sim.bursts import radio_bursts
+from perchctl.sim.bursts import Bursts, radio_bursts
 from perchctl.sim.capture.server import SIMULATED_SYSTEM, CaptureServer
-from perchctl.sim.crtp.server import CrtpServer
-from perchctl.sim.crtp.udp import Address, UdpEndpoint
+from perchctl.sim.crtp.codec import Packet
+from perchctl.sim.crtp.server import CrtpServer, LinkOptions
 from perchctl.sim.process.control import HostSetup
-from perchctl.sim.process.mjpeg import MjpegServer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.surfaces import Picture
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.sim.world import TrueState
 
@@ -223,3 +231,222 @@ class _PictureFeed:
         with self._changed:
             back = round((self._past[-1].t_s - t_s) / CONTROL_PERIOD_S)
             return self._past[max(-len(self._past), -1 - max(0, back))]
+
+
+# --- The link's carrier: one CRTP packet a UDP datagram, as cflib's `udp://` driver sends them ---
+
+
+_STREAM = 90  # this part's own stream of the seed
+_RECEIVE_BYTES = 1 << 20
+_NULL_HEADER = 0xFF
+_EPS_S = 1e-9
+
+Address = tuple[str, int]
+
+
+class UdpEndpoint:
+    """The socket of a simulated vehicle, bound to loopback.
+
+    Answers go to the requesting address. What the vehicle sends by itself goes to the
+    peer: the last address that sent anything but a scan's probe. `heard` is told of each
+    datagram that is a packet, before anything is made of it: time, sender, bytes.
+    """
+
+    def __init__(self, port: int, options: LinkOptions, bursts: Bursts | None = None) -> None:
+        """`port` 0 lets the operating system choose; `bursts`: in which nothing passes. Raises
+        ConnectionFailed when taken."""
+        self._options = options
+        self._bursts = bursts
+        self._random = np.random.default_rng([options.loss_seed, _STREAM])
+        self._peer: Address | None = None
+        self.heard: Callable[[float, Address, bytes], None] | None = None
+        self._silent: tuple[float, float] | None = None
+        if options.silent_from_s is not None:
+            self._silent = (options.silent_from_s, options.silent_from_s + options.silent_for_s)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self.socket.setblocking(False)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+            self.socket.bind(("127.0.0.1", port))
+        except OSError as error:
+            self.socket.close()
+            raise ConnectionFailed(
+                f"UDP port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
+            ) from None
+        self.port = int(self.socket.getsockname()[1])
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def silence(self, from_s: float, duration_s: float) -> None:
+        """Receive and send nothing for a while of simulated time."""
+        self._silent = (from_s, from_s + duration_s)
+
+    def serve(self, server: CrtpServer, t_s: float) -> None:
+        """Handle every datagram that has arrived. `t_s`: simulated time, for the silence."""
+        while True:
+            try:
+                datagram, address = self.socket.recvfrom(64)
+            except (BlockingIOError, InterruptedError):
+                return
+            except ConnectionError:  # a former peer's port is closed (Windows)
+                continue
+            if self._is_silent(t_s) or self._is_lost(t_s):
+                continue
+            packet = Packet.decode(datagram)
+            if packet is None:
+                continue
+            if self.heard is not None:
+                self.heard(t_s, address, datagram)
+            if datagram[0] != _NULL_HEADER:
+                self._peer = address
+            self._send(server.handle(packet), address, t_s)
+
+    def send_due(self, server: CrtpServer, t_s: float) -> None:
+        """Send what the vehicle sends by itself; nothing is kept for a missing peer."""
+        if self._peer is not None:
+            self._send(server.due(), self._peer, t_s)
+
+    def _send(self, packets: Iterable[Packet], address: Address, t_s: float) -> None:
+        for packet in packets:
+            if self._is_silent(t_s) or self._is_lost(t_s):
+                continue
+            try:
+                self.socket.sendto(packet.encode(), address)
+            except OSError:  # full buffer or a peer that is gone: lost like over the air
+                continue
+
+    def _is_silent(self, t_s: float) -> bool:
+        return self._silent is not None and (
+            self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S
+        )
+
+    def _is_lost(self, t_s: float) -> bool:
+        if self._bursts is not None and self._bursts.lost(t_s):
+            return True
+        rate = self._options.loss_rate
+        return rate > 0.0 and float(self._random.random()) < rate
+
+
+# --- The simulated camera's picture over HTTP, as a network camera would send it ---------------
+# One part of a multipart answer is one JPEG; a slow client skips frames, the newest wins.
+
+
+PATH = "/stream.mjpg"
+JPEG_QUALITY = 92
+_BOUNDARY = "perchctlframe"
+_WAIT_S = 0.5
+_CLIENT_TIMEOUT_S = 5.0
+
+
+class _Newest:
+    """The newest picture; encoded once, by the first client that requests it."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._encoding = threading.Lock()
+        self._image: Picture | None = None
+        self._number = 0
+        self._encoded: tuple[int, bytes] = (0, b"")
+        self.closed = False
+
+    def put(self, image: Picture) -> None:
+        with self._changed:
+            self._image = image
+            self._number += 1
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        with self._changed:
+            self.closed = True
+            self._changed.notify_all()
+
+    def after(self, number: int) -> tuple[int, bytes] | None:
+        """The first picture newer than `number`, as JPEG; None when none came for a while."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
+            newest, image = self._number, self._image
+        if image is None or newest <= number:
+            return None
+        with self._encoding:
+            if self._encoded[0] < newest:
+                ok, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+                if not ok:
+                    return None
+                self._encoded = (newest, jpeg.tobytes())
+            return self._encoded
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    allow_reuse_address = True
+
+    def __init__(self, port: int) -> None:
+        self.newest = _Newest()
+        super().__init__(("127.0.0.1", port), _Handler)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A client that goes away is no error."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = _CLIENT_TIMEOUT_S
+    server: _Server
+
+    def do_GET(self) -> None:
+        if self.path.split("?", 1)[0] != PATH:
+            self.send_error(404, f"the stream is at {PATH}")
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.flush()
+        number = 0
+        while not self.server.newest.closed:
+            answer = self.server.newest.after(number)
+            if answer is None:
+                continue
+            number, jpeg = answer
+            self.wfile.write(
+                f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n"
+                f"Content-Length: {len(jpeg)}\r\n\r\n".encode()
+                + jpeg
+                + b"\r\n"
+            )
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Requests are not worth a line on the terminal."""
+
+
+class MjpegServer:
+    """Serves the newest of the published pictures on loopback.
+
+    `port` 0 lets the operating system choose. Raises ConnectionFailed when it is taken.
+    """
+
+    def __init__(self, port: int = 0) -> None:
+        try:
+            self._server = _Server(port)
+        except OSError as error:
+            raise ConnectionFailed(
+                f"TCP port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
+            ) from None
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}{PATH}"
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
+        )
+        self._thread.start()
+
+    def publish(self, image: Picture) -> None:
+        """Grey uint8 (h, w). Costs nothing while nobody watches."""
+        self._server.newest.put(image)
+
+    def close(self) -> None:
+        self._server.newest.close()
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()

@@ -33,7 +33,7 @@ from perchctl.geometry import (
     rotation_from_rpy,
 )
 from perchctl.log import recorded_pictures
-from perchctl.log.recording.layout import layout
+from perchctl.log.recording.export import layout
 from perchctl.log.recording.messages import calibration_message
 from perchctl.log.recording.shapes import SCHEMAS
 from perchctl.log.sent import sent_values

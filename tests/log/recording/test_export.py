@@ -10,7 +10,7 @@ import pytest
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.log import export_mcap, recorded_pictures
-from perchctl.log.recording.layout import layout
+from perchctl.log.recording.export import layout
 from perchctl.log.write import FlightLogWriter
 from tests.helpers import log as synthetic
 from tests.helpers import recorded

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from perchctl.vision import Detection, Detections
-from perchctl.vision.markers.motion import predicted_corners, with_motion
+from perchctl.vision.markers.detect import predicted_corners, with_motion
 from tests.helpers.markers import box
 
 
