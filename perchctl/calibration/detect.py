@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.saddle import Room, fit_saddles
 from perchctl.calibration.tags import find_tags
 from perchctl.calibration.types import BoardView, Grey
 from perchctl.geometry import Array
@@ -36,7 +35,7 @@ def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -
 
     Args:
         image: grey, uint8 (h, w).
-        refine: fit the corners (`perchctl.calibration.saddle`); otherwise they are
+        refine: fit the corners (`perchctl.calibration.detect`); otherwise they are
             OpenCV's, with `cv2.cornerSubPix` in the window of OpenCV's own program for
             chessboards, and in Kalibr's for aprilgrids.
 
@@ -180,3 +179,258 @@ def _local_axes(cells: Array, corners: Array) -> tuple[Array, Array]:
     along = (H[:2, 0] - at * H[2, 0]) / w
     down = (H[:2, 1] - at * H[2, 1]) / w
     return along, down
+
+
+# --- The corner where four squares meet, by fitting the picture around it ----------------------
+# `cv2.cornerSubPix` with a fixed window takes in the neighbouring corners of small squares
+# and wastes most of large ones. Here the window follows the square's own size and slant,
+# and the grey levels in it are fitted by what a lens makes of two crossing edges:
+#
+#     I = a + gx x + gy y + (c + hx x + hy y) tanh(d1 / w1) tanh(d2 / w2)
+#
+# with d1, d2 the distances from two lines through the corner and w1, w2 the edges' spread,
+# one for each line since motion blurs them unequally. Light that falls off over the corner
+# scales the contrast too (h); without that term it pulls corners by 0.01 px. Any blur or
+# shift of edges (bloom) that is the same on both sides of the corner leaves the fitted place
+# where it is.
+# All corners of a picture run through the same arrays (Levenberg-Marquardt).
+
+
+MIN_REACH_PX, MAX_REACH_PX = 2.0, 14.0
+GRID = 21  # samples across the largest window
+_ITERATIONS = 25
+_STILL_PX = 5e-4
+_LONGEST: Array = np.array([0.5, 0.5, 0.2, 0.2, 1.0, 1.0])  # step: px, rad, logarithms
+_MIN_SLOPE_PX = 5.0
+_MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
+
+
+@dataclass(frozen=True, eq=False)
+class Saddles:
+    """corners_px (n, 2); ok (n,): the fit holds; sigma_px (n,): its own spread from the
+    grey residuals; width_px (n,): the wider edge's spread."""
+
+    corners_px: Array
+    ok: NDArray[np.bool_]
+    sigma_px: Array
+    width_px: Array
+
+
+@dataclass(frozen=True)
+class Room:
+    """What is around a corner, in squares.
+
+    Attributes:
+        reach: half of the window; the next corner's edges begin at 1.
+        white, black: how far the white and the black squares are of one grey at their rims (a
+            ChArUco board's markers begin in its white squares, a tag's cells in the black).
+    """
+
+    reach: float = 0.42
+    white: float = 1.0
+    black: float = 1.0
+
+
+def fit_saddles(
+    image: NDArray[np.uint8],
+    corners_px: Array,
+    along_px: Array,
+    down_px: Array,
+    room: Room = Room(),
+) -> Saddles:
+    """Refine corners.
+
+    Args:
+        image: grey picture (h, w).
+        corners_px: first guess, good to a fifth of a square, (n, 2).
+        along_px, down_px: the vectors from a corner to its neighbours on the board, as
+            the picture shows them, (n, 2) each.
+        room: how far the picture is of use around a corner.
+    """
+    n = len(corners_px)
+    start = np.asarray(corners_px, dtype=np.float64).reshape(-1, 2)
+    if n == 0:
+        return Saddles(start, np.zeros(0, dtype=np.bool_), np.zeros(0), np.zeros(0))
+    axes = np.stack([along_px, down_px], axis=2)  # (n, 2, 2): board units -> px
+    size_px = _thickness_px(axes)
+    reach = np.clip(
+        room.reach,
+        MIN_REACH_PX / np.maximum(size_px, 1e-6),
+        MAX_REACH_PX / np.maximum(size_px, 1e-6),
+    )
+    uv, offsets = _window(axes, reach)
+    grey, inside = _sample(image, start, offsets)
+    positive = _white_quadrants(grey, uv)
+    weight = inside * _unprinted(uv, positive, room.white, room.reach, size_px)
+    weight *= _unprinted(uv, ~positive, room.black, room.reach, size_px)
+    return _fit(start, axes, offsets, grey, weight, size_px, reach)
+
+
+def _thickness_px(axes: Array) -> Array:
+    """The narrower height of the parallelogram that a square makes, (n,)."""
+    area = np.abs(axes[:, 0, 0] * axes[:, 1, 1] - axes[:, 0, 1] * axes[:, 1, 0])
+    longer = np.linalg.norm(axes, axis=1).max(axis=1)
+    return np.asarray(area / np.maximum(longer, 1e-9))
+
+
+def _window(axes: Array, reach: Array) -> tuple[Array, Array]:
+    """Sample places in board units (n, m, 2) and in px from the corner (n, m, 2)."""
+    t = np.linspace(-1.0, 1.0, GRID)
+    u, v = np.meshgrid(t, t)
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)[None] * reach[:, None, None]
+    return uv, np.einsum("nij,nmj->nmi", axes, uv)
+
+
+def _sample(
+    image: NDArray[np.uint8], centre: Array, offsets: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    places = centre[:, None] + offsets
+    h, w = image.shape
+    inside = (
+        (places[..., 0] >= 0)
+        & (places[..., 0] <= w - 1)
+        & (places[..., 1] >= 0)
+        & (places[..., 1] <= h - 1)
+    )
+    xy = places.astype(np.float32)
+    grey = cv2.remap(image.astype(np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR)
+    return np.asarray(grey, dtype=np.float64), inside
+
+
+def _white_quadrants(grey: Array, uv: Array) -> NDArray[np.bool_]:
+    """Where u v > 0 is white, (n,)."""
+    product = np.sign(uv[..., 0] * uv[..., 1])
+    # Near the corner only: there even a ChArUco board's white is empty.
+    near = np.abs(uv).max(axis=2) < 0.5 * np.abs(uv).max(axis=(1, 2))[:, None]
+    return np.asarray((grey * product * near).sum(axis=1) > 0)
+
+
+def _unprinted(
+    uv: Array, positive: NDArray[np.bool_], margin: float, reach: float, size_px: Array
+) -> Array:
+    """0 inside of what is printed in the squares of one colour (those with u v > 0 where
+    `positive`), and within its blur, else 1, (n, m)."""
+    if margin >= reach:
+        return np.ones(uv.shape[:2])
+    those = (uv[..., 0] * uv[..., 1] > 0) == positive[:, None]
+    clear = np.maximum(margin - 1.0 / np.maximum(size_px, 1e-6), 0.5 * margin)
+    return np.asarray(~(those & (np.abs(uv).min(axis=2) > clear[:, None])), dtype=np.float64)
+
+
+def _fit(
+    start: Array,
+    axes: Array,
+    offsets: Array,
+    grey: Array,
+    weight: Array,
+    size_px: Array,
+    reach: Array,
+) -> Saddles:
+    n = len(start)
+    span_px = reach * size_px
+    # Lines: along u (normal to it: 1) and along v. State: x, y, angle 1, 2, ln w1, ln w2.
+    state = np.zeros((n, 6))
+    state[:, 2] = np.arctan2(axes[:, 0, 0], -axes[:, 1, 0])
+    state[:, 3] = np.arctan2(axes[:, 0, 1], -axes[:, 1, 1])
+    state[:, 4:] = np.log(np.clip(0.12 * size_px, 0.5, 1.5))[:, None]
+    damping = np.full(n, 1e-3)
+    linear, residual, J = _model(state, offsets, grey, weight)
+    cost = (residual**2).sum(axis=1)
+    top = np.log(np.maximum(_MAX_WIDTH_SHARE * span_px, 2 * _MIN_WIDTH_PX))
+    on = np.arange(n)  # those that still move
+    for _ in range(_ITERATIONS):
+        step = _step(J[on], residual[on], damping[on])
+        trial = state[on] + step
+        trial[:, 4:] = np.clip(trial[:, 4:], np.log(_MIN_WIDTH_PX), top[on, None])
+        linear_t, residual_t, J_t = _model(trial, offsets[on], grey[on], weight[on])
+        cost_t = (residual_t**2).sum(axis=1)
+        better = cost_t < cost[on]
+        now = on[better]
+        gained = cost[now] - cost_t[better]
+        state[now], linear[now] = trial[better], linear_t[better]
+        residual[now], J[now], cost[now] = residual_t[better], J_t[better], cost_t[better]
+        damping[on] = np.where(better, damping[on] / 5.0, damping[on] * 5.0).clip(1e-7, 1e3)
+        settled = np.abs(step[:, :2]).max(axis=1) < _STILL_PX
+        settled[better] &= gained < 1e-3 * cost[now] + 1e-9
+        on = on[~settled]
+        if len(on) == 0:
+            break
+    return _judged(start, state, linear, cost, J, weight, span_px)
+
+
+def _step(J: Array, residual: Array, damping: Array) -> Array:
+    """The damped step of each corner, of bounded length, (n, 6)."""
+    A = J.transpose(0, 2, 1) @ J
+    b = (J.transpose(0, 2, 1) @ residual[..., None])[..., 0]
+    scale = np.einsum("nii->ni", A)
+    A[:, range(6), range(6)] += damping[:, None] * scale + 1e-9
+    step = np.nan_to_num(np.linalg.solve(A, b[..., None])[..., 0])
+    return np.asarray(np.clip(step, -_LONGEST, _LONGEST))
+
+
+def _model(state: Array, offsets: Array, grey: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Best a, gx, gy, c, hx, hy for the state (n, 6); weighted residuals (n, m); the derivative of
+    the modelled grey (n, m, 6), freed of what those can take up."""
+    x = offsets[..., 0] - state[:, 0, None]
+    y = offsets[..., 1] - state[:, 1, None]
+    parts = []
+    for k in (0, 1):
+        c, s = np.cos(state[:, 2 + k, None]), np.sin(state[:, 2 + k, None])
+        w = np.exp(state[:, 4 + k, None])
+        d = c * x + s * y
+        t = np.tanh(d / w)
+        parts.append((c, s, w, d, t, 1.0 - t * t, -s * x + c * y))
+    (c1, s1, w1, d1, t1, g1, e1), (c2, s2, w2, d2, t2, g2, e2) = parts
+    u, v, cross = offsets[..., 0], offsets[..., 1], t1 * t2
+    # In a window of few pixels the contrast's slope cannot be distinguished from a shift.
+    slope = cross * (np.abs(offsets).max(axis=(1, 2)) > _MIN_SLOPE_PX)[:, None]
+    base = np.stack([np.ones_like(x), u, v, cross, u * slope, v * slope], axis=2)
+    base *= weight[..., None]
+    turned = base.transpose(0, 2, 1)
+    normal = turned @ base
+    normal[:, range(6), range(6)] += 1e-9
+    inverse = np.linalg.inv(normal)
+    wanted = weight * grey
+    linear = (inverse @ (turned @ wanted[..., None]))[..., 0]
+    residual = wanted - (base @ linear[..., None])[..., 0]
+    q1, q2 = g1 * t2 / w1, g2 * t1 / w2
+    gain = linear[:, 3, None] + linear[:, 4, None] * u + linear[:, 5, None] * v
+    contrast = (gain * weight)[..., None]
+    J = contrast * np.stack(
+        [-(c1 * q1 + c2 * q2), -(s1 * q1 + s2 * q2), e1 * q1, e2 * q2, -d1 * q1, -d2 * q2], axis=2
+    )
+    J -= base @ (inverse @ (turned @ J))
+    return linear, residual, J
+
+
+def _judged(
+    start: Array,
+    state: Array,
+    linear: Array,
+    cost: Array,
+    J: Array,
+    weight: Array,
+    span_px: Array,
+) -> Saddles:
+    samples = weight.sum(axis=1)
+    noise2 = cost / np.maximum(samples - 12.0, 1.0)
+    # Samples lie closer than pixels do: neighbours share their noise.
+    pixels = np.minimum(1.0, (2.0 * span_px / GRID) ** 2)
+    A = (J.transpose(0, 2, 1) @ J) * pixels[:, None, None]
+    A[:, range(6), range(6)] += 1e-9
+    covariance = np.linalg.inv(A) * noise2[:, None, None]
+    sigma = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 0.0) / 2.0)
+    contrast = np.abs(linear[:, 3])
+    shift = np.linalg.norm(state[:, :2], axis=1)
+    crossing = np.abs(np.sin(state[:, 2] - state[:, 3]))
+    ok = (
+        np.isfinite(state).all(axis=1)
+        & (samples > 0.4 * GRID * GRID * 0.5)
+        & (contrast > 4.0)
+        & (np.sqrt(noise2) < 0.45 * contrast)
+        & (shift < np.maximum(1.5, 0.6 * span_px))
+        & (crossing > 0.1)
+        & (sigma < 0.5)
+    )
+    corners = np.where(ok[:, None], start + state[:, :2], start)
+    return Saddles(corners, ok, sigma, np.exp(state[:, 4:]).max(axis=1))

@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
+from perchctl.calibration.check import Level, level, limit_mm, sentence
 from perchctl.calibration.lens import PARAMETERS
 from perchctl.calibration.predict import distortion_curve, ray_errors_px
 from perchctl.calibration.types import Calibration
-from perchctl.calibration.verdict import Level, level, limit_mm, sentence
 from perchctl.geometry import Array
 from perchctl.plot import (
     BLACK,

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from perchctl.calibration.check import CheckResult
+from perchctl.calibration.check import CheckResult, level, limit_mm, sentence
 from perchctl.calibration.lens import PARAMETERS
 from perchctl.calibration.types import Calibration, Rejection
-from perchctl.calibration.verdict import level, limit_mm, sentence
 from perchctl.vision import CameraModel
 
 _MOST_MISSING = 8

@@ -20,6 +20,7 @@ from .criteria import tilt_problem as tilt_problem
 from .criteria import too_near_problem as too_near_problem
 from .criteria import unmeasured_problem as unmeasured_problem
 from .criteria import unsettled_problem as unsettled_problem
+from .hands import defer_interrupts as defer_interrupts
 from .hands import flight_order as flight_order
 from .hands import flight_processes as flight_processes
 from .hands import run_order as run_order
@@ -38,8 +39,6 @@ from .lockstep import with_positioning as with_positioning
 from .loop import RESCUED as RESCUED
 from .loop import FlightParts as FlightParts
 from .loop import fly as fly
-from .memory import give_back_memory as give_back_memory
-from .memory import peak_memory_mb as peak_memory_mb
 from .outside import external_height_problem as external_height_problem
 from .outside import millimetres_problem as millimetres_problem
 from .outside import nearest_axis as nearest_axis
@@ -47,14 +46,16 @@ from .outside import world_problem as world_problem
 from .preflight import out_of_view as out_of_view
 from .preflight import place_seen as place_seen
 from .preflight import target_from as target_from
-from .rates import rate_record as rate_record
-from .rates import rate_text as rate_text
 from .results import FlightResult as FlightResult
 from .results import align_columns as align_columns
 from .results import campaign_summary as campaign_summary
 from .results import campaign_table as campaign_table
+from .results import give_back_memory as give_back_memory
 from .results import none_took_off_text as none_took_off_text
 from .results import peak_mb as peak_mb
+from .results import peak_memory_mb as peak_memory_mb
+from .results import rate_record as rate_record
+from .results import rate_text as rate_text
 from .results_file import campaign_header as campaign_header
 from .results_file import commit_of as commit_of
 from .results_file import open_results as open_results
@@ -77,7 +78,6 @@ from .sweep import sweep_grid as sweep_grid
 from .sweep import sweep_record as sweep_record
 from .sweep import sweep_results as sweep_results
 from .sweep import sweep_text as sweep_text
-from .uninterrupted import defer_interrupts as defer_interrupts
 from .variants import VariantResult as VariantResult
 from .variants import fly_variants as fly_variants
 from .variants import whole_seeds as whole_seeds

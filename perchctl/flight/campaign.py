@@ -16,10 +16,9 @@ from typing import Any, TypeVar
 import cv2
 
 from perchctl.errors import PerchError, SafetyAbort, TimedOut
+from perchctl.flight.hands import defer_interrupts
 from perchctl.flight.lockstep import LockstepFlight, fly_lockstep
-from perchctl.flight.memory import give_back_memory, peak_memory_mb
-from perchctl.flight.results import FlightEnd, FlightResult
-from perchctl.flight.uninterrupted import defer_interrupts
+from perchctl.flight.results import FlightEnd, FlightResult, give_back_memory, peak_memory_mb
 from perchctl.log import FlightSummary, LogWatcher
 from perchctl.mission import Event, EventKeeper, Phase, Watcher
 from perchctl.profile import Profile

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, bootstrap
 
-from perchctl.flight.rates import LEVEL, rate_record, rate_text
-from perchctl.flight.results import FlightResult, align_columns
+from perchctl.flight.results import LEVEL, FlightResult, align_columns, rate_record, rate_text
 
 FEWEST_PAIRS = 20
 """An interval of fewer would promise too much: of 8 pairs a bootstrap's is wrong five times as

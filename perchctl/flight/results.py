@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import gc
+import resource
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
+from scipy.special import betaincinv
 
 from perchctl.errors import SafetyAbort
-from perchctl.flight.memory import peak_memory_mb
-from perchctl.flight.rates import rate_record, rate_text
 from perchctl.sim import Scenario
 
 FlightEnd = Literal["perched", "landed", "aborted", "refused"]
@@ -194,3 +198,75 @@ def campaign_rows(
         rows.append(("real-time factor", f"{figures['realtime_factor']:.1f}"))
     rows.append(("peak memory [MB]", f"{figures['peak_memory_mb']:.0f}"))
     return rows
+
+
+# --- Rates as what is known of them: k of n, and the interval that the true rate is in ---------
+
+
+LEVEL = 0.95
+
+
+def rate_interval(k: int, n: int, level: float = LEVEL) -> tuple[float, float]:
+    """Where the true rate is after `k` of `n`: the exact interval of Clopper and Pearson (1934),
+    which holds it in at least `level` of all campaigns; half of the rest is on either side.
+    Nothing seen is (0, 1). Raises ValueError where `k` of `n` cannot be."""
+    if not 0 <= k <= n:
+        raise ValueError(f"{k} of {n} is no rate")
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"a level is between 0 and 1, found {level}")
+    side = 0.5 * (1.0 - level)
+    low = float(betaincinv(k, n - k + 1, side)) if k else 0.0
+    high = float(betaincinv(k + 1, n - k, 1.0 - side)) if k < n else 1.0
+    return low, high
+
+
+def rate_text(k: int, n: int, level: float = LEVEL) -> str:
+    """``97 of 100 (91.5 to 99.4 %)``, ``100 of 100 (>= 96.4 %)``, ``0 of 100 (<= 3.6 %)``."""
+    if n == 0:
+        return "0 of 0"
+    low, high = (100.0 * bound for bound in rate_interval(k, n, level))
+    if k == n:
+        return f"{k} of {n} (>= {low:.1f} %)"
+    if k == 0:
+        return f"{k} of {n} (<= {high:.1f} %)"
+    return f"{k} of {n} ({low:.1f} to {high:.1f} %)"
+
+
+def rate_record(k: int, n: int, level: float = LEVEL) -> dict[str, float | list[float]]:
+    """For JSON: `rate` and its `interval`; empty where nothing was seen."""
+    if n == 0:
+        return {}
+    return {"rate": round(k / n, 6), "interval": [round(b, 6) for b in rate_interval(k, n, level)]}
+
+
+# --- How much memory a campaign takes ----------------------------------------------------------
+
+
+_STATUS = Path("/proc/self/status")
+_RSS_UNIT = 1 if sys.platform == "darwin" else 1024  # getrusage's, bytes
+
+
+def give_back_memory() -> None:
+    """What a flight leaves behind. Its objects know of each other, so Python frees them when it
+    next looks through everything, which may be many flights later; and the C library keeps what
+    it is given back in pieces."""
+    gc.collect()
+    if not gc.get_freeze_count():
+        # What is left are the program's own modules and what it keeps for all flights: nothing
+        # to look through again and again, which takes as long as 30 pictures.
+        gc.freeze()
+    with contextlib.suppress(AttributeError, OSError):  # glibc has it, others do not
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def peak_memory_mb() -> float:
+    """The most that this process, or any that it has waited for, ever held (1e6 bytes)."""
+    own, ended = (
+        resource.getrusage(who).ru_maxrss * _RSS_UNIT * 1e-6
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    # Linux hands a program the peak of the one that started it; its own is told elsewhere.
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        lines = _STATUS.read_text().splitlines()
+        own = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) * 1024e-6
+    return max(own, ended)

@@ -20,8 +20,7 @@ from perchctl.flight.compared import (
     success_verdict,
     variants_record,
 )
-from perchctl.flight.rates import rate_record, rate_text
-from perchctl.flight.results import FlightResult, align_columns
+from perchctl.flight.results import FlightResult, align_columns, rate_record, rate_text
 from perchctl.profile import (
     Profile,
     changed_profile,

@@ -255,3 +255,21 @@ class CflibLink:
                     self._told(SentCommand(at_s, "farewell", FAREWELL))
         else:
             connection.abandon()
+
+
+# --- A vehicle's state estimate, read and nothing else: no parameter set, nothing armed --------
+
+
+class EstimateLink(CflibLink):
+    """A `CflibLink` that commands nothing, not even at its end. Errors as there."""
+
+    def close(self) -> None:
+        """Leave at once and without cflib's farewell: the vehicle may fly for another."""
+        self._leave(farewell=False)
+
+    def _may_say_farewell(self) -> bool:
+        return False  # neither when connecting fails half-way
+
+    def _prepare(self, connection: Connection) -> None:
+        check_firmware(connection.cf, self._uri)
+        self._start_logging(connection)

@@ -16,9 +16,8 @@ import numpy as np
 from perchctl.calibration import AttitudeSample
 from perchctl.errors import NotFound, TimedOut
 from perchctl.geometry import Array
-from perchctl.link.cflib_link import SILENCE_S
+from perchctl.link.cflib_link import SILENCE_S, EstimateLink
 from perchctl.link.connection import Connection
-from perchctl.link.estimate import EstimateLink
 from perchctl.link.log_blocks import FIRST_SAMPLE_TIMEOUT_S, start_block
 from perchctl.link.prepare import check_firmware
 from perchctl.link.telemetry import VARIANCE_BLOCK

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from perchctl.errors import NotFound, TimedOut
+from perchctl.link.cflib_link import EstimateLink
 from perchctl.link.connection import Connection, send_packets
-from perchctl.link.estimate import EstimateLink
 from perchctl.link.prepare import missing_variables
 from perchctl.link.variables import has_variable, parameters, variables
 from perchctl.profile import LinkConfig

@@ -5,9 +5,9 @@ from .compare.table import comparison_text as comparison_text
 from .compare.table import profile_differences as profile_differences
 from .exact import from_exact as from_exact
 from .exact import to_exact as to_exact
-from .export.as_csv import csv_text as csv_text
 from .export.as_parquet import check_parquet as check_parquet
 from .export.as_parquet import parquet_bytes as parquet_bytes
+from .export.table import csv_text as csv_text
 from .export.table import log_columns as log_columns
 from .frames import log_frames as log_frames
 from .frames import shows_target as shows_target

@@ -58,3 +58,15 @@ def cannot_start(path: Path, error: OSError) -> str:
         f"{path}: the flight log cannot be created ({error.strerror or error}): free the place, "
         f"or {_ELSEWHERE}"
     )
+
+
+# --- Where a recording lies --------------------------------------------------------------------
+
+
+SUFFIX = ".mcap"
+LAYOUT_SUFFIX = ".foxglove.json"
+
+
+def recording_path(path: Path | str) -> Path:
+    """The recording's place, of a log's path or the recording's own."""
+    return path_beside(path, SUFFIX)

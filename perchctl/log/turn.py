@@ -1,6 +1,6 @@
 """A turn of the loop as a record of the flight log, whole and exact.
 
-The record's keys are the fields of `perchctl.mission.turn.Turn`; nothing is rounded.
+The record's keys are the fields of `perchctl.mission.watch.Turn`; nothing is rounded.
 """
 
 from __future__ import annotations

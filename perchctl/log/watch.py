@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from perchctl.camera import FrameSource, WatchedSource
 from perchctl.log.fields import event_record, tick_record
-from perchctl.log.place import log_path
+from perchctl.log.place import SUFFIX, log_path, recording_path
 from perchctl.log.read import PhaseSpan
-from perchctl.log.recording.place import SUFFIX, recording_path
 from perchctl.log.sent import sent_values
 from perchctl.log.summary import FlightSummary, recording_values
 from perchctl.log.write import FlightLogWriter, make_header

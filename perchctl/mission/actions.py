@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from perchctl.mission import lander
 from perchctl.mission.context import Context
+from perchctl.mission.guards import sinking
 from perchctl.mission.guidance import (
     FREE_SPEED_MPS,
     LIFTED_M,
@@ -23,7 +24,6 @@ from perchctl.mission.guidance import (
     unpressed,
     walk,
 )
-from perchctl.mission.hold import sinking
 from perchctl.mission.release import (
     Acted,
     catch,

@@ -5,10 +5,8 @@
 
 from __future__ import annotations
 
-from perchctl.mission.row import Row
-from perchctl.mission.safety import AIR, BEFORE_CONTACT, BY_CAMERA, IN_THE_OPEN
 from perchctl.mission.state import FLYING_PHASES, Phase
-from perchctl.mission.table import TABLE
+from perchctl.mission.table import AIR, BEFORE_CONTACT, BY_CAMERA, IN_THE_OPEN, TABLE, Row
 
 _GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
     (AIR, "in the air"),

@@ -20,13 +20,11 @@ from perchctl.mission.conditions import (
     touched_aside_m,
 )
 from perchctl.mission.context import Context
+from perchctl.mission.guards import hold_reason
 from perchctl.mission.guidance import presses
-from perchctl.mission.hold import hold_reason
 from perchctl.mission.imu import led_astray
 from perchctl.mission.mounting import MountWatch, sight_of, watched
 from perchctl.mission.release import catch_above_m, is_carried
-from perchctl.mission.row import Row, risen
-from perchctl.mission.safety import IN_THE_OPEN
 from perchctl.mission.state import (
     TERMINALS,
     Condition,
@@ -35,7 +33,7 @@ from perchctl.mission.state import (
     Phase,
     PlannerState,
 )
-from perchctl.mission.table import TABLE, first_match
+from perchctl.mission.table import IN_THE_OPEN, TABLE, Row, first_match, risen
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import Command

@@ -9,15 +9,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from perchctl.geometry import Array
-from perchctl.log import shows_target
+from perchctl.log import FlightLog, shows_target, summarise_flight
+from perchctl.mission import Findings, flight_findings
+from perchctl.profile import CameraConfig
 from perchctl.report.edges import LinkHealth, OutsideHealth
 from perchctl.report.energy import EnergyHistory
-from perchctl.report.findings import findings_in
 from perchctl.report.sight import Sight, part_of
 from perchctl.report.track import Track
 from perchctl.report.words import count, length, milliseconds, share, times
+from perchctl.vision import Consistency
 
 SWING_M, LEAST_SWINGS = 0.03, 4
 """Farther than that to both sides of the target, one after the other."""
@@ -294,3 +297,36 @@ def _number(value: Any) -> float | None:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     return float(value) if math.isfinite(value) else None
+
+
+# --- Latency and mounting as a flight showed them, also where its log has no end ---------------
+
+
+WORKED_OUT = (
+    "delay_s",
+    "delay_sigma_s",
+    *(f"turn_{axis}{part}_rad" for axis in "xyz" for part in ("", "_sigma")),
+)
+
+
+def findings_in(log: FlightLog) -> Findings | None:
+    """The summary's; else what the last ticks had worked out. None where neither is there."""
+    if log.summary is not None:
+        return summarise_flight(log).findings
+    newest = next(
+        (r for r in reversed(log.records) if all(r.get(k) is not None for k in WORKED_OUT)), None
+    )
+    profile = log.header.get("profile")
+    if newest is None or not isinstance(profile, dict):
+        return None
+    try:
+        camera = CameraConfig.model_validate(profile.get("camera"))
+    except ValidationError:  # of an older perchctl
+        return None
+    seen = Consistency(
+        delay_s=newest["delay_s"],
+        delay_sigma_s=newest["delay_sigma_s"],
+        turn_rad=tuple(newest[f"turn_{axis}_rad"] for axis in "xyz"),
+        turn_sigma_rad=tuple(newest[f"turn_{axis}_sigma_rad"] for axis in "xyz"),
+    )
+    return flight_findings(seen, camera)

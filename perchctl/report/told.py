@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from perchctl.errors import PerchError
 from perchctl.log import FlightLog, FlightSummary, summarise_flight
 from perchctl.mission import Findings
-from perchctl.report.advice import Advice, advice_of
+from perchctl.report.advice import Advice, advice_of, findings_in
 from perchctl.report.edges import LinkHealth, OutsideHealth, link_of, outside_of
 from perchctl.report.energy import EnergyHistory, energy_history
-from perchctl.report.findings import findings_in
 from perchctl.report.losses import losses_of
 from perchctl.report.sight import Sight, sight_of
 from perchctl.report.story import Sentence, story_of

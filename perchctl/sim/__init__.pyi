@@ -17,6 +17,7 @@ from .firmware import Firmware as Firmware
 from .firmware.controller import Estimate as Estimate
 from .hand import draw_hand as draw_hand
 from .hand import record_hand as record_hand
+from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import most_thrust_n as most_thrust_n
 from .process.handle import SimProcess as SimProcess
 from .process.shared import CLOCK_MARGIN_S as CLOCK_MARGIN_S
@@ -25,7 +26,6 @@ from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
 from .scenario import Neighbour as Neighbour
 from .scenario import Scenario as Scenario
-from .thrust_curve import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .told import EventExplainer as EventExplainer
 from .vehicle import SimulatedVehicle as SimulatedVehicle
 from .world import REST_HEIGHT_M as REST_HEIGHT_M

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from perchctl.profile import SimulationConfig
-from perchctl.sim.gusts import Gust
+from perchctl.sim.scenario import Gust
 
 _STREAM = 21
 _AIR, _CELL, _TILT, _LAMP, _FLOW, _FLOOR, _RADIO, _CAPTURE = range(8)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-
-from perchctl.sim.gusts import Gust
 
 CONTROL_PERIOD_S = 0.002
 """Step of the physics and of the firmware model (500 Hz)."""
@@ -54,7 +54,7 @@ class Scenario:
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
         draught_mps: the wind with its smooth gusts (`perchctl.sim.world`).
-        gusts: single ones beside it (`perchctl.sim.gusts`).
+        gusts: single ones beside it (`perchctl.sim.scenario`).
         ceiling_suction: share of thrust gained with the rotors' plane at the ceiling.
         magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
@@ -151,3 +151,32 @@ class Scenario:
     gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
+
+
+# --- Single gusts: a door, a passer-by, an air conditioner that starts -------------------------
+# Each is the "one minus cosine" by which gusts are modelled in aviation (MIL-F-8785C): smooth
+# from nothing to its peak and back, once.
+
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Gust:
+    """Blows from `start_s` for `length_s`, at the most with `peak_mps` (world axes)."""
+
+    start_s: float
+    length_s: float
+    peak_mps: Vector
+
+
+def blown(gusts: Sequence[Gust], t_s: float) -> Vector:
+    """What all of them add to the wind at that time, m/s."""
+    x = y = z = 0.0
+    for gust in gusts:
+        phase = (t_s - gust.start_s) / gust.length_s
+        if 0.0 < phase < 1.0:
+            share = 0.5 * (1.0 - math.cos(2.0 * math.pi * phase))
+            px, py, pz = gust.peak_mps
+            x, y, z = x + share * px, y + share * py, z + share * pz
+    return (x, y, z)

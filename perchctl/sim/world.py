@@ -6,7 +6,7 @@ origin on the floor under the start. One `World.step` is one `CONTROL_PERIOD_S`.
 Assumptions of the model, each with its source:
 
 - Motors: `perchctl.sim.powertrain`; their battery: `perchctl.sim.cell`; the curve between a
-  motor's voltage and its thrust: `perchctl.sim.thrust_curve`.
+  motor's voltage and its thrust: `perchctl.sim.powertrain`.
 - Drag is linear in the airspeed. Of a Crazyflie's four rotors 9.2e-7 N/(m/s) level and
   10.3e-7 vertically a rad/s of their summed speed have been identified (Foerster, ETH
   Zurich, 2015); lifting 42 g they turn at 7600 rad/s together (2.9e-8 N/(rad/s)^2
@@ -42,9 +42,8 @@ from perchctl.geometry import (
 )
 from perchctl.sim.carried import Stop, Way
 from perchctl.sim.cell import RESISTANCE_OHM, CellKind
-from perchctl.sim.gusts import blown
 from perchctl.sim.powertrain import Powertrain
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario, blown
 
 ARM_M = 0.046  # hub to motor axis, X configuration
 YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust

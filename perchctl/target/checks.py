@@ -19,7 +19,7 @@ from perchctl.target.drawing import (
     marker_cells,
 )
 from perchctl.target.lengths import mm_text
-from perchctl.target.reading import PlainReader
+from perchctl.target.limits import PlainReader
 from perchctl.vision import MARKERS
 
 RING_RANGE_PER_LARGE_SIDE = (RING_MIN_PER_LARGE_SIDE, 9.0 / 150.0)

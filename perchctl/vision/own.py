@@ -3,7 +3,7 @@
 Several vehicles may hang under one ceiling, each with its target. Where ids do not tell these
 apart, the place does: the one counts that is nearest to where the profile says that the own one
 is, in the world of the state estimate, or else to the upward axis through the gear. That
-decides once; from then on the lock (`perchctl.vision.gate`) stays with the one that was chosen.
+decides once; from then on the lock (`perchctl.vision.tracks`) stays with the one that was chosen.
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ from perchctl.geometry import R_MARKER_TARGET, Array, finite, yaw_of
 from perchctl.profile import PoseConfig, TargetConfig
 from perchctl.values import replace
 from perchctl.vision.camera_model import undistort_px
-from perchctl.vision.curl import lift_of
 from perchctl.vision.points import Points, make_points
 from perchctl.vision.solve import (
     PoseCandidate,
@@ -32,6 +31,7 @@ from perchctl.vision.solve import (
     covariance,
     flat,
     gauss_newton,
+    lift_of,
     mirror_solution,
     solve,
 )

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from perchctl.geometry import Array, wrap_rad
 from perchctl.profile import KalmanConfig
 from perchctl.values import replace
-from perchctl.vision.filter import POSITION, FilterSetup, Measurement, make_filter, step_track
-from perchctl.vision.gate import Sight, Verdict, judged, locked, remembered
+from perchctl.vision.filter import (
+    MAX_TRACK_GAP_S,
+    POSITION,
+    FilterSetup,
+    Measurement,
+    foreseen,
+    foreseen_z,
+    make_filter,
+    start_track,
+    step_track,
+)
 from perchctl.vision.own import NOWHERE, OwnTargetPlace, refusal
 from perchctl.vision.places import measurement
 from perchctl.vision.pose import PoseSetup
@@ -158,3 +169,263 @@ def _stepped(
     """All tracks one frame on."""
     tracks = {n: step_track(old.get(n), fed.get(n), t_s, constants) for n in names}
     return {n: track for n, track in tracks.items() if track is not None}
+
+
+# --- Whether a pose is the target's that was locked on -----------------------------------------
+# Something else can look like the target: one more of it, a smaller one, or one of its markers,
+# lone and of another size. In a picture it cannot be told from the target, but the target does not
+# jump. A pose that contradicts the lock by more than noise, motion and drift explain is a
+# stranger's and feeds no filter; the planner then sees a target that is not measured. The stranger
+# is watched: as long as it goes on it stays one, however vague the lock becomes meanwhile.
+#
+# The lock goes over to a stranger explicitly: to one that rests on both markers, at once if the
+# lock never did, or, if it is as far away as the target was, after `REACQUIRE_S` in which the
+# target was not seen, though its place is in the picture; and to any that was seen more often than
+# a lock that is hardly begun. A lock that nothing has confirmed for `FORGET_S` is forgotten.
+#
+# One pose a picture is judged. While something is seen where the lock is, be it a lone marker of
+# the size that is expected, the search (`perchctl.vision.markers.search.choose`) hands on that, and
+# no whole target beside it: with or without `detector.window`. So a lock on a lone look-alike goes
+# over to a whole target once the look-alike is out of sight, and not before.
+#
+# Where the state estimate jumps, the target seems to jump in the world, but not in the picture:
+# a pose that goes on from the last one relative to the vehicle, though not in the world, is the
+# target's, too.
+
+
+REACQUIRE_S, REACQUIRE_FRAMES = 3.0, 30
+FORGET_S = 10.0
+ESTABLISHED_FRAMES = 5
+"""A lock of fewer frames was perhaps no target: a stranger that was seen more often counts more."""
+
+_JUMPED = "the state estimate jumped, the target did not"
+_GATE = 25.0  # squared distance in four dimensions: by chance in 5 of 100 000
+_SAME_RANGE = 4.0  # standard deviations
+# What no covariance knows of: calibration, print, latency; beside it a share of the range.
+_LEAST_M, _LEAST_YAW_RAD = 0.01, math.radians(4.0)
+_SIDEWAYS, _ALONG = 0.015, 0.02
+_PLACE: Array = np.diag([0.0, 1.0, 1.0, 1.0])
+_TURNED_RAD = math.radians(15.0)  # worth a word
+# How a hovering vehicle moves relative to the target while its estimate jumps.
+_CALM_S, _CALM_MPS, _CALM_RADPS = 0.35, 0.3, 0.5
+_EXPLAINED = 0.25  # most that the picture may show of a jump, of squared misfits
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A frame's pose, as a measurement of the tracks; `whole` if it rests on both markers;
+    `looks_there` if the lock's place is in the picture."""
+
+    t_s: float
+    pose: MarkerPose
+    measured: Measurement
+    in_world: bool
+    whole: bool
+    looks_there: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Whether the pose is the target's; if so, whether the tracks have to begin anew there,
+    else whose it is; and a sentence for people where that is not as ever. `same`: though the
+    tracks begin anew, it is the target that was locked on."""
+
+    taken: bool
+    afresh: bool = False
+    same: bool = False
+    stranger: Stranger | None = None
+    text: str = ""
+    refused: bool = False  # another vehicle's, by its place
+
+
+def judged(
+    lock: Lock | None, stranger: Stranger | None, sight: Sight, constants: FilterSetup
+) -> Verdict:
+    """The verdict on a frame's pose."""
+    lock, stranger = remembered(lock, stranger, sight.t_s)
+    if stranger is not None and stranger.in_world != sight.in_world:
+        stranger = None
+    if lock is None or lock.in_world != sight.in_world:
+        return Verdict(taken=True)
+    if sight.t_s <= lock.track.t_s:  # the tracks are beyond it
+        return Verdict(taken=False, stranger=stranger)
+    if stranger is None and _clearly(lock.track, sight, constants):
+        return Verdict(taken=True)
+    wanted = _expected(lock.track, sight.t_s, constants)
+    fit = _misfit(wanted, sight, constants)
+    other = None
+    if stranger is not None:
+        other = _misfit(_expected(stranger.track, sight.t_s, constants), sight, constants)
+    theirs = other is not None and other.squared <= _GATE
+    if fit.squared <= _GATE and not (theirs and other is not None and other.cost < fit.cost):
+        return Verdict(taken=True, stranger=stranger)
+    if not theirs and _goes_on(lock, sight, fit):
+        return Verdict(taken=True, afresh=True, same=True, text=_JUMPED)
+    seen = _watched(stranger if theirs else None, sight, fit, constants)
+    if _believed(lock, seen, sight):
+        text = f"target taken up anew, {fit.away_m:.2f} m from where it was"
+        return Verdict(taken=True, afresh=True, text=text)
+    return Verdict(taken=False, stranger=seen, text=f"not the tracked target: {seen.text}")
+
+
+def remembered(
+    lock: Lock | None, stranger: Stranger | None, t_s: float
+) -> tuple[Lock | None, Stranger | None]:
+    """What of both still counts."""
+    if stranger is not None and not 0.0 <= t_s - stranger.track.t_s <= MAX_TRACK_GAP_S:
+        stranger = None
+    if lock is None:
+        return None, None
+    age_s = t_s - lock.track.t_s
+    # A place in the level frame means nothing for long, but a stranger stays a stranger.
+    lasting = lock.in_world or stranger is not None
+    # A clock that was set back: nothing that is older than it will be confirmed.
+    if age_s < -MAX_TRACK_GAP_S or age_s > (FORGET_S if lasting else MAX_TRACK_GAP_S):
+        return None, None
+    return lock, stranger
+
+
+def locked(lock: Lock | None, track: MarkerTrack, sight: Sight, verdict: Verdict) -> Lock:
+    """The lock after a pose that was taken; `track` is what it fed."""
+    anew = verdict.afresh and not verdict.same
+    before = None if lock is None or anew or lock.in_world != sight.in_world else lock
+    return Lock(
+        track=track,
+        pose=sight.pose,
+        in_world=sight.in_world,
+        frames=1 if before is None else before.frames + 1,
+        whole=sight.whole or (before is not None and before.whole),
+    )
+
+
+# --- how well a pose fits ----------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """By how much it is off (4,); its square in units of its spread S (4, 4); how far away (m),
+    how far turned, how much farther up (m), and whether that alone is too much."""
+
+    off: Array
+    squared: float
+    S: Array
+    away_m: float
+    turned_rad: float
+    farther_m: float
+    another_range: bool
+
+    @property
+    def cost(self) -> float:
+        """The squared distance with what a vaguer claim costs."""
+        return self.squared + float(np.linalg.slogdet(self.S)[1])
+
+
+def _expected(track: MarkerTrack, t_s: float, constants: FilterSetup) -> Measurement:
+    """What a measurement at a later time should be, however late: what is not measured
+    drifts."""
+    ahead = foreseen(track, t_s, constants)
+    # The most that it drifts counts as three standard deviations.
+    drift_m = min(constants.drift_mps, 1.0) / 3.0 * max(t_s - track.t_s, 0.0)
+    assert ahead.R is not None
+    return replace(ahead, R=ahead.R + drift_m**2 * _PLACE)
+
+
+def _misfit(wanted: Measurement, sight: Sight, constants: FilterSetup) -> _Fit:
+    measured = sight.measured
+    assert wanted.R is not None
+    assert wanted.bias is not None
+    off = measured.z - wanted.z
+    off[0] = wrap_rad(float(off[0]))
+    # A constant error moves both.
+    bias = wanted.bias if measured.bias is None else measured.bias - wanted.bias
+    R = constants.R if measured.R is None else measured.R
+    S = wanted.R + R + bias @ bias.T + np.diag(_unclaimed(_range_m(sight)) ** 2)
+    return _Fit(
+        off=off,
+        squared=float(off @ np.linalg.solve(S, off)),
+        S=S,
+        away_m=float(np.linalg.norm(off[1:])),
+        turned_rad=abs(float(off[0])),
+        farther_m=float(off[3]),
+        another_range=bool(off[3] ** 2 > _SAME_RANGE**2 * S[3, 3]),
+    )
+
+
+def _clearly(track: MarkerTrack, sight: Sight, constants: FilterSetup) -> bool:
+    """Whether what no pose claims explains it all, as in most frames: no other spread can
+    make that too little."""
+    off = sight.measured.z - foreseen_z(track, sight.t_s, constants)
+    off[0] = wrap_rad(float(off[0]))
+    off /= _unclaimed(_range_m(sight))
+    return float(off @ off) <= _GATE
+
+
+def _range_m(sight: Sight) -> float:
+    return math.hypot(*sight.pose.tvec_m.tolist())
+
+
+def _unclaimed(range_m: float) -> Array:
+    """Spread of (yaw, x, y, z) that no pose claims."""
+    sideways_m, along_m = _LEAST_M + _SIDEWAYS * range_m, _LEAST_M + _ALONG * range_m
+    return np.array([_LEAST_YAW_RAD, sideways_m, sideways_m, along_m])
+
+
+def _goes_on(lock: Lock, sight: Sight, fit: _Fit) -> bool:
+    """Whether the pose goes on from the last one as seen from the vehicle, much better than
+    in the world (`fit`): what is off in both did not come about by the estimate."""
+    dt_s = sight.t_s - lock.track.t_s
+    if not sight.in_world or dt_s > _CALM_S:
+        return False
+    range_m = _range_m(sight)
+    off = np.array([wrap_rad(sight.pose.e_yaw_rad - lock.pose.e_yaw_rad), 0.0, 0.0, 0.0])
+    off[1:] = sight.pose.e_m - lock.pose.e_m
+    moved_m = math.hypot(_CALM_MPS, _CALM_RADPS * range_m) * dt_s
+    moved = np.array([_CALM_RADPS * dt_s, moved_m, moved_m, moved_m])
+    unclaimed = _unclaimed(range_m)
+    seen, jumped = (float(((o / unclaimed) ** 2).sum()) for o in (off, fit.off))
+    calm = float((off * off / (unclaimed**2 + moved * moved)).sum()) <= _GATE
+    return calm and seen < _EXPLAINED * jumped
+
+
+# --- strangers ---------------------------------------------------------------------
+
+
+def _watched(before: Stranger | None, sight: Sight, fit: _Fit, constants: FilterSetup) -> Stranger:
+    if before is not None:
+        track = step_track(before.track, sight.measured, sight.t_s, constants)
+        assert track is not None
+        whole = before.whole + int(sight.whole)
+        return replace(before, track=track, frames=before.frames + 1, whole=whole)
+    where = f"{fit.away_m:.2f} m away from it"
+    if fit.turned_rad > _TURNED_RAD:
+        where += f" and turned by {math.degrees(fit.turned_rad):.0f} deg"
+    if fit.another_range:
+        where = f"{abs(fit.farther_m):.2f} m {'above' if fit.farther_m > 0.0 else 'below'} it"
+        where += ", or of another size"
+    return Stranger(
+        track=start_track(sight.measured, sight.t_s, constants),
+        in_world=sight.in_world,
+        since_s=sight.t_s,
+        frames=1,
+        whole=int(sight.whole),
+        another_range=fit.another_range,
+        text=where,
+    )
+
+
+def _believed(lock: Lock, stranger: Stranger, sight: Sight) -> bool:
+    """Whether the target is there now, and not where the lock has it."""
+    if lock.frames < ESTABLISHED_FRAMES and stranger.frames > lock.frames:
+        return True
+    if stranger.whole < ESTABLISHED_FRAMES or not sight.whole:
+        return False
+    if not lock.whole:
+        return True
+    unseen_s = sight.t_s - max(stranger.since_s, lock.track.t_s)
+    # What is not looked at is not empty; where the estimate jumped, it is looked for in vain.
+    return (
+        (sight.looks_there or unseen_s >= 2.0 * REACQUIRE_S)
+        and not stranger.another_range
+        and stranger.whole >= REACQUIRE_FRAMES
+        and unseen_s >= REACQUIRE_S
+    )

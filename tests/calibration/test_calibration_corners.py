@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import BoardView, Grey
-from perchctl.calibration.detect import find_board
-from perchctl.calibration.saddle import fit_saddles
+from perchctl.calibration.detect import find_board, fit_saddles
 from perchctl.geometry import Array
 from perchctl.target import parse_board
 from perchctl.vision import project

@@ -13,10 +13,10 @@ import pytest
 
 from perchctl.calibration import BoardView, calibrate_camera, check_calibration, views_of_images
 from perchctl.calibration.bundle import start_fit
-from perchctl.calibration.covariance import lens_covariance
+from perchctl.calibration.check import level, limit_mm, sentence
 from perchctl.calibration.lens import make_camera, parameters_of, pixel_derivatives, rays_of
 from perchctl.calibration.predict import position_errors_mm, predict_errors, ray_difference_px
-from perchctl.calibration.verdict import level, limit_mm, sentence
+from perchctl.calibration.solve import lens_covariance
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, project

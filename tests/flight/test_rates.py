@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.flight import rate_record, rate_text
-from perchctl.flight.rates import rate_interval
+from perchctl.flight.results import rate_interval
 
 
 def _at_most(k: int, n: int, p: float) -> float:

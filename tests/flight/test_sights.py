@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from perchctl.calibration import profile_camera
 from perchctl.flight import History, Senses, add_samples
-from perchctl.flight.sights import CARRIED_FOR_S, Sights, is_carried
+from perchctl.flight.senses import CARRIED_FOR_S, Sights, is_carried
 from perchctl.geometry import Place
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry

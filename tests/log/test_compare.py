@@ -18,7 +18,7 @@ from perchctl.log import (
     plot_comparison,
     read_log,
 )
-from perchctl.log.compare.align import stretches, ticks_of
+from perchctl.log.compare.plot import stretches, ticks_of
 from tests.helpers import log as synthetic
 
 

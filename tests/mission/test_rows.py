@@ -25,8 +25,7 @@ from perchctl.mission import (
 )
 from perchctl.mission.felt import Mismatch
 from perchctl.mission.mounting import SIGHTS_IN_A_ROW, MountWatch
-from perchctl.mission.row import Row, risen
-from perchctl.mission.table import TABLE, first_match
+from perchctl.mission.table import TABLE, Row, first_match, risen
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,

@@ -24,7 +24,7 @@ from perchctl.mission import (
     planner,
 )
 from perchctl.mission.context import BLOWN_MPS, CORRECTED_S
-from perchctl.mission.hold import BLIND_VARIANCE_M2, LOWEST_M
+from perchctl.mission.guards import BLIND_VARIANCE_M2, LOWEST_M
 from perchctl.mission.imu import Reckoning
 from perchctl.mission.lander import (
     BRAKE_RAD_PER_MPS,

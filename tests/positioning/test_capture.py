@@ -16,8 +16,7 @@ import perchctl
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, UsageError
 from perchctl.positioning import FeedThread, PositionFeed, open_capture
 from perchctl.positioning import capture as capture_module
-from perchctl.positioning.capture import MotionCapture, setup_of
-from perchctl.positioning.child import CaptureSetup
+from perchctl.positioning.capture import CaptureSetup, MotionCapture, setup_of
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import ExternalPosition
 from tests.positioning.fake_library import write_library

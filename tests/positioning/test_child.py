@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import pytest
 
 from perchctl.children import Channel
-from perchctl.positioning import child
+from perchctl.positioning import capture
 
 
 def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -17,11 +17,11 @@ def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.M
         own = socket.create_connection(listener.getsockname())
         parent, _ = listener.accept()
     ended = threading.Event()
-    monkeypatch.setattr(child.os, "_exit", lambda code: ended.set())
+    monkeypatch.setattr(capture.os, "_exit", lambda code: ended.set())
     channel = Channel(own)
     parent.sendall(b"\x02\x00\x00\x00N.")  # a setup: None, pickled
     assert channel.receive(0.05) is None
-    thread = threading.Thread(target=child._end_with, args=(channel,))
+    thread = threading.Thread(target=capture._end_with, args=(channel,))
     thread.start()
     assert not ended.wait(0.3)  # long after that limit
     parent.close()
@@ -33,10 +33,10 @@ def test_a_reader_outlives_the_time_in_which_it_was_set_up(monkeypatch: pytest.M
 class Parent:
     """Gives the setup, and takes what is said."""
 
-    def __init__(self, setup: child.CaptureSetup, gone: bool = False) -> None:
+    def __init__(self, setup: capture.CaptureSetup, gone: bool = False) -> None:
         self.setup, self.gone, self.said = setup, gone, list[Any]()
 
-    def receive(self, timeout_s: float) -> child.CaptureSetup:
+    def receive(self, timeout_s: float) -> capture.CaptureSetup:
         return self.setup
 
     def send(self, message: Any) -> None:
@@ -56,23 +56,23 @@ def test_a_host_that_cannot_be_resolved_is_named(
     def resolve(name: str) -> str:
         raise raised
 
-    parent = Parent(child.CaptureSetup("optitrack", {"hostname": host}))
-    monkeypatch.setattr(child, "connect_back", lambda: parent)
-    monkeypatch.setattr(child, "_loaded", lambda: None)
-    monkeypatch.setattr(child.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(child.socket, "gethostbyname", resolve)
-    child.serve_parent()
+    parent = Parent(capture.CaptureSetup("optitrack", {"hostname": host}))
+    monkeypatch.setattr(capture, "connect_back", lambda: parent)
+    monkeypatch.setattr(capture, "_loaded", lambda: None)
+    monkeypatch.setattr(capture.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(capture.socket, "gethostbyname", resolve)
+    capture.serve_parent()
     (said,) = parent.said
-    assert isinstance(said, child.Failed)
+    assert isinstance(said, capture.Failed)
     assert words in said.text
 
 
 def test_a_parent_that_is_gone_is_left_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    parent = Parent(child.CaptureSetup("vicon", {"hostname": "lab"}), gone=True)
-    monkeypatch.setattr(child, "connect_back", lambda: parent)
-    monkeypatch.setattr(child, "_loaded", lambda: lambda kind, options: None)
-    monkeypatch.setattr(child.signal, "signal", lambda *_: None)
-    child.serve_parent()
+    parent = Parent(capture.CaptureSetup("vicon", {"hostname": "lab"}), gone=True)
+    monkeypatch.setattr(capture, "connect_back", lambda: parent)
+    monkeypatch.setattr(capture, "_loaded", lambda: lambda kind, options: None)
+    monkeypatch.setattr(capture.signal, "signal", lambda *_: None)
+    capture.serve_parent()
 
 
 class Clock:
@@ -100,9 +100,9 @@ class Client:
 
 class Sent:
     def __init__(self) -> None:
-        self.frames: list[child.Arrived] = []
+        self.frames: list[capture.Arrived] = []
 
-    def send(self, frame: child.Arrived) -> None:
+    def send(self, frame: capture.Arrived) -> None:
         self.frames.append(frame)
 
 
@@ -111,10 +111,10 @@ def test_what_waited_in_the_library_s_queue_is_not_passed_on_as_new(
 ) -> None:
     """After a pause come the frames of the pause, one upon the other, the oldest first."""
     clock, sent = Clock(), Sent()
-    monkeypatch.setattr(child, "time", clock)
+    monkeypatch.setattr(capture, "time", clock)
     steady, queued = [0.01] * 3, [0.5, 1e-5, 1e-5, 1e-5]
     with pytest.raises(RuntimeError):
-        child._pass_on(Client(clock, steady + queued + steady), sent, False)  # type: ignore[arg-type]
+        capture._pass_on(Client(clock, steady + queued + steady), sent, False)  # type: ignore[arg-type]
     times_s = [frame.t_s for frame in sent.frames]
     begun_s = 100.0 + sum(steady) + sum(queued)
     assert len(times_s) == 2 * len(steady)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.report.advice import SWING_M, Advice, swings_of
-from perchctl.report.findings import findings_in
+from perchctl.report.advice import SWING_M, Advice, findings_in, swings_of
 from perchctl.report.told import tell
 from tests.helpers.log import GONE_S, SUMMARY
 from tests.helpers.told import Change, flown_s, made

@@ -10,8 +10,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.faults.radio import FaultyRadio
 from perchctl.link import Radio, simulated_radio
-from perchctl.link.bursty import BurstyRadio
-from perchctl.link.mock import TELEMETRY_DELAY_S
+from perchctl.link.mock import TELEMETRY_DELAY_S, BurstyRadio
 from perchctl.sim import Bursts, Packet, Scenario
 from perchctl.sim.bursts import CONNECTED_S
 

@@ -18,7 +18,7 @@ import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.sim import CONTROL_PERIOD_S, Packet, Port, Scenario, SimProcess
-from perchctl.sim.process.runner import MAX_LAG_S, Runner
+from perchctl.sim.process.child import MAX_LAG_S, Runner
 from tests.helpers.crtp_process import ROOT, WAIT_S, wired
 from tests.helpers.crtp_rig import Client
 
@@ -213,7 +213,7 @@ _PARENT = """
 import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
-from perchctl.sim.process.control import HostSetup
+from perchctl.sim.process.shared import HostSetup
 from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.process.host import VehicleHost
 started = []

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from perchctl.sim import MOTOR_FORCE_N
 from perchctl.sim.firmware.motors import MOTORS_OFF, THRUST_MIN, MotorDriver
-from perchctl.sim.thrust_curve import FULL_COMMAND, STANDSTILL_V, motor_v, thrust_n
+from perchctl.sim.powertrain import FULL_COMMAND, STANDSTILL_V, motor_v, thrust_n
 
 # Command, duty cycle, battery under that load.
 MEASURED = [

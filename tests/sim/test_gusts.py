@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.sim import Scenario
-from perchctl.sim.gusts import Gust, blown
+from perchctl.sim.scenario import Gust, blown
 from perchctl.sim.world import SUCTION_LENGTH_M, Wind
 
 GUST = Gust(2.0, 1.0, (0.6, 0.0, 0.1))

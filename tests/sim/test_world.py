@@ -12,8 +12,16 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import GRAVITY_MPS2, rotation_from_rpy
 from perchctl.sim import CONTROL_PERIOD_S, MOTOR_FORCE_N, REST_HEIGHT_M, Scenario
-from perchctl.sim.powertrain import MOTOR_COAST_S, MOTOR_LAG_S, STANDING_LAG_S, Powertrain
-from perchctl.sim.thrust_curve import FULL_COMMAND, STANDSTILL_V, motor_v, thrust_n
+from perchctl.sim.powertrain import (
+    FULL_COMMAND,
+    MOTOR_COAST_S,
+    MOTOR_LAG_S,
+    STANDING_LAG_S,
+    STANDSTILL_V,
+    Powertrain,
+    motor_v,
+    thrust_n,
+)
 from perchctl.sim.world import DRAG_LEVEL_NSPM, DRAG_VERTICAL_NSPM, GEAR_RADIUS_M, World
 
 OFF = (0.0, 0.0, 0.0, 0.0)

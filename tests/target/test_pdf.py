@@ -24,9 +24,9 @@ from perchctl.target import (
     svg_bytes,
     target_pages,
 )
+from perchctl.target.limits import PlainReader
 from perchctl.target.page import Circle, Filled, Item, Line, Polygon, Text
 from perchctl.target.page import text_width as width_of
-from perchctl.target.reading import PlainReader
 from perchctl.target.sheets import fitting_page
 from tests.helpers.raster import DPI, PX_PER_MM, black_runs_mm, page_picture
 

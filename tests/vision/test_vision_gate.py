@@ -22,8 +22,8 @@ from perchctl.vision import (
     PipelineState,
 )
 from perchctl.vision.filter import Measurement, make_filter
-from perchctl.vision.gate import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S, Sight, judged
 from perchctl.vision.pipeline import follow
+from perchctl.vision.tracks import ESTABLISHED_FRAMES, FORGET_S, REACQUIRE_S, Sight, judged
 from perchctl.vision.types import Lock, MarkerTrack, Stranger
 from tests.helpers.seen import seen_from
 

@@ -118,7 +118,7 @@ def covariance(
     wanted: NDArray[np.intp],
     robust: tuple[float, float] = (1.0, 1.0),
 ) -> Array:
-    """Of the `wanted` parameters at a minimum, as `perchctl.calibration.covariance` has it: the
+    """Of the `wanted` parameters at a minimum, as `perchctl.calibration.solve` has it: the
     inverse information, or what leaving out each block in turn (the jackknife) shows where that
     is more, since the errors of neighbouring pictures go together.
 

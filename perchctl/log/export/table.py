@@ -5,9 +5,11 @@ The columns are the same for every log: a field without a value anywhere is an e
 
 from __future__ import annotations
 
+import csv
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from typing import Any, Literal
 
 from perchctl.errors import InvalidValue
@@ -161,3 +163,21 @@ def _wrong(log: FlightLog, key: str, value: Any, allowed: str) -> InvalidValue:
         f"{log.path}: {key} must be {allowed}, found {shown}: the file is damaged, take the "
         f"original"
     )
+
+
+# --- A flight as comma-separated values --------------------------------------------------------
+
+
+def csv_text(columns: Sequence[Column]) -> str:
+    """A line of names, then a line each row; a missing value is empty, a flag 0 or 1."""
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([column.name for column in columns])
+    writer.writerows(zip(*([_cell(v) for v in column.values] for column in columns), strict=True))
+    return text.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if value is None:
+        return ""
+    return int(value) if isinstance(value, bool) else value

@@ -10,8 +10,8 @@ from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from perchctl.log.place import recording_path
 from perchctl.log.read import FlightLog, read_log
-from perchctl.log.recording.place import recording_path
 
 if TYPE_CHECKING:
     from perchctl.log.recording.export import Exported

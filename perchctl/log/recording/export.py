@@ -15,11 +15,11 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.files import PartFile, cannot_be_written, check_output, check_place, write_files
+from perchctl.log.place import LAYOUT_SUFFIX, SUFFIX, recording_path
 from perchctl.log.read import FlightLog
 from perchctl.log.recording import messages as m
 from perchctl.log.recording.container import DiskStream
 from perchctl.log.recording.messages import FRAME, IMAGE
-from perchctl.log.recording.place import LAYOUT_SUFFIX, SUFFIX, recording_path
 from perchctl.log.recording.walk import Walked, walk
 from perchctl.log.recording.writing import Writing
 from perchctl.log.sent import sent_values

@@ -20,9 +20,8 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from perchctl.log.jsonl import encode
 from perchctl.log.recording import messages as m
 from perchctl.log.recording.container import Container, Stream
-from perchctl.log.recording.messages import BODY, TARGET, stamp
+from perchctl.log.recording.messages import BODY, TARGET, Epoch, epoch_of, stamp
 from perchctl.log.recording.shapes import LOOP_TIMES
-from perchctl.log.recording.times import Epoch, epoch_of
 from perchctl.profile import Profile
 from perchctl.vision import CameraModel, Frame
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from perchctl.sim.firmware.motors import MOTORS_OFF, Motors
+from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.thrust_curve import FULL_COMMAND, MOTOR_FORCE_N
 
 PROPELLERS, BATTERY = "startPropTest", "startBatTest"
 REST_S, ON_S, PERIOD_S, SENSED_S = 0.1, 0.05, 1.0, 0.1

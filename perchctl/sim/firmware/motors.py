@@ -9,8 +9,8 @@ costs no height (docs/firmware.md, "Yaw step").
 
 from __future__ import annotations
 
+from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, THRUST_MIN_N, motor_v
 from perchctl.sim.scenario import CONTROL_PERIOD_S
-from perchctl.sim.thrust_curve import FULL_COMMAND, MOTOR_FORCE_N, THRUST_MIN_N, motor_v
 
 Motors = tuple[float, float, float, float]
 MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)

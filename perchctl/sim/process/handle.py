@@ -33,8 +33,7 @@ from perchctl.profile import TargetConfig
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.carried import Stop
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.control import LINGER_S, START_TIMEOUT_S, HostSetup, Pace
-from perchctl.sim.process.shared import SharedTime
+from perchctl.sim.process.shared import LINGER_S, START_TIMEOUT_S, HostSetup, Pace, SharedTime
 from perchctl.sim.scenario import Scenario
 from perchctl.vision import CameraModel
 

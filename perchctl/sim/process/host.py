@@ -22,7 +22,7 @@ from perchctl.sim.bursts import Bursts, radio_bursts
 from perchctl.sim.capture.server import SIMULATED_SYSTEM, CaptureServer
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.server import CrtpServer, LinkOptions
-from perchctl.sim.process.control import HostSetup
+from perchctl.sim.process.shared import HostSetup
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.surfaces import Picture
 from perchctl.sim.vehicle import SimulatedVehicle

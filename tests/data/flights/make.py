@@ -36,9 +36,9 @@ from perchctl.flight import (  # noqa: E402
     lockstep,
 )
 from perchctl.log import LogWatcher  # noqa: E402
+from perchctl.log.place import recording_path  # noqa: E402
 from perchctl.log.recording.container import Container, DiskStream  # noqa: E402
 from perchctl.log.recording.messages import FRAME, IMAGE  # noqa: E402
-from perchctl.log.recording.place import recording_path  # noqa: E402
 from perchctl.log.recording.walk import walk  # noqa: E402
 from perchctl.mission import (  # noqa: E402
     FlightReport,
