@@ -37,9 +37,7 @@ from perchctl.target import (
     parse_board,
     parse_length,
     parse_page,
-    png_bytes,
     suggest_target,
-    svg_bytes,
     target_pages,
     tile_page,
     updated_profile_text,
@@ -138,26 +136,17 @@ def _sheet_files(
     title: str,
     date: datetime.date | None = None,
 ) -> dict[Path, bytes]:
-    """The PDF, and the pictures that were requested beside it."""
+    """The PDF, by its place."""
     from perchctl.target import pdf_bytes
 
     pdf = request.output or Path(default)
     if pdf.suffix.lower() != ".pdf":
-        raise UsageError(
-            f"-o {pdf}: the file must end in .pdf; --svg and --png DPI write pictures beside it"
-        )
+        raise UsageError(f"-o {pdf}: the file must end in .pdf")
     printed = list(pages)
     if request.tile is not None:
         sheet = parse_page(request.tile)
         printed = [tile for page in pages for tile in tile_page(page, sheet)]
-    files = {pdf: pdf_bytes(printed, title, date)}
-    for number, page in enumerate(pages):
-        side = "" if number == 0 else "_back"
-        if request.svg:
-            files[pdf.with_name(f"{pdf.stem}{side}.svg")] = svg_bytes(page)
-        if request.png_dpi is not None:
-            files[pdf.with_name(f"{pdf.stem}{side}.png")] = png_bytes(page, request.png_dpi)
-    return files
+    return {pdf: pdf_bytes(printed, title, date)}
 
 
 def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:

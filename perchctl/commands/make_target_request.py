@@ -16,7 +16,7 @@ SIDE_LIMITS_M = (0.004, 2.0)
 _PROFILE = {"profile": "-p"}
 _OUTPUT = {"output": "-o"}
 _PAGE = {"page": "--page"}
-_SHEET = _PAGE | {"tile": "--tile", "png_dpi": "--png", "svg": "--svg"}
+_SHEET = _PAGE | {"tile": "--tile"}
 _MAGNET = {"magnet": "--magnet"}
 _MARKERS = {
     "large": "--large",
@@ -53,8 +53,6 @@ class TargetRequest:
     small_dict: str | None = None
     magnet: str = "50mm"
     tile: str | None = None
-    png_dpi: int | None = None
-    svg: bool = False
     board: str | None = None
     camera: str | None = None
     cam: str | None = None

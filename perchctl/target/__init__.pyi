@@ -36,7 +36,6 @@ from .page import Page as Page
 from .page import parse_page as parse_page
 from .pdf import pdf_bytes as pdf_bytes
 from .plot import draw_design as draw_design
-from .png import png_bytes as png_bytes
 from .print_check import PrintCheck as PrintCheck
 from .print_check import PrintVerdict as PrintVerdict
 from .sheets import TAG_BORDER_CELLS as TAG_BORDER_CELLS
@@ -44,6 +43,5 @@ from .sheets import board_page as board_page
 from .sheets import tag_cells as tag_cells
 from .sheets import target_pages as target_pages
 from .suggest import suggest_target as suggest_target
-from .svg import svg_bytes as svg_bytes
 from .tiles import tile_page as tile_page
 from .visible import FieldOfView as FieldOfView

@@ -40,11 +40,6 @@ def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
     assert Path("target.pdf").read_bytes() == first
 
 
-def test_pictures_beside_the_pdf() -> None:
-    call("-o", "mine.pdf", "--png", "100", "--svg", "--large", "12cm", "--page", "letter")
-    assert files() == {"mine.pdf", "mine.png", "mine.svg", "mine_back.png", "mine_back.svg"}
-
-
 def test_a_board() -> None:
     out, _ = call("--board", "chessboard:9x6:25mm", "-o", "board.pdf", "--json")
     assert json.loads(out) == {"files": ["board.pdf"], "board": "chessboard:9x6:25mm"}
@@ -52,10 +47,10 @@ def test_a_board() -> None:
 
 def test_the_profile_s_own_date_is_on_the_sheet() -> None:
     Path("mine.yaml").write_text("extends: sim\ndate: 2026-03-01\n")
-    call("-p", "mine.yaml", "--svg")
-    assert "(profile mine, 2026-03-01)" in Path("target.svg").read_text()
-    call("-p", "mine.yaml", "--svg", "--large", "140mm", "--force")
-    assert "2026" not in Path("target.svg").read_text()
+    call("-p", "mine.yaml")
+    assert b"D:20260301" in Path("target.pdf").read_bytes()
+    call("-p", "mine.yaml", "--large", "140mm", "--force")
+    assert b"D:2026" not in Path("target.pdf").read_bytes()
 
 
 @pytest.mark.long
@@ -78,11 +73,9 @@ REFUSALS = [
     (["--magnet", "20mm"], 30, "not inside the magnet"),
     (["--page", "150x150mm"], 30, "--page a4 holds it"),
     (["--page", "a9"], 30, "allowed are a4, letter, a3"),
-    (["--png", "9"], 30, "50 to 1200 dpi"),
     (["-o", "target.txt"], 2, "must end in .pdf"),
     (["-o", "/dev/null/target.pdf"], 30, "/dev/null is a file, not a folder"),
     (["--camera", CAMERA, "--plot", "design.pdf"], 30, "must end in .png"),
-    (["--camera", CAMERA, "-o", "design.pdf", "--png", "60"], 2, "name another with --plot"),
     (["-p", "nothing"], 20, "profile 'nothing' not found"),
     (["--board", "chessboard:9x6"], 30, "COLUMNSxROWS:SQUARE"),
     (["--board", "chessboard:9x6:25mm", "--camera", CAMERA], 2, "different tasks"),
@@ -97,12 +90,12 @@ REFUSALS = [
     (["--noise", "3"], 2, "--noise needs --camera"),
     (["--plot", "d.png"], 2, "--plot needs --camera"),
     (["--board", "chessboard:9x6:25mm", "--large", "15cm"], 2, "--large does not go with --board"),
-    (["--board", "chessboard:9x6:25mm", "-p", "sim"], 2, "takes -o, --page, --tile, --png, --svg"),
+    (["--board", "chessboard:9x6:25mm", "-p", "sim"], 2, "takes -o, --page, --tile"),
     (["--board", "chessboard:9x6:25mm", "--blur", "3"], 2, "--blur does not go with --board"),
     (["--camera", CAMERA, "--page", "a3"], 2, "--page is for the sheet"),
     (["--camera", CAMERA, "--magnet", "6cm"], 2, "prints with -o only"),
     (["--camera", CAMERA, "--suggest", "--small", "2cm"], 2, "proposes both markers"),
-    (["--measured-large", "149.6", "-p", "m.yaml", "--svg"], 2, "--svg does not go with"),
+    (["--measured-large", "149.6", "-p", "m.yaml", "--tile", "a4"], 2, "--tile does not go with"),
     (["--measured-large", "149.6"], 2, "name the profile"),
     (["--measured-large", "149.6", "-p", "crazyflie"], 2, "-p crazyflie -o my_vehicle.yaml"),
     (["--measured-large", "0.1496", "-p", "m.yaml"], 30, "measure the black square, in mm"),
@@ -121,16 +114,16 @@ def test_a_refusal_is_one_sentence_and_leaves_nothing(
     assert files() == set()
 
 
-def test_a_file_that_cannot_be_written_leaves_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    Path("t.png").mkdir()
-    _, err = call("-o", "t.pdf", "--png", "60", code=30)
-    assert "t.png is a folder" in err
-    assert files() == {"t.png"}
+def test_a_folder_of_that_name_is_left_alone() -> None:
+    Path("t.pdf").mkdir()
+    _, err = call("-o", "t.pdf", code=30)
+    assert "t.pdf is a folder" in err
+    assert files() == {"t.pdf"}
 
 
 def test_a_full_disk_leaves_nothing() -> None:
-    with full_disk(room=20_000):
-        _, err = call("-o", "t.pdf", "--png", "300", code=30)
+    with full_disk(room=1_000):
+        _, err = call("-o", "t.pdf", code=30)
     assert "cannot be written: File too large" in err
     assert files() == set()
 

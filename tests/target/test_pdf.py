@@ -20,15 +20,13 @@ from perchctl.target import (
     parse_board,
     parse_page,
     pdf_bytes,
-    png_bytes,
-    svg_bytes,
     target_pages,
 )
 from perchctl.target.limits import PlainReader
 from perchctl.target.page import Circle, Filled, Item, Line, Polygon, Text
 from perchctl.target.page import text_width as width_of
 from perchctl.target.sheets import fitting_page
-from tests.helpers.raster import DPI, PX_PER_MM, black_runs_mm, page_picture
+from tests.helpers.raster import PX_PER_MM, black_runs_mm, page_picture
 
 TARGET = TargetConfig()
 MAGNET_M = 0.05
@@ -135,8 +133,6 @@ def test_the_same_bytes_for_the_same_target() -> None:
     assert first != pdf_bytes(pages_of(TARGET, "a4"), "target", datetime.date(2026, 3, 2))
     assert b"D:20260301" in first
     assert b"/PrintScaling /None" in first
-    for make in (svg_bytes, lambda page: png_bytes(page, 100)):
-        assert make(pages_of(TARGET, "a4")[0]) == make(pages_of(TARGET, "a4")[0])
 
 
 def test_the_caption_says_what_is_printed() -> None:
@@ -223,35 +219,6 @@ def test_a_page_too_small_is_refused_with_the_one_that_fits(large: float, page: 
         assert named[1] == fitting_page(target)
     else:
         assert "allowed are a4, letter, a3" in str(refused.value)
-
-
-def test_png_is_true_to_size_and_knows_its_resolution() -> None:
-    data = png_bytes(pages_of(TARGET, "a4")[0], DPI // 2)
-    assert b"pHYs" + (11811).to_bytes(4) * 2 + b"\x01" in data
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert picture is not None
-    assert picture.shape == (3508, 2480)
-    row = black_runs_mm(picture[round((297 / 2 - 70) * 300 / 25.4)], 300)
-    assert max(b - a for a, b in row) == pytest.approx(150.0, abs=0.02)
-    assert set(PlainReader(TARGET).read(np.asarray(picture, np.uint8))) == {"large", "small"}
-
-
-@pytest.mark.parametrize("dpi", [0, 49, 5000])
-def test_a_resolution_out_of_range_is_refused(dpi: int) -> None:
-    with pytest.raises(InvalidValue, match="50 to 1200"):
-        png_bytes(pages_of(TARGET, "a4")[0], dpi)
-
-
-def test_svg_holds_the_same_black_area() -> None:
-    front, _ = pages_of(TARGET, "a4")
-    text = svg_bytes(front).decode()
-    assert 'width="210mm" height="297mm" viewBox="0 0 210 297"' in text
-    path = re.search(r'<path d="([^"]+)"/>', text)
-    assert path is not None
-    boxes = re.findall(r"M(\S+) (\S+)h(\S+)v(\S+)h(\S+)z", path[1])
-    area = sum(float(w) * float(h) for _, _, w, h, _ in boxes)
-    black = next(item for item in front.items if isinstance(item, Filled))
-    assert area == pytest.approx(sum(w * h for *_, w, h in black.boxes), rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -53,10 +53,6 @@ def make_target(
             "--tile", help="Print it on several sheets of this size, to be glued: a4, a3."
         ),
     ] = None,
-    png: Annotated[
-        int | None, typer.Option("--png", metavar="DPI", help="Also as PNG, at that resolution.")
-    ] = None,
-    svg: Annotated[bool, typer.Option("--svg", help="Also as SVG.")] = False,
     board: Annotated[
         str | None,
         typer.Option(
@@ -116,8 +112,6 @@ def make_target(
             small_dict=small_dict,
             magnet=magnet,
             tile=tile,
-            png_dpi=png,
-            svg=svg,
             board=board,
             camera=camera,
             cam=cam,
