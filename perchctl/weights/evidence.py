@@ -23,9 +23,9 @@ from perchctl.weights.fit import (
     closed_form,
     inverse_variance,
     sums_of,
+    t_quantile,
 )
 from perchctl.weights.lms import LmsOptions, LmsRun, lms, lms_folds, thinned
-from perchctl.weights.student import quantile
 from perchctl.weights.types import PAPER_WEIGHTS
 
 FITTED = ("lms", "nlms", "closed_form", "inverse_variance")
@@ -117,7 +117,7 @@ def _fitted(raw: Array, folds: Array) -> Fitted:
     g = len(folds)
     folds = np.where(np.isfinite(folds), folds, raw)
     spread = np.sqrt((g - 1) / g * ((folds - folds.mean(axis=0)) ** 2).sum(axis=0))
-    half = quantile(g - 1) * spread
+    half = t_quantile(g - 1) * spread
     return Fitted(raw, clipped(raw), raw - half, raw + half, clipped(folds))
 
 
@@ -180,7 +180,7 @@ def _method(square: Array, reference: Array) -> MethodErrors:
     square, reference = np.where(both, square, np.nan), np.where(both, reference, np.nan)
     rms, influence = _root(square)
     other, other_influence = _root(reference)
-    t = np.array([quantile(int(count) - 1) for count in g])
+    t = np.array([t_quantile(int(count) - 1) for count in g])
     half = _half(influence, g, t)
     gain = other - rms
     gain_half = _half(other_influence - influence, g, t)

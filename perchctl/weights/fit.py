@@ -9,15 +9,16 @@ seam at +-180 deg nor a constant turn of the data changes a weight.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
-from perchctl.weights.student import half_width
 from perchctl.weights.types import AXES, YAW, Measurements, wrap
 
 OUTLIER_SIGMAS = 6.0
@@ -29,6 +30,19 @@ ODD_POSITION_SIGMAS = 8.0
 LEAST_ROWS = 8
 """Rows a position, on average, below which nothing is called an outlier."""
 _MAD_TO_SIGMA = 1.4826
+
+
+def t_quantile(freedom: int) -> float:
+    """The two-sided 95 % quantile of Student's t; inf without a degree of freedom."""
+    return float(stdtrit(freedom, 0.975)) if freedom >= 1 else math.inf
+
+
+def _half_width(values: Array) -> Array:
+    """Of the 95 % interval of the mean of `values` (g, ...), over the first axis."""
+    g = len(values)
+    if g < 2:
+        return np.full(values.shape[1:], np.inf)
+    return np.asarray(t_quantile(g - 1) * values.std(axis=0, ddof=1) / math.sqrt(g))
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +230,7 @@ def biases(sums: Sums) -> dict[str, Bias]:
     for name, total in (("large", sums.a), ("small", sums.b)):
         means = total / n
         mean = means.mean(axis=0)
-        half = half_width(means)
+        half = _half_width(means)
         mean[YAW] = wrap(mean[YAW])
         found[name] = Bias(mean, half)
     return found

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from perchctl.errors import InvalidValue
 from perchctl.weights import fit, lms
 from perchctl.weights.evidence import evidence, fit_all, gain_over
-from perchctl.weights.student import quantile
 from tests.helpers.weights_data import BEST, independent, known, measured
 
 
@@ -175,7 +174,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
         folds = fit.closed_form(sums.without())
         spread = np.sqrt(0.9 * ((folds - folds.mean(axis=0)) ** 2).sum(axis=0))
         away = np.abs(fit.closed_form(sums.total()) - [0.8, 0.5, 0.2, 0.2])
-        inside += int((away < quantile(9) * spread).sum())
+        inside += int((away < fit.t_quantile(9) * spread).sum())
     assert 0.88 < inside / 240 < 0.995
 
 
@@ -183,4 +182,4 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
     ("freedom", "expected"), [(1, 12.7062), (2, 4.3027), (9, 2.2622), (30, 2.0423), (1000, 1.9623)]
 )
 def test_student_s_quantiles(freedom: int, expected: float) -> None:
-    assert quantile(freedom) == pytest.approx(expected, abs=1e-4)
+    assert fit.t_quantile(freedom) == pytest.approx(expected, abs=1e-4)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from perchctl.geometry import Array
 
@@ -150,11 +151,5 @@ def covariance(
 
 def student_factor(freedom: int) -> float:
     """Half the width of a 95 % interval whose spread was estimated from so many values, over the
-    normal distribution's (Cornish and Fisher's expansion, within 1 % from 4 on)."""
-    z2, v = IN_95**2, float(max(freedom, 3))
-    return (
-        1.0
-        + (z2 + 1.0) / (4.0 * v)
-        + (5.0 * z2**2 + 16.0 * z2 + 3.0) / (96.0 * v**2)
-        + (3.0 * z2**3 + 19.0 * z2**2 + 17.0 * z2 - 15.0) / (384.0 * v**3)
-    )
+    normal distribution's; below 3 degrees of freedom that of 3."""
+    return float(stdtrit(max(freedom, 3), 0.975)) / IN_95
