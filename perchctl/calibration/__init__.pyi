@@ -35,14 +35,10 @@ from .mounting.turns import rotation_vectors as rotation_vectors
 from .pictures import views_of_images as views_of_images
 from .pictures import views_of_video as views_of_video
 from .plot import draw_calibration as draw_calibration
-from .preview import LensPreview as LensPreview
-from .preview import UndistortedView as UndistortedView
 from .report import calibration_lines as calibration_lines
 from .report import calibration_record as calibration_record
 from .report import camera_record as camera_record
 from .report import check_record as check_record
-from .seen import board_seen_instead as board_seen_instead
-from .seen import larger_board as larger_board
 from .solve import AUTO_MODEL as AUTO_MODEL
 from .solve import calibrate_camera as calibrate_camera
 from .types import BoardView as BoardView

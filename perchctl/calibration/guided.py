@@ -24,8 +24,7 @@ GONE_AFTER_S = 3.0
 
 @dataclass(frozen=True, eq=False)
 class CaptureMoment:
-    """What to show of a frame: the picture, the corners found, the coverage, the advice, and
-    the views taken until then."""
+    """What to show of a frame: the picture, the corners found, the coverage, the advice."""
 
     index: int
     image: Grey
@@ -34,7 +33,6 @@ class CaptureMoment:
     taken: int
     advice: str
     shot: bool
-    views: tuple[BoardView, ...] = ()
 
 
 def capture_views(
@@ -83,7 +81,6 @@ def capture_views(
                 len(state.taken),
                 state.advice,
                 state.shot,
-                state.taken,
             )
         )
     return list(state.taken)

@@ -18,7 +18,6 @@ from perchctl.calibration import (
     Grey,
     Rejection,
     assumed_size_warning,
-    board_seen_instead,
     calibrate_camera,
     calibration_lines,
     calibration_record,
@@ -27,7 +26,6 @@ from perchctl.calibration import (
     camera_text,
     check_calibration,
     check_record,
-    larger_board,
     learn_gear,
     load_calibration,
     load_sized,
@@ -298,15 +296,9 @@ def _find_views(request: CalibrateRequest, source: Source, board: Board) -> _Fou
             views, missing = views_of_video(Path(source.place), board, refine, progress)
     if not views:
         count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
-        other = board_seen_instead(source.samples(), board)
-        hint = other or "is it wholly in view, sharp, and --board its true layout?"
         raise InvalidValue(
-            f"none of {count} of {source} shows the board {board.notation()}; {hint}"
-        )
-    whole = larger_board(source.samples(), board)
-    if whole:
-        raise InvalidValue(
-            f"the pictures show a larger board than {board.notation()}: use --board {whole}"
+            f"none of {count} of {source} shows the board {board.notation()}; is it wholly in "
+            f"view, sharp, and --board its true layout?"
         )
     return _Found(views, missing)
 

@@ -19,8 +19,6 @@ from perchctl.calibration import (
     BoardView,
     CaptureMoment,
     Grey,
-    LensPreview,
-    UndistortedView,
     capture_views,
 )
 from perchctl.camera import FrameSource
@@ -56,7 +54,6 @@ def captured_views(
         stop = stack.enter_context(Stopper().installed())
         camera = _any_camera(source.size_px or _SIZE_UNTIL_KNOWN_PX)
         page = stack.enter_context(live_page(camera, "perchctl calibrate", port))
-        preview = LensPreview()
         bars = stack.enter_context(coverage_bars())
         say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
 
@@ -65,10 +62,8 @@ def captured_views(
                 keeper.keep(moment.image)
             bars(moment.covered, moment.taken, moment.advice)
             if page is not None:
-                preview.offer(moment.views)
-                flat = preview.flat
-                page.show(moment.index, sketch_of(moment, flat))
-                page.tell(lambda: page_state(moment, flat))
+                page.show(moment.index, sketch_of(moment))
+                page.tell(lambda: page_state(moment))
 
         views = capture_views(source, board, show, stopped=stop.requested.is_set)
     if not views:
@@ -120,23 +115,19 @@ def _any_camera(size_px: tuple[int, int]) -> CameraModel:
     return CameraModel(size_px, K, np.zeros(5))
 
 
-def sketch_of(moment: CaptureMoment, flat: UndistortedView | None) -> Sketch:
+def sketch_of(moment: CaptureMoment) -> Sketch:
     outlines: tuple[tuple[str, Any], ...] = ()
     if len(moment.corners_px) >= 3:
         hull = cv2.convexHull(moment.corners_px.astype(np.float32)).reshape(-1, 2)
         outlines = (("small" if moment.shot else "large", hull.astype(np.float64)),)
-    places_px = None if flat is None else flat.places_px
-    return Sketch(moment.image, outlines, None, (moment.advice,), places_px)
+    return Sketch(moment.image, outlines, None, (moment.advice,))
 
 
-def page_state(moment: CaptureMoment, flat: UndistortedView | None) -> dict[str, Any]:
+def page_state(moment: CaptureMoment) -> dict[str, Any]:
     rows: list[list[str | float]] = [
         [name, f"{100 * share:.0f} %", share] for name, share in moment.covered.items()
     ]
     rows.append(["views", str(moment.taken)])
-    if flat is not None:
-        by = f"by {flat.views} views"
-        rows.append(["lens", f"{by}: undistorted below, what is straight must look straight"])
     return {"rows": rows, "phase": moment.advice}
 
 

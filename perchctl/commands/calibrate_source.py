@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from perchctl.calibration import Grey
 from perchctl.camera import (
     IMAGE_SUFFIXES,
-    BrokenPicture,
     FrameSource,
     ImagesSource,
-    VideoSource,
     image_files,
     open_source,
-    read_grey,
     source_spec,
     without_password,
 )
@@ -61,24 +56,6 @@ class Source:
         if self.files:
             return ImagesSource(self.files)
         return open_source(self.spec, 0.0, self.size_px, time.monotonic)
-
-    def samples(self) -> list[Grey]:
-        """A few pictures from over the whole recording."""
-        if self.scheme == "images":
-            paths = self.pictures()
-            step = max(1, len(paths) // _SAMPLES)
-            samples: list[Grey] = []
-            for path in paths[::step][:_SAMPLES]:
-                with contextlib.suppress(BrokenPicture):  # which has been told
-                    samples.append(read_grey(path))
-            return samples
-        source = VideoSource(Path(self.place))
-        frames: list[Grey] = []
-        while (frame := source.poll(0.0)) is not None and len(frames) < _SAMPLES:
-            if frame.index % _SAMPLE_EVERY == 0:
-                frames.append(frame.image)
-        source.close()
-        return frames
 
 
 def sized(source: Source, text: str | None) -> Source:

@@ -3,7 +3,6 @@ from .changed import changed_profile as changed_profile
 from .changed import profile_value as profile_value
 from .dictionaries import aruco_dictionary as aruco_dictionary
 from .dictionaries import check_marker_id as check_marker_id
-from .dictionaries import dictionary_names as dictionary_names
 from .dictionaries import dictionary_size as dictionary_size
 from .edit import writable_profile as writable_profile
 from .edit import write_profile_values as write_profile_values

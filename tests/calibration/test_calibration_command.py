@@ -15,10 +15,7 @@ from perchctl.calibration import load_calibration
 from perchctl.calibration.lens import parameters_of
 from perchctl.vision import CameraModel
 from tests.helpers.boards import (
-    APRILGRID,
     CHARUCO,
-    draw_camera,
-    render_folder,
 )
 from tests.helpers.calibrating import calibrate, refused
 
@@ -153,75 +150,6 @@ def test_pictures_of_two_sizes(rendered: Rendered, tmp_path: Path) -> None:
     )
     assert "480x300" in sentence
     assert "480x360" in sentence
-
-
-@pytest.mark.parametrize(
-    ("board", "hint"),
-    [
-        ("charuco:8x6:25mm:18mm:DICT_5X5_100", "10x7 squares"),
-        ("charuco:10x6:25mm:18mm:DICT_5X5_100", "charuco:10x7:25mm:18mm:DICT_5X5_100"),
-        ("charuco:10x7:25mm:18mm:DICT_6X6_100", "DICT_5X5_100"),
-        ("chessboard:9x6:25mm", "charuco"),
-    ],
-)
-def test_the_wrong_board_says_what_was_seen(
-    rendered: Rendered, tmp_path: Path, board: str, hint: str
-) -> None:
-    result = calibrate(f"images:{rendered[0]}", "-b", board, "-o", str(tmp_path / "o.yaml"))
-    assert hint in refused(result, 30)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.fixture(scope="module")
-def april_folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CameraModel]:
-    camera = draw_camera(np.random.default_rng(8), (480, 360))
-    folder = tmp_path_factory.mktemp("april")
-    render_folder(folder, camera, APRILGRID, 8, seed=8)
-    return folder, camera
-
-
-def test_an_aprilgrid_by_kalibr_s_own_file(april_folder: Rendered, tmp_path: Path) -> None:
-    folder, truth = april_folder
-    board = tmp_path / "april_6x6.yaml"
-    board.write_text(
-        "target_type: 'aprilgrid'\ntagCols: 6\ntagRows: 6\ntagSize: 0.022\ntagSpacing: 0.3\n"
-    )
-    output = tmp_path / "camera.yaml"
-    result = calibrate(f"images:{folder}", "-b", str(board), "-o", str(output), "--json")
-    assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    error = np.abs(parameters_of(load_calibration(output)) - parameters_of(truth))
-    assert (error < 3.5 * np.array(list(told["std"].values()))).all()
-    assert error[:2].max() < 0.7
-    assert told["views_used"] == 8
-    assert told["rms_px"] < 0.12
-    assert yaml.safe_load(output.read_text())["board"] == APRILGRID.notation()
-
-
-@pytest.mark.parametrize(
-    ("board", "hint"),
-    [
-        ("aprilgrid:5x6:22mm:0.3", "an aprilgrid of 6 columns and 6 or more rows"),
-        ("aprilgrid:7x6:22mm:0.3", "an aprilgrid of 6 columns and 6 or more rows"),
-        ("aprilgrid:6x4:22mm:0.3", "larger board than aprilgrid:6x4:22mm:0.3: use --board "
-         "aprilgrid:6x6:22mm:0.3"),
-        (BOARD, "they show AprilTags"),
-        ("chessboard:9x6:25mm", "they show AprilTags"),
-    ],
-)  # fmt: skip
-def test_the_wrong_board_for_an_aprilgrid_says_what_was_seen(
-    april_folder: Rendered, tmp_path: Path, board: str, hint: str
-) -> None:
-    pictures = f"{april_folder[0]}/board_0[0123].png"
-    assert hint in refused(calibrate(pictures, "-b", board, "-o", f"{tmp_path}/o.yaml"), 30)
-
-
-def test_an_aprilgrid_named_for_another_board_says_what_was_seen(
-    rendered: Rendered, tmp_path: Path
-) -> None:
-    pictures = f"{rendered[0]}/board_0[0123].png"
-    said = refused(calibrate(pictures, "-b", "aprilgrid", "-o", f"{tmp_path}/o.yaml"), 30)
-    assert "is it a charuco board?" in said
 
 
 def test_a_print_is_measured_along_both_sides(rendered: Rendered, tmp_path: Path) -> None:

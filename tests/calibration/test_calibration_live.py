@@ -219,9 +219,8 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
 def test_the_page_s_bars_are_shares_and_no_characters() -> None:
     image = np.zeros((4, 4), np.uint8)
     covered = {"x": 0.5, "y": 0.0, "size": 1.0, "tilt": 0.25}
-    state = page_state(
-        CaptureMoment(0, image, np.empty((0, 2)), covered, 3, "hold still", False), None
-    )
+    moment = CaptureMoment(0, image, np.empty((0, 2)), covered, 3, "hold still", False)
+    state = page_state(moment)
     assert state["phase"] == "hold still"
     *bars, views = state["rows"]
     assert [(name, share) for name, _, share in bars] == list(covered.items())

@@ -90,31 +90,6 @@ def test_the_stream_gives_the_drawn_picture(page: LivePage) -> None:
         connection.close()
 
 
-def test_the_picture_without_distortion_comes_once_the_lens_is_known(page: LivePage) -> None:
-    image = np.zeros((48, 64), np.uint8)
-    image[:, 40:] = 200
-    page.show(0, Sketch(image))
-    assert json.loads(ask(page.url, "/state")[1])["flat"] is False
-    assert page.jpeg_after(0, flat=True) is None
-    columns, rows = np.meshgrid(np.arange(64.0), np.arange(48.0))
-    places = np.stack([columns + 20, rows], axis=2).astype(np.float32)  # 20 px to the left
-    page.show(1, Sketch(image, flat_places_px=places))
-    assert json.loads(ask(page.url, "/state")[1])["flat"] is True
-    connection = http.client.HTTPConnection("127.0.0.1", urlsplit(page.url).port or 0, timeout=5.0)
-    try:
-        connection.request("GET", "/flat")
-        flat = read_part(connection.getresponse())
-    finally:
-        connection.close()
-    assert flat[:, 24:40].mean() == pytest.approx(200.0, abs=5.0)
-    assert flat[:, :16].mean() < 5.0
-    drawn = page.jpeg_after(0)
-    assert drawn is not None
-    plain = cv2.imdecode(np.frombuffer(drawn[1], np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert plain is not None
-    assert plain[:, :36].mean() < 5.0
-
-
 def test_too_many_readers_are_sent_away(page: LivePage) -> None:
     page.show(0, Sketch(np.zeros((48, 64), np.uint8)))
     port = urlsplit(page.url).port or 0

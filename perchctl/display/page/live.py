@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 import cv2
 
-from perchctl.display.page.sketch import Sketch, draw_flat, draw_sketch
+from perchctl.display.page.sketch import Sketch, draw_sketch
 from perchctl.errors import InvalidValue
 from perchctl.vision import CameraModel
 
@@ -70,7 +70,7 @@ class LivePage:
         self._number = 0
         self._frame: int | None = None
         self._times: deque[float] = deque(maxlen=_RATE_FRAMES)
-        self._jpegs: dict[bool, tuple[int, bytes]] = {}
+        self._jpeg: tuple[int, bytes] | None = None
         self._describe: Callable[[], PageState] = dict
         self._told_s: float | None = None  # None: nothing is due
         self._read_s: float | None = None
@@ -142,7 +142,6 @@ class LivePage:
         else:
             stop = "requested" if self._stop_requested else "ready"
         fixed = {"title": self.title, "rate_hz": round(self.rate_hz(), 1), "stop": stop}
-        fixed["flat"] = self._is_there(-1, flat=True)  # there is a picture without distortion
         told_s, card = self._told_s, self._card
         fixed["age_s"] = None if told_s is None else round(max(0.0, self._clock() - told_s), 2)
         fixed["card"] = card
@@ -164,33 +163,22 @@ class LivePage:
             return 0.0
         return (len(times) - 1) / (times[-1] - times[0])
 
-    def jpeg_after(self, number: int, flat: bool = False) -> tuple[int, bytes] | None:
-        """The newest picture if newer than `number`, drawn; or the same `flat`, without the
-        lens's distortion. None when none came for a while."""
+    def jpeg_after(self, number: int) -> tuple[int, bytes] | None:
+        """The newest picture if newer than `number`, drawn. None when none came for a while."""
         with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._is_there(number, flat), WAIT_S)
+            self._changed.wait_for(lambda: self.closed or self._number > number, WAIT_S)
             newest, sketch = self._number, self._sketch
-            if sketch is None or not self._is_there(number, flat):
+            if sketch is None or newest <= number:
                 return None
         with self._drawing:  # once, for all readers
-            known = self._jpegs.get(flat)
-            if known is None or known[0] < newest:
-                picture = draw_flat(sketch) if flat else draw_sketch(sketch, self.camera)
-                if picture is None:
-                    return None
+            if self._jpeg is None or self._jpeg[0] < newest:
+                picture = draw_sketch(sketch, self.camera)
                 quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
                 ok, jpeg = cv2.imencode(".jpg", picture, quality)
                 if not ok:
                     return None
-                known = self._jpegs[flat] = (newest, jpeg.tobytes())
-            return known
-
-    def _is_there(self, number: int, flat: bool) -> bool:
-        """Whether a picture newer than `number` has come, and can be drawn `flat`."""
-        sketch = self._sketch
-        if sketch is None or self._number <= number:
-            return False
-        return not flat or sketch.flat_places_px is not None
+                self._jpeg = (newest, jpeg.tobytes())
+            return self._jpeg
 
     def pause(self, seconds: float) -> bool:
         """Wait, less when the page closes; True when it has."""
@@ -257,7 +245,7 @@ class Content(Protocol):
 
     def was_read(self, state: dict[str, Any]) -> None: ...
 
-    def jpeg_after(self, number: int, flat: bool = False) -> tuple[int, bytes] | None: ...
+    def jpeg_after(self, number: int) -> tuple[int, bytes] | None: ...
 
     def pause(self, seconds: float) -> bool: ...
 
@@ -295,18 +283,17 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         if not self._from_here():
             return
-        wanted = urlsplit(self.path).path
-        match wanted:
+        match urlsplit(self.path).path:
             case "/":
                 self._send_page()
             case "/state":
                 state = self.server.page.state()
                 self._send(200, "application/json", json.dumps(state).encode())
                 self.server.page.was_read(state)
-            case "/stream" | "/flat":
-                self._send_stream(flat=wanted == "/flat")
+            case "/stream":
+                self._send_stream()
             case _:
-                self._refuse(404, "there is /, /state, /stream and /flat")
+                self._refuse(404, "there is /, /state and /stream")
 
     def do_POST(self) -> None:
         if not self._from_here():
@@ -342,22 +329,22 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.page.opened.set()
         self._send(200, "text/html; charset=utf-8", html.encode(), policy)
 
-    def _send_stream(self, flat: bool) -> None:
+    def _send_stream(self) -> None:
         if not self.server.streams.acquire(blocking=False):
             self._refuse(503, f"{MAX_STREAMS} others are looking already")
             return
         try:
-            self._stream(flat)
+            self._stream()
         finally:
             self.server.streams.release()
 
-    def _stream(self, flat: bool) -> None:
+    def _stream(self) -> None:
         self._head(200, f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
         self.end_headers()
         self.wfile.write(f"--{_BOUNDARY}\r\n".encode())
         page, number = self.server.page, 0
         while not page.closed:
-            newest = page.jpeg_after(number, flat)
+            newest = page.jpeg_after(number)
             if newest is None:
                 continue
             number, jpeg = newest

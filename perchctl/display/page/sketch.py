@@ -29,15 +29,12 @@ class Sketch:
         outlines: marker's name and its corners (4, 2) px.
         pose: rvec (3,) and tvec (3,) of the axes to draw, and their length in m.
         text: lines for the lower left corner.
-        flat_places_px: where each pixel of the same picture without the lens's distortion is
-            found in this one, (h, w, 2) float32; None: there is no such picture.
     """
 
     image: NDArray[np.uint8]
     outlines: tuple[tuple[str, Array], ...] = ()
     pose: tuple[Array, Array, float] | None = None
     text: tuple[str, ...] = ()
-    flat_places_px: NDArray[np.float32] | None = None
 
 
 def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
@@ -57,15 +54,6 @@ def draw_sketch(sketch: Sketch, camera: CameraModel) -> NDArray[np.uint8]:
         _draw_axes(picture, *sketch.pose, camera)
     _draw_text(picture, sketch.text)
     return picture
-
-
-def draw_flat(sketch: Sketch) -> NDArray[np.uint8] | None:
-    """The picture without the lens's distortion, grey (h, w), where that is known."""
-    if sketch.flat_places_px is None:
-        return None
-    places = sketch.flat_places_px
-    flat = cv2.remap(sketch.image, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
-    return np.asarray(flat, dtype=np.uint8)
 
 
 def _draw_axes(
