@@ -42,7 +42,7 @@ _LOOSE_THRESHOLDS = Thresholds(15, 35)
 
 @dataclass(frozen=True, eq=False)
 class DetectorSetup:
-    """What `detect` needs, made once by `make_aruco_detector`; nothing in it changes later.
+    """What `detect_markers` needs, made once by `make_aruco_detector`; nothing in it changes later.
 
     `dictionaries` are the large and the small marker's, each with the marker and, behind it
     (`MIRROR_INDEX`), its mirror image where that cannot be confused with the marker
