@@ -727,5 +727,5 @@ def test_the_planner_s_landing_is_the_lander() -> None:
         for module in imported(f"mission/{path.name}")
         if module == "perchctl.mission.lander"
     }
-    assert takers == {"safety", "table"}
+    assert takers == {"table"}
     assert not imported("mission/planner.py")["perchctl.vehicle"] & {"Land", "StopMotors"}
