@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.commands.log_file import opened
@@ -12,33 +11,21 @@ from perchctl.files import check_output
 from perchctl.log import compare_flights, comparison_record, comparison_text
 
 
-@dataclass(frozen=True)
-class CompareRequest:
-    """The command line as it was given; None is not given."""
-
-    one: Path
-    other: Path
-    output: Path | None = None
-    force: bool = False
-    as_json: bool = False
-
-
-def run(request: CompareRequest) -> int:
+def run(one_path: Path, other_path: Path, picture: Path | None, force: bool, as_json: bool) -> int:
     """Print the differences, draw both where asked to; returns the exit code.
 
     Errors: NotFound, InvalidValue.
     """
-    picture = request.output
     if picture is not None:
-        check_output(picture, FORMATS, request.force, DRAWN_IN)
-    with opened(request.one) as one, opened(request.other) as other:
+        check_output(picture, FORMATS, force, DRAWN_IN)
+    with opened(one_path) as one, opened(other_path) as other:
         found = compare_flights(one, other)
         record, text = comparison_record(found), comparison_text(found)
     if picture is not None:
         from perchctl.log import plot_comparison
 
         plot_comparison(one, other, picture)
-    if request.as_json:
+    if as_json:
         print_record(record | {"plot": None if picture is None else str(picture)})
         return 0
     print(text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,42 +27,33 @@ ENDINGS = {"csv": ".csv", "parquet": ".parquet", "mcap": ".mcap"}
 _COUNTS = ("rows", "columns", "pictures")
 
 
-@dataclass(frozen=True)
-class ExportRequest:
-    """The command line as it was given; None is not given."""
-
-    file: Path | None = None
-    csv: bool = False
-    parquet: bool = False
-    mcap: bool = False
-    output: Path | None = None
-    force: bool = False
-    profile: str | None = None
-    log_dir: Path | None = None
-    as_json: bool = False
-
-
-def run(request: ExportRequest) -> int:
+def run(
+    file: Path | None,
+    forms: Sequence[str],
+    output: Path | None,
+    force: bool,
+    profile: str | None,
+    log_dir: Path | None,
+    as_json: bool,
+) -> int:
     """Write; returns the exit code. Errors: NotFound, InvalidValue, UsageError."""
-    form = _form(request)
-    if request.output == STDOUT and (form != "csv" or request.as_json):
+    form = _form(forms, output)
+    if output == STDOUT and (form != "csv" or as_json):
         beside_it = "--json" if form == "csv" else f"--{form}"
         raise UsageError(f"-o - is CSV on stdout, which {beside_it} does not go with: name a file")
     if form == "parquet":
         check_parquet()
-    path = log_file(request.file, request.profile, request.log_dir)
-    if request.output == STDOUT:
+    path = log_file(file, profile, log_dir)
+    if output == STDOUT:
         with opened(path) as log:
             text = csv_text(log_columns(log))
         sys.stdout.write(text)
         return 0
-    place = request.output or path_beside(
-        path, ("_export" if form == "mcap" else "") + ENDINGS[form]
-    )
-    check_output(place, (ENDINGS[form],), request.force, f"what --{form} writes")
+    place = output or path_beside(path, ("_export" if form == "mcap" else "") + ENDINGS[form])
+    check_output(place, (ENDINGS[form],), force, f"what --{form} writes")
     write = _write_mcap if form == "mcap" else _write_table
-    done = write(path, place, request.force)
-    if request.as_json:
+    done = write(path, place, force)
+    if as_json:
         print_record({"log": str(path), "output": str(place), "format": form, **done})
         return 0
     counted = ", ".join(f"{done[key]} {key}" for key in _COUNTS if key in done)
@@ -72,18 +63,17 @@ def run(request: ExportRequest) -> int:
     return 0
 
 
-def _form(request: ExportRequest) -> str:
+def _form(asked: Sequence[str], output: Path | None) -> str:
     """What is asked for by name, or else by the output's ending. Errors: UsageError."""
-    asked = [form for form in ENDINGS if getattr(request, form)]
     if len(asked) > 1:
         raise UsageError(f"--{asked[0]} and --{asked[1]} are two files: ask for one at a time")
     if asked:
         return asked[0]
-    if request.output == STDOUT:
+    if output == STDOUT:
         return "csv"
-    if request.output is not None:
+    if output is not None:
         for form, ending in ENDINGS.items():
-            if request.output.suffix.lower() == ending:
+            if output.suffix.lower() == ending:
                 return form
     raise UsageError(
         "say in which form: --csv, --parquet or --mcap, or by the name, as in -o flight.csv"

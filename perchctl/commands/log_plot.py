@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from perchctl.commands.log_file import log_file, opened
@@ -14,29 +13,24 @@ FORMATS = (".png", ".pdf", ".svg")
 DRAWN_IN = "what plots are drawn in"
 
 
-@dataclass(frozen=True)
-class PlotRequest:
-    """The command line as it was given; None is not given."""
-
-    file: Path | None = None
-    output: Path | None = None
-    force: bool = False
-    profile: str | None = None
-    log_dir: Path | None = None
-    as_json: bool = False
-
-
-def run(request: PlotRequest) -> int:
+def run(
+    file: Path | None,
+    output: Path | None = None,
+    force: bool = False,
+    profile: str | None = None,
+    log_dir: Path | None = None,
+    as_json: bool = False,
+) -> int:
     """Draw; returns the exit code. Errors: NotFound, InvalidValue, UsageError."""
-    path = log_file(request.file, request.profile, request.log_dir)
-    picture = request.output or path_beside(path, ".png")
+    path = log_file(file, profile, log_dir)
+    picture = output or path_beside(path, ".png")
     with opened(path) as log:
-        check_output(picture, FORMATS, request.force, DRAWN_IN)
+        check_output(picture, FORMATS, force, DRAWN_IN)
         outcome = summarise_flight(log).outcome
     from perchctl.log import plot_flight
 
     plot_flight(log, picture)
-    if request.as_json:
+    if as_json:
         print_record({"log": str(path), "plot": str(picture), "outcome": outcome})
     else:
         print(f"plot:      {picture}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 from perchctl.commands.log_file import log_file
@@ -19,28 +19,22 @@ from perchctl.report import (
 )
 
 
-@dataclass(frozen=True)
-class ReportRequest:
-    """The command line as it was given; None is not given."""
-
-    files: tuple[Path, ...] = ()
-    output: Path | None = None
-    force: bool = False
-    profile: str | None = None
-    log_dir: Path | None = None
-    as_json: bool = False
-
-
-def run(request: ReportRequest) -> int:
+def run(
+    named: Sequence[Path],
+    output: Path | None,
+    force: bool,
+    profile: str | None,
+    log_dir: Path | None,
+    as_json: bool,
+) -> int:
     """Errors: NotFound and InvalidValue (a log, the place of the page), UsageError."""
-    files = _files(request)
-    output = request.output or (report_path_of(files[0]) if len(files) == 1 else None)
-    output = output or session_path_of(files)
+    files = _files([log_file(name, profile, log_dir) for name in named or (None,)])
+    output = output or (report_path_of(files[0]) if len(files) == 1 else session_path_of(files))
     if any(same_file(output, path) for path in files):
         raise UsageError(f"{output} is one of the logs; write the page to another file")
-    check_output(output, REPORT_SUFFIXES, request.force, "a page for a browser")
+    check_output(output, REPORT_SUFFIXES, force, "a page for a browser")
     flights = write_report(files, output)
-    if request.as_json:
+    if as_json:
         print_record(_record(output, flights))
     else:
         print(output)
@@ -50,12 +44,10 @@ def run(request: ReportRequest) -> int:
     return 0
 
 
-def _files(request: ReportRequest) -> tuple[Path, ...]:
-    """Each log once; without any the newest."""
-    named = request.files or (None,)
+def _files(paths: Sequence[Path]) -> tuple[Path, ...]:
+    """Each log once."""
     files: list[Path] = []
-    for name in named:
-        path = log_file(name, request.profile, request.log_dir)
+    for path in paths:
         if any(path == known or same_file(path, known) for known in files):
             say(f"{path} is named twice: it is told once")
             continue

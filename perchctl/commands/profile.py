@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from dataclasses import dataclass
 
 from perchctl.camera import profile_record, without_passwords
 from perchctl.check import Verdict, profile_rows
@@ -15,29 +14,20 @@ from perchctl.profile import editor_schema, find_profile, load_profile, profile_
 DEFAULT_PROFILE = "sim"
 
 
-@dataclass(frozen=True)
-class ProfileRequest:
-    """The command line as it was given; None is not given."""
-
-    profile: str | None = None
-    schema: bool = False
-    as_json: bool = False
-
-
-def run(request: ProfileRequest) -> int:
+def run(named: str | None, schema: bool, as_json: bool) -> int:
     """Print, and say what is doubtful; returns the exit code. Errors: NotFound, InvalidValue,
     UsageError."""
-    if request.schema:
-        if request.profile is not None:
+    if schema:
+        if named is not None:
             raise UsageError(
-                f"--schema is of every profile: -p {request.profile} does not apply; leave it out"
+                f"--schema is of every profile: -p {named} does not apply; leave it out"
             )
         print(json.dumps(editor_schema(), indent=2))
         return 0
-    name = request.profile or DEFAULT_PROFILE
+    name = named or DEFAULT_PROFILE
     profile = load_profile(name)
     found = profile_rows(profile)
-    if request.as_json:
+    if as_json:
         record = {
             "profile_file": str(find_profile(name)),
             "profile": profile_record(profile),

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 import perchctl
 from perchctl.calibration import load_calibration
-from perchctl.commands.profile import ProfileRequest, run
+from perchctl.commands.profile import run
 from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
 from perchctl.profile import Profile, file_names, find_calibration, load_profile
 
@@ -369,7 +369,7 @@ def test_the_command_shows_no_password(
     path.write_text(
         'description: "at http://me:secret@h/s"\ncamera: {source: "http://me:secret@h/s"}\n'
     )
-    assert run(ProfileRequest(str(path), as_json=as_json)) == 0
+    assert run(str(path), False, as_json) == 0
     shown = capsys.readouterr()
     assert "http://h/s" in shown.out
     assert "secret" not in shown.out + shown.err

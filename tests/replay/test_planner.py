@@ -15,7 +15,6 @@ import pytest
 
 import perchctl
 from perchctl.commands import log_plot, log_replay
-from perchctl.commands.log_replay import ReplayRequest
 from perchctl.errors import EXIT_CODES, InvalidValue, ReplayDiffers, UsageError
 from perchctl.log import (
     FlightLog,
@@ -411,7 +410,7 @@ def test_a_fault_of_the_planner_is_not_the_file_s(
 
     path = log_of(tmp_path, lines_of()[:120])
     plan_by(monkeypatch, fails)
-    code = log_replay.run(ReplayRequest(path, as_json=True))
+    code = log_replay.run(path, as_json=True)
     found = json.loads(capsys.readouterr().out)
     assert code == 61
     assert found["first_difference"]["field"] == "error"
@@ -419,7 +418,7 @@ def test_a_fault_of_the_planner_is_not_the_file_s(
     assert (found["ticks"], found["differences"]) == (1, 1)
     monkeypatch.setattr("perchctl.log.plot_flight", fails)
     with pytest.raises(ValueError, match="by the test"):
-        log_plot.run(log_plot.PlotRequest(path))
+        log_plot.run(path)
 
 
 def test_a_damaged_turn_is_the_file_s(tmp_path: Path) -> None:

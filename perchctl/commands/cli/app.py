@@ -10,7 +10,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO, TypeVar
+from typing import Annotated, Any, NoReturn, ParamSpec, TextIO
 
 import typer
 from typer.core import TyperGroup
@@ -155,13 +155,13 @@ def main() -> Any:
     return code
 
 
-Request = TypeVar("Request")
+P = ParamSpec("P")
 
 
-def perform(run: Callable[[Request], int], request: Request) -> NoReturn:
+def perform(run: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> NoReturn:
     """Do the command's work, its libraries being loaded, and leave with its exit code."""
     loaded()
-    code = run(request)
+    code = run(*args, **kwargs)
     sys.stdout.flush()  # a full disk or a closed pipe shows here, not after the last line
     raise typer.Exit(code)
 

@@ -34,9 +34,9 @@ def plot(
 ) -> None:
     """Draw a flight: errors, detections, lost frames, height, battery, the last seconds."""
     with reported(as_json):
-        from perchctl.commands.log_plot import PlotRequest, run
+        from perchctl.commands.log_plot import run
 
-        perform(run, PlotRequest(file, output, force, profile, log_dir, as_json))
+        perform(run, file, output, force, profile, log_dir, as_json)
 
 
 def show(
@@ -51,9 +51,9 @@ def show(
 ) -> None:
     """Tell a flight: how it ended and why, its phases, holds, battery, frames, findings."""
     with reported(as_json):
-        from perchctl.commands.log_show import ShowRequest, run
+        from perchctl.commands.log_show import run
 
-        perform(run, ShowRequest(file, listed, count, profile, log_dir, as_json))
+        perform(run, file, listed, count, profile, log_dir, as_json)
 
 
 def report(
@@ -69,9 +69,9 @@ def report(
 ) -> None:
     """Write one page that tells the flight, or several, in sentences and plots."""
     with reported(as_json):
-        from perchctl.commands.log_report import ReportRequest, run
+        from perchctl.commands.log_report import run
 
-        perform(run, ReportRequest(tuple(files or ()), output, force, profile, log_dir, as_json))
+        perform(run, files or (), output, force, profile, log_dir, as_json)
 
 
 def replay(
@@ -114,12 +114,9 @@ def replay(
     Exit codes: 0 where nothing differs, 61 where something does.
     """
     with reported(as_json):
-        from perchctl.commands.log_replay import ReplayRequest, run
+        from perchctl.commands.log_replay import run
 
-        perform(
-            run,
-            ReplayRequest(file, tuple(settings or ()), profile, pictures, output, force, as_json),
-        )
+        perform(run, file, settings or (), profile, pictures, output, force, as_json)
 
 
 def export(
@@ -147,20 +144,11 @@ def export(
 ) -> None:
     """Write a log in a form that other programs open."""
     with reported(as_json):
-        from perchctl.commands.log_export import ExportRequest, run
+        from perchctl.commands.log_export import run
 
-        request = ExportRequest(
-            file=file,
-            csv=csv,
-            parquet=parquet,
-            mcap=mcap,
-            output=output,
-            force=force,
-            profile=profile,
-            log_dir=log_dir,
-            as_json=as_json,
-        )
-        perform(run, request)
+        asked = {"csv": csv, "parquet": parquet, "mcap": mcap}
+        forms = [form for form, is_asked in asked.items() if is_asked]
+        perform(run, file, forms, output, force, profile, log_dir, as_json)
 
 
 def compare(
@@ -179,9 +167,9 @@ def compare(
 ) -> None:
     """Compare two flights: what differs, and in which keys their profiles do."""
     with reported(as_json):
-        from perchctl.commands.log_compare import CompareRequest, run
+        from perchctl.commands.log_compare import run
 
-        perform(run, CompareRequest(one, other, output, force, as_json))
+        perform(run, one, other, output, force, as_json)
 
 
 SUMMARY = "After a flight: its log shown, drawn, compared, exported, replayed, told."

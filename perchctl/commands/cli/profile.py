@@ -27,6 +27,6 @@ def profile(
 ) -> None:
     """Show a profile as it is flown: every key with its value, unit, bounds and meaning."""
     with reported(as_json):
-        from perchctl.commands.profile import ProfileRequest, run
+        from perchctl.commands.profile import run
 
-        perform(run, ProfileRequest(name, schema, as_json))
+        perform(run, name, schema, as_json)
