@@ -120,10 +120,16 @@ def contact_aside_m(c: Context) -> tuple[float, float]:
 
 
 def touched_aside_m(c: Context) -> tuple[float, float] | None:
-    """The same as it was when a press that it backs off from met the target's height: what has
-    not come down since is still there, wherever the estimate has drifted to. None if it has."""
+    """The same as it was when it touched something at the target's height and backed off: what has
+    not left since is still there, wherever decks let the estimate slide to. None where it has left,
+    and where a sight of now or a motion capture tells its place."""
     state = c.state
-    if state.phase is not Phase.RECOVER or state.contact_aside_m is None:
+    if state.phase is not Phase.RECOVER or state.contact_aside_m is None or c.fresh:
+        return None
+    x_m, y_m, _ = c.obs.telemetry.position_m
+    away_m = math.hypot(x_m - state.entry_m[0], y_m - state.entry_m[1])
+    by_capture = c.profile.positioning.by == "mocap" and c.placed
+    if by_capture and away_m > c.profile.planner.perch.contact_xy_m:
         return None
     return state.contact_aside_m, state.contact_sigma_m
 

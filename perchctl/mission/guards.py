@@ -218,7 +218,7 @@ def is_held_elsewhere(c: Context) -> bool:
     if touched is None:
         return is_held(c)
     aside_m, sigma_m = touched
-    return is_held(c) and aside_m - sigma_m > c.profile.planner.perch.contact_xy_m
+    return is_held(c) and aside_m - 2.0 * sigma_m > c.profile.planner.perch.contact_xy_m
 
 
 def why_held(c: Context) -> str:

@@ -481,13 +481,14 @@ def _reckon(c: Context) -> PlannerState:
     target = obs.target
     if target is not None:
         seen = obs.new_frame and target.measured
-        # An estimate that was without a position since then was moved when that came back.
-        moved = state.stale_s is not None and state.stale_s >= target.measured_s
-        if seen or (c.placed and not c.by_sight and not moved):
+        if seen or (c.placed and not c.by_sight):
             yaw_rad, (ex, ey, ez) = obs.telemetry.yaw_rad, target.e_m
             cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
+            # An estimate that was without a position since then was moved when that came back.
+            if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
+                aside_m, sigma_m = new.aside_m, new.aside_sigma_m
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
     held_s = c.held(Condition.CARRIED)
     flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned

@@ -188,15 +188,13 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
         case Phase.RECOVER:
             z_m = obs.telemetry.position_m[2]
             blocked_z_m = z_m if new.row == "blocked" else old.blocked_z_m
-            pressed = old.phase is Phase.PERCH
-            touched = pressed or new.row == "blocked"
-            at_height = pressed and abs(c.error_z_m) <= contact_within_m(c)
-            aside_m, sigma_m = contact_aside_m(c)
+            touched = old.phase is Phase.PERCH or new.row == "blocked"
+            kept_aside_m, kept_sigma_m = _touched_aside(old, new.row, c)
             return replace(
                 new,
                 stopped_s=None,
-                contact_aside_m=aside_m if at_height else None,
-                contact_sigma_m=sigma_m,
+                contact_aside_m=kept_aside_m,
+                contact_sigma_m=kept_sigma_m,
                 # In the magnet's reach until it is seen below.
                 contact_z_m=z_m if touched else old.contact_z_m,
                 released_s=None,
@@ -214,6 +212,8 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
             if new.row == "mounting":
                 # The setpoint is ahead, and every centimetre there is one in a wrong direction.
                 new = replace(new, setpoint=None)
+            if old.phase is Phase.RECOVER and new.row != "hangs-at-contact":
+                new = replace(new, contact_aside_m=None)  # nothing was felt to hold it there
             return lander.started(new, old, obs, c.profile)
         case Phase.ASCEND:
             return replace(new, searches=0)
@@ -222,3 +222,17 @@ def _started_phase(new: PlannerState, old: PlannerState, c: Context) -> PlannerS
             return replace(new, entry_m=(sp.x_m, sp.y_m, sp.z_m), entry_yaw_rad=sp.yaw_rad)
         case _:
             return new
+
+
+def _touched_aside(old: PlannerState, row: str, c: Context) -> tuple[float | None, float]:
+    """How far aside of the target it touched something at the target's height, with the standard
+    deviation, for what backs off from there; None where nothing was felt to be touched."""
+    kept = old.contact_aside_m, old.contact_sigma_m
+    if row == "not-released":  # the contact was proven, and nothing has come off
+        return kept
+    if old.phase is Phase.RECOVER:  # pressed again before it had left
+        return kept if old.contact_z_m is not None else (None, 0.0)
+    carried = max(c.held(Condition.CONTACT), c.held(Condition.CARRIED)) >= 0.0
+    if old.phase is Phase.PERCH and carried and abs(c.error_z_m) <= contact_within_m(c):
+        return contact_aside_m(c)
+    return None, 0.0

@@ -436,3 +436,22 @@ def test_positions_that_come_back_do_not_move_a_gear_that_has_not_moved(
         obs = observation(t_s, telemetry=tel, target=target, position_age_s=max(0.0, gone_s))
         state, _ = planner.step_mission(state, felt(obs), MOCAP)
     assert math.hypot(*state.reckoning.aside_m) == pytest.approx(aside_m, abs=0.01)
+
+
+def test_a_gap_in_the_positions_brings_nothing_nearer_to_the_magnet() -> None:
+    """Hovering below a target that is out of sight since: how far below it is, the position tells
+    as soon as it is back."""
+    felt, state = Felt(), state_in(Phase.ALIGN, z_m=HANG_Z_M - 0.35)
+    for t_s in times(8.0):
+        since_s = t_s - 10.0
+        target = target_at(
+            t_s, body_m=(0.0, 0.0, HANG_Z_M - 0.35), measured=since_s < 0.2,
+            measured_s=min(t_s, 10.2), tracked=since_s < 0.7,
+        )  # fmt: skip
+        gone_s = since_s - 0.2 if 0.2 < since_s < 0.5 else 0.0
+        obs = observation(
+            t_s, telemetry=telemetry(t_s, HANG_Z_M - 0.35), target=target, position_age_s=gone_s
+        )
+        state, _ = planner.step_mission(state, felt(obs), MOCAP)
+    assert state.reckoning.below_m == pytest.approx(0.35, abs=0.01)
+    assert state.reach_s is None

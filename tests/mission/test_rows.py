@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -100,14 +101,15 @@ def seen(z_m: float = 1.0, **obs: Any) -> Look:
     return lambda t_s: observation(t_s, z_m, **obs)
 
 
-def unseen(z_m: float = 1.0) -> Look:
+def unseen(z_m: float = 1.0, sigma_m: float = 1e-3, **tel: Any) -> Look:
     """The target is where it was, but no longer tracked."""
 
     def look(t_s: float) -> Observation:
         remembered = target_at(
-            t_s, body_m=(0.0, 0.0, z_m), measured=False, tracked=False, measured_s=START_S - 1.0
-        )
-        return observation(t_s, z_m, target=remembered)
+            t_s, body_m=(0.0, 0.0, z_m), measured=False, tracked=False, measured_s=START_S - 1.0,
+            sigma_m=np.full(3, sigma_m),
+        )  # fmt: skip
+        return observation(t_s, telemetry=replace(telemetry(t_s, z_m), **tel), target=remembered)
 
     return look
 
@@ -219,7 +221,7 @@ CASES: dict[str, Case] = {
         state={"entered_s": START_S, "contact_z_m": CONTACT_Z_M - 0.2}, z_m=CONTACT_Z_M - 0.2,
     ),
     "hangs-at-contact": Case(
-        P.RECOVER, P.LANDING, aside(0.06, CONTACT_Z_M, thrust=QUIET), 2.2, O.SAFETY,
+        P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
         state={
             "entered_s": START_S, "contact_z_m": CONTACT_Z_M, "contact_aside_m": 0.01,
             "contact_sigma_m": 0.05,

@@ -12,7 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState, planner
+from perchctl.mission.conditions import touched_aside_m
+from perchctl.mission.context import Context
 from perchctl.mission.release import UNREAD_S
+from perchctl.mission.table import TABLE
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     CRASHED,
@@ -376,7 +379,7 @@ def backed_off_from(
     [
         (0.012, 0.022, "caught", Phase.PERCHED, Outcome.PERCHED),
         (0.012, 0.075, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
-        (0.03, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
+        (0.04, 0.01, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
         (0.012, math.inf, "hangs-at-contact", Phase.PERCHED, Outcome.SAFETY),
         (0.06, 0.01, "held", Phase.ABORTED, Outcome.SAFETY),
     ],
@@ -388,7 +391,85 @@ def test_what_hangs_where_it_touched_the_target_is_told_by_its_place_there(
     state, rows = backed_off_from(aside_m, sigma_m)
     assert {"beside-the-magnet", row} <= rows
     assert (state.phase, state.outcome) == (ends, outcome)
-    assert state.contact_aside_m == pytest.approx(aside_m)
+    if ends is Phase.PERCHED:
+        assert state.contact_aside_m == pytest.approx(aside_m)
+
+
+@pytest.mark.parametrize(
+    ("touched", "by", "moved_m"), [(False, "deck", 0.0), (False, "deck", 0.1), (True, "mocap", 0.1)]
+)
+def test_what_a_hand_holds_where_nothing_was_touched_is_not_caught(
+    touched: bool, by: str, moved_m: float
+) -> None:
+    """A press that ended in the air, near the target; or one that touched it, and then went aside
+    by a motion capture, which does not slide."""
+    profile = Profile.model_validate({"positioning": by})
+    felt, state = Felt(), state_in(Phase.PERCH, z_m=HANG_Z_M - 0.04)
+    state = replace(state, entered_s=10.0 - PROFILE.planner.perch.timeout_s + 0.3, reach_s=None)
+    for i in range(1, 400):
+        t_s = 10.0 + 0.02 * i
+        held = state.phase is not Phase.PERCH
+        x_m = 0.03 + (moved_m if held else 0.0)
+        tel = telemetry(
+            t_s, thrust=(0.34 if held else 1.2 if touched else 1.0) * HOVER_THRUST,
+            position_m=(x_m, 0.0, HANG_Z_M - 0.04),
+        )  # fmt: skip
+        target = target_at(
+            t_s, body_m=tel.position_m, sigma_m=np.full(3, 0.01), measured=False, tracked=False,
+            measured_s=10.0,
+        )  # fmt: skip
+        state, _ = planner.step_mission(
+            state, felt(observation(t_s, telemetry=tel, target=target)), profile
+        )
+        if state.phase not in (Phase.PERCH, Phase.RECOVER):
+            break
+    assert (state.phase, state.row) == (Phase.LANDING, "held")
+
+
+def recovering(row: str, old: PlannerState, **obs: object) -> PlannerState:
+    """One tick on, into RECOVER by that row."""
+    table = tuple(
+        replace(r, when=lambda c: True) for r in TABLE if r.name == row and old.phase in r.phases
+    )
+    state, _ = planner.step_mission(old, observation(10.02, HANG_Z_M, **obs), PROFILE, table)
+    assert (state.phase, state.row) == (Phase.RECOVER, row)
+    return state
+
+
+@pytest.mark.parametrize(
+    ("phase", "row", "kept"),
+    [
+        (Phase.COMPLETE, "not-released", True), (Phase.COMPLETE, "slipped", False),
+        (Phase.RECOVER, "blocked", True), (Phase.PERCH, "no-contact", False),
+    ],
+)  # fmt: skip
+def test_what_has_not_come_off_keeps_the_place_where_it_touched(
+    phase: Phase, row: str, kept: bool
+) -> None:
+    old = replace(
+        state_in(phase, z_m=HANG_Z_M), contact_z_m=HANG_Z_M, contact_aside_m=0.01,
+        contact_sigma_m=0.02,
+    )  # fmt: skip
+    assert recovering(row, old).contact_aside_m == (0.01 if kept else None)
+
+
+def test_a_sight_of_now_tells_the_place_better_than_a_touch_of_before() -> None:
+    state = replace(state_in(Phase.RECOVER, z_m=HANG_Z_M), contact_z_m=HANG_Z_M)
+    state = replace(state, contact_aside_m=0.01, contact_sigma_m=0.01)
+    seen = observation(10.02, HANG_Z_M)
+    assert seen.target is not None
+    lost = replace(seen, target=replace(seen.target, tracked=False))
+    assert touched_aside_m(Context(state, lost, PROFILE)) == (0.01, 0.01)
+    assert touched_aside_m(Context(state, seen, PROFILE)) is None
+
+
+def test_a_landing_for_another_reason_proves_no_touch() -> None:
+    old = replace(
+        state_in(Phase.RECOVER, z_m=HANG_Z_M), contact_z_m=HANG_Z_M, contact_aside_m=0.01,
+        contact_sigma_m=0.02, attempts=PROFILE.planner.attempts, entered_s=9.0,
+    )  # fmt: skip
+    state, _ = planner.step_mission(old, observation(10.02, HANG_Z_M), PROFILE)
+    assert (state.row, state.contact_aside_m) == ("attempts-used", None)
 
 
 def test_what_hangs_where_it_was_pressed_below_the_target_has_not_touched_it() -> None:
