@@ -93,7 +93,7 @@ MOST_NAMES = {
     "log": 42,
     "mission": 60,
     "positioning": 15,
-    "profile": 54,
+    "profile": 55,
     "replay": 15,
     "report": 15,
     "sim": 31,

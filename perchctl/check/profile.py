@@ -1,7 +1,7 @@
 """What a profile tells about a flight before anything is opened: the check's rows of it.
 
 What no flight could end well with is refused when the profile is read; here is what is read, and
-was hardly meant.
+was hardly meant. `fly` asks the same, with the computer's disk, before it connects.
 """
 
 from __future__ import annotations
@@ -17,7 +17,14 @@ from perchctl.check.row import Row, Verdict
 from perchctl.errors import PerchError, SafetyAbort
 from perchctl.flight import FlyOptions
 from perchctl.geometry import Array
-from perchctl.profile import REACHED_SHARE, Limit, Profile, data_folder, find_calibration
+from perchctl.profile import (
+    OVERDUE_SHARE,
+    REACHED_SHARE,
+    Limit,
+    Profile,
+    data_folder,
+    find_calibration,
+)
 from perchctl.target import check_target, mm_text, sees_small_marker
 
 FAR_M = 0.15
@@ -276,8 +283,6 @@ LEAST_TILT_DEG, LEAST_FENCE_M, LEAST_STALE_S = 20.0, 0.3, 10.0
 MOST_GROUND_TOLERANCE_M = 0.45
 """What hangs is higher."""
 USUAL_RATE_HZ = 25.0
-OVERDUE = 0.5
-"""Of the landing's time: so long it goes by setpoints (`perchctl.mission.lander`)."""
 
 
 def _least_time_s(takeoff_m: float, takeoff_mps: float, *dwells_s: float) -> float:
@@ -329,7 +334,7 @@ DOUBTFUL: Mapping[str, tuple[Limit, ...]] = {
         Limit(
             ("safety.max_height_m", "planner.landing.speed_mps"), "planner.landing.timeout_s",
             "from there it is not down by setpoints when half of that is over, and is left to its "
-            "own landing", of=lambda height_m, speed_mps: height_m / speed_mps / OVERDUE,
+            "own landing", of=lambda height_m, speed_mps: height_m / speed_mps / OVERDUE_SHARE,
             words="twice the time that landing from {0} takes at {1}",
         ),
         Limit(

@@ -22,11 +22,11 @@ from perchctl.camera import (
     scheme_of,
     without_password,
 )
-from perchctl.check import OVERDUE
 from perchctl.errors import InvalidValue
 from perchctl.link import check_uri
 from perchctl.profile import (
     FARTHEST_ON_BODY_M,
+    OVERDUE_SHARE,
     PICTURE_EDGES,
     Profile,
     edges_beside,
@@ -303,7 +303,7 @@ def _heights(ceiling_m: float) -> dict[str, dict[str, Any]]:
     search_m = round(max(low_m, ceiling_m - FAR_SIGHT_M), 2)
     most_m = round(ceiling_m + OVER_THE_CEILING_M, 2)
     landing = Profile().planner.landing
-    down_s = most_m / landing.speed_mps / OVERDUE
+    down_s = most_m / landing.speed_mps / OVERDUE_SHARE
     return {
         "planner": {
             "takeoff_height_m": min(0.5, search_m),

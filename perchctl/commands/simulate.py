@@ -21,7 +21,7 @@ from perchctl.flight import (
     campaign_summary,
     campaign_table,
     defer_interrupts,
-    none_took_off_text,
+    none_took_off,
 )
 from perchctl.log import make_log_folder
 from perchctl.startup import leave_at_ctrl_c, loaded
@@ -94,5 +94,5 @@ def _campaign(request: SimulateRequest) -> int:
             report,
             kept,
             profiles=[profile],
-            objection=none_took_off_text,
+            objection=none_took_off,
         )

@@ -51,7 +51,7 @@ from .results import align_columns as align_columns
 from .results import campaign_summary as campaign_summary
 from .results import campaign_table as campaign_table
 from .results import give_back_memory as give_back_memory
-from .results import none_took_off_text as none_took_off_text
+from .results import none_took_off as none_took_off
 from .results import peak_mb as peak_mb
 from .results import peak_memory_mb as peak_memory_mb
 from .results import rate_record as rate_record

@@ -1,4 +1,4 @@
-"""The flight loop: newest frame, telemetry, pipeline, planner, link, log; one thread.
+"""The flight loop: telemetry, newest frame, pipeline, planner, link, log; one thread.
 
 Time comes from a `Clock`, so the same loop flies in real time through cflib and in
 lockstep with a simulated vehicle.
@@ -66,7 +66,7 @@ HUNG_S = 0.25
 
 
 class Positions(Protocol):
-    """What the loop needs of a `perchctl.positioning.feed.PositionFeed`."""
+    """What the loop needs of a `perchctl.positioning.PositionFeed`."""
 
     def status(self, now_s: float) -> FeedStatus: ...
 

@@ -1,4 +1,5 @@
-"""How flights ended: one flight's result and the figures of a campaign of them."""
+"""How flights ended: one flight's result, the figures of a campaign of them, its rates with their
+intervals, and the memory that it takes."""
 
 from __future__ import annotations
 
@@ -122,7 +123,7 @@ def worst_first(results: Iterable[FlightResult]) -> list[FlightResult]:
     return sorted(bad, key=lambda r: (-_SEVERITY.index(r.outcome), r.seed))
 
 
-def none_took_off_text(results: Sequence[FlightResult]) -> SafetyAbort | None:
+def none_took_off(results: Sequence[FlightResult]) -> SafetyAbort | None:
     """What a campaign says of which every flight was refused: that is no seed's doing."""
     if not results or any(r.outcome != "refused" for r in results):
         return None

@@ -1,7 +1,7 @@
 """What a flight was set up with, in its log's header: enough to decide it again elsewhere.
 
 The profile stands there with every key. The files that it names for the camera may be others
-by the time of a replay, so what was in them stands there, too.
+by the time of a replay, so what was in them stands there, too; and how the computer calculates.
 """
 
 from __future__ import annotations

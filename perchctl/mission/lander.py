@@ -1,5 +1,7 @@
 """The one way down, for the planner's LANDING, for the watchdog while the loop is silent, and for
-the rescue after an exception: `step(state, observation, profile) -> (state, command)`, pure.
+the rescue after an exception.
+
+Pure: `step_landing(state, observation, profile) -> (state, command)`.
 
 What it does follows from three things (`MANOEUVRES`, the table of docs/architecture.md):
 
@@ -41,7 +43,7 @@ from perchctl.mission.release import (
     stop_motors,
 )
 from perchctl.mission.state import Condition, Observation, Phase, PlannerState, Severity
-from perchctl.profile import LandingConfig, Profile
+from perchctl.profile import OVERDUE_SHARE, LandingConfig, Profile
 from perchctl.values import replace
 from perchctl.vehicle import (
     FULL_THRUST,
@@ -145,7 +147,6 @@ PEELED_M = 0.1
 """Below the contact by so much, the magnet has let go."""
 PEEL_BELOW_M, PEEL_S = 0.35, 4.0
 DROPPING_MPS = -0.35
-OVERDUE = 0.5
 """Of the landing's time: what is up there by then is left to its own landing."""
 FALLING_G, FALLEN_MPS = 0.5, 1.0
 """A landing that ends 5 cm above the floor drops it no faster, and is over."""
@@ -648,7 +649,7 @@ def _setpoints(c: Context) -> Acted:
         return state, away
     c = Context(state, c.obs, c.profile)
     # When its time is over nothing is sent any more: by then it must be landing by itself.
-    overdue = c.in_phase_s > OVERDUE * c.profile.planner.landing.timeout_s
+    overdue = c.in_phase_s > OVERDUE_SHARE * c.profile.planner.landing.timeout_s
     if overdue or c.height_m <= c.profile.planner.landing.handover_m:
         return _own_landing(c)
     return _by_setpoints(c)

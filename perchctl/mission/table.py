@@ -100,6 +100,12 @@ def risen(before: Severity, row: Severity) -> Severity:
 
 P, S, O, C = Phase, Severity, Outcome, Condition  # noqa: E741 - column names of the table below
 
+# --- The safety rows, gravest first -----------------------------------------------------------
+
+KNOCKED_S = 0.04
+"""More than one sample of telemetry."""
+
+# Where a row applies.
 AIR = FLYING_PHASES | {P.LANDING}
 BY_CAMERA = frozenset({P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.RECOVER})
 IN_THE_OPEN = BY_CAMERA | {P.APPROACH}
@@ -232,8 +238,7 @@ SAFETY: tuple[Row, ...] = (
     ),
 )  # fmt: skip
 
-KNOCKED_S = 0.04
-"""More than one sample of telemetry."""
+# --- The whole table ---------------------------------------------------------------------------
 
 TABLE: tuple[Row, ...] = (
     *SAFETY,

@@ -36,6 +36,7 @@ from .plain_yaml import split_values as split_values
 from .positioning import CAPTURE_SYSTEMS as CAPTURE_SYSTEMS
 from .positioning import PositioningConfig as PositioningConfig
 from .positioning import host_fault as host_fault
+from .schema import OVERDUE_SHARE as OVERDUE_SHARE
 from .schema import REACHED_SHARE as REACHED_SHARE
 from .schema import Limit as Limit
 from .schema import LinkConfig as LinkConfig

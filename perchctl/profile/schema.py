@@ -108,6 +108,8 @@ class Profile(Section):
 
 REACHED_SHARE = 0.8
 """Of the take-off height: from here on it counts as reached (`Condition.AT_TAKEOFF_HEIGHT`)."""
+OVERDUE_SHARE = 0.5
+"""Of the landing's time: so long it goes by setpoints, and then by the vehicle's own landing."""
 
 
 def _sum(*parts: float) -> float:

@@ -6,6 +6,9 @@ is exact at each pixel of a tile in which they show an edge; other tiles are fil
 (`perchctl.sim.tiles`). The ceiling's is evaluated at every eighth and interpolated,
 which errs by less than 0.01 px for lenses up to 90 degrees.
 
+Behind the renderer: what the lens makes of the pixels, the sheets on the ceiling, what an analogue
+link does to a picture, and the motion within one exposure.
+
 Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
 """
 
@@ -512,7 +515,7 @@ def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:
     count = min(2 * math.ceil(reach) + 1, MAX_SAMPLES)
     at = (np.arange(count) + 0.5) / count * (len(path) - 1)
     steps = np.arange(len(path))
-    half = min(math.ceil(reach) + 1, 12)
+    half = min(math.ceil(reach) + 1, MAX_KERNEL_REACH_PX)
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     for x, y in zip(
         np.interp(at, steps, path[:, 0]), np.interp(at, steps, path[:, 1]), strict=True

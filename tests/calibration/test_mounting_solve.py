@@ -19,8 +19,8 @@ from perchctl.calibration import (
     solve_pivot,
 )
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.result import student_factor
-from perchctl.calibration.mounting.solve import Carried, measured, missing
+from perchctl.calibration.mounting.result import Carried, measured, student_factor
+from perchctl.calibration.mounting.solve import missing
 from perchctl.calibration.mounting.turns import turns_from_rpy
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy

@@ -15,7 +15,7 @@ from perchctl.flight import (
     FlightResult,
     campaign_summary,
     campaign_table,
-    none_took_off_text,
+    none_took_off,
     run_campaign,
     seed_log_path,
 )
@@ -65,9 +65,9 @@ def test_it_has_no_time_and_no_attempts_to_compare() -> None:
 
 
 def test_where_none_took_off_it_is_not_the_seeds() -> None:
-    assert none_took_off_text([]) is None
-    assert none_took_off_text([REFUSED, LANDED]) is None
-    problem = none_took_off_text([REFUSED, REFUSED])
+    assert none_took_off([]) is None
+    assert none_took_off([REFUSED, LANDED]) is None
+    problem = none_took_off([REFUSED, REFUSED])
     assert isinstance(problem, SafetyAbort)
     assert "every flight was refused before take-off: the battery is flat" in str(problem)
 

@@ -18,13 +18,13 @@ from perchctl.calibration.mounting.recording import (
     MountingRecording,
     SeenPose,
 )
-from perchctl.calibration.mounting.result import Carried, Measured, Pivoted, measured
+from perchctl.calibration.mounting.result import Carried, Pivoted
 from perchctl.calibration.mounting.turns import nearest_turn, rotation_matrices, rotation_vectors
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, rpy_from_rotation
 
-__all__ = ["Carried", "Measured", "Pivoted", "measured", "missing", "solve_carry", "solve_pivot"]
-
+LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
+"""Also such as cannot be: a clock that is wrong is to be named, not hidden at the grid's end."""
 MOST_TURN_SIGMA_DEG = 0.5
 MOST_LATENCY_SIGMA_S = 0.01
 MOST_TIP_SIGMA_M = 1e-3
@@ -244,11 +244,11 @@ _MOST_LATE_S = 1.0
 
 def missing(recording: MountingRecording) -> tuple[str, ...]:
     """Which motion is still lacking, in a few words each; nothing: it is enough."""
-    lacking = _carry(recording) if recording.part == "carry" else _pivot(recording)
+    lacking = _lacking_carry(recording) if recording.part == "carry" else _lacking_pivot(recording)
     return tuple(lacking)
 
 
-def _carry(recording: MountingRecording) -> list[str]:
+def _lacking_carry(recording: MountingRecording) -> list[str]:
     attitudes, poses = recording.attitudes, recording.poses
     if len(attitudes) < 2 or len(poses) < 2:
         return ["bring the target into view"] if len(attitudes) >= 2 else ["wait for the vehicle"]
@@ -273,7 +273,7 @@ def _carry(recording: MountingRecording) -> list[str]:
     return lacking
 
 
-def _pivot(recording: MountingRecording) -> list[str]:
+def _lacking_pivot(recording: MountingRecording) -> list[str]:
     if len(recording.poses) < 2:
         return ["bring the target into view"]
     lacking = []
@@ -328,14 +328,13 @@ def tilt_extents_deg(tilts: Array) -> tuple[float, float]:
     return min(extents), max(extents)
 
 
-# --- Turn of the camera and latency from nothing: no start is needed, whatever the camera's turn
+# --- Turn of the camera and latency from nothing -------------------------------------------------
+# No start is needed, whatever the camera's turn.
 # Between two pictures the camera turns by the same rotation as the body, seen in its own axes:
 # ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid the R_body_cam
 # that fits best follows in closed form; the latency with the least misfit wins.
 
 
-LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
-"""Also such as cannot be: a clock that is wrong is to be named, not hidden at the grid's end."""
 _SPAN_S = (0.2, 0.5)
 _MOST_PAIRS = 400
 _ROUNDS = 3
