@@ -98,7 +98,6 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     views = capture_views(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
     assert 5 <= len(views) <= 7
     assert sum(m.shot for m in moments) == len(views)
-    assert [len(m.views) for m in moments] == [m.taken for m in moments]
     shots = [m.index for m in moments if m.shot]
     assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
     assert moments[0].advice == "hold still"

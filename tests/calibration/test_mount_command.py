@@ -377,7 +377,7 @@ def test_the_simulator_tells_the_truth_beside(
     def quick(held: Any, *_: Any, **__: Any) -> MountingRecording:
         return parts[held.part]
 
-    monkeypatch.setattr("perchctl.sim.hand.record_hand", quick)
+    monkeypatch.setattr("perchctl.sim.record_hand", quick)
     result = mount("--truth", "sim", "--seed", str(SEED), "--part", "pivot", "--json")
     record = json.loads(result.stdout)
     truth = hand("carry", SEED)
