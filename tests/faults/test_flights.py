@@ -32,8 +32,10 @@ from perchctl.faults.oracle import FLAGS
 from perchctl.faults.program import PlantedError
 from perchctl.faults.promises import PROMISE_OF, PROMISES
 from perchctl.faults.summary import worst_first
+from perchctl.flight import loop
 from perchctl.flight.record import flown_record
-from perchctl.mission import Phase, planner
+from perchctl.mission import Phase
+from perchctl.mission.planner import step_mission
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, SHORT
@@ -241,14 +243,14 @@ def test_an_exception_that_no_fault_planted_is_counted(
     error: Exception, counted: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The vehicle is landed all the same."""
-    step = planner.step_mission
+    step = step_mission
 
     def raising(state: Any, *rest: Any) -> Any:
         if state.phase is Phase.SEARCH:
             raise error
         return step(state, *rest)
 
-    monkeypatch.setattr(planner, "step", raising)
+    monkeypatch.setattr(loop, "step_mission", raising)
     result = flown("disk-full", Phase.ALIGN)
     assert (result.end, result.counted) == ("failed", counted)
     assert str(error) in result.reason

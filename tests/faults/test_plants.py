@@ -16,7 +16,7 @@ from perchctl.commands.positioning import POSITIONINGS, positioned
 from perchctl.faults import flight as faulty
 from perchctl.faults.flight import fly_fault_seed
 from perchctl.faults.oracle import Flag
-from perchctl.flight import OperatorSwitch
+from perchctl.flight import OperatorSwitch, loop
 from perchctl.mission import (
     Context,
     Observation,
@@ -78,7 +78,7 @@ def says_landed(patch: Patch) -> None:
             state = replace(state, phase=Phase.LANDED, row="landed")
         return state, command
 
-    patch.setattr(planner, "step", landed)
+    patch.setattr(loop, "step_mission", landed)
 
 
 def deceived(change: Callable[[Profile], Profile]) -> Callable[[Patch], None]:
@@ -118,7 +118,7 @@ def believes_old_telemetry(patch: Patch) -> None:
         telemetry = replace(obs.telemetry, t_s=obs.t_s, behind_s=0.0)
         return step(state, replace(obs, telemetry=telemetry), *rest)
 
-    patch.setattr(planner, "step", believing)
+    patch.setattr(loop, "step_mission", believing)
 
 
 @dataclass(frozen=True)

@@ -353,7 +353,7 @@ def test_ctrl_c_lands_from_every_phase(phase: Phase) -> None:
     assert flown.way[-3:] == [phase.value, "LANDING", end]
     assert report.outcome is Outcome.OPERATOR
     assert EXIT_CODE_OF[report.outcome] == 130
-    words = "the magnet holds" if flown.flight.hanging else "motors off"
+    words = "hanging with" if flown.flight.hanging else "motors off"
     assert report.reason.startswith(f"the operator asked to land; {words}")
     assert not flown.flight.locked
     assert not flown.flight.fell

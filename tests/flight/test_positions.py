@@ -188,7 +188,7 @@ def test_a_firmware_without_the_parameters_is_one_sentence(
 ) -> None:
     from perchctl.link import cflib_link
 
-    monkeypatch.setattr(cflib_link, "parameters_of", lambda config: {"locSrv.nothing": 1.0})
+    monkeypatch.setattr(cflib_link, "estimator_parameters", lambda config: {"locSrv.nothing": 1.0})
     link = CflibLink(sim.uri, LinkConfig(), time.monotonic, positioning=CONFIG)
     with pytest.raises(NotFound, match=r"no parameter locSrv\.nothing, which positioning from"):
         link.connect()
