@@ -19,9 +19,6 @@ from perchctl.camera import (
 )
 from perchctl.errors import InvalidValue, NotFound, UsageError
 
-_SAMPLES = 4
-_SAMPLE_EVERY = 30  # frames of a video
-
 
 @dataclass(frozen=True)
 class Source:

@@ -1,5 +1,6 @@
-"""The perching planner: `step_mission(state, observation, profile)
--> (state, command)`.
+"""The perching planner.
+
+`step_mission(state, observation, profile) -> (state, command)`.
 
 Pure: no clock, no input but its arguments, so a log replays to the same commands
 (`perchctl.replay.decide`, and `tests/replay/test_corpus.py` demands it).
