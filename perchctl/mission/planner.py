@@ -234,7 +234,8 @@ def _touched_aside(old: PlannerState, row: str, c: Context) -> tuple[float | Non
         return kept
     if old.phase is Phase.RECOVER:  # pressed again before it had left
         return kept if old.contact_z_m is not None else (None, 0.0)
-    carried = max(c.held(Condition.CONTACT), c.held(Condition.CARRIED)) >= 0.0
+    proven = c.held(Condition.CONTACT) >= c.profile.planner.perch.contact_dwell_s
+    carried = proven or c.held(Condition.CARRIED) >= 0.0  # which has that dwell in itself
     if old.phase is Phase.PERCH and carried and abs(c.error_z_m) <= contact_within_m(c):
         return contact_aside_m(c)
     return None, 0.0

@@ -15,6 +15,7 @@ from perchctl.mission import Observation, Operator, Outcome, Phase, PlannerState
 from perchctl.mission.conditions import touched_aside_m
 from perchctl.mission.context import Context
 from perchctl.mission.release import UNREAD_S
+from perchctl.mission.state import Condition
 from perchctl.mission.table import TABLE
 from perchctl.profile import Profile
 from perchctl.vehicle import (
@@ -451,6 +452,14 @@ def test_what_has_not_come_off_keeps_the_place_where_it_touched(
         contact_sigma_m=0.02,
     )  # fmt: skip
     assert recovering(row, old).contact_aside_m == (0.01 if kept else None)
+
+
+def test_one_sample_that_looks_like_a_contact_is_no_touch() -> None:
+    tel = telemetry(10.02, HANG_Z_M, thrust=1.2 * HOVER_THRUST)
+    for since_s, touched in ((10.0, False), (9.0, True)):
+        state = replace(state_in(Phase.PERCH, z_m=HANG_Z_M), since={Condition.CONTACT: since_s})
+        after = recovering("no-contact", state, telemetry=tel)
+        assert (after.contact_aside_m is not None) is touched
 
 
 def test_a_sight_of_now_tells_the_place_better_than_a_touch_of_before() -> None:
