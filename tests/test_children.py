@@ -6,7 +6,20 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from tests.helpers.flights import ROOT
+
+
+def loaded(code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+    )
+    return done.stdout or done.stderr
 
 
 def test_the_watch_over_the_parent_loads_no_library() -> None:
@@ -16,11 +29,15 @@ def test_the_watch_over_the_parent_loads_no_library() -> None:
         "pickle.loads(pickle.dumps(end_with_parent)); "
         "print(sorted({'numpy', 'cv2', 'mujoco', 'pydantic'} & set(sys.modules)))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=60.0,
+    assert loaded(code) == "[]\n"
+
+
+def test_the_simulator_starts_no_process_as_it_is_loaded() -> None:
+    """MuJoCo's window library would, and one that is ended halfway prints a traceback."""
+    pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
+    code = (
+        "import sys; begun = []; "
+        "sys.addaudithook(lambda name, _: name == 'subprocess.Popen' and begun.append(name)); "
+        "import perchctl.sim.world; print(begun, 'glfw' in sys.modules)"
     )
-    assert done.stdout == "[]\n", done.stderr
+    assert loaded(code) == "[] False\n"

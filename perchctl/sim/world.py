@@ -25,13 +25,19 @@ Assumptions of the model, each with its source:
 from __future__ import annotations
 
 import math
+import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
+
+# Nothing is drawn with it; its window library would start a process with each import, which
+# complains where it is ended halfway.
+os.environ.setdefault("MUJOCO_GL", "disable")
+
+import mujoco
 
 from perchctl.geometry import (
     GRAVITY_MPS2,
