@@ -413,8 +413,11 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
         state = replace(state, since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
     if Context(state, obs, profile).position_age_s > profile.positioning.hold_s:
         state = replace(state, stale_s=obs.t_s)
+    step_m = _step_m(state.last, obs.telemetry)
+    if profile.positioning.by != "target" and math.hypot(*step_m[:2]) > STEPPED_M:
+        state = replace(state, stepped_s=obs.telemetry.t_s)
     if obs.jumped:
-        state = _jumped(state, obs)
+        state = _jumped(state, obs, step_m)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
         # Where no hover thrust was learned yet, the present one has to do.
         hover = _hover_thrust(state, obs)
@@ -487,8 +490,10 @@ def _reckon(c: Context) -> PlannerState:
             cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
-            # An estimate that was without a position since then was moved when that came back.
-            if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
+            # An estimate that was without a position since then was moved when that came back,
+            # and one that has stepped since then has the target where it was before.
+            moved = not seen and state.stale_s is not None and state.stale_s >= target.measured_s
+            if moved or state.stepped_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
     held_s = c.held(Condition.CARRIED)
@@ -522,25 +527,29 @@ def _reckon(c: Context) -> PlannerState:
     )
 
 
-UNSEEN_S, AT_REST_S = 0.15, 0.3
+UNSEEN_S, AT_REST_S, STEPPED_M = 0.15, 0.3, 0.03
 Place = tuple[float, float, float]
 
 
-def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
+def _step_m(last: Telemetry | None, tel: Telemetry) -> Place:
+    """By how much the estimate's place has moved beyond its speed. Nothing where samples are
+    missing in between: it may be the vehicle that has moved, even to the floor."""
+    dt_s = math.inf if last is None else tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
+    if last is None or dt_s > UNSEEN_S:
+        return (0.0, 0.0, 0.0)
+    (x, y, z), (lx, ly, lz), (vx, vy, vz) = tel.position_m, last.position_m, tel.velocity_mps
+    return (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
+
+
+def _jumped(state: PlannerState, obs: Observation, moved_m: Place) -> PlannerState:
     """The estimate's world has moved, the vehicle has not: ground, contact and what else is
-    remembered are where the estimate has them now, and it is held where it is. Where samples
-    are missing before the step, it may be the vehicle that has moved, even to the floor; where
-    positions from outside have come again, the step ends a drift, and what was true before is."""
-    tel, last = obs.telemetry, state.last
-    if last is None:
+    remembered are where the estimate has them now, and it is held where it is. Where positions
+    from outside have come again, the step ends a drift, and what was true before is."""
+    tel = obs.telemetry
+    if state.last is None:
         return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
     x, y, z = tel.position_m
-    vx, vy, vz = tel.velocity_mps
-    dt_s = tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
-    lx, ly, lz = last.position_m
-    moved_m = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
-    put_right = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
-    if dt_s > UNSEEN_S or put_right:
+    if state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S:
         moved_m = (0.0, 0.0, 0.0)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
     if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:
