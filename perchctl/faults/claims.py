@@ -13,7 +13,7 @@ from perchctl.flight import RESCUED
 from perchctl.mission import RESCUE, Event, EventKind, Finding, FlightReport, Outcome, Phase
 
 Claim = Literal[
-    "hangs on the target", "hangs", "stands", "hangs or stands",
+    "hangs on the target", "held off the target", "hangs", "stands", "hangs or stands",
     "motors off", "locked", "ended by the supervisor", "tilted", "not seen down",
 ]  # fmt: skip
 """All that say hanging or standing say that the motors are off, too; `not seen down` says that
@@ -34,7 +34,7 @@ ROW_CLAIMS: dict[str, frozenset[Claim]] = {
     "perched": _claims("hangs on the target"),
     "hung": _claims("hangs"),
     "landed": _claims("stands"),
-    "held-elsewhere": _claims("hangs"),
+    "held-elsewhere": _claims("held off the target"),
     "hangs-or-stands": _claims("hangs or stands"),
     "landing-timeout": _claims("not seen down"),
 }
@@ -56,7 +56,7 @@ and whether it came down at all."""
 RESCUE_CLAIMS: dict[Finding | None, frozenset[Claim]] = {
     Finding.STANDS: _claims("stands"),
     Finding.HANGS: _claims("hangs"),
-    Finding.HELD: _claims("hangs"),
+    Finding.HELD: _claims("held off the target"),
     Finding.UNKNOWN: _claims("hangs or stands"),
     None: _claims("not seen down"),
 }

@@ -58,7 +58,9 @@ TILT_WITHIN_DEG = 10.0
 tilt by an estimate."""
 CLAIM_S = 0.5
 """A claim has to become true within this time (motors are cut 25 ms after the order)."""
-SAY_OFF: frozenset[Claim] = frozenset({"hangs", "stands", "hangs or stands", "motors off"})
+SAY_OFF: frozenset[Claim] = frozenset(
+    {"held off the target", "hangs", "stands", "hangs or stands", "motors off"}
+)
 SEEN_S = 6.0
 """What has been at rest and heard for so long has been seen: a supervisor's word that does not
 agree is taken for old after 5 s."""
@@ -90,6 +92,7 @@ class Sample(NamedTuple):
     uplink: bool = True  # what the program sends would arrive
     astray_m: float = 0.0  # from where it should be, less what the fault has made it drift by
     miss_m: float = 0.0  # of the gear from the target's centre, horizontally
+    below_m: float = 0.0  # the gear below the printed target's plane
     overdue: bool = False  # it should have been on its way down for some time
     heard: bool = True  # its telemetry arrives in time, and tells what is true
 
@@ -315,6 +318,9 @@ class Oracle:
         match claim:
             case "hangs on the target":
                 return s.hanging and not s.motors_on and s.miss_m <= self._limits.magnet_radius_m
+            case "held off the target":
+                off_m = math.hypot(s.miss_m, s.below_m)
+                return s.hanging and not s.motors_on and off_m > self._limits.magnet_radius_m
             case "hangs":
                 return s.hanging and not s.motors_on
             case "stands":

@@ -53,6 +53,7 @@ def sample_of(vehicle: SimulatedVehicle) -> Sample:
     weight_n = vehicle.scenario.mass_kg * GRAVITY_MPS2
     _, qx, qy, _ = world.quaternion
     up_z = 1.0 - 2.0 * (qx * qx + qy * qy)
+    target_z_m = vehicle.scenario.ceiling_z_m + vehicle.scenario.target_above_ceiling_m
     ceiling_n, floor = world.contacts()
     motors_on = max(firmware.motors) > 0.0
     lift_n = sum(world.powertrain.forces_n)
@@ -78,4 +79,5 @@ def sample_of(vehicle: SimulatedVehicle) -> Sample:
         supervisor.crashed or supervisor.tumbled,
         math.hypot(world.vx_mps, world.vy_mps),
         miss_m=world.gear_miss_m(),
+        below_m=target_z_m - world.gear_tip_m()[2],
     )

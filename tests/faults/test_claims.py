@@ -100,7 +100,7 @@ def test_what_a_rescue_says_counts_too(found: Finding | None) -> None:
     claims = claims_of_rescue(note(f"ValueError{RESCUE}{RESCUED[found]}"))
     words = {
         "stands on the floor": "stands", "hangs on the magnet": "hangs",
-        "something holds the vehicle": "hangs",
+        "something holds the vehicle": "held off the target",
         "whether the vehicle hangs or stands": "hangs or stands",
         "could not be confirmed": "not seen down",
     }  # fmt: skip

@@ -234,6 +234,12 @@ LOCKED = ON_THE_FLOOR._replace(locked=True, ended_by_vehicle=True)
         ("hangs on the target", HANGING._replace(miss_m=0.026), {"lied"}),
         ("hangs on the target", HANGING._replace(motors_on=True), {"lied"}),
         ("hangs on the target", ON_THE_FLOOR, {"lied"}),
+        ("held off the target", HANGING, {"lied"}),
+        ("held off the target", HANGING._replace(miss_m=0.015, below_m=0.019), {"lied"}),
+        ("held off the target", HANGING._replace(miss_m=0.026), set()),
+        ("held off the target", HANGING._replace(below_m=-0.026), set()),
+        ("held off the target", HANGING._replace(below_m=0.2, motors_on=True), {"lied"}),
+        ("held off the target", ON_THE_FLOOR._replace(below_m=2.0), {"lied"}),
         ("hangs", HANGING._replace(miss_m=0.026), set()),
         ("hangs", HANGING, set()),
         ("hangs", HANGING._replace(motors_on=True), {"lied"}),
@@ -285,7 +291,7 @@ def test_a_claim_has_half_a_second_to_become_true() -> None:
 
 @pytest.mark.parametrize("claim", sorted(SAY_OFF))
 def test_motors_that_were_said_to_be_off_turn_no_more(claim: Claim) -> None:
-    truth = HANGING if claim == "hangs" else ON_THE_FLOOR
+    truth = HANGING._replace(below_m=0.1) if claim.startswith("h") else ON_THE_FLOOR
     script = Script().show(truth, 1.0)
     script.oracle.claims(frozenset({claim}), script.t_s)
     assert script.show(truth, 3.0).flags == set()

@@ -181,4 +181,9 @@ def test_a_sample_tells_how_far_the_gear_is_from_the_target() -> None:
     x_m, y_m = vehicle.world.magnet.target_xy_m
     vehicle.world.set_pose((x_m + 0.04, y_m, 1.0))
     gear_m = SCENARIO.gear_body_m
-    assert sample_of(vehicle).miss_m == pytest.approx(math.hypot(0.04 + gear_m[0], gear_m[1]))
+    sample = sample_of(vehicle)
+    assert sample.miss_m == pytest.approx(math.hypot(0.04 + gear_m[0], gear_m[1]))
+    assert sample.below_m == pytest.approx(SCENARIO.ceiling_z_m - gear_m[2] - 1.0)
+    above = WatchedVehicle(replace(SCENARIO, target_above_ceiling_m=0.1), CAMERA, TargetConfig())
+    above.world.set_pose((x_m, y_m, SCENARIO.ceiling_z_m - gear_m[2]))
+    assert sample_of(above).below_m == pytest.approx(0.1)
