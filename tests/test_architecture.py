@@ -17,7 +17,7 @@ ROOT = Path(perchctl.__file__).resolve().parent
 # Library -> the modules (by prefix) that may import it; `*.plot`: modules of that name.
 HOMES: dict[str, tuple[str, ...]] = {
     "cflib": ("perchctl.link",),
-    "typer": ("perchctl.commands.cli",),
+    "typer": ("perchctl.commands",),
     "click": (),
     "rich": ("perchctl.commands", "perchctl.display"),
     "filterpy": ("perchctl.vision.filter",),
@@ -255,9 +255,11 @@ def cycle(imports: list[Import]) -> list[str]:
 
 
 def test_the_walk_sees_the_project() -> None:
-    assert {"perchctl.geometry", "perchctl.mission.planner", "perchctl.commands.cli"} <= set(
-        MODULES
-    )
+    assert {
+        "perchctl.geometry",
+        "perchctl.mission.planner",
+        "perchctl.commands.command_line",
+    } <= set(MODULES)
     assert len(IMPORTS) > 100
 
 
@@ -298,10 +300,10 @@ def test_no_clock_where_time_is_an_argument() -> None:
 
 def test_only_the_command_line_loads_typer_and_nothing_heavy() -> None:
     """`perchctl --help` stays quick: a subcommand loads libraries when it runs."""
-    allowed = ("perchctl.errors", "perchctl.startup", "perchctl.commands.cli")
+    allowed = ("perchctl.errors", "perchctl.startup")
     heavy = ("numpy", "cv2", "cflib", "matplotlib", "mujoco", "filterpy", "pydantic", "scipy")
     for i in IMPORTS:
-        if not i.at_load or not is_under(i.importer, ("perchctl.commands.cli",)):
+        if not i.at_load or not is_under(i.importer, ("perchctl.commands.command_line",)):
             continue
         assert i.imported.split(".")[0] not in heavy, str(i)
         if i.imported.startswith("perchctl."):

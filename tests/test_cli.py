@@ -20,8 +20,8 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl import __version__
 from perchctl.calibration import load_calibration
-from perchctl.commands.cli import app
-from perchctl.commands.cli.app import reported
+from perchctl.commands import app
+from perchctl.commands.command_line import COMMANDS, reported
 from perchctl.commands.output import confirmed
 from perchctl.errors import EXIT_CODES, Interrupted
 from perchctl.flight import PLAIN_SEED
@@ -59,7 +59,7 @@ def test_help_loads_nothing_heavy() -> None:
     """It answers in under 0.3 s because of what it does not import."""
     code = (
         "import sys\nsys.argv = ['perchctl', '--help']\n"
-        "from perchctl.commands.cli import main\n"
+        "from perchctl.commands import main\n"
         "try:\n    main()\nexcept SystemExit:\n    pass\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
@@ -78,6 +78,12 @@ def test_the_help_lists_the_commands_in_the_order_of_use() -> None:
     commands = ["make-target", "calibrate", "new-profile", "profile"]
     commands += ["fit-weights", "track", "fly", "simulate"]
     assert re.findall(rf"^\W*({'|'.join(commands)}) ", run("--help").stdout, re.M) == commands
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_has_the_first_sentence_of_each_help(name: str) -> None:
+    shown = " ".join(run(name, "--help").stdout.split())
+    assert COMMANDS[name][1] in shown
 
 
 def test_fly_help_lists_every_exit_code() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands.cli.app import reported
+from perchctl.commands.command_line import reported
 from perchctl.errors import InvalidValue, ProfileNote
 from tests.helpers.commands import elsewhere, run, run_apart  # noqa: F401
 

@@ -18,8 +18,7 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.commands import complete
-from perchctl.commands.cli import app
+from perchctl.commands import app, complete
 from perchctl.commands.fly import FlyRequest, fly, resolve
 from perchctl.errors import EXIT_CODES, ConnectionFailed
 from perchctl.flight import SessionResult

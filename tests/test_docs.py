@@ -21,7 +21,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.calibration import load_calibration, write_recordings
 from perchctl.cluster import parse_address
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.flight import fly_lockstep
 from perchctl.log import decode_line
 from perchctl.mission.table import TABLE

@@ -1,1 +1,2 @@
-from .cli import main as main
+from .command_line import app as app
+from .command_line import main as main

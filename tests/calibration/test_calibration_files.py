@@ -21,7 +21,7 @@ from perchctl.calibration import (
     profile_camera,
 )
 from perchctl.calibration.lens import COEFFICIENTS, parameters_of
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import CameraConfig
 from perchctl.vision import CameraModel

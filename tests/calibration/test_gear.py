@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from perchctl.calibration import learn_gear
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from tests.helpers.gear import SIZE_PX, legs, turned_about, write_turned_about
 

@@ -27,8 +27,7 @@ from perchctl.calibration import (
 )
 from perchctl.calibration.mounting.report import KEYS, turn_between_deg, written_gear_cam_m
 from perchctl.calibration.mounting.result import Carried
-from perchctl.commands import calibrate_mount
-from perchctl.commands.cli import app
+from perchctl.commands import app, calibrate_mount
 from perchctl.geometry import Array, rpy_from_rotation
 from perchctl.profile import Mounting, load_profile
 from tests.helpers.mounting import hand, seen

@@ -31,9 +31,8 @@ from perchctl.calibration import (
 )
 from perchctl.calibration.mounting.capture import MOST_S
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.commands import calibrate_mount_live
+from perchctl.commands import app, calibrate_mount_live
 from perchctl.commands.calibrate_mount_live import guide, page_state
-from perchctl.commands.cli import app
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import R_MARKER_TARGET
 from perchctl.link import MotionLink

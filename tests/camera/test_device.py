@@ -25,9 +25,8 @@ from perchctl.camera.v4l2 import (
     open_driver,
     value_of,
 )
-from perchctl.commands import check
+from perchctl.commands import app, check
 from perchctl.commands.check import camera_lines, list_cameras
-from perchctl.commands.cli import app
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import CameraConfig
 from tests.helpers.live import wait_for

@@ -14,9 +14,9 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.check import CheckScope, Row, Verdict, camera, compared, gone, session
 from perchctl.check.row import failed, passed, skipped, warned
+from perchctl.commands import app
 from perchctl.commands import check as command
 from perchctl.commands.check import CheckRequest, exit_code, run, table
-from perchctl.commands.cli import app
 from perchctl.errors import UsageError
 from perchctl.sim import SimProcess
 from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed

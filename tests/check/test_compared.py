@@ -13,7 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from perchctl.check import Verdict, compared
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.flight import wall_date
 from perchctl.profile import PositioningConfig
 from perchctl.sim.capture.settings import SWAPPED_XY, TRUE_AXES, Y_UP, axes_matrix

@@ -19,7 +19,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 import cv2
 from typer.testing import CliRunner
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.commands.positioning import POSITIONINGS, positioned
 from perchctl.errors import SafetyAbort
 from perchctl.faults import FAULTS, FaultResult, fault_summary, fault_table

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typer.testing import CliRunner, Result
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 
 
 def calibrate(*words: str) -> Result:

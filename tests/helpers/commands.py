@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from tests.helpers.flights import ROOT
 
 ON_THE_WAY = ("perchctl: connecting", "perchctl: check: ", "perchctl: flown ")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from typer.testing import CliRunner, Result
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.weights.table import NEEDED
 
 

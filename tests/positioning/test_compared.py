@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from perchctl.check import Verdict
 from perchctl.check import compared as check_compared
 from perchctl.check.row import failed, passed, skipped, warned
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.errors import SafetyAbort
 from perchctl.flight import session
 from perchctl.positioning import compared

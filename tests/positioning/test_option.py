@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner, Result
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.commands.complete import positionings
 from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from perchctl.check import Verdict, profile_rows
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.commands.new_profile import NewProfileRequest, run
 from perchctl.commands.new_profile_answers import QUESTIONS, WRITTEN
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.profile import load_profile
 from tests.helpers.disk import full_disk
 

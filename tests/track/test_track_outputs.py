@@ -13,7 +13,7 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.track import TrackRequest, resolve
 from perchctl.commands.track import track as track_source

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
-from perchctl.commands.cli import app
+from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
 from perchctl.weights.report import figure

@@ -7,16 +7,19 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import (
+from perchctl.commands.command_line import (
     CamOption,
+    Command,
     ForceOption,
     JsonOption,
     ViewOption,
     ViewPortOption,
+    complete_profile,
+    complete_source,
+    new_app,
     perform,
     reported,
 )
-from perchctl.commands.cli.complete import complete_profile, complete_source
 
 
 def calibrate(
@@ -200,3 +203,7 @@ def calibrate(
             ),
         )
         perform(run, request)
+
+
+app = new_app()
+app.command(cls=Command)(calibrate)

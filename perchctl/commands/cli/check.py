@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import ProfileOption, SourceOption, UriOption, perform, reported
+from perchctl.commands.command_line import (
+    Command,
+    ProfileOption,
+    SourceOption,
+    UriOption,
+    new_app,
+    perform,
+    reported,
+)
 
 
 def check(
@@ -73,3 +81,7 @@ def check(
             as_json=as_json,
         )
         perform(run, request)
+
+
+app = new_app()
+app.command(cls=Command)(check)

@@ -7,8 +7,16 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import ForceOption, JsonOption, ProfileOption, perform, reported
-from perchctl.commands.cli.complete import complete_source
+from perchctl.commands.command_line import (
+    Command,
+    ForceOption,
+    JsonOption,
+    ProfileOption,
+    complete_source,
+    new_app,
+    perform,
+    reported,
+)
 
 
 def fit_weights(
@@ -122,3 +130,7 @@ def fit_weights(
             as_json=as_json,
         )
         perform(run, request)
+
+
+app = new_app()
+app.command(cls=Command)(fit_weights)

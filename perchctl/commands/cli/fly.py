@@ -7,13 +7,16 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import (
+from perchctl.commands.command_line import (
+    EXIT_TABLE,
+    Command,
     PositioningOption,
     ProfileOption,
     SourceOption,
     UriOption,
     ViewOption,
     ViewPortOption,
+    new_app,
     perform,
     reported,
 )
@@ -70,3 +73,7 @@ def fly(
             view_port=view_port,
         )
         perform(run, request)
+
+
+app = new_app()
+app.command(cls=Command, epilog=EXIT_TABLE)(fly)

@@ -7,16 +7,19 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import (
+from perchctl.commands.command_line import (
+    Command,
     ForceOption,
     JsonOption,
     LogArgument,
     LogDirOption,
     LogProfileOption,
+    complete_log,
+    complete_profile,
+    new_app,
     perform,
     reported,
 )
-from perchctl.commands.cli.complete import complete_log, complete_profile
 
 
 def plot(
@@ -172,9 +175,7 @@ def compare(
         perform(run, one, other, output, force, as_json)
 
 
-SUMMARY = "After a flight: its log shown, drawn, compared, exported, replayed, told."
-
-log = typer.Typer(rich_markup_mode=None)
+app = new_app()
 
 for _name, _command in (
     ("show", show),
@@ -185,10 +186,10 @@ for _name, _command in (
     ("report", report),
 ):
     _summary = (_command.__doc__ or "").split("\n\n")[0]
-    log.command(_name, short_help=_summary)(_command)
+    app.command(_name, short_help=_summary, cls=Command)(_command)
 
 
-@log.callback(invoke_without_command=True)
+@app.callback(invoke_without_command=True)
 def _top(context: typer.Context) -> None:
     """After a flight: its log shown, drawn, compared, exported, replayed, told.
 

@@ -7,8 +7,16 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import CamOption, ForceOption, JsonOption, perform, reported
-from perchctl.commands.cli.complete import complete_profile
+from perchctl.commands.command_line import (
+    CamOption,
+    Command,
+    ForceOption,
+    JsonOption,
+    complete_profile,
+    new_app,
+    perform,
+    reported,
+)
 
 
 def make_target(
@@ -126,3 +134,7 @@ def make_target(
             as_json=as_json,
         )
         perform(run, request)
+
+
+app = new_app()
+app.command(cls=Command)(make_target)

@@ -7,8 +7,15 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import ForceOption, JsonOption, perform, reported
-from perchctl.commands.cli.complete import complete_source
+from perchctl.commands.command_line import (
+    Command,
+    ForceOption,
+    JsonOption,
+    complete_source,
+    new_app,
+    perform,
+    reported,
+)
 
 
 def new_profile(
@@ -97,3 +104,7 @@ def new_profile(
         }
         answers = {name: text for name, text in given.items() if text is not None}
         perform(run, NewProfileRequest(output, answers, defaults, force, as_json))
+
+
+app = new_app()
+app.command(cls=Command)(new_profile)

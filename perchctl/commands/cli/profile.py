@@ -6,8 +6,14 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import JsonOption, perform, reported
-from perchctl.commands.cli.complete import complete_profile
+from perchctl.commands.command_line import (
+    Command,
+    JsonOption,
+    complete_profile,
+    new_app,
+    perform,
+    reported,
+)
 
 
 def profile(
@@ -30,3 +36,7 @@ def profile(
         from perchctl.commands.profile import run
 
         perform(run, name, schema, as_json)
+
+
+app = new_app()
+app.command(cls=Command)(profile)

@@ -7,15 +7,17 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import (
+from perchctl.commands.command_line import (
+    Command,
     ForceOption,
     JsonOption,
     PositioningOption,
     ProfileOption,
+    complete_profile,
+    new_app,
     perform,
     reported,
 )
-from perchctl.commands.cli.complete import complete_profile
 
 
 def simulate(
@@ -118,3 +120,7 @@ def simulate(
             sweep=tuple(sweep or ()),
         )
         perform(run, request)
+
+
+app = new_app()
+app.command(cls=Command)(simulate)

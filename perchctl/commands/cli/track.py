@@ -7,16 +7,18 @@ from typing import Annotated
 
 import typer
 
-from perchctl.commands.cli.app import (
+from perchctl.commands.command_line import (
     CamOption,
+    Command,
     ForceOption,
     ProfileOption,
     ViewOption,
     ViewPortOption,
+    complete_source,
+    new_app,
     perform,
     reported,
 )
-from perchctl.commands.cli.complete import complete_source
 
 
 def track(
@@ -84,3 +86,7 @@ def track(
             view_port=view_port,
         )
         perform(run, request)
+
+
+app = new_app()
+app.command(cls=Command)(track)

@@ -1,9 +1,15 @@
-"""What the subcommands share: the application, its failures as sentences, common options."""
+"""What the subcommands share: the application, its failures as sentences, common options.
+
+A subcommand is one file of `perchctl.commands`: options, work and words together. It is loaded
+only as it is used, so that the help is quick, and may import whatever it needs at its top.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import importlib
 import os
 import signal
 import sys
@@ -13,15 +19,9 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn, ParamSpec, TextIO
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from perchctl import __version__
-from perchctl.commands.cli.complete import (
-    complete_log,
-    complete_positioning,
-    complete_profile,
-    complete_source,
-)
 from perchctl.errors import (
     EXIT_CODES,
     Interrupted,
@@ -40,8 +40,120 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BAD_PLACE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ENOTDIR)
 
 
+COMMANDS: dict[str, tuple[str, str]] = {
+    "make-target": (
+        "cli.make_target",
+        "Print the target (or a board), true to size; design it; write measured sizes.",
+    ),
+    "calibrate": (
+        "cli.calibrate",
+        "Calibrate the camera, and report what its error means in mm at the target.",
+    ),
+    "new-profile": (
+        "cli.new_profile",
+        "Write a profile of your vehicle, every key commented, in a short dialogue.",
+    ),
+    "profile": (
+        "cli.profile",
+        "Show a profile as it is flown: every key with its value, unit, bounds and meaning.",
+    ),
+    "fit-weights": (
+        "cli.fit_weights",
+        "Fit the merge weights to poses whose truth is known, and verify that they help.",
+    ),
+    "track": (
+        "cli.track",
+        "Find the target in a camera, video or pictures, without a vehicle.",
+    ),
+    "check": (
+        "cli.check",
+        "Look at vehicle, camera, computer and profile on the ground, and say what is not fit to "
+        "fly.",
+    ),
+    "fly": (
+        "cli.fly",
+        "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
+    ),
+    "simulate": (
+        "cli.simulate",
+        "Fly many seeded scenarios in lockstep, faster than real time, and count.",
+    ),
+    "log": (
+        "cli.log",
+        "After a flight: its log shown, drawn, compared, exported, replayed, told.",
+    ),
+}
+"""In the order in which one uses them: the file, and the first sentence of its help."""
+
+_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
+
+
+class Command(TyperCommand):
+    """Lists its options by their `rich_help_panel`, those without one first."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        sections: dict[str, list[tuple[str, str]]] = {}
+        for param in self.get_params(ctx):
+            record = param.get_help_record(ctx)
+            if record is not None:
+                plain = "Arguments" if param.param_type_name == "argument" else "Options"
+                panel = getattr(param, "rich_help_panel", None) or plain
+                sections.setdefault(panel, []).append(record)
+        for name, records in sections.items():
+            with formatter.section(name):
+                formatter.write_dl(records)
+
+
+class Group(TyperGroup):
+    """Subcommands, of which the first is the main one: it is done where none is named."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or args[0] not in (*self.commands, *_SETTINGS["help_option_names"]):
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """That of the main subcommand, with the others listed below it."""
+        name, main_command = next(iter(self.commands.items()))
+        inner = typer.Context(main_command, info_name=ctx.info_name, parent=ctx.parent, **_SETTINGS)
+        main_command.format_usage(inner, formatter)
+        main_command.format_help_text(inner, formatter)
+        main_command.format_options(inner, formatter)
+        with formatter.section(f"Subcommands; without one it is {name}"):
+            formatter.write_dl(
+                [(each.name, each.get_short_help_str(200)) for each in self.commands.values()]
+            )
+        main_command.format_epilog(inner, formatter)
+
+
+class _Unloaded(TyperCommand):
+    """A subcommand whose file is loaded once it is used."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> typer.Context:
+        with reported("--json" in sys.argv):
+            command = _load(self.name or "")
+        context: typer.Context = command.make_context(*args, **kwargs)
+        return context
+
+
+def _load(name: str) -> Any:
+    module = importlib.import_module(f"perchctl.commands.{COMMANDS[name][0]}")
+    command = typer.main.get_command(module.app)
+    command.name = name
+    return command
+
+
 class _Commands(TyperGroup):
     """Wrong usage is told by the object of `--json`, too."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in COMMANDS:
+            return None
+        # The whole sentence: of its own accord the list of the commands cuts it.
+        return _Unloaded(cmd_name, short_help=COMMANDS[cmd_name][1])
 
     def invoke(self, ctx: Any) -> Any:
         as_json = "--json" in ctx.args
@@ -54,15 +166,52 @@ class _Commands(TyperGroup):
             raise
 
 
-# Without rich's panels: they cut what is longer than a cell, and leave a narrow one for it.
-app = typer.Typer(
-    name="perchctl",
-    cls=_Commands,
-    help="Hang a Crazyflie onto a ceiling by the sight of a printed target.",
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
+def new_app(cls: type[TyperGroup] = TyperGroup) -> typer.Typer:
+    """The application of a subcommand, or with `cls=Group` of a group of them."""
+    # Without rich's panels: they cut what is longer than a cell, and leave a narrow one for it.
+    return typer.Typer(
+        cls=cls,
+        add_completion=cls is _Commands,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings=_SETTINGS,
+    )
+
+
+app = new_app(_Commands)
+
+
+def examples(*lines: str) -> str:
+    """The end of a subcommand's help; \\b keeps the lines as they are."""
+    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+# What options offer to a shell at Tab; the work behind it loads libraries.
+
+
+def complete_log(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import logs
+
+    return logs(incomplete)
+
+
+def complete_positioning(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import positionings
+
+    return positionings(incomplete)
+
+
+def complete_profile(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import profiles
+
+    return profiles(incomplete)
+
+
+def complete_source(incomplete: str) -> list[str]:
+    from perchctl.commands.complete import sources
+
+    return sources(incomplete)
+
 
 ProfileOption = Annotated[
     str,
@@ -156,6 +305,19 @@ def main() -> Any:
 
 
 P = ParamSpec("P")
+
+
+def reporting(run: Callable[P, int]) -> Callable[P, NoReturn]:
+    """The function of a subcommand, which returns its exit code: its failures become sentences,
+    and with `as_json` an object."""
+
+    @functools.wraps(run)
+    def do(*args: P.args, **kwargs: P.kwargs) -> NoReturn:
+        with reported(bool(kwargs.get("as_json"))):
+            perform(run, *args, **kwargs)
+        raise AssertionError("perform leaves")
+
+    return do
 
 
 def perform(run: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> NoReturn:
@@ -279,5 +441,6 @@ def _top(
         typer.Option("--version", "-V", callback=_print_version, is_eager=True, help="Version."),
     ] = False,
 ) -> None:
+    """Hang a Crazyflie onto a ceiling by the sight of a printed target."""
     if context.invoked_subcommand is None:
         print(context.get_help())
