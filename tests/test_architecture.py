@@ -39,6 +39,7 @@ CLOCKLESS = (
     "perchctl.geometry",
     "perchctl.vision",
     "perchctl.mission",
+    "perchctl.perception",
 )
 CLOCKS = ("time", "datetime", "sched", "threading", "asyncio", "signal")
 
@@ -59,6 +60,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("perchctl.mission",),
     ("perchctl.target",),
     ("perchctl.camera", "perchctl.positioning"),
+    ("perchctl.perception",),
     ("perchctl.calibration",),
     ("perchctl.sim",),
     ("perchctl.link", "perchctl.log"),
@@ -88,10 +90,11 @@ MOST_NAMES = {
     "commands": 15,
     "display": 15,
     "faults": 15,
-    "flight": 83,
+    "flight": 77,
     "link": 31,
     "log": 42,
     "mission": 60,
+    "perception": 15,
     "positioning": 15,
     "profile": 55,
     "replay": 15,

@@ -14,7 +14,8 @@ from perchctl.check.pictures import Blur, Light, blur_of, light_of, noise_of
 from perchctl.check.rehearsal import Rehearsal
 from perchctl.check.row import Row, by_limits, failed, passed, skipped, warned
 from perchctl.errors import PerchError
-from perchctl.flight import MIRRORED_FRAMES, too_near_problem
+from perchctl.flight import too_near_problem
+from perchctl.perception import MIRRORED_FRAMES
 from perchctl.profile import Profile
 from perchctl.target import Optics, TargetDesign, blind_lines, cm_text, design_ranges, make_design
 from perchctl.vision import BLENDED, Pipeline

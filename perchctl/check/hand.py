@@ -22,8 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from perchctl.check.row import Row, failed, passed, skipped, warned
-from perchctl.flight import History, attitude_at, nearest_axis
+from perchctl.flight import nearest_axis
 from perchctl.geometry import Array, rotation_from_rpy, rpy_from_rotation
+from perchctl.perception import History, attitude_at
 from perchctl.positioning import Placed
 from perchctl.profile import PositioningConfig
 from perchctl.vehicle import Telemetry

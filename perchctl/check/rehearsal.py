@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from perchctl.camera import FrameSource, WrappedSource
-from perchctl.flight import Clock, Senses
+from perchctl.flight import Clock, FlightInputs
 from perchctl.link import Guard, SentCallback, ignore_sent
 from perchctl.profile import Profile
 from perchctl.target import PrintCheck, PrintVerdict
@@ -127,7 +127,7 @@ def rehearse(
     move.
     """
     noted = _Noted(source)
-    senses = Senses(_only_heard(link, profile), noted, pipeline, profile)
+    senses = FlightInputs(_only_heard(link, profile), noted, pipeline, profile)
     done = Rehearsal(source.live)
     prints = PrintCheck(pipeline.camera, profile.target)
     period_s = 1.0 / profile.link.loop_hz
@@ -146,7 +146,7 @@ def rehearse(
     end_s = clock.now()
     done.problem = source.problem(end_s) or ""
     done.silent_s = end_s - (done.arrivals[-1][1] if done.arrivals else start_s)
-    done.remarks = senses.take_remarks()
+    done.remarks = senses.perception.take_remarks()
     target = senses.target(end_s)
     done.target = target if target is not None and target.tracked else None
     newest = senses.history.newest
@@ -156,7 +156,12 @@ def rehearse(
 
 
 def _note(
-    done: Rehearsal, frame: Frame, senses: Senses, prints: PrintCheck, work_s: float, now_s: float
+    done: Rehearsal,
+    frame: Frame,
+    senses: FlightInputs,
+    prints: PrintCheck,
+    work_s: float,
+    now_s: float,
 ) -> None:
     if senses.repeated:
         done.repeats += 1

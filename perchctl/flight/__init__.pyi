@@ -24,11 +24,10 @@ from .hands import defer_interrupts as defer_interrupts
 from .hands import flight_order as flight_order
 from .hands import flight_processes as flight_processes
 from .hands import run_order as run_order
-from .history import History as History
-from .history import add_late_samples as add_late_samples
-from .history import add_samples as add_samples
-from .history import attitude_at as attitude_at
-from .history import battery_age_s as battery_age_s
+from .inputs import ENDED_TEXT as ENDED_TEXT
+from .inputs import SENSED as SENSED
+from .inputs import FlightInputs as FlightInputs
+from .inputs import lateness_text as lateness_text
 from .kept import CampaignResults as CampaignResults
 from .kept import JudgedFlight as JudgedFlight
 from .kept import log_keeper as log_keeper
@@ -60,11 +59,6 @@ from .results_file import campaign_header as campaign_header
 from .results_file import commit_of as commit_of
 from .results_file import open_results as open_results
 from .results_file import profile_sha256 as profile_sha256
-from .senses import ENDED_TEXT as ENDED_TEXT
-from .senses import MIRRORED_FRAMES as MIRRORED_FRAMES
-from .senses import SENSED as SENSED
-from .senses import Senses as Senses
-from .senses import lateness_text as lateness_text
 from .session import PLAIN_SEED as PLAIN_SEED
 from .session import FlyOptions as FlyOptions
 from .session import OperatorSwitch as OperatorSwitch

@@ -14,6 +14,7 @@ from typing import Protocol
 from perchctl.camera import FrameSource
 from perchctl.errors import Interrupted, NotFound
 from perchctl.flight.clock import Clock
+from perchctl.flight.inputs import FlightInputs
 from perchctl.flight.outside import AtRest
 from perchctl.flight.preflight import (
     refuse,
@@ -23,7 +24,6 @@ from perchctl.flight.preflight import (
     still_waiting_for,
 )
 from perchctl.flight.rescue import Rescued, rescue
-from perchctl.flight.senses import Senses
 from perchctl.flight.turns import Turns
 from perchctl.flight.watchdog import Watchdog
 from perchctl.link import FRESH_S, Link
@@ -103,17 +103,17 @@ def fly(parts: FlightParts) -> FlightReport:
     anything unforeseen after the rescue.
     """
     turns = Turns(parts.clock, parts.watchers)
-    senses = Senses(
+    inputs = FlightInputs(
         parts.link, parts.source, parts.pipeline, parts.profile, send=parts.link.external,
         recorded=turns.are_told,
     )  # fmt: skip
-    _wait_until_ready(parts, senses, turns)  # nothing is started before it returns
-    if senses.history.newest is not None:
-        senses.ground_z_m = senses.history.newest.position_m[2]
+    _wait_until_ready(parts, inputs, turns)  # nothing is started before it returns
+    if inputs.history.newest is not None:
+        inputs.ground_z_m = inputs.history.newest.position_m[2]
     watchdog, told = Watchdog(parts.profile, parts.operator, parts.position_age_s), _teller(parts)
     parts.link.guard(watchdog, told)
     try:
-        return _mission(parts, senses, watchdog, turns)
+        return _mission(parts, inputs, watchdog, turns)
     except BaseException as error:
         watchdog.rescuing()
         found = rescue(
@@ -122,13 +122,13 @@ def fly(parts: FlightParts) -> FlightReport:
             parts.profile,
             parts.operator,
             watchdog.state,
-            senses.history,
+            inputs.history,
             parts.position_age_s,
             told,
-            senses.felt.motion,
+            inputs.perception.motion.motion,
         )
         with contextlib.suppress(Exception):  # the log may be what failed
-            turns.failed(senses, error)
+            turns.failed(inputs, error)
         _tell_rescue(parts, error, found)
         raise
 
@@ -163,23 +163,23 @@ def _tell_rescue(parts: FlightParts, error: BaseException, found: Rescued) -> No
             watcher.event(Event(parts.clock.now(), EventKind.NOTE, text))
 
 
-def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
+def _wait_until_ready(parts: FlightParts, inputs: FlightInputs, turns: Turns) -> None:
     refuse_unmeasured(parts.link, parts.profile, positions=parts.positions is not None)
     started_s, at_rest = parts.clock.now(), AtRest()
     while True:
         now_s = parts.clock.now()
         if parts.operator() is not Operator.NONE:
             raise Interrupted("interrupted before take-off: nothing was started")
-        senses.take_in(now_s)
-        newest = senses.history.newest
+        inputs.take_in(now_s)
+        newest = inputs.history.newest
         refuse(newest, parts.profile)
-        outside = _outside(parts, senses, now_s)
+        outside = _outside(parts, inputs, now_s)
         refuse_strange(outside, newest, parts.profile, now_s, at_rest)
-        turns.waiting(senses, now_s, outside)
+        turns.waiting(inputs, now_s, outside)
         waiting = still_waiting_for(
-            newest, senses.frames > 0, senses.camera_problem or senses.refused,
+            newest, inputs.frames > 0, inputs.camera_problem or inputs.perception.refused,
             now_s - started_s, parts.profile,
-            senses.target(now_s), 0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
+            inputs.target(now_s), 0.0 if newest is None else now_s - newest.t_s + newest.behind_s,
             outside, parts.pipeline.camera,
         )  # fmt: skip
         if parts.source.finished:
@@ -188,29 +188,31 @@ def _wait_until_ready(parts: FlightParts, senses: Senses, turns: Turns) -> None:
                 f"go on, from a camera or a longer recording"
             )
         if not waiting:
-            if newest is not None and senses.sights is not None:
-                target = senses.sights.feed.target
+            if newest is not None and inputs.target_positioning is not None:
+                target = inputs.target_positioning.feed.target
                 refuse_out_of_view(target, newest, parts.profile, parts.pipeline.camera)
             return
         parts.clock.wait_until(now_s + 1.0 / parts.profile.link.loop_hz)
 
 
-def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turns) -> FlightReport:
+def _mission(
+    parts: FlightParts, inputs: FlightInputs, watchdog: Watchdog, turns: Turns
+) -> FlightReport:
     period_s = 1.0 / parts.profile.link.loop_hz
     clock = parts.clock
     due_s = clock.now()
     state: PlannerState | None = None
     passed: list[Event] = []
     redone = log_noted = False
-    told = senses.noticed.newest  # to the log
+    told = inputs.perception.calibration.newest  # to the log
     while True:
         now_s = clock.now()
         turns.begin(now_s)
-        senses.take_in(now_s, look=not _is_blind(state))
-        now_s = _present(parts, senses, now_s)
+        inputs.take_in(now_s, look=not _is_blind(state))
+        now_s = _present(parts, inputs, now_s)
         late_s = max(0.0, now_s - due_s)
-        outside = _outside(parts, senses, now_s)
-        obs = _observe(parts, senses, now_s, late_s, outside)
+        outside = _outside(parts, inputs, now_s)
+        obs = _observe(parts, inputs, now_s, late_s, outside)
         turns.lap()
         turns.observed(obs)
         before = state
@@ -220,23 +222,23 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
         overruled = new.phase in FLYING_PHASES and watchdog.overruled_s > late_s
         if not redone and (overruled or clock.now() - now_s > HUNG_S):
             redone = True  # nothing that was decided before a hang is sent after it
-            turns.redone(senses, obs, new, command)
+            turns.redone(inputs, obs, new, command)
             continue
         state, redone = new, False
         if not isinstance(command, Idle):
             parts.link.send(command)
         turns.lap()
         watchdog.tick(max(due_s, now_s) + period_s, state, command, obs)
-        senses.sends_sights = state.blind_s is None
+        inputs.sends_sights = state.blind_s is None
         if state.astray and parts.positions is not None and not (before and before.astray):
             parts.positions.stop()
-            senses.felt = drop_sights(senses.felt)
+            inputs.perception.motion = drop_sights(inputs.perception.motion)
         events = events_of(before, state, obs, parts.profile)
         if obs.log_problem is not None and not log_noted:
             log_noted = True
             text = f"the log of this flight is incomplete: {obs.log_problem}"
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
-        for text in (*senses.take_remarks(), *parts.remarks()):
+        for text in (*inputs.perception.take_remarks(), *parts.remarks()):
             events.append(Event(now_s, EventKind.NOTE, text, state.phase))
         for event in events:
             event = replace(event, simulated=parts.simulated(event))
@@ -244,50 +246,50 @@ def _mission(parts: FlightParts, senses: Senses, watchdog: Watchdog, turns: Turn
                 passed.append(event)
             for watcher in parts.watchers:
                 watcher.event(event)
-        turn = turns.flown(senses, obs, state, command, outside)
-        tick = _tick(senses, state, command, obs, told, turn)
-        told = senses.noticed.newest
+        turn = turns.flown(inputs, obs, state, command, outside)
+        tick = _tick(inputs, state, command, obs, told, turn)
+        told = inputs.perception.calibration.newest
         for watcher in parts.watchers:
             watcher.tick(tick)
         if is_mission_over(state):
             watchdog.end(motors_off=state.phase is not Phase.ABORTED)
-            return report_of(state, obs, tuple(passed), senses)
+            return report_of(state, obs, tuple(passed), inputs)
         due_s += period_s
         if due_s < now_s:
             due_s = now_s + period_s  # never try to catch up with a burst of old ticks
         clock.wait_until(due_s)
 
 
-def _outside(parts: FlightParts, senses: Senses, now_s: float) -> FeedStatus | None:
+def _outside(parts: FlightParts, inputs: FlightInputs, now_s: float) -> FeedStatus | None:
     """How it goes with positions from outside, or by the target; None where decks measure."""
-    if senses.sights is not None:
-        return senses.sights.status(now_s)
+    if inputs.target_positioning is not None:
+        return inputs.target_positioning.status(now_s)
     return None if parts.positions is None else parts.positions.status(now_s)
 
 
-def _present(parts: FlightParts, senses: Senses, began_s: float) -> float:
+def _present(parts: FlightParts, inputs: FlightInputs, began_s: float) -> float:
     """The turn's time. Where camera or vision hung, it is the present, with what has arrived
     meanwhile: a setpoint for the time before the hang would be a stale one."""
     now_s = parts.clock.now()
     if now_s - began_s <= HUNG_S:
         return began_s
-    senses.present(began_s, now_s)
+    inputs.present(began_s, now_s)
     return now_s
 
 
 def _tick(
-    senses: Senses,
+    inputs: FlightInputs,
     state: PlannerState,
     command: Command,
     obs: Observation,
     told: Consistency | None,
     turn: Turn,
 ) -> Tick:
-    newest = senses.noticed.newest
+    newest = inputs.perception.calibration.newest
     return Tick(
         obs.t_s,
         obs.telemetry,
-        senses.output,
+        inputs.output,
         obs.target,
         state,
         command,
@@ -307,10 +309,14 @@ def _is_blind(state: PlannerState | None) -> bool:
 
 
 def _observe(
-    parts: FlightParts, senses: Senses, now_s: float, late_s: float, outside: FeedStatus | None
+    parts: FlightParts,
+    inputs: FlightInputs,
+    now_s: float,
+    late_s: float,
+    outside: FeedStatus | None,
 ) -> Observation:
     return replace(
-        senses.observation(now_s),
+        inputs.observation(now_s),
         link_problem=parts.link.problem(now_s),
         loop_late_s=late_s,
         operator=parts.operator(),
@@ -353,10 +359,10 @@ def events_of(
 
 
 def report_of(
-    state: PlannerState, obs: Observation, passed: tuple[Event, ...], senses: Senses
+    state: PlannerState, obs: Observation, passed: tuple[Event, ...], inputs: FlightInputs
 ) -> FlightReport:
-    seen, camera = senses.noticed_at_last(), senses.profile.camera
-    c = Context(state, obs, senses.profile)
+    seen, camera = inputs.perception.consistency(), inputs.profile.camera
+    c = Context(state, obs, inputs.profile)
     return FlightReport(
         phase=state.phase,
         outcome=state.outcome or Outcome.SAFETY,

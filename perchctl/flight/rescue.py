@@ -8,7 +8,6 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from perchctl.flight.clock import Clock
-from perchctl.flight.history import History, add_samples
 from perchctl.link import Link, SentCallback, ignore_sent
 from perchctl.mission import (
     Condition,
@@ -24,6 +23,7 @@ from perchctl.mission import (
     step_landing,
     touchdown_of,
 )
+from perchctl.perception import History, add_samples
 from perchctl.profile import Profile
 from perchctl.vehicle import Command, EmergencyStop, Idle
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 
 from perchctl.flight.clock import Clock, SimulatedClock, WallClock
-from perchctl.flight.senses import Senses
+from perchctl.flight.inputs import FlightInputs
 from perchctl.mission import (
     ExternalPositions,
     Observation,
@@ -53,15 +53,17 @@ class Turns:
         if self._wall is not None:
             self._laps_s.append(self._wall())
 
-    def waiting(self, senses: Senses, now_s: float, outside: FeedStatus | None) -> None:
+    def waiting(self, inputs: FlightInputs, now_s: float, outside: FeedStatus | None) -> None:
         turn = Turn(
-            self._counted(), "waiting", now_s, now_s, senses.taken, senses.poses,
+            self._counted(), "waiting", now_s, now_s, inputs.taken, inputs.poses,
             outside=told_of(outside),
         )  # fmt: skip
         self._tell(turn)
 
-    def redone(self, senses: Senses, obs: Observation, new: PlannerState, command: Command) -> None:
-        self._tell(self._turn("redone", senses, obs, new, command, None))
+    def redone(
+        self, inputs: FlightInputs, obs: Observation, new: PlannerState, command: Command
+    ) -> None:
+        self._tell(self._turn("redone", inputs, obs, new, command, None))
 
     def observed(self, obs: Observation) -> None:
         """What is about to be decided on."""
@@ -77,37 +79,37 @@ class Turns:
         """The planner has done its part: what fails from now on is not its fault."""
         self._undecided, self._untold = None, (obs, new, command, outside)
 
-    def failed(self, senses: Senses, error: BaseException) -> None:
+    def failed(self, inputs: FlightInputs, error: BaseException) -> None:
         """The flight broke off. Where the planner raised, tell what it was shown: by that its
         fault can be found again. Where it had decided, tell what: it may have been sent."""
         obs, untold = self._undecided, self._untold
         self._undecided = self._untold = None
         if untold is not None:
             obs, new, command, outside = untold
-            turn = self._turn("flown", senses, obs, new, command, told_of(outside))
+            turn = self._turn("flown", inputs, obs, new, command, told_of(outside))
             self._tell(replace(turn, timing=None))  # by now the rescue's time is in it
         elif obs is not None and isinstance(error, Exception):  # else it was only interrupted
             self._tell(
                 Turn(
-                    self._counted(), "failed", self._began_s, obs.t_s, senses.taken, senses.poses,
+                    self._counted(), "failed", self._began_s, obs.t_s, inputs.taken, inputs.poses,
                     observation=obs, error=type(error).__name__,
                 )
             )  # fmt: skip
 
     def flown(
         self,
-        senses: Senses,
+        inputs: FlightInputs,
         obs: Observation,
         new: PlannerState,
         command: Command,
         outside: FeedStatus | None,
     ) -> Turn:
-        return self._turn("flown", senses, obs, new, command, told_of(outside))
+        return self._turn("flown", inputs, obs, new, command, told_of(outside))
 
     def _turn(
         self,
         role: TurnRole,
-        senses: Senses,
+        inputs: FlightInputs,
         obs: Observation,
         new: PlannerState,
         command: Command,
@@ -119,8 +121,8 @@ class Turns:
             role=role,
             began_s=self._began_s,
             t_s=obs.t_s,
-            taken=senses.taken,
-            poses=senses.poses,
+            taken=inputs.taken,
+            poses=inputs.poses,
             observation=obs,
             command=command,
             phase=new.phase,

@@ -13,9 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from perchctl.flight.history import History, add_samples
 from perchctl.link import is_cut, knows_its_position
 from perchctl.mission import Observation, Operator, Phase, PlannerState, step_landing
+from perchctl.perception import History, add_samples
 from perchctl.profile import Profile
 from perchctl.values import replace
 from perchctl.vehicle import (

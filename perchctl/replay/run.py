@@ -11,14 +11,11 @@ from perchctl.calibration import profile_camera
 from perchctl.errors import InvalidValue
 from perchctl.flight import (
     SENSED,
-    History,
-    add_late_samples,
-    add_samples,
-    battery_age_s,
     lateness_text,
 )
 from perchctl.log import FlightLog, computer_differences, flown_camera, flown_mask, flown_profile
 from perchctl.mission import Observation, Turn
+from perchctl.perception import History, add_late_samples, add_samples, battery_age_s
 from perchctl.profile import Profile
 from perchctl.replay.compare import Difference, first_differing, same
 from perchctl.replay.decide import Decided, decide, first_of, whole_turns
@@ -340,7 +337,7 @@ def _on_keys(changed: Sequence[str], pictures: bool) -> Iterator[str]:
 
 
 # --- What the planner would be shown, from a log alone ------------------------------------------
-# The part of the senses that needs no picture.
+# The part of the inputs that needs no picture.
 # Telemetry and the frames' times are recorded, so whether the estimate jumped, how old battery and
 # camera are, and which picture came too late can be judged anew. What a picture showed cannot: the
 # target stays where it was estimated in the flight.

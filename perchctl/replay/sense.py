@@ -1,4 +1,4 @@
-"""A flight seen again: the recorded telemetry and pictures through the loop's own senses.
+"""A flight seen again: the recorded telemetry and pictures through the loop's own inputs.
 
 The same pictures, samples and times have to give the same poses, to the bit, on one thread.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.flight import ENDED_TEXT, SENSED, Senses
+from perchctl.flight import ENDED_TEXT, SENSED, FlightInputs
 from perchctl.mission import FrameSeen, Observation, PoseSeen, Turn, TurnInputs
 from perchctl.profile import Profile
 from perchctl.vehicle import Telemetry
@@ -48,7 +48,7 @@ class Sensed:
 
 
 class _Given:
-    """The recorded edges of one turn after another, as the senses ask for them."""
+    """The recorded edges of one turn after another, as the inputs ask for them."""
 
     def __init__(
         self, pictures: Iterable[Picture], size_px: tuple[int, int], later_s: float
@@ -144,14 +144,14 @@ def sense(
     cannot be read: from then on the pipeline would remember another flight.
     """
     given = _Given(pictures, pipeline.camera.size_px, later_s)
-    senses = Senses(given, given, pipeline, profile, recorded=True)
+    inputs = FlightInputs(given, given, pipeline, profile, recorded=True)
     with one_thread():
         for turn in turns:
             given.turn(turn)
-            senses.take_in(turn.began_s, look=turn.taken.look)
+            inputs.take_in(turn.began_s, look=turn.taken.look)
             if turn.t_s != turn.began_s:
-                senses.present(turn.began_s, turn.t_s)
-            yield Sensed(turn, senses.poses, _observed(turn, senses))
+                inputs.present(turn.began_s, turn.t_s)
+            yield Sensed(turn, inputs.poses, _observed(turn, inputs))
 
 
 def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
@@ -162,10 +162,10 @@ def _readable(pictures: Iterable[Picture]) -> Iterator[Picture]:
         raise PicturesUnreadable(str(error)) from error
 
 
-def _observed(turn: Turn, senses: Senses) -> Observation | None:
-    if turn.observation is None or senses.history.newest is None:
+def _observed(turn: Turn, inputs: FlightInputs) -> Observation | None:
+    if turn.observation is None or inputs.history.newest is None:
         return None
-    seen = senses.observation(turn.t_s)
+    seen = inputs.observation(turn.t_s)
     return replace(turn.observation, **{name: getattr(seen, name) for name in SENSED})
 
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from perchctl.camera import HealthState, HealthVerdict, assess_frame, mirrored_note
+from perchctl.camera import mirrored_note
 from perchctl.display import PageState, Sketch
 from perchctl.geometry import wrap_rad, yaw_of
+from perchctl.perception import Perception
 from perchctl.profile import CameraConfig, Profile
 from perchctl.track.result import Tracked, text_rows, track_record, tracked_of
 from perchctl.vision import (
@@ -21,16 +22,12 @@ from perchctl.vision import (
     INTERLACED,
     MARKERS,
     CameraModel,
-    FieldState,
     Frame,
     MarkerPose,
     Pipeline,
     PipelineOutput,
-    PipelineState,
     camera_profile,
     make_pipeline,
-    pictures,
-    step,
 )
 
 MOST_NOTES = 20
@@ -51,7 +48,7 @@ def camera_pipeline(profile: Profile, camera: CameraModel, stills: bool = False)
 
 @dataclass(eq=False)
 class Tracker:
-    """Frame in, results out; remembers what the pipeline must (nothing with `stills`).
+    """Frame in, results out; nothing is remembered with `stills`.
 
     `notes` are the sentences that the newest picture deserves.
     """
@@ -65,17 +62,17 @@ class Tracker:
     output: PipelineOutput | None = None
     picture: Frame | None = None
     more: bool = False  # another field of the same frame follows
-    _state: PipelineState = field(default_factory=PipelineState)
-    _fields: FieldState = field(default_factory=FieldState)
-    _health: HealthState = field(default_factory=HealthState)
     _last: Tracked | None = None
     _pose: MarkerPose | None = None  # the newest that a picture showed
     _interlaced: bool = False
 
+    def __post_init__(self) -> None:
+        self._perception = Perception(self.setup, stills=self.stills)
+
     def results(self, frame: Frame, name: str | int) -> Iterator[Tracked]:
         """The frame's result, or those of its two fields; none for a live source's repetition
         of the last picture. `picture`, `notes` and `output` are those of the newest."""
-        judged = self._assess(frame)
+        judged = self._perception.assess(frame, self.live or not self.stills)
         if self.live and judged.kind == "repeated":
             return
         self.picture, self.output = frame, None
@@ -83,18 +80,15 @@ class Tracker:
         if self.live and judged.kind in _NO_PICTURE:
             yield Tracked(name, frame.t_s)
             return
-        if self.stills:
-            found: tuple[Frame, ...] = (frame,)
-        else:
-            self._fields, found = pictures(self._fields, frame, self.setup)
         about, self.notes = self.notes, ()
-        for k, picture in enumerate(found, start=1):
-            self.more = k < len(found)
-            yield self._track(picture, name, about)
+        looked = list(self._perception.look(frame))
+        for k, (picture, output) in enumerate(looked, start=1):
+            self.more = k < len(looked)
+            yield self._track(picture, output, name, about)
 
-    def _track(self, picture: Frame, name: str | int, about: tuple[str, ...]) -> Tracked:
-        before = PipelineState() if self.stills else self._state
-        self._state, output = step(before, picture, None, self.setup)
+    def _track(
+        self, picture: Frame, output: PipelineOutput, name: str | int, about: tuple[str, ...]
+    ) -> Tracked:
         last = None if self._last is None else self._last.target
         self.picture, self.output = picture, output
         self._last = tracked_of(name, picture.t_s, output, not self.stills, last)
@@ -117,11 +111,6 @@ class Tracker:
         if output.disagreeing_frames >= (1 if self.stills else self.disagreement_frames):
             self.notes += (_DISAGREE,)
         return self._last
-
-    def _assess(self, frame: Frame) -> HealthVerdict:
-        alike_is_frozen = self.live or not self.stills
-        self._health, judged = assess_frame(self._health, frame, alike_is_frozen)
-        return judged
 
 
 @dataclass(eq=False)

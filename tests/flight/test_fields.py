@@ -7,10 +7,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from perchctl.flight import Senses
-from perchctl.flight.senses import REMARK_PICTURES
+from perchctl.flight import FlightInputs
 from perchctl.geometry import rpy_from_rotation
 from perchctl.link import Link
+from perchctl.perception import perception
+from perchctl.perception.perception import REMARK_PICTURES
 from perchctl.profile import Profile
 from perchctl.vehicle import FLYING, Telemetry
 from perchctl.vision import Frame, make_pipeline
@@ -77,14 +78,14 @@ def flown_by(scene: Pass, count: int = 14) -> tuple[list[Any], list[str]]:
     """The outputs of all turns with a frame, and what was remarked."""
     vehicle = Vehicle(scene)
     pipeline = make_pipeline(PROFILE, CAMERA)
-    senses = Senses(cast(Link, vehicle), cast(Any, Camera(scene, count)), pipeline, PROFILE)
+    inputs = FlightInputs(cast(Link, vehicle), cast(Any, Camera(scene, count)), pipeline, PROFILE)
     outputs, remarks = [], []
     for k in range(1, 80):
         vehicle.now_s = k * PERIOD_S
-        senses.take_in(vehicle.now_s)
-        remarks += senses.take_remarks()
-        if senses.output is not None:
-            outputs.append(senses.output)
+        inputs.take_in(vehicle.now_s)
+        remarks += inputs.perception.take_remarks()
+        if inputs.output is not None:
+            outputs.append(inputs.output)
     return outputs, remarks
 
 
@@ -101,22 +102,24 @@ def test_a_target_stands_still_under_fields_in_flight(first: str) -> None:
     assert [text.partition(":")[0] for text in remarks] == ["interlaced"]
 
 
-def test_both_fields_are_measured() -> None:
-    """The later one is a turn's output; the filter had the earlier one too."""
+def test_both_fields_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The later one is a tick's output; the filter had the earlier one too."""
     scene = Pass(0.25, (0.2, 0.0, 0.0), camera_fields="top")
     seen: list[float] = []
+    real = perception.step
 
-    class Noting(Senses):
-        def _remark(self, output: Any) -> None:
-            seen.append(output.detections.t_s)
+    def noted(state: Any, picture: Frame, *more: Any) -> Any:
+        seen.append(picture.t_s)
+        return real(state, picture, *more)
 
+    monkeypatch.setattr(perception, "step", noted)
     vehicle = Vehicle(scene)
-    noting = Noting(
+    inputs = FlightInputs(
         cast(Link, vehicle), cast(Any, Camera(scene, 10)), make_pipeline(PROFILE, CAMERA), PROFILE
     )
     for k in range(1, 60):
         vehicle.now_s = k * PERIOD_S
-        noting.take_in(vehicle.now_s)
+        inputs.take_in(vehicle.now_s)
     assert len(seen) >= 16
     assert np.diff(seen)[-6:] == pytest.approx(0.02, abs=1e-3)
 

@@ -15,10 +15,10 @@ from perchctl.commands.fly import EXIT_CODE_OF
 from perchctl.errors import EXIT_CODES
 from perchctl.flight import PLAIN_SEED, FlightResult, campaign_summary, fly_lockstep, run_campaign
 from perchctl.flight.campaign import fly_seed
-from perchctl.flight.senses import SLEW
 from perchctl.geometry import rot_z
 from perchctl.log import FlightLog, read_log
 from perchctl.mission import SEVEN_PHASES, Event, EventKeeper, Operator, Outcome, Phase, Tick
+from perchctl.perception.perception import SLEW
 from perchctl.profile import load_profile
 from perchctl.sim import draw_scenario
 from tests.helpers.flights import SEED, SHORT, Flown, fly_short, short_profile

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.flight import loop, senses
+from perchctl.flight import loop
 from perchctl.mission import Finding, Operator, Phase, Tick
 from perchctl.mission.lander import LEAST_ORDERS, MAX_ORDERS, PEEL_S
+from perchctl.perception import perception
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,
@@ -59,7 +60,7 @@ AIRBORNE_TICKS = 60
 
 
 def test_a_failure_in_vision_lands_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(senses, "step", _later(senses.step, AIRBORNE_TICKS))
+    monkeypatch.setattr(perception, "step", _later(perception.step, AIRBORNE_TICKS))
     landed_after_a_break(Rig())
 
 

@@ -13,10 +13,11 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.display.watch import status_of
-from perchctl.flight import fly_lockstep, senses
+from perchctl.flight import fly_lockstep
 from perchctl.geometry import Array, rot_z, wrap_rad
 from perchctl.log.watch import Truth, flight_record
 from perchctl.mission import Context, Phase, Tick, planner
+from perchctl.perception import perception
 from perchctl.sim import draw_scenario
 from perchctl.vision import strategies
 from tests.helpers.flights import SEED, NoLog, short_profile
@@ -53,7 +54,7 @@ class Counted:
 def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
     """One quiet flight, watched from everywhere."""
     counted, looker = Counted(), Looker()
-    solve, step, act = strategies.estimate_pose, senses.step, planner.act
+    solve, step, act = strategies.estimate_pose, perception.step, planner.act
 
     def solved(*arguments: Any) -> Any:
         counted.in_step += counted.stepping
@@ -73,7 +74,7 @@ def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(strategies, "estimate_pose", solved)
-        patch.setattr(senses, "step", stepped)
+        patch.setattr(perception, "step", stepped)
         patch.setattr(planner, "act", acted)
         flown = fly_lockstep(PROFILE, log=looker, scenario=SCENARIO)
         assert flown.report.phase is Phase.PERCHED

@@ -11,9 +11,9 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.errors import SafetyAbort, TimedOut
-from perchctl.flight import senses
 from perchctl.flight.preflight import still_waiting_for
 from perchctl.mission import Operator, Outcome
+from perchctl.perception import perception
 from perchctl.vehicle import PositionSetpoint
 from perchctl.vision import Detections
 from tests.helpers.flights import fly_short
@@ -151,14 +151,14 @@ def test_a_picture_of_another_size_in_flight_is_no_measurement() -> None:
 
 
 def test_a_mirrored_picture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = senses.step
+    real = perception.step
 
     def mirrored(*arguments: Any) -> Any:
         state, output = real(*arguments)
         seen = Detections(output.detections.frame_index, output.detections.t_s, mirrored=True)
         return state, replace(output, detections=seen)
 
-    monkeypatch.setattr(senses, "step", mirrored)
+    monkeypatch.setattr(perception, "step", mirrored)
     for is_set in (False, True):
         camera = PROFILE.camera.model_copy(update={"mirrored": is_set})
         it = Rig(profile=PROFILE.model_copy(update={"camera": camera}))
@@ -170,7 +170,7 @@ def test_a_mirrored_picture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_mirrored_picture_once_is_a_chance(monkeypatch: pytest.MonkeyPatch) -> None:
-    real, left = senses.step, [senses.MIRRORED_FRAMES - 1]
+    real, left = perception.step, [perception.MIRRORED_FRAMES - 1]
 
     def seldom(*arguments: Any) -> Any:
         state, output = real(*arguments)
@@ -178,5 +178,5 @@ def test_a_mirrored_picture_once_is_a_chance(monkeypatch: pytest.MonkeyPatch) ->
         seen = replace(output.detections, mirrored=left[0] >= 0)
         return state, replace(output, detections=seen)
 
-    monkeypatch.setattr(senses, "step", seldom)
+    monkeypatch.setattr(perception, "step", seldom)
     assert "mirrored" not in Rig().fly().reason

@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.calibration import profile_camera
-from perchctl.flight import History, Senses, add_samples
-from perchctl.flight.senses import CARRIED_FOR_S, Sights, is_carried
+from perchctl.flight import FlightInputs
+from perchctl.flight.inputs import CARRIED_FOR_S, TargetPositioning, is_carried
 from perchctl.geometry import Place
+from perchctl.perception import History, add_samples
 from perchctl.profile import SafetyConfig
 from perchctl.vehicle import ExternalPosition, Telemetry
 from perchctl.vision import MarkerPose, MeasuredMarkers, make_pipeline
@@ -34,14 +35,14 @@ def at_rest(lasts_s: float = 0.5, **changes: object) -> list[Telemetry]:
     return [telemetry(1.0 + SAMPLE_S * i, 1.97, **changes) for i in range(n)]
 
 
-def hung() -> tuple[Sights, list[ExternalPosition]]:
+def hung() -> tuple[TargetPositioning, list[ExternalPosition]]:
     sent: list[ExternalPosition] = []
 
     def send(place: ExternalPosition) -> bool:
         sent.append(place)
         return True
 
-    sights = Sights(send, PIPELINE, TARGET_ONLY)
+    sights = TargetPositioning(send, PIPELINE, TARGET_ONLY)
     sights.feed.target = TARGET
     return sights, sent
 
@@ -125,14 +126,14 @@ def test_without_sights_to_send_the_target_is_where_it_is_seen(
 ) -> None:
     """The estimate runs away by then: by it what hangs would be seen far below its target."""
     nobody: Any = None
-    senses = Senses(nobody, nobody, PIPELINE, TARGET_ONLY)
-    assert senses.sights is not None
-    senses.sights.feed.target = TARGET
+    inputs = FlightInputs(nobody, nobody, PIPELINE, TARGET_ONLY)
+    assert inputs.target_positioning is not None
+    inputs.target_positioning.feed.target = TARGET
     drifted = [replace(sample, position_m=(0.0, 0.0, 1.2)) for sample in at_rest()]
-    senses.history, senses.sends_sights = history(drifted), sends
-    now_s = senses.last_good_frame_s = drifted[-1].t_s
+    inputs.perception.history, inputs.sends_sights = history(drifted), sends
+    now_s = inputs.last_good_frame_s = drifted[-1].t_s
     seen = target_at(now_s, (0.0, 0.0, 2.0), (0.0, 0.0, 1.95))
-    monkeypatch.setattr("perchctl.flight.senses.estimate", lambda *_, **__: seen)
-    target = senses.target(now_s)
+    monkeypatch.setattr("perchctl.perception.perception.estimate", lambda *_, **__: seen)
+    target = inputs.target(now_s)
     assert target is not None
     assert bool(abs(target.e_m[2] - seen.e_m[2]) > 0.5) is sends

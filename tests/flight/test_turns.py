@@ -216,5 +216,5 @@ def test_in_real_time_its_parts_are_timed() -> None:
     assert parts == pytest.approx((0.01, 0.302, 0.0, 0.313))
 
 
-def test_what_the_senses_give_is_of_the_observation() -> None:
+def test_what_the_inputs_give_is_of_the_observation() -> None:
     assert set(SENSED) < {f.name for f in fields(Observation)}

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from perchctl.flight import History, add_samples
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.link import MockLink
 from perchctl.mission import (
@@ -21,6 +20,7 @@ from perchctl.mission import (
     lander,
     planner,
 )
+from perchctl.perception import History, add_samples
 from perchctl.profile import Profile
 from perchctl.sim import REST_HEIGHT_M, SimulatedVehicle, draw_scenario
 from perchctl.vehicle import ExternalPosition, Idle, PositionSetpoint, Telemetry

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from perchctl.flight import FlightParts, History, fly
+from perchctl.flight import FlightParts, fly
 from perchctl.flight.loop import Positions
 from perchctl.flight.rescue import Rescued, rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.mission import Event, FlightReport, Observation, Operator, Phase, Tick, planner
+from perchctl.perception import History
 from perchctl.profile import Profile
 from perchctl.vehicle import (
     HL_ACTIVE,

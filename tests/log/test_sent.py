@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from perchctl.flight import History, fly
+from perchctl.flight import fly
 from perchctl.flight.rescue import rescue
 from perchctl.link.mock import ScriptedLink
 from perchctl.link.sender import Sender
@@ -20,6 +20,7 @@ from perchctl.log.recording.recorder import Recorder
 from perchctl.log.sent import sent_values, takeovers_of
 from perchctl.log.write import FlightLogWriter
 from perchctl.mission import FlightReport, Operator, Outcome, Phase, SentCommand
+from perchctl.perception import History
 from perchctl.profile import load_profile
 from perchctl.report.story import story_of
 from perchctl.report.track import Track

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.flight import fly, senses
+from perchctl.flight import fly
 from perchctl.log import FlightLog, LogWatcher, read_log
 from perchctl.log.write import FlightLogWriter, make_header
 from perchctl.mission import Operator, Phase, Tick
+from perchctl.perception import perception
 from perchctl.profile import changed_profile
 from perchctl.replay import Picture, replay, replay_lines, replay_record
 from perchctl.replay.run import Replay
@@ -119,13 +120,13 @@ def test_with_another_latency_the_pictures_are_of_another_time(
 ) -> None:
     """They are still found, by the recorded time."""
     log, given_s = begun(flight[0]), []
-    inside = senses.pictures
+    inside = perception.pictures
 
     def looked_at(state: FieldState, frame: Frame, pipeline: Pipeline) -> Any:
         given_s.append(frame.t_s)
         return inside(state, frame, pipeline)
 
-    monkeypatch.setattr(senses, "pictures", looked_at)
+    monkeypatch.setattr(perception, "pictures", looked_at)
     seen_again(log, flight[1])
     as_flown_s = given_s.copy()
     given_s.clear()

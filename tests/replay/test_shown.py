@@ -15,9 +15,10 @@ import pytest
 
 import perchctl.mission
 from perchctl.camera import VERDICT_TEXTS
-from perchctl.flight import SENSED, history
+from perchctl.flight import SENSED
 from perchctl.log import FlightLog, flown_profile
 from perchctl.mission import Turn
+from perchctl.perception import history
 from perchctl.profile import PositioningConfig, Profile, SafetyConfig, changed_profile
 from perchctl.replay import replay, replay_lines, replay_record
 from perchctl.replay.compare import first_differing, same

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from perchctl.flight import History
-from perchctl.flight.senses import (
+from perchctl.mission import Context, Phase
+from perchctl.perception import History
+from perchctl.perception.perception import (
     SLEW,
     USED_SIGMA_S,
-    Noticed,
-    noticed,
+    OnlineCalibration,
+    update_calibration,
 )
-from perchctl.mission import Context, Phase
 from perchctl.profile import USED_LATENCY_S, CameraConfig
 from perchctl.vision import CameraModel, Consistency, MarkerPose
 from perchctl.vision.pose import make_pose_setup
@@ -38,39 +38,41 @@ def _seen(delay_s: float, sigma_s: float) -> Consistency:
     return Consistency(delay_s, sigma_s, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
 
 
-def _frames(start: Noticed, camera: CameraConfig, count: int, pose: MarkerPose = POSE) -> Noticed:
+def _frames(
+    start: OnlineCalibration, camera: CameraConfig, count: int, pose: MarkerPose = POSE
+) -> OnlineCalibration:
     """At rest under the target, without a new solve."""
     history = History(tuple(telemetry(10.0 + 0.01 * k) for k in range(-40, 40)))
     state = replace(start, solved_s=1e9, seen_s=10.0)
     for k in range(1, count + 1):
         t_s = 10.0 + k * FRAME_S
-        state = noticed(state, t_s, pose, history, SETUP, camera, 0.005)
+        state = update_calibration(state, t_s, pose, history, SETUP, camera, 0.005)
     return state
 
 
 def test_a_sure_latency_is_taken_over_slowly() -> None:
     """20 ms a second: what the target's place makes of that is what it makes of a drift."""
-    start = Noticed(newest=_seen(0.04, 0.004))
+    start = OnlineCalibration(newest=_seen(0.04, 0.004))
     assert _frames(start, MEASURED, 1).used_s == pytest.approx(SLEW * FRAME_S)
     assert _frames(start, MEASURED, 45).used_s == pytest.approx(0.03, rel=0.01)
     assert _frames(start, MEASURED, 200).used_s == pytest.approx(0.04)
 
 
 def test_an_unsure_latency_changes_nothing() -> None:
-    unsure = Noticed(newest=_seen(0.04, 1.01 * USED_SIGMA_S), used_s=0.01)
+    unsure = OnlineCalibration(newest=_seen(0.04, 1.01 * USED_SIGMA_S), used_s=0.01)
     assert _frames(unsure, MEASURED, 30).used_s == 0.01
-    assert _frames(Noticed(), MEASURED, 30).used_s == 0.0
+    assert _frames(OnlineCalibration(), MEASURED, 30).used_s == 0.0
 
 
 def test_a_number_in_the_profile_is_not_overruled() -> None:
-    assert _frames(Noticed(newest=_seen(0.04, 0.004)), TOLD, 200).used_s == 0.0
+    assert _frames(OnlineCalibration(newest=_seen(0.04, 0.004)), TOLD, 200).used_s == 0.0
 
 
 @pytest.mark.parametrize(
     ("delay_s", "bound_s"), [(-0.3, USED_LATENCY_S[0]), (0.5, USED_LATENCY_S[1])]
 )
 def test_what_is_used_stays_within_bounds(delay_s: float, bound_s: float) -> None:
-    used_s = _frames(Noticed(newest=_seen(delay_s, 0.004)), MEASURED, 600).used_s
+    used_s = _frames(OnlineCalibration(newest=_seen(delay_s, 0.004)), MEASURED, 600).used_s
     assert MEASURED.start_latency_s + used_s == pytest.approx(bound_s)
 
 
@@ -78,23 +80,25 @@ def test_what_is_no_number_teaches_nothing() -> None:
     """A covariance that broke down, and an interval that did."""
     history = History(tuple(telemetry(10.0 + 0.01 * k) for k in range(-40, 40)))
     broken = replace(POSE, cov=np.full((4, 4), math.nan))
-    learned = noticed(Noticed(), 10.0, broken, history, SETUP, MEASURED, 0.005)
+    start = OnlineCalibration()
+    learned = update_calibration(start, 10.0, broken, history, SETUP, MEASURED, 0.005)
     assert learned.newest is None
     assert learned.sums.level is None
-    unknown = Noticed(newest=_seen(math.nan, math.nan), used_s=0.01)
+    unknown = OnlineCalibration(newest=_seen(math.nan, math.nan), used_s=0.01)
     assert _frames(unknown, MEASURED, 30).used_s == 0.01
 
 
 def test_after_a_gap_nothing_jumps() -> None:
-    start = replace(Noticed(newest=_seen(0.1, 0.004)), solved_s=1e9, seen_s=2.0)
+    start = replace(OnlineCalibration(newest=_seen(0.1, 0.004)), solved_s=1e9, seen_s=2.0)
     history = History((telemetry(9.9), telemetry(10.1)))
-    assert noticed(start, 10.0, POSE, history, SETUP, MEASURED, 0.005).used_s <= SLEW * 0.1
+    used_s = update_calibration(start, 10.0, POSE, history, SETUP, MEASURED, 0.005).used_s
+    assert used_s <= SLEW * 0.1
 
 
 def test_nothing_is_learned_right_under_the_target() -> None:
     near = replace(POSE, tvec_m=np.array([0.0, 0.0, 0.1]))
-    assert _frames(Noticed(), MEASURED, 20, near).sums.level is None
-    assert _frames(Noticed(), MEASURED, 20).sums.level is not None
+    assert _frames(OnlineCalibration(), MEASURED, 20, near).sums.level is None
+    assert _frames(OnlineCalibration(), MEASURED, 20).sums.level is not None
 
 
 def test_a_later_picture_is_as_fresh_as_it_can_be() -> None:

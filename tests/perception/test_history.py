@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.flight import History, add_samples
 from perchctl.flight.loop import events_of
 from perchctl.mission import Outcome, planner
+from perchctl.perception import History, add_samples
 from perchctl.vehicle import Telemetry
 from tests.helpers.loop_rig import PROFILE, Rig, Vehicle
 from tests.helpers.mission import observation, telemetry

@@ -1,0 +1,281 @@
+"""What a tick of the loop takes in: telemetry, at most one frame, and what follows from them."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from perchctl.camera import VERDICT_TEXTS, FrameSource, check_size, mirrored_note
+from perchctl.mission import FrameSeen, Observation, PoseSeen, TurnInputs
+from perchctl.perception import (
+    History,
+    Perception,
+    add_late_samples,
+    add_samples,
+    attitude_at,
+    attitude_of,
+    battery_age_s,
+)
+from perchctl.positioning import FeedStatus, SightFeed
+from perchctl.profile import Profile, SafetyConfig
+from perchctl.values import replace
+from perchctl.vehicle import SendPosition, Telemetry
+from perchctl.vision import (
+    Frame,
+    MeasuredMarkers,
+    Pipeline,
+    PipelineOutput,
+    TargetEstimate,
+    surest_pose,
+)
+
+HEARD_S = 0.15
+"""A sight that is carried on by an older estimate swings the vehicle that flies by it."""
+ENDED_TEXT = " has ended"
+SENSED = (
+    "telemetry", "target", "new_frame", "camera_age_s", "camera_problem", "battery_age_s",
+    "jumped", "turned_rad", "disagreeing_frames", "delay_s", "target_refused", "imu",
+    "felt", "mismatch",
+)  # fmt: skip
+"""The fields of an `Observation` that come from here; the others are the loop's."""
+
+
+class GivesTelemetry(Protocol):
+    """The part of a `perchctl.link.Link` that is read here."""
+
+    def telemetry(self) -> list[Telemetry]: ...
+
+
+@dataclass(eq=False)
+class FlightInputs:
+    """What a tick of the loop takes in: telemetry, at most one frame, and what follows from them.
+
+    `output` is what this tick's frame gave, None where there was none to look at; `repeated`: it
+    was the one before once more. `target_positioning`: where the target is the vehicle's
+    positioning system, what hands its places to `send`; else None.
+    """
+
+    link: GivesTelemetry
+    source: FrameSource
+    pipeline: Pipeline
+    profile: Profile
+    send: SendPosition = lambda place: True
+    recorded: bool = False  # the ticks are: with the pictures' checksums and the present's spread
+    perception: Perception = field(init=False)
+    target_positioning: TargetPositioning | None = field(init=False, default=None)
+    sends_sights: bool = True  # until the way down goes on without them
+    output: PipelineOutput | None = None
+    taken: TurnInputs = field(default_factory=TurnInputs)  # in this tick
+    blind: bool = False
+    repeated: bool = False
+    last_good_frame_s: float = -math.inf
+    camera_problem: str | None = None
+    frames: int = 0
+    ground_z_m: float = 0.0  # of the estimate, where the flight begins
+    _note: str | None = None
+
+    def __post_init__(self) -> None:
+        self.perception = Perception(self.pipeline, self.profile)
+        if self.profile.positioning.by == "target":
+            self.target_positioning = TargetPositioning(self.send, self.pipeline, self.profile)
+
+    @property
+    def history(self) -> History:
+        return self.perception.history
+
+    def take_in(self, now_s: float, *, look: bool = True) -> None:
+        """Telemetry and at most one frame. Without `look`, at the ceiling, the frame only counts
+        as a sign of the camera's life."""
+        perception, positioning = self.perception, self._positioning
+        samples = self.link.telemetry()
+        perception.history = add_samples(self.history, samples, self.profile.safety)
+        if positioning is not None:
+            positioning.begin(self.history, now_s, touches=not look)
+        self.output, self.blind, self.repeated = None, not look, False
+        frame = self.source.poll(now_s)
+        problem = self.source.problem(now_s)
+        self.taken = TurnInputs(
+            tuple(samples), frame=_seen(frame), problem=problem, ended=self.source.finished,
+            live=self.source.live, look=look,
+        )  # fmt: skip
+        used_s = perception.calibration.used_s
+        if frame is not None and used_s:
+            frame = replace(frame, t_s=frame.t_s - used_s)
+        if frame is None:
+            if problem is None and self.source.finished:
+                problem = f"{self.source.describe()}{ENDED_TEXT}"
+            if problem is not None:
+                self.camera_problem = problem
+            return
+        if self.frames == 0:
+            check_size(self.source.size_px, self.pipeline.camera, self.source.describe())
+        rejection = problem or self._rejection(frame, now_s)
+        self.repeated = rejection == VERDICT_TEXTS["repeated"]
+        if rejection is not None:
+            if not self.repeated:  # which says nothing new, of the camera's troubles neither
+                self.camera_problem = rejection
+            return
+        self.last_good_frame_s = now_s
+        self.frames += 1
+        if look:
+            for _, self.output in perception.look(frame, used_s):
+                if positioning is not None and self._is_heard(now_s):
+                    positioning.see(perception.state.measured, self.history, now_s)
+        mirrored = perception.is_mirrored
+        self.camera_problem = mirrored_note(self.profile.camera) if mirrored else self._note
+
+    @property
+    def _positioning(self) -> TargetPositioning | None:
+        return self.target_positioning if self.sends_sights else None
+
+    def _is_heard(self, now_s: float) -> bool:
+        """Whether the telemetry is new enough to carry a sight on to the present."""
+        newest = self.history.newest
+        return newest is not None and now_s - newest.t_s + newest.behind_s <= HEARD_S
+
+    def present(self, began_s: float, now_s: float) -> None:
+        """What has arrived while camera or vision hung, since the tick of `began_s`."""
+        late = self.link.telemetry()
+        self.perception.history = add_late_samples(self.history, late, self.profile.safety)
+        self.taken = replace(self.taken, late=tuple(late))
+        if self.last_good_frame_s == began_s:
+            self.last_good_frame_s = now_s  # the picture came: it is not the camera that is gone
+
+    def observation(self, now_s: float) -> Observation:
+        """The part of it that is seen: the fields of `SENSED`."""
+        perception, newest = self.perception, self.history.newest
+        assert newest is not None
+        return Observation(
+            t_s=now_s,
+            telemetry=newest,
+            target=self.target(now_s),
+            new_frame=self.output is not None,
+            camera_age_s=now_s - self.last_good_frame_s,
+            camera_problem=self.camera_problem,
+            battery_age_s=battery_age_s(self.history, now_s),
+            jumped=self.history.jumped,
+            turned_rad=self.history.turned_rad,
+            disagreeing_frames=perception.state.disagreeing_frames,
+            delay_s=perception.calibration.used_s,
+            target_refused=perception.refused,
+            imu=self.history.imu,
+            felt=perception.motion.motion,
+            mismatch=perception.motion.mismatch,
+        )
+
+    @property
+    def poses(self) -> dict[str, PoseSeen]:
+        """The unfiltered ones of this tick's picture."""
+        poses = {} if self.output is None else self.output.poses
+        return {name: PoseSeen(p.t_s, p.e_m, p.e_yaw_rad) for name, p in poses.items()}
+
+    def target(self, now_s: float) -> TargetEstimate | None:
+        """The estimate at the present. The filter coasts by frames: while none are looked
+        at, its target is a remembered place."""
+        target = self.perception.target(now_s, spread=self.recorded)
+        if self._positioning is not None:  # else the estimate runs away
+            target = self._positioning.steered(target, self.history)
+        stale = now_s - self.last_good_frame_s > self.profile.safety.camera_hold_s
+        if target is not None and (self.blind or stale):
+            return replace(target, tracked=False)
+        return target
+
+    def _rejection(self, frame: Frame, now_s: float) -> str | None:
+        """Why this frame is no measurement: of another size, frozen, no picture at all, or too
+        old."""
+        height, width = frame.image.shape[:2]
+        if (width, height) != (size_px := self.pipeline.camera.size_px):
+            return f"the picture has {width}x{height} px, the calibration {size_px[0]}x{size_px[1]}"
+        live = self.source.live
+        verdict = self.perception.assess(frame, live)
+        if self.recorded and self.taken.frame is not None:
+            seen = replace(self.taken.frame, checksum=zlib.crc32(frame.image.tobytes()))
+            self.taken = replace(self.taken, frame=seen)
+        # A dark target may still be seen, and a bare ceiling looks like an empty screen:
+        # such pictures are searched all the same, but the user is shown why.
+        self._note = verdict.text if verdict.kind in ("dark", "uniform") else None
+        if not verdict.usable and self._note is None:
+            return verdict.text
+        return lateness_text(now_s - frame.t_s, self.profile.safety) if live else None
+
+
+def lateness_text(age_s: float, safety: SafetyConfig) -> str | None:
+    """Why a live picture of this age is no measurement."""
+    return f"the picture is {age_s:.1f} s late" if age_s > safety.max_frame_age_s else None
+
+
+def _seen(frame: Frame | None) -> FrameSeen | None:
+    if frame is None:
+        return None
+    return FrameSeen(frame.index, frame.t_s, frame.t_arrival_s, frame.fields, frame.repeated)
+
+
+# --- The target as positioning system, tick by tick --------------------------------------------
+# Standing, pressed or hanging, the place is known better than by any picture, and is sent in its
+# stead; only while the accelerometer says that something carries the vehicle. What falls while it
+# is told that it hangs would look as if it hung, so the first sample that says otherwise ends that.
+
+
+CARRIED_FOR_S = 0.1
+CARRIED_G, CARRIED_MEAN_G = 0.25, 0.06
+"""An accelerometer at rest reads one g; with turning motors it scatters by 0.04, the mean of ten by
+0.013."""
+SINKING_MPS = -0.15
+"""No such speed comes of a bias while the place is sent."""
+FROZEN_S = 0.06
+"""An attitude that reads the very same for so long is not the one at the picture's exposure, and
+0.1 rad of it places a vehicle 1.2 m under the target 12 cm aside."""
+
+
+class TargetPositioning:
+    """Of one flight. `status` goes to the planner as that of a motion capture does."""
+
+    def __init__(self, send: SendPosition, pipeline: Pipeline, profile: Profile) -> None:
+        self.feed = SightFeed(send, profile, pipeline.pose)
+        self._touches = False
+
+    def status(self, now_s: float) -> FeedStatus:
+        return self.feed.status(now_s)
+
+    def begin(self, history: History, now_s: float, *, touches: bool) -> None:
+        """A tick, before its picture. `touches`: contact was proven, and nothing has shown since
+        that it ended."""
+        newest = history.newest
+        self._touches = touches
+        if newest is None or not is_carried(history, now_s):
+            return
+        touching_m = self.feed.touching(newest.yaw_rad)
+        if touching_m is None:
+            self.feed.stand(now_s)
+        elif touches:
+            self.feed.known(touching_m, now_s)
+
+    def see(self, measured: MeasuredMarkers, history: History, now_s: float) -> None:
+        """A picture. What is pressed or hangs needs none, and the last ones were of before."""
+        pose = surest_pose(measured)
+        if pose is None or self._touches or history.imu.attitude_age_s > FROZEN_S:
+            return
+        then, now = attitude_at(history, pose.t_s), attitude_at(history, now_s)
+        if then is not None and now is not None:
+            self.feed.see(pose, then, now, now_s, at_rest=is_carried(history, now_s))
+
+    def steered(self, target: TargetEstimate | None, history: History) -> TargetEstimate | None:
+        """The target where it stands; as it is seen until its place is known."""
+        newest = history.newest
+        if target is None or newest is None:
+            return target
+        return self.feed.steered(target, attitude_of(newest))
+
+
+def is_carried(history: History, now_s: float) -> bool:
+    """Whether something has carried the vehicle for the last moments, by fresh samples."""
+    newest = history.newest
+    if newest is None or now_s - newest.t_s + newest.behind_s > CARRIED_FOR_S:
+        return False
+    lately = [s for s in history.samples if newest.t_s - s.t_s <= CARRIED_FOR_S]
+    mean_g = sum(s.acc_z_g for s in lately) / len(lately)
+    return abs(mean_g - 1.0) <= CARRIED_MEAN_G and all(
+        abs(s.acc_z_g - 1.0) <= CARRIED_G and s.velocity_mps[2] > SINKING_MPS for s in lately
+    )

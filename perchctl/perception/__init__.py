@@ -1,0 +1,5 @@
+"""From frames and telemetry to the target: the one session through which every command looks."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
