@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.commands import app, complete
-from perchctl.commands.fly import FlyRequest, fly, resolve
+from perchctl.commands.fly import fly_and_report, resolve
 from perchctl.errors import EXIT_CODES, ConnectionFailed
 from perchctl.flight import SessionResult
 from perchctl.link.connection import open_connection, plain_cause
@@ -237,7 +237,7 @@ def test_ctrl_c_in_the_drawing_leaves_the_result(
         os.kill(os.getpid(), 2)  # Ctrl-C
 
     monkeypatch.setattr("perchctl.log.plot_flight", draw)
-    code = fly(resolve(FlyRequest()), True, None)
+    code = fly_and_report(resolve(), True, None)
     out, err = capsys.readouterr()
     told = json.loads(out)
     assert (code, told["exit_code"], told["outcome"], told["plot"]) == (130, 130, "landed", None)
@@ -249,7 +249,7 @@ def test_the_object_names_the_plot(
     flown: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("perchctl.log.plot_flight", lambda *_: None)
-    fly(resolve(FlyRequest()), True, None)
+    fly_and_report(resolve(), True, None)
     told = json.loads(capsys.readouterr().out)
     assert told["plot"] == told["log"].replace(".jsonl", ".png")
     assert flown[-1] == f"plot:      {told['plot']}"
@@ -269,7 +269,7 @@ def test_ctrl_c_behind_the_landing_does_not_replace_the_result(
 
     monkeypatch.setattr(LogWatcher, "close", slow)
     monkeypatch.setattr("perchctl.log.plot_flight", lambda *_: None)
-    assert fly(resolve(FlyRequest()), True, None) == 130
+    assert fly_and_report(resolve(), True, None) == 130
     assert json.loads(capsys.readouterr().out)["outcome"] == "landed"
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from perchctl.camera import CameraControl, ConnectedCamera, find_cameras
 from perchctl.check import CheckScope, Row, Verdict, check, scan_rows
-from perchctl.commands.fly import FlyRequest, resolve
+from perchctl.commands.fly import resolve
 from perchctl.commands.interrupt import interruptible, unheeded
 from perchctl.commands.output import confirmed, say
 from perchctl.errors import (
@@ -100,13 +100,7 @@ def _rows(request: CheckRequest, wanted: CheckScope) -> Iterator[Row]:
         yield from scan_rows(request.uri)
         return
     options = resolve(
-        FlyRequest(
-            profile=request.profile,
-            uri=request.uri,
-            source=request.source,
-            seed=request.seed,
-            log_dir=request.log_dir,
-        )
+        request.profile, request.uri, request.source, seed=request.seed, log_dir=request.log_dir
     )
     yield from check(options, wanted)
 

@@ -62,7 +62,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Fit the merge weights to poses whose truth is known, and verify that they help.",
     ),
     "track": (
-        "cli.track",
+        "track",
         "Find the target in a camera, video or pictures, without a vehicle.",
     ),
     "check": (
@@ -71,7 +71,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "fly.",
     ),
     "fly": (
-        "cli.fly",
+        "fly",
         "Fly the seven phases: find the target, align, ascend, perch, stop the motors.",
     ),
     "simulate": (

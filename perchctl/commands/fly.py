@@ -1,4 +1,4 @@
-"""The work behind `perchctl fly`: options in, a flight, its log, plot and exit code out."""
+"""`perchctl fly`: options in, a flight, its log, plot and exit code out."""
 
 from __future__ import annotations
 
@@ -7,14 +7,29 @@ import dataclasses
 import sys
 import textwrap
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from perchctl.calibration import profile_camera
 from perchctl.camera import profile_record, without_password
 from perchctl.check import Row, Verdict, comparison_rows, profile_rows, warnings_before_flight
+from perchctl.commands.command_line import (
+    EXIT_TABLE,
+    Command,
+    PositioningOption,
+    ProfileOption,
+    SourceOption,
+    UriOption,
+    ViewOption,
+    ViewPortOption,
+    examples,
+    new_app,
+    reporting,
+)
 from perchctl.commands.flight_plot import plot_of
 from perchctl.commands.interrupt import drawn, signals_to_operator, unheeded
 from perchctl.commands.output import confirmed, print_record, say, tell
@@ -72,32 +87,56 @@ EXIT_CODE_OF: dict[Outcome, int] = {
 }
 
 
-@dataclass(frozen=True)
-class FlyRequest:
-    """The command line as it was given; None is not given."""
-
-    profile: str = "sim"
-    uri: str | None = None
-    source: str | None = None
-    positioning: str | None = None
-    seed: int | None = None
-    log_dir: Path | None = None
-    record: bool | None = None
-    dry_run: bool = False
-    yes: bool = False
-    as_json: bool = False
-    view: bool = False
-    view_port: int = 0
+app = new_app()
 
 
-def run(request: FlyRequest) -> int:
-    """Fly, or show the plan; returns the exit code.
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl fly",
+        "perchctl fly -p my_vehicle.yaml --dry-run",
+        "perchctl fly -p my_vehicle.yaml --uri radio://0/80/2M/E7E7E7E7E7 --view",
+    )
+    + "\n\n"
+    + EXIT_TABLE,
+)
+@reporting
+def fly(
+    profile: ProfileOption = "sim",
+    uri: UriOption = None,
+    source: SourceOption = None,
+    positioning: PositioningOption = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Seed of the simulated scenario; 11 by default.")
+    ] = None,
+    log_dir: Annotated[
+        Path | None, typer.Option("--log-dir", help="Folder for the flight log and its plot.")
+    ] = None,
+    record: Annotated[
+        bool | None,
+        typer.Option(
+            "--record/--no-record",
+            help="Keep the pictures, in an MCAP file beside the log; by default of real vehicles.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show the resolved plan; connect nothing.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask before arming.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object on stdout at the end.")
+    ] = False,
+    view: ViewOption = False,
+    view_port: ViewPortOption = 0,
+) -> int:
+    """Fly the seven phases: find the target, align, ascend, perch, stop the motors.
 
-    Errors: those before the flight, and unforeseen ones after the vehicle was landed.
+    Without options it flies the simulated vehicle. Ctrl-C once lands, again after half
+    a second, or held for two, cuts the motors.
     """
-    options = resolve(request)
-    if request.dry_run:
-        if request.as_json:
+    options = resolve(profile, uri, source, positioning, seed, log_dir, record)
+    if dry_run:
+        if as_json:
             print_record(plan(options))
         else:
             print(plan_text(options))
@@ -105,29 +144,37 @@ def run(request: FlyRequest) -> int:
     for warning in warnings_before_flight(options):
         say(f"check: {warning}")
     require_comparison(options.profile.positioning, options.uri, simulated=options.simulated)
-    asks = not (request.yes or options.simulated)
+    asks = not (yes or options.simulated)
     if asks and not sys.stdin.isatty():
         raise UsageError(f"about to arm {options.uri}, and there is nobody to ask: add --yes")
-    return fly(options, request.as_json, page_port(request.view, request.view_port), asks)
+    return fly_and_report(options, as_json, page_port(view, view_port), asks)
 
 
-def resolve(request: FlyRequest) -> FlyOptions:
-    """The command line on top of the profile. Errors: NotFound, InvalidValue, UsageError."""
-    profile = positioned(load_profile(request.profile), request.positioning)
+def resolve(
+    profile_name: str = "sim",
+    uri: str | None = None,
+    source: str | None = None,
+    positioning: str | None = None,
+    seed: int | None = None,
+    log_dir: Path | None = None,
+    record: bool | None = None,
+) -> FlyOptions:
+    """The command line on top of the profile; None is not given. Errors: NotFound, InvalidValue,
+    UsageError."""
+    profile = positioned(load_profile(profile_name), positioning)
     options = FlyOptions(
         profile=profile,
-        profile_path=find_profile(request.profile),
+        profile_path=find_profile(profile_name),
         # An empty URI or source is an unset shell variable: not the profile's, but an error.
-        uri=profile.link.uri if request.uri is None else request.uri,
-        source=profile.camera.source if request.source is None else request.source,
-        seed=PLAIN_SEED if request.seed is None else request.seed,
-        log_dir=request.log_dir or Path(profile.log.directory),
+        uri=profile.link.uri if uri is None else uri,
+        source=profile.camera.source if source is None else source,
+        seed=PLAIN_SEED if seed is None else seed,
+        log_dir=log_dir or Path(profile.log.directory),
     )
-    record = not options.simulated if request.record is None else request.record
-    options = replace(options, record=record)
+    options = replace(options, record=not options.simulated if record is None else record)
     check_options(options)
-    if request.seed is not None and not options.simulated:
-        say(f"--seed {request.seed} is of simulated flights: it changes nothing at {options.uri}")
+    if seed is not None and not options.simulated:
+        say(f"--seed {seed} is of simulated flights: it changes nothing at {options.uri}")
     return options
 
 
@@ -137,7 +184,7 @@ def ask_before_arming(uri: str) -> None:
         raise UsageError("not confirmed: nothing was started")
 
 
-def fly(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False) -> int:
+def fly_and_report(options: FlyOptions, as_json: bool, port: int | None, asks: bool = False) -> int:
     """Fly, log, plot, report how it ended; returns the exit code. `port` of the live page; `asks`:
     somebody at the terminal has to say yes before it arms."""
     simulated_seed = options.seed if options.simulated else None

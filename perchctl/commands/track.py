@@ -1,4 +1,4 @@
-"""The work behind `perchctl track`: the pipeline on any source, without a vehicle."""
+"""`perchctl track`: the pipeline on any source, without a vehicle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TextIO
+from typing import Annotated, TextIO
+
+import typer
 
 from perchctl.calibration import assumed_size_warning, load_calibration, load_sized
 from perchctl.camera import (
@@ -24,6 +26,18 @@ from perchctl.camera import (
     open_source,
     source_spec,
     without_password,
+)
+from perchctl.commands.command_line import (
+    CamOption,
+    Command,
+    ForceOption,
+    ProfileOption,
+    ViewOption,
+    ViewPortOption,
+    complete_source,
+    examples,
+    new_app,
+    reporting,
 )
 from perchctl.commands.interrupt import Stopper
 from perchctl.commands.output import say
@@ -54,22 +68,7 @@ OPEN_PAGE_WITHIN_S = 60.0
 """How long a recording waits, on a terminal, for somebody to open the page."""
 
 
-@dataclass(frozen=True)
-class TrackRequest:
-    """The command line as it was given; None is not given."""
-
-    source: str
-    profile: str = "sim"
-    calibration: Path | None = None
-    cam: str | None = None
-    stills: bool = False
-    video: bool = False
-    as_json: bool = False
-    csv: Path | None = None
-    overlay: Path | None = None
-    force: bool = False
-    view: bool = False
-    view_port: int = 0
+app = new_app()
 
 
 @dataclass(frozen=True)
@@ -86,52 +85,116 @@ class TrackOptions:
     page_port: int | None
 
 
-def run(request: TrackRequest) -> int:
-    """Track to the source's end; returns the exit code. Errors: as `resolve` and `track`."""
-    track(resolve(request))
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl track camera:0 --view",
+        "perchctl track video:flight.mp4 --overlay seen.mp4 --csv poses.csv",
+        "perchctl track 'images:pictures/*.png' --json",
+    ),
+)
+@reporting
+def track(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="camera:N or its name, rtsp://..., http://..., aideck://HOST, video:FILE, "
+            "images:DIR (or a pattern), or a path.",
+            autocompletion=complete_source,
+        ),
+    ],
+    profile: ProfileOption = "sim",
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration", help="Camera calibration (ROS, OpenCV or Kalibr); else the profile's."
+        ),
+    ] = None,
+    cam: CamOption = None,
+    stills: Annotated[
+        bool,
+        typer.Option(
+            "--stills", help="Each picture alone, no window, no filter: as files of pictures are."
+        ),
+    ] = False,
+    video: Annotated[
+        bool, typer.Option("--video", help="The files are one video's pictures, at 30 Hz.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON line a frame.")] = False,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", help="Write the results as CSV, t_s first.")
+    ] = None,
+    overlay: Annotated[
+        Path | None, typer.Option("--overlay", help="Write the pictures with results as .mp4.")
+    ] = None,
+    force: ForceOption = False,
+    view: ViewOption = False,
+    view_port: ViewPortOption = 0,
+) -> int:
+    """Find the target in a camera, video or pictures, without a vehicle.
+
+    Poses are in the OpenCV camera frame with cv2.aruco's marker axes: X_cam = R(rvec) X_marker +
+    tvec. A JSON line holds frame, t_s, stage (large, both, small, none), large and small (null,
+    or corners_px TL TR BR BL, rvec_rad, tvec_m, reprojection_px) and target (null, or rvec_rad,
+    tvec_m, yaw_rad, sigma_m, sigma_yaw_rad). With both markers in sight target is their joint
+    pose; but for stills it is filtered, and goes on for a few frames after stage none.
+    yaw_rad is atan2(R[1,0], R[0,0]): the marker's heading in the picture's plane. sigma_m is
+    along the camera's x, y, z.
+    """
+    options = resolve(
+        source, profile, calibration, cam, stills, video, as_json, csv, overlay, force,
+        page_port(view, view_port),
+    )  # fmt: skip
+    track_source(options)
     return 0
 
 
-def resolve(request: TrackRequest) -> TrackOptions:
-    """What can be refused before anything is opened. Errors: NotFound, InvalidValue,
-    UsageError."""
-    profile = load_profile(request.profile)
-    source = source_spec(request.source)
-    stills = _are_stills(request, source)
-    for path, suffix in ((request.csv, ".csv"), (request.overlay, ".mp4")):
+def resolve(
+    source: str,
+    profile_name: str = "sim",
+    calibration: Path | None = None,
+    cam: str | None = None,
+    stills: bool = False,
+    video: bool = False,
+    as_json: bool = False,
+    csv: Path | None = None,
+    overlay: Path | None = None,
+    force: bool = False,
+    port: int | None = None,
+) -> TrackOptions:
+    """What can be refused before anything is opened; None is not given. Errors: NotFound,
+    InvalidValue, UsageError."""
+    profile = load_profile(profile_name)
+    source = source_spec(source)
+    stills = _are_stills(source, stills, video)
+    for path, suffix in ((csv, ".csv"), (overlay, ".mp4")):
         if path is not None:
             place = source.partition(":")[2]
             if place and same_file(path, Path(place).expanduser()):
                 raise UsageError(f"{path} is the source itself; write the result to another file")
-            check_output(path, (suffix,), request.force)
-    if request.calibration is None:
+            check_output(path, (suffix,), force)
+    if calibration is None:
         calibration = find_calibration(profile.camera.calibration)
-        cam = request.cam or profile.camera.cam
+        cam = cam or profile.camera.cam
     else:
-        calibration, cam = find_calibration(str(request.calibration)), request.cam
-    port = page_port(request.view, request.view_port)
-    elsewhere = request.csv or request.overlay or port is not None
-    outputs = OutputOptions(
-        lines=request.as_json or not elsewhere,
-        as_json=request.as_json,
-        csv=request.csv,
-        overlay=request.overlay,
-    )
+        calibration = find_calibration(str(calibration))
+    lines = as_json or not (csv or overlay or port is not None)
+    outputs = OutputOptions(lines=lines, as_json=as_json, csv=csv, overlay=overlay)
     return TrackOptions(source, profile, calibration, cam, stills, outputs, port)
 
 
-def _are_stills(request: TrackRequest, source: str) -> bool:
+def _are_stills(source: str, stills: bool, video: bool) -> bool:
     """Files of pictures need not belong together, unless the user says so."""
-    if request.video and request.stills:
+    if video and stills:
         raise UsageError("--stills and --video contradict each other: give one of them")
-    if request.video and not is_pictures(source):
+    if video and not is_pictures(source):
         raise UsageError(
             f"--video is for files of pictures, and {source} gives a video anyway: leave it out"
         )
-    return request.stills or (is_pictures(source) and not request.video)
+    return stills or (is_pictures(source) and not video)
 
 
-def track(
+def track_source(
     options: TrackOptions,
     out: TextIO | None = None,
     clock: Callable[[], float] = time.monotonic,

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from perchctl.commands.fly import live_page
-from perchctl.commands.track import TrackRequest, resolve, track
+from perchctl.commands.track import resolve, track_source
 from perchctl.display import FlightPage, LivePage, Sketch
 from perchctl.flight import FlyOptions, OperatorSwitch
 from perchctl.flight.session import AGAIN_S, HELD_S
@@ -176,10 +176,8 @@ def test_track_serves_its_numbers_while_it_runs(
 ) -> None:
     pictures = write_pictures(tmp_path / "pictures")
     out = Looking(capsys)
-    request = TrackRequest(
-        str(pictures), calibration=CALIBRATION, stills=True, view=True, as_json=True
-    )
-    track(resolve(request), out)
+    options = resolve(str(pictures), calibration=CALIBRATION, stills=True, as_json=True, port=0)
+    track_source(options, out)
     lines = [json.loads(line) for line in out.getvalue().splitlines()]
     assert len(lines) == len(VIEWS)
     assert out.state["track"] == lines[1]  # the newest when the third line was written

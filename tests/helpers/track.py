@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from perchctl.commands.track import TrackRequest, resolve
-from perchctl.commands.track import track as track_source
+from perchctl.commands.track import resolve, track_source
 from tests.helpers.recording import (
     CALIBRATION,
 )
@@ -22,8 +21,7 @@ def track(source: str | Path, profile: str = "sim", **options: Any) -> list[dict
     """The JSON lines of one run."""
     out = io.StringIO()
     options.setdefault("calibration", CALIBRATION)
-    request = TrackRequest(str(source), profile, as_json=True, **options)
-    track_source(resolve(request), out)
+    track_source(resolve(str(source), profile, as_json=True, **options), out)
     return [json.loads(line, parse_constant=pytest.fail) for line in out.getvalue().splitlines()]
 
 

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.commands.track import TrackRequest, resolve
-from perchctl.commands.track import track as track_source
+from perchctl.commands.track import resolve, track_source
 from tests.helpers.interlaced import Pass
 from tests.helpers.recording import write_video
 from tests.helpers.target_picture import CAMERA
@@ -35,8 +34,8 @@ def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def track(source: Path, calibration: Path, **options: Any) -> list[dict[str, Any]]:
     out = io.StringIO()
-    request = TrackRequest(str(source), "sim", as_json=True, calibration=calibration, **options)
-    track_source(resolve(request), out)
+    options |= {"as_json": True, "calibration": calibration}
+    track_source(resolve(str(source), "sim", **options), out)
     return [json.loads(line) for line in out.getvalue().splitlines()]
 
 

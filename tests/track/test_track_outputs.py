@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from perchctl.commands import app
 from perchctl.commands.interrupt import Stopper
-from perchctl.commands.track import TrackRequest, resolve
-from perchctl.commands.track import track as track_source
+from perchctl.commands.track import resolve, track_source
 from perchctl.errors import Interrupted, InvalidValue, NotFound, UsageError
 from perchctl.profile import load_profile
 from perchctl.track.result import CSV_COLUMNS
@@ -78,10 +77,8 @@ def test_ctrl_c_leaves_whole_files(video: Path, tmp_path: Path) -> None:
     stopper = Stopper()
     out = PressingOut(stopper)
     options = resolve(
-        TrackRequest(
-            str(video), "sim", CALIBRATION, as_json=True,
-            csv=tmp_path / "x.csv", overlay=tmp_path / "x.mp4",
-        )
+        str(video), "sim", CALIBRATION, as_json=True,
+        csv=tmp_path / "x.csv", overlay=tmp_path / "x.mp4",
     )  # fmt: skip
     with pytest.raises(Interrupted) as caught:
         track_source(options, out, stopper=stopper)
@@ -158,7 +155,7 @@ def test_bad_input_is_one_sentence(
 
 def test_the_source_is_not_overwritten(video: Path) -> None:
     with pytest.raises(UsageError, match="source itself"):
-        resolve(TrackRequest(str(video), "sim", CALIBRATION, overlay=video))
+        resolve(str(video), "sim", CALIBRATION, overlay=video)
 
 
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path) -> None:
@@ -196,7 +193,7 @@ def test_a_print_error_is_named(video: Path, capsys: pytest.CaptureFixture[str])
     profile = load_profile("sim")
     small = profile.target.small.model_copy(update={"side_m": 0.024})
     target = profile.target.model_copy(update={"small": small})
-    options = resolve(TrackRequest(str(video), "sim", CALIBRATION, as_json=True))
+    options = resolve(str(video), "sim", CALIBRATION, as_json=True)
     wrong = options.profile.model_copy(update={"target": target})
     track_source(dataclasses.replace(options, profile=wrong), io.StringIO())
     said = capsys.readouterr().err
