@@ -24,8 +24,8 @@ from common import (
 
 from perchctl.geometry import Array
 from perchctl.vision import MARKERS, Detection, Detections, Frame
+from perchctl.vision.markers.corners import side_lengths_px
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.square import side_lengths_px
 
 SIDES_PX = (
     64,

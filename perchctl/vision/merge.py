@@ -1,12 +1,294 @@
-"""Merging the two markers into the one pose of the target (paper, section II-A.2)."""
+"""The two ways from one frame's markers to the target.
+
+`weights` is the paper's (section II-A): a pose and a Kalman filter for each marker, then W.
+`joint` solves both markers' corners at once and filters that one pose. A strategy names its
+tracks, measures (which poses there are, and which track each feeds) and merges the tracks.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from perchctl.geometry import Array, circular_mean
 from perchctl.profile import MergeConfig, WeightsConfig
-from perchctl.vision.types import MarkerPose, Stage
+from perchctl.vision.filter import POSITION, VELOCITY, YAW, X, Y, Z
+from perchctl.vision.pose import PoseCandidate, PoseSetup, estimate_pose, level_rotation
+from perchctl.vision.types import (
+    MARKERS,
+    Attitude,
+    Detection,
+    Detections,
+    MarkerPose,
+    MarkerTrack,
+    MeasuredMarkers,
+    Stage,
+)
+
+CONSISTENT_CHI2 = 4.0
+"""Per degree of freedom: below it, both markers' corners fit one pose so well that the two
+cannot contradict (that takes four standard deviations)."""
+_PLACE_YAW = [X, Y, Z, YAW]
+_STAGE_OF = {"joint": Stage.BOTH, "large": Stage.LARGE, "small": Stage.SMALL}
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """The target in the tracks' frame: (x, y, z, yaw), velocity, covariances; `bias_m` (3, 4) is
+    what the tracks' `bias` makes of the place."""
+
+    vector: Array
+    velocity_mps: Array
+    cov_m2: Array
+    bias_m: Array
+    var_yaw_rad2: float
+    unseen: int
+    stage: Stage
+
+
+@dataclass(frozen=True, eq=False)
+class MergePrior:
+    """What is known before a frame is solved.
+
+    `near` is the target's last pose, moved by the vehicle's motion since; `normal_cam` (3,)
+    the target's normal at that last pose, in the camera's axes of then.
+    """
+
+    attitude: Attitude | None
+    near: PoseCandidate | None
+    normal_cam: Array | None
+
+
+class MergeStrategy(Protocol):
+    """How poses of both markers become one: the paper's weights, or one joint solution."""
+
+    @property
+    def tracks(self) -> tuple[str, ...]:
+        """Names of its filters."""
+
+    def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
+        """Solve what this frame needs, once, and choose the track that each pose feeds."""
+
+    def merge(
+        self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
+    ) -> Merged | None:
+        """The target from the tracks; `fed` is what the newest frame fed them with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The paper's: each marker its pose and its filter, merged by W (equations 5, 8, 12)."""
+
+    config: MergeConfig
+    pose: PoseSetup
+    tracks: tuple[str, ...] = MARKERS
+
+    def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
+        singles = _singles(
+            _seen(detections, self.pose), detections.t_s, prior, self.pose, prior.near
+        )
+        contradicting = _contradict(singles, self.config)
+        fed = _usable(singles, contradicting, prior, self.config, self.pose)
+        return MeasuredMarkers(singles, fed, contradicting)
+
+    def merge(
+        self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
+    ) -> Merged | None:
+        """The tracks that this frame fed, or else those unseen for the shortest time."""
+        if not tracks:
+            return None
+        least = min(track.unseen for track in tracks.values())
+        used = {name: track for name, track in tracks.items() if track.unseen == least}
+        used = {name: track for name, track in used.items() if name in fed} or used
+        if len(used) == 1:
+            name, track = next(iter(used.items()))
+            return _alone(track, fed.get(name))
+        large, small = used["large"], used["small"]
+        weights = self.config.weights
+        order = _PLACE_YAW
+        variance = merge_variance(np.diag(large.P)[order], np.diag(small.P)[order], weights)
+        w = np.array([weights.x, weights.y, weights.z])
+        return Merged(
+            vector=merge_pair(large.x[order], small.x[order], weights),
+            velocity_mps=w * large.x[VELOCITY] + (1.0 - w) * small.x[VELOCITY],
+            cov_m2=np.diag(variance[:3]),
+            bias_m=w[:, None] * large.bias[POSITION] + (1.0 - w[:, None]) * small.bias[POSITION],
+            var_yaw_rad2=float(variance[3]),
+            unseen=least,
+            stage=Stage.BOTH if fed else Stage.NONE,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Both markers' corners in one solve, one filter; a marker alone feeds the same one."""
+
+    config: MergeConfig
+    pose: PoseSetup
+    tracks: tuple[str, ...] = ("joint",)
+
+    def measure(self, detections: Detections, prior: MergePrior) -> MeasuredMarkers:
+        seen, t_s = _seen(detections, self.pose), detections.t_s
+        joint = None
+        if len(seen) == 2:
+            joint = estimate_pose(
+                seen, t_s, prior.attitude, self.pose, prior.normal_cam, prior.near
+            )
+        clear = joint is not None and joint.chi2 < CONSISTENT_CHI2
+        enough = joint is not None and clear and self.config.stages == "seen"
+        # The joint tilt is the surest: the single markers of its frame start from it.
+        singles = {}
+        if not enough or self.pose.config.each_marker:
+            near = prior.near if joint is None else PoseCandidate(joint.rvec_rad, joint.tvec_m)
+            singles = _singles(seen, t_s, prior, self.pose, near)
+        if joint is None:
+            contradicting = _contradict(singles, self.config)
+            fed = _usable(singles, contradicting, prior, self.config, self.pose)
+            if len(fed) == 2:
+                return MeasuredMarkers(
+                    singles, {"joint": better_conditioned(fed["large"], fed["small"])}
+                )
+            return MeasuredMarkers(singles, _as_joint(fed), contradicting)
+        poses = {"joint": joint, **singles}
+        if enough:
+            return MeasuredMarkers(poses, {"joint": joint})
+        contradicting = not clear and _contradict(singles, self.config)
+        fed = _usable(singles, contradicting, prior, self.config, self.pose)
+        return MeasuredMarkers(
+            poses, _as_joint(fed) if len(fed) == 1 else {"joint": joint}, contradicting
+        )
+
+    def merge(
+        self, tracks: Mapping[str, MarkerTrack], fed: Mapping[str, MarkerPose]
+    ) -> Merged | None:
+        return _alone(tracks["joint"], fed.get("joint")) if tracks else None
+
+
+def make_strategy(config: MergeConfig, pose: PoseSetup) -> MergeStrategy:
+    """The profile's `merge.method`."""
+    return Joint(config, pose) if config.method == "joint" else Weights(config, pose)
+
+
+def _seen(detections: Detections, setup: PoseSetup) -> list[Detection]:
+    return seen_at_once(detections, setup.readout_s, setup.camera.size_px[1])
+
+
+def _singles(
+    seen: list[Detection],
+    t_s: float,
+    prior: MergePrior,
+    setup: PoseSetup,
+    start: PoseCandidate | None,
+) -> dict[str, MarkerPose]:
+    found = (estimate_pose([d], t_s, prior.attitude, setup, prior.normal_cam, start) for d in seen)
+    return {pose.source: pose for pose in found if pose is not None}
+
+
+def _contradict(singles: Mapping[str, MarkerPose], config: MergeConfig) -> bool:
+    if len(singles) < 2:
+        return False
+    return disagree(singles["large"], singles["small"], config.disagreement_m)
+
+
+def _usable(
+    singles: Mapping[str, MarkerPose],
+    contradicting: bool,
+    prior: MergePrior,
+    config: MergeConfig,
+    setup: PoseSetup,
+) -> dict[str, MarkerPose]:
+    """The single markers' poses that count: of two that contradict the better, else what
+    the stage asks for."""
+    if len(singles) < 2:
+        return dict(singles)
+    use = better_conditioned(singles["large"], singles["small"])
+    if contradicting:
+        return {use.source: use}
+    offset = setup.gear_body_m - setup.T_body_cam[:3, 3]
+    z_m = float(use.e_m[2] + (level_rotation(prior.attitude) @ offset)[2])
+    stage = choose_stage(True, True, z_m, config)
+    return dict(singles) if stage is Stage.BOTH else {stage.value: singles[stage.value]}
+
+
+def _as_joint(fed: Mapping[str, MarkerPose]) -> dict[str, MarkerPose]:
+    pose = next(iter(fed.values()), None)
+    return {} if pose is None else {"joint": pose}
+
+
+def _alone(track: MarkerTrack, pose: MarkerPose | None) -> Merged:
+    return Merged(
+        vector=track.x[_PLACE_YAW],
+        velocity_mps=track.x[VELOCITY],
+        cov_m2=track.P[POSITION, POSITION],
+        bias_m=track.bias[POSITION],
+        var_yaw_rad2=float(track.P[YAW, YAW]),
+        unseen=track.unseen,
+        stage=Stage.NONE if pose is None else _STAGE_OF[pose.source],
+    )
+
+
+# --- Corners of a rolling shutter at one moment ------------------------------------------------
+# The rows of such a picture are exposed one after the other within the read-out time, and what
+# moves is sheared, stretched or squeezed: at 20 ms and 0.3 m/s by as much as the target moves in
+# a few milliseconds. A frame's time is its middle row's. Each corner is moved back along
+# its own motion in the picture, by the time that its row was exposed later.
+
+
+UNKNOWN_READOUT_S = 0.012
+"""One standard deviation of a camera's read-out time where nobody has said it."""
+FLOW_SIGMA, TURN_SIGMA = 0.05, 0.015
+"""Of a motion, along and across, as shares of it: it was measured from the frame before to this
+one, and changes."""
+
+
+def seen_at_once(
+    detections: Detections, readout_s: float | None, height_px: int
+) -> list[Detection]:
+    """The markers with their corners at the frame's own time, as far as their motion is known.
+
+    `readout_s` is from a picture's first row to its last; where it is None the corners stay
+    where they are, with what a likely read-out would do to them for an error (`common_px`);
+    else with what the motion's own error does.
+    """
+    seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
+    if readout_s == 0.0:
+        return seen
+    late = UNKNOWN_READOUT_S if readout_s is None else readout_s
+    out = []
+    for d in seen:
+        flow = detections.flow_px_s.get(d.marker, detections.velocity_px_s)
+        if flow is None:
+            out.append(d)
+            continue
+        # From frame to frame a corner that moves down is also seen later.
+        flow = flow / (1.0 + flow[..., 1:] * late / (height_px - 1.0))
+        moved_px = flow * _late_s(d.corners_px, late, height_px)
+        if readout_s is None:
+            out.append(replace(d, common_px=moved_px))
+        else:
+            turned_px = TURN_SIGMA * float(np.abs(moved_px).max())
+            cov_px2 = None if d.cov_px2 is None else d.cov_px2 + turned_px**2 * np.eye(8)
+            out.append(
+                replace(
+                    d,
+                    corners_px=d.corners_px - moved_px,
+                    sigma_px=float(np.hypot(d.sigma_px, turned_px)),
+                    cov_px2=cov_px2,
+                    common_px=FLOW_SIGMA * moved_px,
+                )
+            )
+    return out
+
+
+def _late_s(corners_px: Array, readout_s: float, height_px: int) -> Array:
+    """How much later than the middle row each corner's row is exposed, (4, 1)."""
+    return np.asarray((corners_px[:, 1:] / (height_px - 1.0) - 0.5) * readout_s)
+
+
+# --- Merging the two markers into the one pose of the target (paper, section II-A.2) -----------
 
 
 def stage_of(large: bool, small: bool) -> Stage:

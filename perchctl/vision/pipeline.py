@@ -22,20 +22,23 @@ from perchctl.vision.fields import FieldsMode, FieldState, classify_fields, sepa
 from perchctl.vision.filter import MAX_TRACK_GAP_S, FilterSetup, predict_track
 from perchctl.vision.markers.cut import prepare_cut_markers
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.detector import DetectorSetup, make_aruco_detector
-from perchctl.vision.markers.mask import GearMask, make_mask
-from perchctl.vision.merge import stage_of
-from perchctl.vision.own import OwnTargetPlace, TargetSelector
-from perchctl.vision.places import seen_from, to_level, to_world
-from perchctl.vision.pose import PoseSetup, make_pose_setup, normal_cam
-from perchctl.vision.predict import expected_corners, update_sight
-from perchctl.vision.solve import PoseCandidate
-from perchctl.vision.strategies import Merged, MergePrior, MergeStrategy, make_strategy
+from perchctl.vision.markers.detector import DetectorSetup, GearMask, make_aruco_detector, make_mask
+from perchctl.vision.merge import Merged, MergePrior, MergeStrategy, make_strategy, stage_of
+from perchctl.vision.pose import PoseCandidate, PoseSetup, make_pose_setup, normal_cam
+from perchctl.vision.target_selection import (
+    OwnTargetPlace,
+    TargetSelector,
+    seen_from,
+    to_level,
+    to_world,
+)
 from perchctl.vision.tracks import (
     TrackedFrame,
     TrackSetup,
+    expected_corners,
     make_track_setup,
     surest_pose,
+    update_sight,
     update_tracks,
 )
 from perchctl.vision.types import (

@@ -19,7 +19,7 @@ from perchctl.log.watch import Truth, flight_record
 from perchctl.mission import Context, Phase, Tick, planner
 from perchctl.perception import perception
 from perchctl.sim import draw_scenario
-from perchctl.vision import strategies
+from perchctl.vision import merge
 from tests.helpers.flights import SEED, NoLog, short_profile
 
 pytestmark = pytest.mark.long
@@ -54,7 +54,7 @@ class Counted:
 def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
     """One quiet flight, watched from everywhere."""
     counted, looker = Counted(), Looker()
-    solve, step, act = strategies.estimate_pose, perception.step, planner.act
+    solve, step, act = merge.estimate_pose, perception.step, planner.act
 
     def solved(*arguments: Any) -> Any:
         counted.in_step += counted.stepping
@@ -73,7 +73,7 @@ def flight() -> Iterator[tuple[list[tuple[Tick, Truth]], Counted]]:
         return act(context)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(strategies, "estimate_pose", solved)
+        patch.setattr(merge, "estimate_pose", solved)
         patch.setattr(perception, "step", stepped)
         patch.setattr(planner, "act", acted)
         flown = fly_lockstep(PROFILE, log=looker, scenario=SCENARIO)

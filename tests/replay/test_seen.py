@@ -26,8 +26,8 @@ from perchctl.replay import replay
 from perchctl.replay.run import Replay
 from perchctl.replay.told import difference_text
 from perchctl.vision import filter as the_filter
-from perchctl.vision import solve
-from perchctl.vision.markers import lines
+from perchctl.vision import pose
+from perchctl.vision.markers import edge_fit
 from tests.helpers.flights import ROOT
 from tests.replay.test_corpus import ANEW, FOLDER, corpus
 
@@ -102,9 +102,9 @@ def test_they_show_all_that_matters() -> None:
 @pytest.mark.parametrize(
     ("module", "name"),
     [
-        (lines, "_SHIFT_PRIOR_PX"),  # the fit of edges
-        (lines, "MIN_LINE_SIGMA_PX"),
-        (solve, "_TRUST"),  # the pose
+        (edge_fit, "_SHIFT_PRIOR_PX"),  # the fit of edges
+        (edge_fit, "MIN_LINE_SIGMA_PX"),
+        (pose, "_TRUST"),  # the pose
         (the_filter, "_PUSH_S"),
     ],
 )

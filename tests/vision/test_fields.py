@@ -27,8 +27,7 @@ from perchctl.vision import (
     step,
 )
 from perchctl.vision.fields import FieldsMode, classify_fields, combing, halves, separate_fields
-from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.ghost import with_ghosts
+from perchctl.vision.markers.detect import detect_markers, with_ghosts
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

@@ -27,7 +27,7 @@ from perchctl.vision import (
     make_pipeline,
     step,
 )
-from perchctl.vision.markers.between import between
+from perchctl.vision.markers.detect import between
 from perchctl.vision.markers.search import choose
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])

@@ -18,7 +18,7 @@ from perchctl.vision import (
     pictures,
     step,
 )
-from perchctl.vision.strategies import UNKNOWN_READOUT_S, seen_at_once
+from perchctl.vision.merge import UNKNOWN_READOUT_S, seen_at_once
 from tests.helpers.interlaced import Pass
 from tests.helpers.target_picture import CAMERA
 

@@ -22,7 +22,7 @@ from perchctl.profile import KalmanConfig, TargetConfig
 from perchctl.vision import Attitude, MarkerPose, Pipeline, PipelineState
 from perchctl.vision.filter import TILTS, X, Y, Z, make_filter, process_noise
 from perchctl.vision.pipeline import follow
-from perchctl.vision.places import measurement
+from perchctl.vision.target_selection import measurement
 from tests.helpers.seen import seen_from
 
 Build = Callable[..., Pipeline]

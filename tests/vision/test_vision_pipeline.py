@@ -40,8 +40,8 @@ from perchctl.vision import (
     estimate_pose,
     step,
 )
-from perchctl.vision.predict import expected_corners
-from perchctl.vision.solve import PoseCandidate
+from perchctl.vision.pose import PoseCandidate
+from perchctl.vision.tracks import expected_corners
 from perchctl.vision.types import Sighting
 from tests.helpers.target_picture import pose_of, render
 

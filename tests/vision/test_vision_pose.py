@@ -27,8 +27,7 @@ from perchctl.vision import (
     project,
     square_corners,
 )
-from perchctl.vision.pose import make_pose_setup, mirror_solution, normal_cam
-from perchctl.vision.solve import PoseCandidate
+from perchctl.vision.pose import PoseCandidate, make_pose_setup, mirror_solution, normal_cam
 from tests.helpers.target_picture import CAMERA, pose_of
 
 SIDES = {"large": 0.150, "small": 0.025}

@@ -15,7 +15,7 @@ from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.profile import CameraConfig, PoseConfig, TargetConfig
 from perchctl.vision import Attitude, MarkerPose
 from perchctl.vision.pose import make_pose_setup
-from perchctl.vision.predict import expected_corners, update_sight
+from perchctl.vision.tracks import expected_corners, update_sight
 from perchctl.vision.types import Sighting
 from tests.helpers.target_picture import CAMERA
 

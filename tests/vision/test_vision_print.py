@@ -18,8 +18,8 @@ from perchctl.vision import (
 )
 from perchctl.vision.filter import PRINT, make_filter
 from perchctl.vision.merge import disagree
-from perchctl.vision.places import measurement
 from perchctl.vision.pose import make_pose_setup
+from perchctl.vision.target_selection import measurement
 from tests.helpers.target_picture import CAMERA, pose_of
 
 SIDES = {"large": 0.150, "small": 0.025}

@@ -7,9 +7,16 @@ import pytest
 
 from perchctl.geometry import Array
 from perchctl.vision import Detection, project, square_corners, undistort_px
-from perchctl.vision.points import Points, make_points
-from perchctl.vision.pose import rotation_matrix
-from perchctl.vision.solve import PoseCandidate, Scored, TiltPrior, gauss_newton, mirror_solution
+from perchctl.vision.pose import (
+    Points,
+    PoseCandidate,
+    Scored,
+    TiltPrior,
+    gauss_newton,
+    make_points,
+    mirror_solution,
+    rotation_matrix,
+)
 from tests.helpers.target_picture import CAMERA, pose_of
 
 TRUE = PoseCandidate(*pose_of(0.03, -0.02, 0.5, 0.4, 0.15, -0.1))

@@ -13,18 +13,29 @@ and only where the one before saw too little.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.values import replace
 from perchctl.vision.fields import halves, interpolated_sigma_px
-from perchctl.vision.markers.between import between
-from perchctl.vision.markers.blurred import expected_in_blur, hidden_in_blur
-from perchctl.vision.markers.by_drawing import aligned
-from perchctl.vision.markers.corners import NESTED_SIGMA_PX, RefinedCorners
+from perchctl.vision.markers.blurred import aligned, expected_in_blur, hidden_in_blur
+from perchctl.vision.markers.corners import (
+    NESTED_SIGMA_PX,
+    NEXT,
+    RefinedCorners,
+    completed,
+    doubled_area,
+    known_from,
+    mean_side_px,
+    nested,
+    shortest_side_px,
+    side_lengths_px,
+    within,
+)
 from perchctl.vision.markers.cut import (
     cut_lately,
     cut_markers,
@@ -32,19 +43,18 @@ from perchctl.vision.markers.cut import (
     may_be_whole,
     measured_lately,
 )
-from perchctl.vision.markers.detector import DetectorSetup
-from perchctl.vision.markers.follow import around, follow, follow_partly
-from perchctl.vision.markers.ghost import with_ghosts
-from perchctl.vision.markers.lines import refine
-from perchctl.vision.markers.mask import Covered, filled, hidden_in, hides
-from perchctl.vision.markers.partly import seen_partly, wholly_seen
-from perchctl.vision.markers.pattern import Pattern, resembles
+from perchctl.vision.markers.detector import Covered, DetectorSetup, filled, hidden_in, hides
+from perchctl.vision.markers.edge_fit import refine, refine_lines
+from perchctl.vision.markers.partial import ROOM_PX, KnownBy, seen_partly, wholly_seen
+from perchctl.vision.markers.pattern import (
+    LEAST_SIDE_PX,
+    Pattern,
+    cells_agree,
+    cells_mostly_agree,
+    resembles,
+)
 from perchctl.vision.markers.search import Found, Look, search, search_halved
-from perchctl.vision.markers.seen_edges import ROOM_PX
-from perchctl.vision.markers.shift import known_from
-from perchctl.vision.markers.square import completed, mean_side_px, nested, side_lengths_px, within
-from perchctl.vision.markers.visible_cells import KnownBy
-from perchctl.vision.own import TargetSelector
+from perchctl.vision.target_selection import TargetSelector
 from perchctl.vision.types import (
     MARKERS,
     CameraModel,
@@ -407,3 +417,290 @@ def _start(
     if name == "small" and other is not None and other.refined:
         return nested(other.corners_px, patterns["large"].drawing.ratio, camera)
     return None
+
+
+# --- Markers where they are expected: no search, only verification -----------------------------
+# Sides are fitted at the predicted corners, and every cell is read through the result's
+# homography: a strict check (all cells right, none nearly wrong) at a tenth of the price of
+# a search.
+
+
+_LEAST_CELL_PX = 2.5  # for lines
+_ANCHOR = 0.12  # of the small marker's side
+
+
+def follow(
+    image: NDArray[np.uint8],
+    expected: Mapping[MarkerName, Array],
+    patterns: Mapping[MarkerName, Pattern],
+    camera: CameraModel,
+    shift: EdgeShift | None = None,
+    hidden: NDArray[np.bool_] | None = None,
+) -> dict[MarkerName, RefinedCorners]:
+    """The expected markers (corners (4, 2) px) that are verified by all sides and cells; `shift`
+    is what was measured of the edges in an earlier picture, `hidden` (h, w) where there is
+    something else."""
+    names = [
+        name
+        for name in MARKERS
+        if name in expected
+        and within(expected[name], image.shape, ROOM_PX)
+        and shortest_side_px(expected[name]) > _LEAST_CELL_PX * patterns[name].rim.cells
+    ]
+    if not names:
+        return {}
+    raw = np.array([expected[name] for name in names])
+    fitted = refine_lines(image, raw, [patterns[name].rim for name in names], camera, shift)
+    return {
+        name: result
+        for name, result in zip(names, fitted, strict=True)
+        if result is not None
+        and wholly_seen(result, image.shape, hidden)
+        and cells_agree(image, result.corners_px, patterns[name])
+    }
+
+
+def follow_partly(
+    image: NDArray[np.uint8],
+    expected: Mapping[MarkerName, Array],
+    seen: Mapping[MarkerName, RefinedCorners],
+    patterns: Mapping[MarkerName, Pattern],
+    camera: CameraModel,
+    shift: EdgeShift | None = None,
+    hidden: NDArray[np.bool_] | None = None,
+) -> dict[MarkerName, RefinedCorners]:
+    """With those that `follow` did not verify, by what is seen of them. Where the small marker
+    was met, the large one is looked for around it instead of where it was expected."""
+    places, seen = dict(expected), dict(seen)
+    if "small" in seen and "large" not in seen:
+        places["large"] = nested(
+            seen["small"].corners_px, 1.0 / patterns["large"].drawing.ratio, camera
+        )
+    for name in MARKERS:
+        if name in places and name not in seen:
+            partly = seen_partly(
+                image, places[name], patterns[name], camera, "track", hidden, shift
+            )
+            if partly is not None:
+                seen[name] = partly
+    large = seen.get("large")
+    if large is not None and "small" not in seen:
+        # Too small for lines, but where it must be: enough to know that it is there.
+        small_px = nested(large.corners_px, patterns["large"].drawing.ratio, camera)
+        if mean_side_px(small_px) > LEAST_SIDE_PX and resembles(image, small_px, patterns["small"]):
+            seen["small"] = RefinedCorners(small_px, NESTED_SIGMA_PX, False)
+    return seen
+
+
+def around(
+    image: NDArray[np.uint8],
+    small: RefinedCorners,
+    patterns: Mapping[MarkerName, Pattern],
+    camera: CameraModel,
+    hidden: NDArray[np.bool_] | None = None,
+) -> RefinedCorners | None:
+    """The large marker around a small one that was found: something may cover a part of
+    it, and it may be cut off by the picture's edge, so long as its sides are lines where they
+    are seen and most cells show."""
+    pattern = patterns["large"]
+    start = nested(small.corners_px, 1.0 / pattern.drawing.ratio, camera)
+    if not np.isfinite(start).all():
+        return None
+    found: RefinedCorners | None = None
+    if within(start, image.shape, ROOM_PX):
+        # A small marker gives a rough place; the first fit is where to look closely.
+        found = refine_lines(image, start[None], [pattern.rim], camera)[0]
+        if found is not None:
+            found = refine_lines(image, found.corners_px[None], [pattern.rim], camera)[0]
+        if (
+            found is not None
+            and wholly_seen(found, image.shape, hidden)
+            and _centred(found, small, pattern, camera)
+            and cells_mostly_agree(image, found.corners_px, pattern)
+        ):
+            return found
+    if found is not None:
+        start = found.corners_px
+    partly = seen_partly(image, start, pattern, camera, "other", hidden)
+    return partly if partly and _centred(partly, small, pattern, camera) else None
+
+
+def _centred(
+    large: RefinedCorners, small: RefinedCorners, pattern: Pattern, camera: CameraModel
+) -> bool:
+    """Whether the small marker is where the large one has it."""
+    centre = nested(large.corners_px, pattern.drawing.ratio, camera)
+    off_px = float(np.abs(centre - small.corners_px).max())
+    return off_px <= max(_ANCHOR * mean_side_px(small.corners_px), 1.0)
+
+
+# --- The markers of two fields, at the moment half way between them ----------------------------
+
+
+_MOST_SIDES = 1.5  # of the marker: the small one at 1.9 m/s
+
+
+def between(a: Detections, b: Detections) -> Detections:
+    """The mean of both fields' corners, which is right for either order of the fields.
+
+    A marker that only one field shows is left out where the other marker is in both: the
+    two would belong to different moments. Nothing lies between two different targets.
+    """
+    both = {
+        name: _middle(one, other)
+        for name in MARKERS
+        if (one := a.get(name)) is not None
+        and (other := b.get(name)) is not None
+        and _is_one(one.corners_px, other.corners_px)
+    }
+    if not both:
+        alone = a if a.large is not None or a.small is not None else b
+        return replace(alone, mirrored=alone.mirrored or b.mirrored)
+    return replace(a, large=both.get("large"), small=both.get("small"), mirrored=False)
+
+
+def _is_one(a_px: Array, b_px: Array) -> bool:
+    """Whether a marker can have moved from one place to the other between the fields."""
+    moved_px = float(np.linalg.norm(a_px.mean(axis=0) - b_px.mean(axis=0)))
+    return moved_px < _MOST_SIDES * mean_side_px(a_px)
+
+
+def _middle(a: Detection, b: Detection) -> Detection:
+    """Each field has its own noise, so the mean is surer than either."""
+    return Detection(
+        a.marker,
+        (a.corners_px + b.corners_px) / 2.0,
+        ((a.sigma_px**2 + b.sigma_px**2) / 4.0) ** 0.5,
+        a.refined and b.refined,
+        max(a.shift_sigma_px, b.shift_sigma_px),
+        cov_px2=_mean_cov_px2(a, b),
+        row_sigma_px=((a.row_sigma_px**2 + b.row_sigma_px**2) / 4.0) ** 0.5,
+        lying_sigma_px=((a.lying_sigma_px**2 + b.lying_sigma_px**2) / 4.0) ** 0.5,
+    )
+
+
+def _mean_cov_px2(a: Detection, b: Detection) -> Array | None:
+    """None where in both the corners spread alike."""
+    if a.cov_px2 is None and b.cov_px2 is None:
+        return None
+    one, other = (d.sigma_px**2 * np.eye(8) if d.cov_px2 is None else d.cov_px2 for d in (a, b))
+    return np.asarray((one + other) / 4.0)
+
+
+# --- Double edges: what a converter leaves that averages the two fields of a moving picture ----
+# Both fields are then in every row, and cannot be taken apart again. A side of a marker shows it:
+# the grey levels across it rise in two equal steps with a plateau between, where blur
+# of any kind makes one.
+
+
+SLOW_PX_S = 80.0
+"""Markers that move no faster have fields too near to each other to be told apart."""
+FIELDS_APART_S = 0.02
+_EVERY = 4
+_PLACES: Array = np.linspace(0.12, 0.88, 32)
+_STEP_PX = 0.5
+_REACH_CELLS, _MOST_REACH_PX = 0.9, 16.0
+_LEAST_REACH_PX, _ROOM_PX = 4.0, 8.0
+_LEAST_PX = 2.5  # between the steps
+_VALLEY = 0.55  # of the lower peak
+_ALIKE = 0.55  # the lower peak in terms of the higher
+_LEAST_SLOPE = 3.0  # grey levels a pixel
+_CELLS = {"large": 6.0, "small": 7.0}  # of a side; with a little less all goes as well
+
+
+def with_ghosts(
+    now: Detections, previous: Detections | None, image: NDArray[np.uint8]
+) -> Detections:
+    """`now` with `ghost_px`, and the corners' spread widened by it, where a marker that moves,
+    or of which that is not known, has double edges. Where the picture before had none, as in
+    most streams, it is looked for in every fourth."""
+    velocity = now.velocity_px_s
+    if velocity is not None and float(np.hypot(*velocity)) < SLOW_PX_S:
+        return now
+    if velocity is not None and previous is not None and previous.ghost_px == 0.0:
+        age = previous.ghost_age + 1
+        if age < _EVERY:
+            return replace(now, ghost_age=age)
+    seen = [d for name in MARKERS if (d := now.get(name)) is not None]
+    shows = _shows_best(seen)
+    ghost_px = 0.0 if shows is None else double_edge_px(image, shows)
+    if ghost_px == 0.0:
+        return now
+    wider = {d.marker: _wider(d, ghost_px / 4.0) for d in seen}
+    return replace(now, large=wider.get("large"), small=wider.get("small"), ghost_px=ghost_px)
+
+
+def _shows_best(seen: Sequence[Detection]) -> Detection | None:
+    """The smallest marker with room enough beside its sides: larger ones bend more, and may
+    be outside of the picture, where sides show nothing."""
+    whole = [d for d in seen if d.cov_px2 is None]
+    small = whole[-1:] if whole and _reach_px(whole[-1]) >= _ROOM_PX else whole[:1]
+    return small[0] if small else None
+
+
+def _reach_px(marker: Detection) -> float:
+    """How far from the sides the next edges are not yet seen."""
+    cell_px = float(side_lengths_px(marker.corners_px).min()) / _CELLS[marker.marker]
+    return min(_REACH_CELLS * cell_px, _MOST_REACH_PX)
+
+
+def _wider(d: Detection, sigma_px: float) -> Detection:
+    """The middle of both steps is where the edge was at the middle moment, but an edge fit may
+    hold to one of them."""
+    cov_px2 = None if d.cov_px2 is None else d.cov_px2 + sigma_px**2 * np.eye(8)
+    return replace(d, sigma_px=float(np.hypot(d.sigma_px, sigma_px)), cov_px2=cov_px2)
+
+
+def double_edge_px(image: NDArray[np.uint8], marker: Detection) -> float:
+    """How far the two steps of a marker's sides are apart, the mean over opposite sides and
+    the greater of the two directions; 0 where the sides are single."""
+    profiles = _profiles(image, marker)
+    if profiles is None:
+        return 0.0
+    apart = _apart_px(profiles)
+    pairs = [(apart[k], apart[k + 2]) for k in (0, 1)]
+    both = [(a + b) / 2.0 for a, b in pairs if min(a, b) > 0.6 * max(a, b) > 0.0]
+    return max(both, default=0.0)
+
+
+def _profiles(image: NDArray[np.uint8], marker: Detection) -> Array | None:
+    """Mean grey across each side from the inside outwards, `_STEP_PX` apart, (4, n); None of a
+    marker that is too small."""
+    reach_px = _reach_px(marker)
+    if reach_px < _LEAST_REACH_PX:
+        return None
+    corners = marker.corners_px
+    sides_px = side_lengths_px(corners)
+    way = corners[NEXT] - corners
+    turn = 1.0 if doubled_area(corners[None])[0] > 0.0 else -1.0
+    out_x, out_y = turn * way[:, 1] / sides_px, -turn * way[:, 0] / sides_px
+    u = np.arange(-reach_px, reach_px + 1e-9, _STEP_PX)
+    foot = corners[:, None] + _PLACES[:, None] * way[:, None]
+    shape = (4, len(_PLACES), len(u))
+    x, y = np.empty(shape, np.float32), np.empty(shape, np.float32)
+    np.add(foot[:, :, None, 0], (out_x[:, None] * u)[:, None], out=x, casting="same_kind")
+    np.add(foot[:, :, None, 1], (out_y[:, None] * u)[:, None], out=y, casting="same_kind")
+    flat = (4 * len(_PLACES), len(u))
+    grey = cv2.remap(image, x.reshape(flat), y.reshape(flat), cv2.INTER_LINEAR)
+    return np.asarray(grey.reshape(shape).sum(axis=1, dtype=np.int32) / float(len(_PLACES)))
+
+
+def _apart_px(profiles: Array) -> list[float]:
+    """The distance of two equal steps in each of the profiles (m, n), 0 where there is one."""
+    rise = np.diff(profiles, axis=1) / _STEP_PX
+    slope = 0.25 * rise[:, :-2] + 0.5 * rise[:, 1:-1] + 0.25 * rise[:, 2:]
+    middle = slope[:, 1:-1]
+    peak = (middle > slope[:, :-2]) & (middle >= slope[:, 2:]) & (middle >= _LEAST_SLOPE)
+    return [_between_px(s, np.flatnonzero(p) + 1) for s, p in zip(slope, peak, strict=True)]
+
+
+def _between_px(slope: Array, peaks: NDArray[np.intp]) -> float:
+    """The distance of the two highest peaks, if they are about equal, with a valley between."""
+    if len(peaks) < 2:
+        return 0.0
+    low, high = np.sort(slope[peaks])[-2:]
+    if low < _ALIKE * high:
+        return 0.0
+    a, b = np.sort(peaks[np.argsort(slope[peaks])[-2:]])
+    apart_px = float(b - a) * _STEP_PX
+    return apart_px if apart_px >= _LEAST_PX and slope[a:b].min() < _VALLEY * low else 0.0

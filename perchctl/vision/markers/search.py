@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
+from perchctl.vision.markers.corners import mean_side_px, nested, within
 from perchctl.vision.markers.detector import (
     MIRROR_INDEX,
     OPENCV_THRESHOLDS,
@@ -22,8 +23,7 @@ from perchctl.vision.markers.detector import (
     Thresholds,
     strict_detector,
 )
-from perchctl.vision.markers.square import mean_side_px, nested, within
-from perchctl.vision.own import TargetSelector
+from perchctl.vision.target_selection import TargetSelector
 from perchctl.vision.types import MARKERS, MarkerName
 
 Look = Literal["near", "window", "fits", "sharp", "blurred", "all"]

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array
 from perchctl.vision import project, square_corners
-from perchctl.vision.markers.align import align
-from perchctl.vision.markers.by_drawing import told_apart, verified
-from perchctl.vision.markers.drawing import Drawing, drawing_of
+from perchctl.vision.markers.blurred import told_apart, verified
+from perchctl.vision.markers.pattern import Drawing, drawing_of
+from perchctl.vision.markers.photometric_fit import align
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 
 LARGE_BITS, SMALL_BITS = bits_of("DICT_4X4_1000", 997), bits_of("DICT_ARUCO_ORIGINAL", 5)

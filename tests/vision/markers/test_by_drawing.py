@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from perchctl.vision.markers.by_drawing import aligned
+from perchctl.vision.markers.blurred import aligned
 from tests.helpers.markers import SETUP, corners
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

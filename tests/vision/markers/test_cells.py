@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel
-from perchctl.vision.markers.align import Alignment, align
-from perchctl.vision.markers.by_drawing import told_apart
+from perchctl.vision.markers.blurred import told_apart
 from perchctl.vision.markers.detect import detect_markers
+from perchctl.vision.markers.photometric_fit import Alignment, align
 from tests.helpers.markers import SETUP, frame
 
 PLAIN = CameraModel((160, 120), np.array([[200.0, 0, 80], [0, 200.0, 60], [0, 0, 1]]), np.zeros(5))

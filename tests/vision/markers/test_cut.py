@@ -23,16 +23,19 @@ from perchctl.vision import (
     undistort,
     undistort_px,
 )
-from perchctl.vision.markers.between import between
-from perchctl.vision.markers.cut import MOST_AGE_S, cut_markers, is_cut, may_be_whole
-from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.ghost import with_ghosts
-from perchctl.vision.markers.outline import outline_of
-from perchctl.vision.markers.overview import lattice_of
+from perchctl.vision.markers.corners import within
+from perchctl.vision.markers.cut import (
+    MOST_AGE_S,
+    cut_markers,
+    fitted,
+    is_cut,
+    lattice_of,
+    may_be_whole,
+    outline_of,
+)
+from perchctl.vision.markers.detect import between, detect_markers, with_ghosts
+from perchctl.vision.markers.partial import look as look_for_edges
 from perchctl.vision.markers.search import Found, search
-from perchctl.vision.markers.seen_edges import look as look_for_edges
-from perchctl.vision.markers.square import within
-from perchctl.vision.markers.visible import fitted
 from tests.helpers.markers import SETUP, both, corners, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.edges import Edges, Surroundings, locate
-from perchctl.vision.markers.profiles import ALONG, PROFILES, STEPS
+from perchctl.vision.markers.edge_fit import ALONG, PROFILES, STEPS, Edges, Surroundings, locate
 
 HALF_PX, NEAR_PX, DEPTH_PX = 7.0, 7.0, 12.0
 OFFSETS: Array = HALF_PX * np.linspace(-1.0, 1.0, STEPS + 1)

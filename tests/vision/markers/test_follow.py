@@ -12,10 +12,8 @@ import pytest
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
 from perchctl.vision import make_aruco_detector
 from perchctl.vision.markers.corners import RefinedCorners
-from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.follow import around, follow
-from perchctl.vision.markers.partly import seen_partly
-from perchctl.vision.markers.visible_cells import KnownBy
+from perchctl.vision.markers.detect import around, detect_markers, follow
+from perchctl.vision.markers.partial import KnownBy, seen_partly
 from tests.helpers.markers import POSE, SETUP, both, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 
@@ -111,7 +109,7 @@ def test_a_near_target_that_has_moved_on_is_looked_for_nearby_before_parts_of_it
         asked.append(args[4])
         return seen_partly(*args)
 
-    monkeypatch.setattr("perchctl.vision.markers.follow.seen_partly", noting)
+    monkeypatch.setattr("perchctl.vision.markers.detect.seen_partly", noting)
     pose = pose_of(0.0, 0.0, 0.16, 0.4)
     expected = both(pose, shift_px=25.0)
     found = detect_markers(frame(render(*pose, noise=3.0)), None, SETUP, CAMERA, expected)

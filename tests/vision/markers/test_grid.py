@@ -9,8 +9,13 @@ from hypothesis import strategies as st
 
 from perchctl.geometry import Array
 from perchctl.vision import undistort_px
-from perchctl.vision.markers.grid import lens_shift_px, make_grid, projected, through_lens
-from perchctl.vision.markers.square import UNIT, corner_jacobian, from_unit, mapped
+from perchctl.vision.markers.corners import UNIT, corner_jacobian, from_unit, mapped
+from perchctl.vision.markers.photometric_fit import (
+    lens_shift_px,
+    make_grid,
+    projected,
+    through_lens,
+)
 from tests.helpers.markers import box, corners
 from tests.helpers.target_picture import CAMERA, pose_of
 

@@ -9,7 +9,7 @@ import pytest
 from perchctl.geometry import Array
 from perchctl.vision import project, square_corners
 from perchctl.vision.markers.corners import RAW_SIGMA_PX, SUBPIX_SIGMA_PX
-from perchctl.vision.markers.lines import refine
+from perchctl.vision.markers.edge_fit import refine
 from perchctl.vision.markers.pattern import rim_of_bits
 from tests.helpers.target_picture import CAMERA, bits_of, pose_of, render
 

@@ -14,9 +14,9 @@ from perchctl.errors import InvalidValue, NotFound, PerchError
 from perchctl.geometry import Array
 from perchctl.profile import Profile, load_profile
 from perchctl.vision import Detections, Frame, MarkerName, field_picture, make_pipeline
+from perchctl.vision.markers.corners import from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.mask import filled, hidden_in, hides, make_mask
-from perchctl.vision.markers.square import from_unit, mapped
+from perchctl.vision.markers.detector import filled, hidden_in, hides, make_mask
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

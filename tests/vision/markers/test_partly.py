@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.profile import DetectorConfig, MarkerConfig, TargetConfig
 from perchctl.vision import Detections, Frame, MarkerName, PipelineState, make_aruco_detector, step
+from perchctl.vision.markers.corners import from_unit, mapped
 from perchctl.vision.markers.detect import detect_markers
-from perchctl.vision.markers.partly import fit_partly, seen_partly
-from perchctl.vision.markers.search import search
-from perchctl.vision.markers.square import from_unit, mapped
-from perchctl.vision.markers.visible_cells import (
+from perchctl.vision.markers.partial import (
     KnownBy,
+    fit_partly,
     may_show_enough,
+    seen_partly,
     visible_cells_agree,
 )
+from perchctl.vision.markers.search import search
 from tests.helpers.markers import POSE, SETUP, corners, followed, frame
 from tests.helpers.target_picture import CAMERA, pose_of, render
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from perchctl.vision.markers.products import gram, mixed, onto
+from perchctl.vision.markers.photometric_fit import gram, mixed, onto
 
 
 @pytest.mark.parametrize("count", [18 * 18, 256, 512, 44 * 44])

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.shift import Border, edge_shift, known_from
-from perchctl.vision.markers.square import UNIT
+from perchctl.vision.markers.corners import UNIT, Border, edge_shift, known_from
 from perchctl.vision.types import EdgeShift
 
 CELLS, CELL_PX = 6, 20.0

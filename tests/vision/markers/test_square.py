@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.geometry import Array
-from perchctl.vision.markers.square import (
+from perchctl.vision.markers.corners import (
     UNIT,
     completed,
     doubled_area,
