@@ -111,9 +111,11 @@ def contact_aside_m(c: Context) -> tuple[float, float]:
     """How far the gear is from the target's axis, and the standard deviation of that.
 
     By decks the place of the last sight is carried on by an estimate that slides, and that the blow
-    on the ceiling shakes; where no position comes, `reckoned` has counted that already."""
+    on the ceiling shakes; where no position comes, `reckoned` has counted that already. A step of
+    the estimate since the last sight makes the place unsure by as much: before it or after it the
+    estimate was wrong."""
     reckoning = c.state.reckoning
-    sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M)
+    sigma_m = math.hypot(reckoning.aside_sigma_m, TOUCHES_M, *reckoning.stepped_m)
     if c.profile.positioning.by == "deck" and c.placed:
         sigma_m = math.hypot(sigma_m, SHAKEN_M, SLIDES_MPS * unseen_s(c))
     return math.hypot(*reckoning.aside_m), sigma_m

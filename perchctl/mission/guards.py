@@ -212,13 +212,13 @@ def is_held(c: Context) -> bool:
 
 
 def is_held_elsewhere(c: Context) -> bool:
-    """Something else than the target's magnet holds it: it does not hang where it met the target's
-    height, or that was surely beside the magnet."""
+    """Something else than the target's magnet holds it: it hangs at another height than the
+    target's, or surely beside the magnet (two standard deviations)."""
     touched = touched_aside_m(c)
-    if touched is None:
-        return is_held(c)
-    aside_m, sigma_m = touched
-    return is_held(c) and aside_m - 2.0 * sigma_m > c.profile.planner.perch.contact_xy_m
+    aside_m, sigma_m = touched or contact_aside_m(c)
+    at_its_height = touched is not None or abs(c.error_z_m) <= contact_within_m(c)
+    beside = aside_m - 2.0 * sigma_m > c.profile.planner.perch.contact_xy_m
+    return is_held(c) and (beside or not at_its_height)
 
 
 def why_held(c: Context) -> str:
@@ -232,10 +232,10 @@ def why_held(c: Context) -> str:
 def why_hangs_at_contact(c: Context) -> str:
     aside_m, sigma_m = touched_aside_m(c) or contact_aside_m(c)
     if not math.isfinite(sigma_m):
-        return "it hangs where it made contact, how far aside of the target is not known"
+        return "it hangs at the target's height, how far aside of it is not known"
     return (
-        f"it hangs where it made contact, {1e3 * aside_m:.0f} +- {1e3 * sigma_m:.0f} mm aside of "
-        f"the target"
+        f"it hangs at the target's height, {1e3 * aside_m:.0f} +- {1e3 * sigma_m:.0f} mm aside of "
+        f"it: that may be its magnet"
     )
 
 

@@ -65,6 +65,13 @@ PUSH_MEMORY_S = 0.05
 """The sideways force is a mean of so long, since turning motors shake single samples by as much as
 a push gives, and each of these would end the comparison for `PUSHED_S`. Of that mean the limit is
 below what a gust gives that gains 1 m/s in a second, 0.09 g."""
+STEP_M, STEP_MPS = 0.005, 0.2
+"""The estimate's position moves by less than that, and that times the time between two samples,
+beyond its speed: by at most 4 mm in 10 ms in flights without a fault of it, kicks included."""
+UNSEEN_S = 0.15
+"""Where samples are missing for longer, a step of the position may be the vehicle's motion."""
+CARRIED_S = 0.05
+"""For at most so long a position is carried on to its sample's time."""
 BIAS_SIGMA_MPS2, SPEED_SIGMA_MPS, BLOW_SHARE = 0.06, 0.01, 0.3
 """Of a reckoned place: what the learned offset and the speed at the last sight leave open, and
 the share of the way itself, since the samples of a blow come each 10 ms."""
@@ -422,6 +429,9 @@ class Reckoning:
         aside_m: from the gear to the target's axis, world axes.
         aside_sigma_m: standard deviation of that; inf where it is unknown.
         sight_s: exposure of the sight that it is carried on from.
+        stepped_m: by how much the estimate's position has moved beyond its speed since then, x and
+            y, world axes: either it was wrong before, or it is now.
+        stepped_s: when it last did so.
         struck_mps: vertical speed just before `ImuMotion.blow`.
     """
 
@@ -436,6 +446,8 @@ class Reckoning:
     aside_m: tuple[float, float] = (0.0, 0.0)
     aside_sigma_m: float = math.inf
     sight_s: float = -math.inf
+    stepped_m: tuple[float, float] = (0.0, 0.0)
+    stepped_s: float = -math.inf
     struck_mps: float = 0.0
 
 
@@ -536,6 +548,31 @@ def _most_climb_m(old: Reckoning, now_s: float, *, flew: bool) -> float:
         return MOST_CLIMB_MPS * (now_s - (old.imu.t_s if old.imu else now_s))
     climb_mps = max(0.0, old.velocity_mps[2]) + CLIMB_SPARE_MPS
     return climb_mps**2 / (2.0 * GRAVITY_MPS2)
+
+
+def stepped(old: Reckoning, last: Telemetry, sample: Telemetry) -> Reckoning:
+    """The reckoning with the step of the estimate's position between two samples: what its speed
+    does not explain. Steps that a correction smears over some samples add up, a position that steps
+    aside and back is where it was. Where samples are missing in between nothing tells."""
+    dt_s = _position_s(sample) - _position_s(last)
+    if not 0.0 < dt_s <= UNSEEN_S:
+        return old
+    x_m, y_m = (
+        sample.position_m[i]
+        - last.position_m[i]
+        - 0.5 * (last.velocity_mps[i] + sample.velocity_mps[i]) * dt_s
+        for i in range(2)
+    )
+    if math.hypot(x_m, y_m) <= STEP_M + STEP_MPS * dt_s:
+        return old
+    sx_m, sy_m = old.stepped_m
+    return replace(old, stepped_m=(sx_m + x_m, sy_m + y_m), stepped_s=sample.t_s)
+
+
+def _position_s(sample: Telemetry) -> float:
+    """When the position was: its packet may be older than the sample, and is carried on by so
+    much (`perchctl.link`)."""
+    return sample.t_s - max(0.0, sample.behind_s - CARRIED_S)
 
 
 def sighted(

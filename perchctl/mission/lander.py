@@ -30,7 +30,7 @@ from perchctl.mission.conditions import KEPT_OVER_A_CHANGE, conditions_since, co
 from perchctl.mission.context import FAR_BELOW_M, HANGING_S, PUT_RIGHT_S, Context
 from perchctl.mission.guards import has_slipped, latency_changed
 from perchctl.mission.guidance import hold_here, limited, presses, unpressed, walk
-from perchctl.mission.imu import REACH_M, reckoned, sighted
+from perchctl.mission.imu import REACH_M, UNSEEN_S, reckoned, sighted, stepped
 from perchctl.mission.release import (
     CATCH_STILL_ABOVE_M,
     STILL_THRUST,
@@ -413,11 +413,8 @@ def observed(state: PlannerState, obs: Observation, profile: Profile) -> Planner
         state = replace(state, since=kept, stale_s=stale_s, caught=True, setpoint=setpoint)
     if Context(state, obs, profile).position_age_s > profile.positioning.hold_s:
         state = replace(state, stale_s=obs.t_s)
-    step_m = _step_m(state.last, obs.telemetry)
-    if profile.positioning.by != "target" and math.hypot(*step_m[:2]) > STEPPED_M:
-        state = replace(state, stepped_s=obs.telemetry.t_s)
     if obs.jumped:
-        state = _jumped(state, obs, step_m)
+        state = _jumped(state, obs)
     if obs.turned_rad > math.radians(profile.safety.heading_lost_deg):
         # Where no hover thrust was learned yet, the present one has to do.
         hover = _hover_thrust(state, obs)
@@ -467,6 +464,8 @@ def _reckon(c: Context) -> PlannerState:
     # By the target no sight is sent on the way down: the estimate's change is what it felt itself.
     astray = state.astray and not c.by_sight
     new = reckoned(state.reckoning, obs.imu, obs.telemetry, believed=believed, astray=astray)
+    if c.located and not c.by_sight and state.last is not None:
+        new = stepped(new, state.last, obs.telemetry)
     rests = obs.t_s - obs.imu.steady_s >= AT_REST_S and obs.t_s - obs.imu.fell_s > HANGING_S
     if state.contact_z_m is not None and new.below_m < REACH_M and rests:
         # What the impact left of a speed is none: pressed or hanging it stands still. On its way
@@ -490,12 +489,12 @@ def _reckon(c: Context) -> PlannerState:
             cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
             sigma_m = float(max(target.sigma_m[:2]))
             aside_m = (float(cos * ex - sin * ey), float(sin * ex + cos * ey))
-            # An estimate that was without a position since then was moved when that came back,
-            # and one that has stepped since then has the target where it was before.
-            moved = not seen and state.stale_s is not None and state.stale_s >= target.measured_s
-            if moved or state.stepped_s >= target.measured_s:
+            # An estimate that was without a position since then was moved when that came back.
+            if not seen and state.stale_s is not None and state.stale_s >= target.measured_s:
                 aside_m, sigma_m = new.aside_m, new.aside_sigma_m
             new = sighted(new, target.measured_s, aside_m, float(ez), sigma_m)
+            if seen and target.measured_s > new.stepped_s:
+                new = replace(new, stepped_m=(0.0, 0.0))
     held_s = c.held(Condition.CARRIED)
     flies = state.phase is not Phase.LANDING  # there the hover thrust is no more than learned
     near = c.by_sight and flies and new.below_m < CARRIED_WITHIN_M
@@ -527,29 +526,25 @@ def _reckon(c: Context) -> PlannerState:
     )
 
 
-UNSEEN_S, AT_REST_S, STEPPED_M = 0.15, 0.3, 0.03
+AT_REST_S = 0.3
 Place = tuple[float, float, float]
 
 
-def _step_m(last: Telemetry | None, tel: Telemetry) -> Place:
-    """By how much the estimate's place has moved beyond its speed. Nothing where samples are
-    missing in between: it may be the vehicle that has moved, even to the floor."""
-    dt_s = math.inf if last is None else tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
-    if last is None or dt_s > UNSEEN_S:
-        return (0.0, 0.0, 0.0)
-    (x, y, z), (lx, ly, lz), (vx, vy, vz) = tel.position_m, last.position_m, tel.velocity_mps
-    return (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
-
-
-def _jumped(state: PlannerState, obs: Observation, moved_m: Place) -> PlannerState:
+def _jumped(state: PlannerState, obs: Observation) -> PlannerState:
     """The estimate's world has moved, the vehicle has not: ground, contact and what else is
-    remembered are where the estimate has them now, and it is held where it is. Where positions
-    from outside have come again, the step ends a drift, and what was true before is."""
-    tel = obs.telemetry
-    if state.last is None:
+    remembered are where the estimate has them now, and it is held where it is. Where samples
+    are missing before the step, it may be the vehicle that has moved, even to the floor; where
+    positions from outside have come again, the step ends a drift, and what was true before is."""
+    tel, last = obs.telemetry, state.last
+    if last is None:
         return replace(state, jump_s=obs.t_s if state.jump_s is None else state.jump_s)
     x, y, z = tel.position_m
-    if state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S:
+    vx, vy, vz = tel.velocity_mps
+    dt_s = tel.t_s - tel.behind_s - (last.t_s - last.behind_s)
+    lx, ly, lz = last.position_m
+    moved_m = (x - lx - vx * dt_s, y - ly - vy * dt_s, z - lz - vz * dt_s)
+    put_right = state.stale_s is not None and obs.t_s - state.stale_s <= PUT_RIGHT_S
+    if dt_s > UNSEEN_S or put_right:
         moved_m = (0.0, 0.0, 0.0)
     setpoint, contact_z_m, blocked_z_m = state.setpoint, state.contact_z_m, state.blocked_z_m
     if state.phase is Phase.LANDING and state.orders and tel.thrust >= 1:

@@ -218,7 +218,6 @@ class PlannerState:
     orders: int = 0
     stopped_s: float | None = None  # first order to stop the motors
     jump_s: float | None = None
-    stepped_s: float = -math.inf  # the estimate's place last moved beyond its speed
     astray: bool = False  # positions from outside lead elsewhere: they prove nothing any more
     stale_s: float | None = None  # when there was no position from outside last
     last: Telemetry | None = None  # of the turn before

@@ -252,8 +252,8 @@ TABLE: tuple[Row, ...] = (
         is_held_elsewhere, P.LANDING, why_held, S.LAND, O.SAFETY,
     ),
     Row(
-        "hangs-at-contact", only(P.RECOVER), is_held, P.LANDING, why_hangs_at_contact,
-        S.LAND, O.SAFETY,
+        "hangs-at-contact", only(P.SEARCH, P.ESTIMATE, P.ALIGN, P.ASCEND, P.PERCH, P.RECOVER),
+        is_held, P.LANDING, why_hangs_at_contact, S.LAND, O.SAFETY,
     ),
     # --- something is in the way -----------------------------------------------
     Row(

@@ -236,6 +236,7 @@ LOCKED = ON_THE_FLOOR._replace(locked=True, ended_by_vehicle=True)
         ("hangs on the target", ON_THE_FLOOR, {"lied"}),
         ("held off the target", HANGING, {"lied"}),
         ("held off the target", HANGING._replace(miss_m=0.015, below_m=0.019), {"lied"}),
+        ("held off the target", HANGING._replace(miss_m=0.015, below_m=0.021), set()),
         ("held off the target", HANGING._replace(miss_m=0.026), set()),
         ("held off the target", HANGING._replace(below_m=-0.026), set()),
         ("held off the target", HANGING._replace(below_m=0.2, motors_on=True), {"lied"}),

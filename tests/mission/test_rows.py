@@ -65,7 +65,8 @@ Look = Callable[[float], Observation]
 @dataclass(frozen=True)
 class Case:
     """One row's case: from `phase`, with what is observed for `lasts_s`, the mission enters
-    `to`, with that outcome and that last command."""
+    `to`, with that outcome and that last command; and by `row`, where another one below it would
+    lead there, too, and say something else."""
 
     phase: Phase
     to: Phase
@@ -76,6 +77,7 @@ class Case:
     state: dict[str, Any] = field(default_factory=dict)
     z_m: float = 1.0
     profile: Any = PROFILE
+    row: str | None = None
 
     def holds(self, table: tuple[Row, ...] = TABLE) -> bool:
         state = replace(state_in(self.phase, START_S, self.z_m), **self.state)
@@ -84,6 +86,7 @@ class Case:
             state, command = planner.step_mission(state, obs, self.profile, table)
             if state.phase is self.to:
                 fits = self.command is None or isinstance(command, self.command)
+                fits = fits and self.row in (None, state.row)
                 return fits and state.outcome is self.outcome
         return False
 
@@ -219,6 +222,7 @@ CASES: dict[str, Case] = {
     "held": Case(
         P.ASCEND, P.LANDING, flown(CONTACT_Z_M - 0.2, thrust=QUIET), 2.2, O.SAFETY,
         state={"entered_s": START_S, "contact_z_m": CONTACT_Z_M - 0.2}, z_m=CONTACT_Z_M - 0.2,
+        row="held",
     ),
     "hangs-at-contact": Case(
         P.RECOVER, P.LANDING, unseen(CONTACT_Z_M, 0.05, thrust=QUIET), 2.2, O.SAFETY,
