@@ -25,7 +25,7 @@ from perchctl.faults.catalogue import AIR, FROM_THE_START, Fault  # noqa: E402
 from perchctl.faults.expected_outcomes import EXPECTED_OUTCOMES  # noqa: E402
 from perchctl.faults.promises import PROMISES  # noqa: E402
 from perchctl.log.fields import EVENT_FIELDS, FIELDS  # noqa: E402
-from perchctl.mission.diagram import diagram, rows_table  # noqa: E402
+from perchctl.mission import FLYING_PHASES, Phase, table  # noqa: E402
 from perchctl.mission.lander import MANOEUVRES, Evidence, Reach, Stage  # noqa: E402
 from perchctl.profile import Profile, SimulationConfig  # noqa: E402
 from perchctl.profile.keys import UNITS, allowed, keys  # noqa: E402
@@ -152,10 +152,52 @@ def manoeuvres() -> str:
     return "\n".join([f"| evidence | {' | '.join(head)} |", "|---" * (len(head) + 1) + "|", *rows])
 
 
+_GROUPS: tuple[tuple[frozenset[Phase], str], ...] = (
+    (table.AIR, "in the air"),
+    (FLYING_PHASES, "before landing"),
+    (table.BEFORE_CONTACT, "before contact"),
+    (table.BY_CAMERA, "by camera"),
+    (table.IN_THE_OPEN, "in the open"),
+)
+
+
+def mission_diagram() -> str:
+    """The undisturbed mission and its ways back, as a mermaid state diagram; the safety
+    rows, which leave from every phase, are in `mission_rows`."""
+    lines = ["stateDiagram-v2", "    [*] --> APPROACH"]
+    for row in table.TABLE:
+        if _group(row) is not None:
+            continue
+        for phase in sorted(row.phases, key=_order):
+            lines.append(f"    {phase.value} --> {row.to.value}: {row.name}")
+    lines += [
+        f"    {phase.value} --> [*]" for phase in (Phase.PERCHED, Phase.LANDED, Phase.ABORTED)
+    ]
+    return "\n".join(lines)
+
+
+def mission_rows() -> str:
+    """Every row in its order, as a Markdown table."""
+    lines = ["| # | row | from | to | severity |", "|---|---|---|---|---|"]
+    for number, row in enumerate(table.TABLE, start=1):
+        origin = _group(row) or ", ".join(p.value for p in sorted(row.phases, key=_order))
+        severity = row.severity.name.lower().replace("_", " ")
+        lines.append(f"| {number} | {row.name} | {origin} | {row.to.value} | {severity} |")
+    return "\n".join(lines)
+
+
+def _group(row: table.Row) -> str | None:
+    return next((name for phases, name in _GROUPS if row.phases == phases), None)
+
+
+def _order(phase: Phase) -> int:
+    return list(Phase).index(phase)
+
+
 PARTS: dict[str, Callable[[], str]] = {
     "import-order": import_order,
-    "diagram": lambda: f"```mermaid\n{diagram()}\n```",
-    "rows": rows_table,
+    "diagram": lambda: f"```mermaid\n{mission_diagram()}\n```",
+    "rows": mission_rows,
     "manoeuvres": manoeuvres,
     "profile-keys": profile_keys,
     "worlds": worlds,
