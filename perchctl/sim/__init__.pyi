@@ -2,11 +2,11 @@ from .bursts import Bursts as Bursts
 from .bursts import radio_bursts as radio_bursts
 from .camera import DeliveredFrame as DeliveredFrame
 from .camera import SimCamera as SimCamera
-from .capture.server import SIMULATED_SYSTEM as SIMULATED_SYSTEM
-from .capture.settings import MILLIMETRES_PER_M as MILLIMETRES_PER_M
-from .capture.settings import CaptureFault as CaptureFault
-from .capture.settings import CaptureSettings as CaptureSettings
-from .capture.system import LockstepCapture as LockstepCapture
+from .capture import MILLIMETRES_PER_M as MILLIMETRES_PER_M
+from .capture import CaptureFault as CaptureFault
+from .capture import CaptureSettings as CaptureSettings
+from .capture import LockstepCapture as LockstepCapture
+from .capture_server import SIMULATED_SYSTEM as SIMULATED_SYSTEM
 from .crtp.codec import Packet as Packet
 from .crtp.codec import Port as Port
 from .crtp.commands import CommandService as CommandService

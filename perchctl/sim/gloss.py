@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from perchctl.geometry import Array
-from perchctl.sim.rays import COARSE_PX, RayGrid, plane_map, trace
-from perchctl.sim.surfaces import PAPER_GREY, Picture
+from perchctl.sim.optics import COARSE_PX, Picture, RayGrid, plane_map, trace
+from perchctl.sim.sheets import PAPER_GREY
 
 SLOPE = 0.03
 _LEAST_GREY = 0.5

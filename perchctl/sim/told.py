@@ -8,7 +8,7 @@ import math
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import NO_PICTURE_TEXT, Event, EventKind
 from perchctl.sim.bursts import Bursts
-from perchctl.sim.cell import RESISTANCE_OHM
+from perchctl.sim.powertrain import RESISTANCE_OHM
 from perchctl.sim.scenario import Scenario
 
 LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")

@@ -11,8 +11,7 @@ import numpy as np
 from perchctl.geometry import Array, rotation_from_quaternion
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
-from perchctl.sim.capture.settings import CaptureSettings
-from perchctl.sim.capture.system import SimCapture
+from perchctl.sim.capture import CaptureSettings, SimCapture
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario

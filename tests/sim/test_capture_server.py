@@ -14,8 +14,8 @@ import pytest
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.sim import SIMULATED_SYSTEM, CaptureFault, CaptureSettings, Scenario, SimProcess
-from perchctl.sim.capture import natnet
-from perchctl.sim.capture.server import CaptureServer
+from perchctl.sim import capture_server as natnet
+from perchctl.sim.capture_server import CaptureServer
 
 WAIT_S = 10.0
 NAMES = ("crazyflie", "target")
@@ -94,7 +94,7 @@ def test_clients_that_have_gone_are_forgotten() -> None:
 
 
 def test_a_hidden_body_is_told_from_one_at_the_origin() -> None:
-    frame = natnet.frame(7, NAMES, CaptureFrame(1.3, {"target": SEEN.bodies["target"]}))
+    frame = natnet.frame_message(7, NAMES, CaptureFrame(1.3, {"target": SEEN.bodies["target"]}))
     kind, length = struct.unpack_from("<HH", frame)
     assert (kind, length) == (natnet.FRAME, len(frame) - 4)
     bodies = [struct.unpack_from("<i3f4ffh", frame, 4 + 16 + 38 * i) for i in range(2)]

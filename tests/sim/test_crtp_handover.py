@@ -7,7 +7,6 @@ on the real firmware, and the tolerance is what the model misses it by at most.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -158,16 +157,6 @@ def test_landing_turns_to_yaw_0_unless_it_is_to_be_kept(
     assert pilot.now("stateEstimate.yaw") == pytest.approx(end_deg, abs=3)
 
 
-def test_the_first_generation_of_land_turns_to_yaw_0(pilot: Pilot) -> None:
-    """Row "without `yaw=None` turn the vehicle to yaw 0": port 8, command 2 has no yaw (source)."""
-    pilot.fly_to(0.8, 1.0)
-    pilot.stream(4.0, lambda: pilot.cf.commander.send_position_setpoint(0, 0, 0.8, 90), 0.05)
-    pilot.send(8, 0, struct.pack("<BBff", 2, 0, 0.0, 3.0))
-    notify(pilot)
-    pilot.advance(2.98)
-    assert pilot.now("stateEstimate.yaw") == pytest.approx(0, abs=4)
-
-
 def test_take_off_turns_to_yaw_0_unless_it_is_to_be_kept(pilot: Pilot) -> None:
     """Row "`takeoff`/`land` without `yaw=None` turn the vehicle to yaw 0 on the way"."""
     for yaw, end_deg in ((None, 60), (0.0, 0)):
@@ -293,12 +282,6 @@ def test_the_level_out_dips(
     curve = [z for t, z in heights(pilot, last_s) if t < 2.0]
     assert min(curve) == pytest.approx(dip_m, abs=0.02)
     assert curve[-1] == pytest.approx(end_m, abs=0.02)
-
-
-# --- On the ceiling ---------------------------------------------------------------
-
-
-# --- Thrust command, duty cycle and voltage ---------------------------------------
 
 
 # --- Losses -----------------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 
 from perchctl.errors import ConnectionFailed
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.child import main
+from perchctl.sim.process.__main__ import main
 from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.process.shared import HostSetup
 from tests.helpers.crtp_process import ROOT, WAIT_S, _parts, wired

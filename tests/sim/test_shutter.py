@@ -19,8 +19,9 @@ from perchctl.sim import (
     SimulatedVehicle,
     draw_scenario,
 )
-from perchctl.sim.shutter import FLICKER_HZ, Shutter, blended
-from perchctl.sim.surfaces import Picture
+from perchctl.sim.camera import FLICKER_HZ, Shutter
+from perchctl.sim.optics import Picture
+from perchctl.sim.renderer import blended
 from perchctl.vision import CameraModel
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
@@ -171,12 +172,6 @@ def test_the_vehicle_remembers_as_far_back_as_a_frame_looks() -> None:
     assert max(oldest) < CONTROL_PERIOD_S
 
 
-def test_the_default_camera_is_plain() -> None:
-    """Its pictures come by the same way as ever."""
-    assert Shutter(draw_scenario(Profile(), 3)).plain
-    assert draw_scenario(Profile(), 3).extra == {}
-
-
 def test_the_profile_decides() -> None:
     profile = Profile.model_validate(
         {"simulation": {
@@ -185,7 +180,6 @@ def test_the_profile_decides() -> None:
         }}
     )  # fmt: skip
     drawn, plain = draw_scenario(profile, 3), draw_scenario(Profile(), 3)
-    assert not Shutter(drawn).plain
     assert drawn == replace(
         plain, camera_fields="bottom", camera_blended=True, camera_readout_s=0.018,
         camera_flicker=0.1, camera_pumping=0.2, extra={"analogue": 0.3},

@@ -4,14 +4,15 @@ Gains and limits are the firmware's defaults for the Crazyflie 2.x; they can be 
 through the parameters of the same names. Angles in degrees, pitch nose up, as inside
 the firmware. Every change of setpoint mode resets all integrators (docs/firmware.md,
 "Setpoint modes"), so the thrust starts again from `thrustBase`. What comes out are thrust
-requests; `perchctl.sim.firmware.motors` turns them into duty cycles.
+requests; `perchctl.sim.firmware.power` turns them into duty cycles.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from perchctl.sim.firmware.motors import MOTORS_OFF, Motors
+from perchctl.sim.firmware.power import MOTORS_OFF, Motors
 from perchctl.sim.firmware.setpoint import ABSOLUTE, DISABLED, MODE_OFF, VELOCITY, Mode, Setpoint
 
 ATTITUDE_DT_S = 0.002
@@ -85,29 +86,22 @@ def _saturated(value: float) -> float:
     return max(-INT16_MAX, min(INT16_MAX, value))
 
 
+@dataclass(slots=True)
 class Estimate:
     """The state estimate in the firmware's units, written once a step."""
 
-    __slots__ = (
-        "gyro_x_dps",
-        "gyro_y_dps",
-        "gyro_z_dps",
-        "pitch_deg",
-        "roll_deg",
-        "vx_mps",
-        "vy_mps",
-        "vz_mps",
-        "x_m",
-        "y_m",
-        "yaw_deg",
-        "z_m",
-    )
-
-    def __init__(self) -> None:
-        self.x_m = self.y_m = self.z_m = 0.0
-        self.vx_mps = self.vy_mps = self.vz_mps = 0.0
-        self.roll_deg = self.pitch_deg = self.yaw_deg = 0.0
-        self.gyro_x_dps = self.gyro_y_dps = self.gyro_z_dps = 0.0
+    x_m: float = 0.0
+    y_m: float = 0.0
+    z_m: float = 0.0
+    vx_mps: float = 0.0
+    vy_mps: float = 0.0
+    vz_mps: float = 0.0
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+    gyro_x_dps: float = 0.0
+    gyro_y_dps: float = 0.0
+    gyro_z_dps: float = 0.0
 
 
 class Controller:

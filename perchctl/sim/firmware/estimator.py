@@ -1,7 +1,7 @@
 """The state estimate: the truth with the errors of a flow deck or of motion capture.
 
 Drift runs from the moment the motors first turn; what a flow deck adds on a bad floor or high
-above it is in `perchctl.sim.flow_deck`. A vehicle without a deck (scenario
+above it is in `perchctl.sim.firmware.flow_deck`. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
@@ -18,17 +18,25 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, cap_deg
-from perchctl.sim.firmware.covariance import POSITION
-from perchctl.sim.firmware.imu import Imu
-from perchctl.sim.firmware.outside import SETTINGS, OutsideFilter, Quaternion, Vector
-from perchctl.sim.flow_deck import FlowDeck, has_flow_errors
+from perchctl.sim.firmware.flow_deck import FlowDeck, has_flow_errors
+from perchctl.sim.firmware.outside import (
+    POSITION,
+    SETTINGS,
+    Imu,
+    OutsideFilter,
+    Quaternion,
+    Vector,
+)
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+
+if TYPE_CHECKING:
+    from perchctl.sim.world import World
 
 _STREAM = 2
 _DEG = 180.0 / math.pi
@@ -46,24 +54,6 @@ _ACC_CUTOFF_HZ = 30.0
 _NO_BIAS = (0.0, 0.0, 0.0)
 _ATTITUDE_GAIN = CONTROL_PERIOD_S / _ATTITUDE_MEMORY_S
 _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
-
-
-class Sensed(Protocol):
-    """The part of `World` that an estimator may read."""
-
-    x_m: float
-    y_m: float
-    z_m: float
-    vx_mps: float
-    vy_mps: float
-    vz_mps: float
-    p_radps: float
-    q_radps: float
-    r_radps: float
-    fx_mps2: float
-    fy_mps2: float
-    fz_mps2: float
-    quaternion: tuple[float, float, float, float]
 
 
 class Estimator:
@@ -96,7 +86,6 @@ class Estimator:
         self._reset_due = True
         self._reset_s = 0.0
         self._rng.uniform()  # keeps the flights of all seeds as they were
-        self.external_count = 0
         self.hears_outside = True
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
@@ -109,15 +98,13 @@ class Estimator:
             self._flow.reset()
 
     def external_position(self, position_m: Vector) -> None:
-        """One measurement from outside; counted always, used by a vehicle without a deck."""
-        self.external_count += 1
+        """One measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.position(position_m)
 
     def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
         """The same with an attitude: w, x, y, z, body to world."""
-        self.external_count += 1
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.pose(position_m, quaternion)
@@ -135,7 +122,7 @@ class Estimator:
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
-        """Of a state as `perchctl.sim.firmware.covariance` counts them. A deck's is the position's
+        """Of a state as `Covariance` counts them. A deck's is the position's
         for all of them: it falls after a reset. Flow says nothing of the height, which a laser
         measures."""
         if self.outside is not None:
@@ -148,7 +135,7 @@ class Estimator:
 
     def update(
         self,
-        world: Sensed,
+        world: World,
         t_s: float,
         *,
         flown: bool,
@@ -196,7 +183,7 @@ class Estimator:
             az + lag * ((world.fz_mps2 + acc_bias[2]) * unit + shake * n6 - az),
         )
 
-    def _integrate(self, world: Sensed) -> tuple[float, float, float, float]:
+    def _integrate(self, world: World) -> tuple[float, float, float, float]:
         """The attitude after one more control period of turning."""
         truth = world.quaternion
         if self.gyro is None:
@@ -216,28 +203,20 @@ class Estimator:
         return (scale * nw, scale * nx, scale * ny, scale * nz)
 
     def _walk(self) -> None:
+        """Position and velocity noise, a step later: each keeps a share of what it was."""
         sigma = self._scenario.estimate_noise_m
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_BATCH).tolist()
-        take = self._white.pop
-        keep = self._position_keep
-        kick = sigma * math.sqrt(1.0 - keep * keep)
-        x, y, z = self._position_noise
-        self._position_noise = (
-            keep * x + kick * take(),
-            keep * y + kick * take(),
-            keep * z + kick * take(),
-        )
-        keep = self._velocity_keep
-        kick = _VELOCITY_NOISE_PER_S * sigma * math.sqrt(1.0 - keep * keep)
-        x, y, z = self._velocity_noise
-        self._velocity_noise = (
-            keep * x + kick * take(),
-            keep * y + kick * take(),
-            keep * z + kick * take(),
-        )
+        self._position_noise = self._walked(self._position_noise, self._position_keep, sigma)
+        sigma *= _VELOCITY_NOISE_PER_S
+        self._velocity_noise = self._walked(self._velocity_noise, self._velocity_keep, sigma)
 
-    def _move_by_deck(self, world: Sensed, *, flown: bool) -> None:
+    def _walked(self, noise: Vector, keep: float, sigma: float) -> Vector:
+        take, kick = self._white.pop, sigma * math.sqrt(1.0 - keep * keep)
+        x, y, z = noise
+        return keep * x + kick * take(), keep * y + kick * take(), keep * z + kick * take()
+
+    def _move_by_deck(self, world: World, *, flown: bool) -> None:
         drift = self._scenario.drift_mps
         dx = dy = dz = 0.0
         if flown:
@@ -261,7 +240,7 @@ class Estimator:
             now.vx_mps, now.vy_mps = now.vx_mps + ex, now.vy_mps + ey
 
     def _move_outside(
-        self, outside: OutsideFilter, imu: Imu, world: Sensed, *, flying: bool, pressed: bool
+        self, outside: OutsideFilter, imu: Imu, world: World, *, flying: bool, pressed: bool
     ) -> None:
         self._reset_if_due(outside)
         if imu.feel(

@@ -2,7 +2,7 @@
 
 `SimProcess` is the handle in the process that flies, `child` runs in the other one. The
 child does not share its terminal's Ctrl-C and outlives a killed parent by a few seconds
-(`runner`), as a real vehicle would.
+(`child`), as a real vehicle would.
 """
 
 from __future__ import annotations
@@ -29,13 +29,10 @@ from perchctl.children import (
     spawn,
 )
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
-from perchctl.profile import TargetConfig
-from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
+from perchctl.sim.capture import CaptureFault
 from perchctl.sim.carried import Stop
-from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.shared import LINGER_S, START_TIMEOUT_S, HostSetup, Pace, SharedTime
+from perchctl.sim.process.shared import START_TIMEOUT_S, HostSetup, Pace, SharedTime
 from perchctl.sim.scenario import Scenario
-from perchctl.vision import CameraModel
 
 ANSWER_TIMEOUT_S = 15.0
 SLOWEST_PACE = 20.0
@@ -77,42 +74,17 @@ class SimProcess:
         scenario: Scenario | None = None,
         pace: Pace = "realtime",
         *,
-        camera: CameraModel | None = None,
-        target: TargetConfig | None = None,
-        capture: CaptureSettings | None = None,
-        link: LinkOptions | None = None,
-        port: int = 0,
-        http_port: int = 0,
-        capture_port: int = 0,
-        truth_file: Path | None = None,
-        heard_file: Path | None = None,
-        linger_s: float = LINGER_S,
         timeout_s: float = START_TIMEOUT_S,
+        **settings: Any,
     ) -> SimProcess:
         """Start the vehicle and wait, for at most `timeout_s`, until it answers.
 
-        Ports 0 are chosen by the operating system. `truth_file` receives JSON lines of
-        `truth()`, 50 a simulated second, `heard_file` of the packets that arrive: time, sender
-        and bytes in hex. `linger_s` is how long the vehicle runs on after
-        this process has gone. Raises `ConnectionFailed` when the child ends or does not
-        come up, `InvalidValue` for an unknown pace.
+        `settings` are further fields of `HostSetup`. Raises `ConnectionFailed` when the child
+        ends or does not come up, `InvalidValue` for an unknown pace.
         """
         if pace not in get_args(Pace):
             raise InvalidValue(f"pace {pace!r} is unknown, choose 'realtime' or 'stepped'")
-        setup = HostSetup(
-            scenario=scenario or Scenario(),
-            pace=pace,
-            camera=camera,
-            target=target,
-            capture=capture,
-            link=link or LinkOptions(),
-            port=port,
-            http_port=http_port,
-            capture_port=capture_port,
-            truth_file=str(truth_file) if truth_file is not None else None,
-            heard_file=str(heard_file) if heard_file is not None else None,
-            linger_s=linger_s,
-        )
+        setup = HostSetup(scenario or Scenario(), pace, **settings)
         # Both processes have mapped the file once the child has answered.
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             shared = SharedTime.create(file := Path(folder, "time"))

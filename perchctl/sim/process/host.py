@@ -10,7 +10,6 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
@@ -19,12 +18,12 @@ import numpy as np
 from perchctl.errors import ConnectionFailed
 from perchctl.geometry import rpy_from_rotation
 from perchctl.sim.bursts import Bursts, radio_bursts
-from perchctl.sim.capture.server import SIMULATED_SYSTEM, CaptureServer
+from perchctl.sim.capture_server import SIMULATED_SYSTEM, CaptureServer
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.server import CrtpServer, LinkOptions
+from perchctl.sim.optics import Picture
 from perchctl.sim.process.shared import HostSetup
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.surfaces import Picture
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.sim.world import TrueState
 
@@ -58,9 +57,9 @@ class VehicleHost:
             if setup.capture is not None:
                 self.positions = CaptureServer(setup.capture.names, setup.capture_port)
             if setup.truth_file is not None:
-                self._truth = Path(setup.truth_file).open("w", encoding="utf-8")  # noqa: SIM115
+                self._truth = setup.truth_file.open("w", encoding="utf-8")
             if setup.heard_file is not None:
-                self._heard = Path(setup.heard_file).open("w", encoding="utf-8")  # noqa: SIM115
+                self._heard = setup.heard_file.open("w", encoding="utf-8")
                 self.endpoint.heard = self._write_heard
         except BaseException:
             self.close()
@@ -270,9 +269,7 @@ class UdpEndpoint:
             self.socket.bind(("127.0.0.1", port))
         except OSError as error:
             self.socket.close()
-            raise ConnectionFailed(
-                f"UDP port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
-            ) from None
+            raise _taken("UDP", port, error) from None
         self.port = int(self.socket.getsockname()[1])
 
     def close(self) -> None:
@@ -339,51 +336,60 @@ _WAIT_S = 0.5
 _CLIENT_TIMEOUT_S = 5.0
 
 
-class _Newest:
-    """The newest picture; encoded once, by the first client that requests it."""
+class MjpegServer:
+    """Serves the newest of the published pictures on loopback.
 
-    def __init__(self) -> None:
+    `port` 0 lets the operating system choose. Raises ConnectionFailed when it is taken.
+    """
+
+    def __init__(self, port: int = 0) -> None:
         self._changed = threading.Condition()
-        self._encoding = threading.Lock()
         self._image: Picture | None = None
         self._number = 0
-        self._encoded: tuple[int, bytes] = (0, b"")
         self.closed = False
+        try:
+            self._server = _HttpServer(port, self)
+        except OSError as error:
+            raise _taken("TCP", port, error) from None
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}{PATH}"
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
+        )
+        self._thread.start()
 
-    def put(self, image: Picture) -> None:
+    def publish(self, image: Picture) -> None:
+        """Grey uint8 (h, w). Costs nothing while nobody watches."""
         with self._changed:
             self._image = image
             self._number += 1
             self._changed.notify_all()
 
+    def after(self, number: int) -> tuple[int, Picture] | None:
+        """The newest picture and its number if that is above `number`; None when none came for a
+        while."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
+            if self._image is None or self._number <= number:
+                return None
+            return self._number, self._image
+
     def close(self) -> None:
+        """End all streams and free the port."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
-
-    def after(self, number: int) -> tuple[int, bytes] | None:
-        """The first picture newer than `number`, as JPEG; None when none came for a while."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
-            newest, image = self._number, self._image
-        if image is None or newest <= number:
-            return None
-        with self._encoding:
-            if self._encoded[0] < newest:
-                ok, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-                if not ok:
-                    return None
-                self._encoded = (newest, jpeg.tobytes())
-            return self._encoded
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
 
 
-class _Server(ThreadingHTTPServer):
+class _HttpServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, port: int) -> None:
-        self.newest = _Newest()
+    def __init__(self, port: int, pictures: MjpegServer) -> None:
+        self.pictures = pictures
         super().__init__(("127.0.0.1", port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -394,7 +400,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     timeout = _CLIENT_TIMEOUT_S
-    server: _Server
+    server: _HttpServer
 
     def do_GET(self) -> None:
         if self.path.split("?", 1)[0] != PATH:
@@ -405,48 +411,24 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         self.wfile.flush()
-        number = 0
-        while not self.server.newest.closed:
-            answer = self.server.newest.after(number)
-            if answer is None:
+        pictures, number = self.server.pictures, 0
+        while not pictures.closed:
+            newer = pictures.after(number)
+            if newer is None:
                 continue
-            number, jpeg = answer
-            self.wfile.write(
-                f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n"
-                f"Content-Length: {len(jpeg)}\r\n\r\n".encode()
-                + jpeg
-                + b"\r\n"
+            number, image = newer
+            _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            jpeg = encoded.tobytes()
+            head = (
+                f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             )
+            self.wfile.write(head.encode() + jpeg + b"\r\n")
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not worth a line on the terminal."""
 
 
-class MjpegServer:
-    """Serves the newest of the published pictures on loopback.
-
-    `port` 0 lets the operating system choose. Raises ConnectionFailed when it is taken.
-    """
-
-    def __init__(self, port: int = 0) -> None:
-        try:
-            self._server = _Server(port)
-        except OSError as error:
-            raise ConnectionFailed(
-                f"TCP port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
-            ) from None
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}{PATH}"
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
-        )
-        self._thread.start()
-
-    def publish(self, image: Picture) -> None:
-        """Grey uint8 (h, w). Costs nothing while nobody watches."""
-        self._server.newest.put(image)
-
-    def close(self) -> None:
-        self._server.newest.close()
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+def _taken(kind: str, port: int, error: OSError) -> ConnectionFailed:
+    return ConnectionFailed(
+        f"{kind} port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
+    )

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from perchctl.profile import TargetConfig
-from perchctl.sim.capture.settings import CaptureSettings
+from perchctl.sim.capture import CaptureSettings
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.scenario import Scenario
 from perchctl.vision import CameraModel
@@ -86,7 +86,7 @@ class HostSetup:
     port: int = 0
     http_port: int = 0
     capture_port: int = 0
-    truth_file: str | None = None
-    heard_file: str | None = None
+    truth_file: Path | None = None
+    heard_file: Path | None = None
     linger_s: float = LINGER_S
     time_file: Path | None = None

@@ -1,37 +1,129 @@
-"""What the cameras of a motion-capture room see of the simulated vehicle, and when it arrives."""
+"""A simulated motion-capture system: what it is like, what goes wrong in it, what its cameras see
+of the simulated vehicle, and when that arrives."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
-from typing import Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from perchctl.errors import InvalidValue
 from perchctl.geometry import (
     Array,
     quaternion_from_rotation,
-    rot_z,
     rotation_from_quaternion,
     rotation_from_rpy,
 )
 from perchctl.positioning import BodyPose, CaptureFrame
-from perchctl.sim.capture.settings import CaptureFault, CaptureSettings, OtherBody, axes_matrix
+
+if TYPE_CHECKING:
+    from perchctl.sim.world import World
 
 _STREAM = 13
 _JITTER_LIMIT_SIGMAS = 3.0
+_AXES = re.compile(r"([+-])([xyz])([+-])([xyz])([+-])([xyz])")
+TRUE_AXES = "+x+y+z"
+Y_UP = "+x+z-y"
+"""The capture's second axis is up, as some systems have it out of the box."""
+SWAPPED_XY = "+y-x+z"
+"""The capture's axes lie a quarter turn from those along which its bodies were defined."""
+MILLIMETRES_PER_M = 1000.0
 
 
-class Seen(Protocol):
-    """The part of the world that cameras see."""
+@dataclass(frozen=True)
+class OtherBody:
+    """A rigid body that is not the vehicle, and stands still."""
 
-    x_m: float
-    y_m: float
-    z_m: float
-    quaternion: tuple[float, float, float, float]
+    name: str
+    position_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class CaptureFault:
+    """What is wrong for a time; as it stands, nothing.
+
+    Attributes:
+        occluded: the vehicle's body is not seen.
+        frozen: all bodies stay where they were seen last, to the last digit.
+        gone: no frame is sent.
+        swapped: the vehicle's body and the first other one have changed names.
+        scale: of all positions; 1000 is millimetres.
+        mirrored: positions with y's sign turned, as a left-handed program sends them.
+        axes: the capture's axes in the world's, such as `+x+z-y`; None: as in the settings.
+        late_s: more than the settings' delay.
+        rate_hz: at most so many frames a second.
+    """
+
+    occluded: bool = False
+    frozen: bool = False
+    gone: bool = False
+    swapped: bool = False
+    scale: float = 1.0
+    mirrored: bool = False
+    axes: str | None = None
+    late_s: float = 0.0
+    rate_hz: float = math.inf
+
+    def __post_init__(self) -> None:
+        if self.axes is not None:
+            axes_matrix(self.axes)
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """A motion-capture system as a lab has it; SI, its world that of the state estimate.
+
+    Attributes:
+        body: the vehicle's rigid body, `body_*` its axes and origin in the vehicle's axes.
+        rate_hz: of its cameras.
+        delay_s, jitter_s: from an exposure to the frame's arrival; one sigma of it.
+        position_noise_m, attitude_noise_rad: one sigma, each axis.
+        axes: the capture's axes in the world's.
+        faults: (from s, to s, what), on the simulation's clock.
+    """
+
+    body: str = "crazyflie"
+    body_rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    body_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    others: tuple[OtherBody, ...] = (OtherBody("wand", (1.2, -0.9, 0.05)),)
+    rate_hz: float = 120.0
+    delay_s: float = 0.01
+    jitter_s: float = 0.0005
+    position_noise_m: float = 0.001
+    attitude_noise_rad: float = 0.005
+    axes: str = TRUE_AXES
+    faults: tuple[tuple[float, float, CaptureFault], ...] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        axes_matrix(self.axes)
+        if not self.rate_hz > 0.0:
+            raise InvalidValue(f"a motion capture at {self.rate_hz:g} Hz sees nothing")
+        if len(set(self.names)) < len(self.names):
+            raise InvalidValue(f"two rigid bodies have one name: {', '.join(self.names)}")
 
     @property
-    def t_s(self) -> float: ...
+    def names(self) -> tuple[str, ...]:
+        """Of all rigid bodies, the vehicle's first."""
+        return (self.body, *(other.name for other in self.others))
+
+
+def axes_matrix(axes: str) -> Array:
+    """(3, 3): world vector to the capture's. Errors: InvalidValue for what is no right-handed
+    set of axes."""
+    parts = _AXES.fullmatch(axes)
+    matrix = np.zeros((3, 3))
+    if parts is not None:
+        for row in range(3):
+            sign, axis = parts.group(2 * row + 1), parts.group(2 * row + 2)
+            matrix[row, "xyz".index(axis)] = 1.0 if sign == "+" else -1.0
+    if round(float(np.linalg.det(matrix))) != 1:
+        raise InvalidValue(f"axes {axes!r} are none; right-handed ones are such as {Y_UP!r}")
+    return matrix
 
 
 class SimCapture:
@@ -47,8 +139,6 @@ class SimCapture:
         self._faults = list(settings.faults)
         self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
         self._p_body_rigid = np.asarray(settings.body_position_m)
-        self._R_capture_world = rot_z(settings.heading_rad)
-        self._origin_m = np.asarray(settings.origin_m)
         self._due_s = float(self._rng.random()) / settings.rate_hz
         self._t_s = 0.0
         self._arrival_s = -math.inf
@@ -64,7 +154,7 @@ class SimCapture:
         """Nothing is wrong any more."""
         self._faults.clear()
 
-    def advance(self, world: Seen) -> None:
+    def advance(self, world: World) -> None:
         """Called each control period: exposes if it is time to."""
         self._t_s = t_s = world.t_s
         if t_s < self._due_s - 1e-9:
@@ -92,7 +182,9 @@ class SimCapture:
             arrived.append(self._under_way.popleft())
         return arrived
 
-    def _bodies(self, world: Seen, noise: Array, faults: list[CaptureFault]) -> dict[str, BodyPose]:
+    def _bodies(
+        self, world: World, noise: Array, faults: list[CaptureFault]
+    ) -> dict[str, BodyPose]:
         """By the name under which the capture has them."""
         if self._before and any(fault.frozen for fault in faults):
             return self._before
@@ -101,7 +193,7 @@ class SimCapture:
         place = np.array((world.x_m, world.y_m, world.z_m)) + R @ self._p_body_rigid
         seen = [self._pose(place, R @ self._R_body_rigid, noise[0], faults)]
         seen += [
-            self._pose(_place(other, world.t_s), np.eye(3), white, faults)
+            self._pose(np.asarray(other.position_m), np.eye(3), white, faults)
             for other, white in zip(settings.others, noise[1:], strict=True)
         ]
         names = list(settings.names)
@@ -112,10 +204,9 @@ class SimCapture:
 
     def _pose(self, place: Array, R: Array, noise: Array, faults: list[CaptureFault]) -> BodyPose:
         settings = self.settings
-        place = self._R_capture_world @ place + self._origin_m
         place = place + settings.position_noise_m * noise[:3]
         a, b, c = (float(v) for v in settings.attitude_noise_rad * noise[3:])
-        R = self._R_capture_world @ R @ rotation_from_rpy(a, b, c)
+        R = R @ rotation_from_rpy(a, b, c)
         axes, scale = settings.axes, 1.0
         for fault in faults:
             axes, scale = fault.axes or axes, scale * fault.scale
@@ -125,11 +216,6 @@ class SimCapture:
         if any(fault.mirrored for fault in faults):
             y = -y
         return BodyPose((x, y, z), quaternion_from_rotation(turn @ R @ turn.T))
-
-
-def _place(other: OtherBody, t_s: float) -> Array:
-    phase = math.sin(2.0 * math.pi * t_s / other.period_s)
-    return np.asarray(other.position_m) + phase * np.asarray(other.swing_m)
 
 
 class LockstepCapture:

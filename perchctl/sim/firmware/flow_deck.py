@@ -24,12 +24,15 @@ the position comes back no farther than the filter can tell from that.
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+
+if TYPE_CHECKING:
+    from perchctl.sim.world import World
 
 _STREAM = 15
 _EVERY = 5  # control periods between two readings: 100 Hz
@@ -50,14 +53,6 @@ _TURN_DENSITY = (GRAVITY_MPS2 * 0.1) ** 2 * 1e-3
 _RANGE_SIGMA_M, _RANGE_FROM_M, _RANGE_RATE_PER_M = 0.0025, 2.5, math.log(80.0) / 1.5
 _RANGE_MEMORY_S = 0.1
 _START_VV, _START_AA = 1e-4, (GRAVITY_MPS2 * 0.01) ** 2
-
-
-class Moving(Protocol):
-    """The part of the world that the deck depends on."""
-
-    x_m: float
-    y_m: float
-    z_m: float
 
 
 def has_flow_errors(scenario: Scenario) -> bool:
@@ -97,7 +92,7 @@ class FlowDeck:
         """Of the speed in x or y, (m/s)^2: that is what `kalman.varPX` holds (source)."""
         return self._vv
 
-    def sees(self, world: Moving) -> bool:
+    def sees(self, world: World) -> bool:
         """Whether there is anything in view whose motion can be measured."""
         scenario = self._scenario
         if scenario.flow_reach_m is not None and world.z_m > scenario.flow_reach_m:
@@ -108,7 +103,7 @@ class FlowDeck:
             for x_m, y_m, radius_m in scenario.bare_floors
         )
 
-    def step(self, world: Moving) -> None:
+    def step(self, world: World) -> None:
         """One control period of flight."""
         self._steps += 1
         if self._steps % _EVERY:

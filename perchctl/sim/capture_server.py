@@ -9,14 +9,75 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from perchctl.errors import ConnectionFailed
-from perchctl.positioning import CaptureFrame
-from perchctl.sim.capture import natnet
+from perchctl.positioning import BodyPose, CaptureFrame
+
+# --- NatNet 3.1, in which OptiTrack's server speaks: what a client asks, and the answers --------
+# Little-endian; each message begins with its kind and the length of what follows. Of a frame only
+# the rigid bodies are filled in; a client steps over the empty lists.
+
+
+CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME = 0, 1, 4, 5, 7
+COMMAND_PORT = 1510
+_VERSION = bytes((3, 1, 0, 0))
+_NAME_BYTES = 256
+_TICKS_HZ = 1_000_000
+_RIGID_BODY = 1
+_TRACKED = 1
+_NO_PARENT = -1
+_EMPTY = struct.pack("<i", 0)
+_UNSEEN = BodyPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+def message(kind: int, body: bytes) -> bytes:
+    return struct.pack("<HH", kind, len(body)) + body
+
+
+def kind_of(request: bytes) -> int | None:
+    """None for what is too short to be one."""
+    return int.from_bytes(request[:2], "little") if len(request) >= 4 else None
+
+
+def server_info(data_port: int) -> bytes:
+    """The answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
+    name = b"perchctl".ljust(_NAME_BYTES, b"\0")
+    where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
+    return message(SERVER_INFO, name + _VERSION + _VERSION + where)
+
+
+def models(names: Sequence[str]) -> bytes:
+    """The answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
+    body = struct.pack("<i", len(names))
+    for number, name in enumerate(names, 1):
+        body += struct.pack("<i", _RIGID_BODY) + name.encode() + b"\0"
+        body += struct.pack("<ii3f", number, _NO_PARENT, 0.0, 0.0, 0.0) + _EMPTY  # no markers
+    return message(MODELS, body)
+
+
+def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> bytes:
+    """One frame; a body that is not in it is marked as not tracked."""
+    parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
+    parts.append(struct.pack("<i", len(names)))
+    for index, name in enumerate(names, 1):
+        pose = seen.bodies.get(name)
+        w, x, y, z = (pose or _UNSEEN).quaternion
+        place = (pose or _UNSEEN).position_m
+        tracked = 0 if pose is None else _TRACKED
+        parts.append(struct.pack("<i3f4ffh", index, *place, x, y, z, w, 0.0, tracked))
+    parts += [_EMPTY] * 4  # skeletons, labelled markers, force plates, devices
+    ticks = round(seen.t_s * _TICKS_HZ)
+    parts.append(struct.pack("<IId3Qh", 0, 0, seen.t_s, ticks, ticks, ticks, 0) + _EMPTY)
+    return message(FRAME, b"".join(parts))
+
+
+# --- The server ----------------------------------------------------------------------------------
+
 
 SIMULATED_SYSTEM = "optitrack"
 """As `motioncapture` calls it."""
@@ -68,7 +129,7 @@ class CaptureServer:
         with self._lock:
             if not self._clients:
                 return
-            datagram = natnet.frame(self._count, self._names, seen)
+            datagram = frame_message(self._count, self._names, seen)
             for client in self._clients:
                 self._send(client, datagram)
             for client in [c for c in self._clients if self._is_gone(c)]:
@@ -106,12 +167,12 @@ class CaptureServer:
                 request, address = self._socket.recvfrom(2048)
             except OSError:  # nothing for a while, or a client that has gone
                 continue
-            kind = natnet.kind_of(request)
+            kind = kind_of(request)
             with contextlib.suppress(OSError):
-                if kind == natnet.CONNECT:
-                    self._socket.sendto(natnet.server_info(self._admit(address[0])), address)
-                elif kind == natnet.ASK_MODELS:
-                    self._socket.sendto(natnet.models(self._names), address)
+                if kind == CONNECT:
+                    self._socket.sendto(server_info(self._admit(address[0])), address)
+                elif kind == ASK_MODELS:
+                    self._socket.sendto(models(self._names), address)
 
     def _admit(self, host: str) -> int:
         """A port of the client's own: several on one computer could not share one."""
