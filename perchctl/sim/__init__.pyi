@@ -3,10 +3,10 @@ from .bursts import radio_bursts as radio_bursts
 from .camera import DeliveredFrame as DeliveredFrame
 from .camera import SimCamera as SimCamera
 from .capture import MILLIMETRES_PER_M as MILLIMETRES_PER_M
+from .capture import SIMULATED_SYSTEM as SIMULATED_SYSTEM
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
 from .capture import LockstepCapture as LockstepCapture
-from .capture_server import SIMULATED_SYSTEM as SIMULATED_SYSTEM
 from .crtp.codec import Packet as Packet
 from .crtp.codec import Port as Port
 from .crtp.commands import CommandService as CommandService
@@ -19,9 +19,9 @@ from .hand import draw_hand as draw_hand
 from .hand import record_hand as record_hand
 from .powertrain import MOTOR_FORCE_N as MOTOR_FORCE_N
 from .powertrain import most_thrust_n as most_thrust_n
+from .process.handle import CLOCK_MARGIN_S as CLOCK_MARGIN_S
+from .process.handle import SharedTime as SharedTime
 from .process.handle import SimProcess as SimProcess
-from .process.shared import CLOCK_MARGIN_S as CLOCK_MARGIN_S
-from .process.shared import SharedTime as SharedTime
 from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
 from .scenario import Neighbour as Neighbour

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim.gloss import shone_upon
 from perchctl.sim.optics import (
     COARSE_PX,
     LEAST_RISE,
@@ -47,6 +46,7 @@ from perchctl.sim.sheets import (
     fill,
     pixels_of,
     printed_sheet,
+    shone_upon,
 )
 from perchctl.vision import CameraModel
 

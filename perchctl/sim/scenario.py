@@ -85,7 +85,7 @@ class Scenario:
             lamp's place (`perchctl.sim.gloss`).
         flow_noise_radps, flow_bias_radps: of the flow deck's readings, the latter in x and y.
         flow_reach_m: above this it sees no flow; None: it always does.
-        bare_floors: x, y and radius of patches without texture (`perchctl.sim.firmware.flow_deck`).
+        bare_floors: x, y and radius of patches without texture (`perchctl.sim.firmware.estimator`).
         radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
             such a time lasts on average (`perchctl.sim.bursts`).
         capture_holes_s: begin and length of the times in which a motion capture does not see

@@ -26,7 +26,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import Phase, PlannerState
 from perchctl.profile import TargetConfig
 from perchctl.sim import CaptureSettings, Neighbour, Scenario, most_thrust_n
-from perchctl.sim.firmware.setpoint import Setpoint
+from perchctl.sim.firmware.controller import Setpoint
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, target_xy_m=(0.1, 0.2))

@@ -6,18 +6,27 @@ cflib's threads are waited for with bounded events; simulated time moves only by
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import struct
 import threading
-from collections.abc import Callable
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import cflib.crtp
+import cv2
+import numpy as np
 import pytest
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
 from cflib.crtp.crtpstack import CRTPPacket
 
+import perchctl
 from perchctl.sim import Scenario, SimProcess
+
+ROOT = str(Path(perchctl.__file__).resolve().parents[1])
 
 WAIT_S = 10.0
 CONNECTED_S = 60.0  # all tables, where a busy machine gives it a tenth of a core
@@ -249,3 +258,34 @@ def kept(pilot: Pilot, name: str, value: float) -> None:
         if read(pilot, name) == pytest.approx(value):
             return
     raise AssertionError(f"{name} is not {value:g}")
+
+
+def log_block(name: str, variables: dict[str, str], period_ms: int = 10) -> LogConfig:
+    block = LogConfig(name=name, period_in_ms=period_ms)
+    for variable, ctype in variables.items():
+        block.add_variable(variable, ctype)
+    return block
+
+
+@contextlib.contextmanager
+def wired(uri: str) -> Iterator[socket.socket]:
+    """A socket to a vehicle's link: one datagram, one packet."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
+        mine.connect(("127.0.0.1", int(uri.rsplit(":", 1)[1])))
+        mine.setblocking(False)
+        yield mine
+
+
+def pictures_of(url: str, count: int) -> list[np.ndarray]:
+    """The first pictures of a stream, decoded."""
+    pictures = []
+    with urllib.request.urlopen(url, timeout=WAIT_S) as answer:
+        assert answer.headers.get_content_type() == "multipart/x-mixed-replace"
+        while len(pictures) < count:
+            line = answer.readline()
+            if line.lower().startswith(b"content-length:"):
+                length = int(line.split(b":")[1])
+                answer.readline()
+                raw = np.frombuffer(answer.read(length), np.uint8)
+                pictures.append(cv2.imdecode(raw, cv2.IMREAD_UNCHANGED))
+    return pictures

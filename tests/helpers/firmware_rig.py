@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.sim import CONTROL_PERIOD_S, Firmware, Scenario
+from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlTakeoff
-from perchctl.sim.firmware.setpoint import Setpoint
 from perchctl.sim.world import World
 
 STREAM_PERIOD_S = 0.02

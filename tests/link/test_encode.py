@@ -21,8 +21,8 @@ from perchctl.link.connection import send_packets
 from perchctl.link.encode import ARM, LAND_TIMES, UNLOCK_THRUST, encode
 from perchctl.sim import CommandService, Packet
 from perchctl.sim.crtp.codec import MAX_DATA
+from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlLand
-from perchctl.sim.firmware.setpoint import Setpoint
 from perchctl.vehicle import (
     Command,
     EmergencyStop,

@@ -14,8 +14,8 @@ import pytest
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.positioning import BodyPose, CaptureFrame
 from perchctl.sim import SIMULATED_SYSTEM, CaptureFault, CaptureSettings, Scenario, SimProcess
-from perchctl.sim import capture_server as natnet
-from perchctl.sim.capture_server import CaptureServer
+from perchctl.sim import capture as natnet
+from perchctl.sim.capture import CaptureServer
 
 WAIT_S = 10.0
 NAMES = ("crazyflie", "target")

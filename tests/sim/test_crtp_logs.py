@@ -13,8 +13,7 @@ import pytest
 from cflib.crazyflie.mem import MemoryElement
 
 from perchctl.sim import SimProcess
-from tests.helpers.crtp_client import _block
-from tests.helpers.crtp_rig import READY, WAIT_S, Client, Pilot
+from tests.helpers.crtp_rig import READY, WAIT_S, Client, Pilot, log_block
 
 
 @pytest.fixture
@@ -29,7 +28,7 @@ def clean(client: Client) -> Iterator[Client]:
 
 def test_log_data_have_period_and_stamp(sim: SimProcess, clean: Client) -> None:
     """Row "Log data: block id, 3-byte ms timestamp, data", with conversion on the way."""
-    block = _block("p", {"pm.vbat": "FP16", "pm.vbatMV": "uint16_t", "acc.z": "float"}, 50)
+    block = log_block("p", {"pm.vbat": "FP16", "pm.vbatMV": "uint16_t", "acc.z": "float"}, 50)
     clean.cf.log.add_config(block)
     stamps: list[int] = []
     data: list[dict[str, float]] = []
@@ -62,14 +61,14 @@ def test_log_data_have_period_and_stamp(sim: SimProcess, clean: Client) -> None:
 def test_log_limits_are_known_to_cflib(clean: Client) -> None:
     """Rows "Unknown log variable: KeyError. Too large a log block: AttributeError"."""
     with pytest.raises(KeyError):
-        clean.cf.log.add_config(_block("u", {"no.such": "float"}))
+        clean.cf.log.add_config(log_block("u", {"no.such": "float"}))
     too_large = {f"kalman.q{i}": "float" for i in range(4)} | {
         f"stateEstimate.{n}": "float" for n in "xyz"
     }
     with pytest.raises(AttributeError):
-        clean.cf.log.add_config(_block("l", too_large))
+        clean.cf.log.add_config(log_block("l", too_large))
     with pytest.raises(AttributeError):
-        clean.cf.log.add_config(_block("s", {"acc.z": "float"}, 2550))
+        clean.cf.log.add_config(log_block("s", {"acc.z": "float"}, 2550))
 
 
 def _create(client: Client, ident: int, count: int, ctype: int = 7) -> int:
@@ -104,7 +103,7 @@ def test_blocks_longer_than_one_packet(sim: SimProcess, clean: Client) -> None:
     """Create and append V2: 13 two-byte variables need a second packet."""
     names = [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
     names += ["pm.vbatMV", "motor.m1", "motor.m2", "supervisor.info"]
-    block = _block("long", dict.fromkeys(names, "uint16_t"))
+    block = log_block("long", dict.fromkeys(names, "uint16_t"))
     clean.cf.log.add_config(block)
     got: list[dict[str, float]] = []
     started, arrived = threading.Event(), threading.Event()

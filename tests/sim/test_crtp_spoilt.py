@@ -13,8 +13,7 @@ from cflib.utils.power_switch import PowerSwitch
 from perchctl.errors import InvalidValue
 from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.crtp.server import LinkOptions
-from tests.helpers.crtp_client import _block
-from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot
+from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot, log_block
 
 
 @pytest.fixture
@@ -79,7 +78,7 @@ def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
             assert client.echo(4)
             assert client.ask(13, 0, b"\x01\x01") == b"\x01\x01\x01"  # arming, the old way
             with pytest.raises(KeyError):
-                client.cf.log.add_config(_block("s", {"supervisor.info": "uint16_t"}))
+                client.cf.log.add_config(log_block("s", {"supervisor.info": "uint16_t"}))
             with pytest.warns(UserWarning, match="protocol version 12"):
                 client.cf.supervisor.send_emergency_stop()
             process.advance(0.5)

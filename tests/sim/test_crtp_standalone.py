@@ -15,9 +15,9 @@ import pytest
 from perchctl.errors import ConnectionFailed
 from perchctl.sim.crtp.server import LinkOptions
 from perchctl.sim.process.__main__ import main
+from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.shared import HostSetup
-from tests.helpers.crtp_process import ROOT, WAIT_S, _parts, wired
+from tests.helpers.crtp_rig import ROOT, WAIT_S, pictures_of, wired
 
 
 def received(mine: socket.socket) -> list[bytes]:
@@ -41,7 +41,7 @@ def test_standalone_runs_until_ctrl_c() -> None:
         uri = process.stdout.readline().split()[1]
         stream = process.stdout.readline().split()[1]
         assert uri.startswith("udp://127.0.0.1:")
-        assert len(_parts(stream, 1)) == 1
+        assert len(pictures_of(stream, 1)) == 1
         process.send_signal(signal.SIGINT)
         assert process.wait(WAIT_S) == 0
 

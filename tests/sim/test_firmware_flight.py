@@ -6,8 +6,8 @@ import math
 
 import pytest
 
+from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HlLand, HlStop, HlTakeoff
-from perchctl.sim.firmware.setpoint import Setpoint
 from perchctl.vehicle import CAN_FLY, CRASHED, LOCKED, TUMBLED
 from tests.helpers.firmware_rig import PERFECT, Rig, make_rig
 

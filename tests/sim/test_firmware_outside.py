@@ -12,9 +12,9 @@ import pytest
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim import Scenario
+from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.outside import IMU_EVERY, Imu
 from perchctl.sim.firmware.planner import HlTakeoff
-from perchctl.sim.firmware.setpoint import Setpoint
 from tests.helpers.firmware_rig import Rig, make_rig
 
 Place = tuple[float, float, float]
@@ -146,24 +146,6 @@ def test_blind_for_twelve_seconds_it_slides_by_what_was_measured() -> None:
         rig.run(12.0)
         aside_m.append(math.hypot(*place(rig)[:2]))
     assert statistics.median(aside_m) == pytest.approx(0.9, abs=0.3)
-
-
-def test_the_heading_is_the_initial_one_until_a_pose_comes() -> None:
-    rig = outside_rig()
-    yaw = lambda: rig.firmware.log_value("stateEstimate.yaw")  # noqa: E731
-    turned = (0.0, 0.0, math.sin(math.radians(15.0)), math.cos(math.radians(15.0)))  # 30 deg
-    fed(rig, 0.5)
-    assert yaw() == pytest.approx(0.0, abs=1.0)
-    rig.firmware.set_parameter("kalman.initialYaw", math.radians(30.0))
-    fed(rig, 0.2)
-    assert yaw() == pytest.approx(0.0, abs=1.0)  # it takes a reset
-    reset(rig)
-    fed(rig, 0.5)
-    assert yaw() == pytest.approx(30.0, abs=1.0)
-    rig.firmware.set_parameter("kalman.initialYaw", 0.0)
-    reset(rig)
-    fed(rig, 1.0, lambda r: r.firmware.external_pose(place(r), turned))
-    assert yaw() == pytest.approx(30.0, abs=1.0)
 
 
 def test_a_wrong_initial_heading_cannot_be_flown() -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim import Firmware
+from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import AxisState, HlGoTo, Polynomial
-from perchctl.sim.firmware.setpoint import Setpoint
 from tests.helpers.firmware_rig import PERFECT, Rig, make_rig
 
 HERE = Setpoint.position(0.0, 0.0, 0.8, 0.0)
@@ -182,16 +182,6 @@ def test_outside_positions_are_only_counted_on_a_flow_deck() -> None:
     rig.firmware.external_pose((5.0, 5.0, 5.0), (0.0, 0.0, 0.0, 1.0))
     rig.run(0.1)
     assert abs(rig.firmware.log_value("stateEstimate.x")) < 0.02
-
-
-def test_same_seed_same_flight() -> None:
-    def flight(seed: int) -> list[float]:
-        rig = make_rig(seed=seed, draught_mps=(0.2, 0.0, 0.0))
-        rig.take_off(settle_s=0.5)
-        return rig.world.state().position_m.tolist()
-
-    assert flight(5) == flight(5)
-    assert flight(5) != flight(6)
 
 
 # Trajectories -----------------------------------------------------------------------

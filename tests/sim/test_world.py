@@ -331,17 +331,6 @@ def test_the_gear_touches_before_the_frame() -> None:
     assert world.gear_tip_m()[2] == pytest.approx(CEILING_M, abs=1e-3)
 
 
-def test_same_seed_same_flight() -> None:
-    def path(seed: int) -> list[float]:
-        world = make(seed=seed, draught_mps=(0.2, 0.1, 0.0))
-        world.set_pose((0.0, 0.0, 1.0))
-        run(world, 0.3, (55000.0, 56000.0, 56000.0, 55000.0))
-        return world.state().position_m.tolist()
-
-    assert path(3) == path(3)
-    assert path(3) != path(4)
-
-
 # The air ------------------------------------------------------------------------------
 
 

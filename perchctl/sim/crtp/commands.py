@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from perchctl.sim.crtp.codec import Packet, Port, Status
+from perchctl.sim.firmware.controller import Setpoint
 from perchctl.sim.firmware.planner import HighLevelCommand, HlGoTo, HlLand, HlStop, HlTakeoff
-from perchctl.sim.firmware.setpoint import Setpoint
 
 if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware

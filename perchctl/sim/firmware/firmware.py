@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
-from perchctl.sim.firmware.controller import Controller
+from perchctl.sim.firmware.controller import MODE_RAW, Controller, Setpoint
 from perchctl.sim.firmware.estimator import Estimator
 from perchctl.sim.firmware.outside import SETTINGS
 from perchctl.sim.firmware.planner import HighLevelCommand, Planner
@@ -19,7 +19,6 @@ from perchctl.sim.firmware.power import (
     MotorDriver,
     PowerMonitor,
 )
-from perchctl.sim.firmware.setpoint import MODE_RAW, Setpoint
 from perchctl.sim.firmware.supervisor import EVERY as SUPERVISOR_EVERY
 from perchctl.sim.firmware.supervisor import State, Supervisor
 from perchctl.sim.firmware.variables import (

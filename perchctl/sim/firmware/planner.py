@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from perchctl.geometry import wrap_rad
-from perchctl.sim.firmware.setpoint import MODE_POSITION, Setpoint
+from perchctl.sim.firmware.controller import MODE_POSITION, Setpoint
 
 IDLE, FLYING, LANDING = 0, 1, 3
 Place = tuple[float, float, float]

@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from perchctl.calibration import load_calibration
 from perchctl.errors import PerchError
 from perchctl.profile import data_file
-from perchctl.sim.capture import CaptureSettings
-from perchctl.sim.capture_server import COMMAND_PORT
+from perchctl.sim.capture import COMMAND_PORT, CaptureSettings
 from perchctl.sim.process.child import Runner
+from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.shared import HostSetup
 from perchctl.sim.scenario import Scenario
 
 

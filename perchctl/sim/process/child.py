@@ -16,13 +16,13 @@ import cv2
 from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
 from perchctl.sim.capture import CaptureFault
-from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.shared import (
+from perchctl.sim.process.handle import (
     CLOCK_MARGIN_S,
     LOOP_PATIENCE_S,
     START_TIMEOUT_S,
     SharedTime,
 )
+from perchctl.sim.process.host import VehicleHost
 from perchctl.sim.scenario import CONTROL_PERIOD_S
 
 

@@ -18,11 +18,11 @@ import numpy as np
 from perchctl.errors import ConnectionFailed
 from perchctl.geometry import rpy_from_rotation
 from perchctl.sim.bursts import Bursts, radio_bursts
-from perchctl.sim.capture_server import SIMULATED_SYSTEM, CaptureServer
+from perchctl.sim.capture import SIMULATED_SYSTEM, CaptureServer
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.server import CrtpServer, LinkOptions
 from perchctl.sim.optics import Picture
-from perchctl.sim.process.shared import HostSetup
+from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.vehicle import SimulatedVehicle
 from perchctl.sim.world import TrueState
