@@ -13,6 +13,7 @@ from .crtp.commands import CommandService as CommandService
 from .crtp.server import PROTOCOL_VERSION as PROTOCOL_VERSION
 from .draw import draw_capture as draw_capture
 from .draw import draw_scenario as draw_scenario
+from .explain import EventExplainer as EventExplainer
 from .firmware import Firmware as Firmware
 from .firmware.controller import Estimate as Estimate
 from .hand import draw_hand as draw_hand
@@ -26,6 +27,5 @@ from .renderer import Renderer as Renderer
 from .scenario import CONTROL_PERIOD_S as CONTROL_PERIOD_S
 from .scenario import Neighbour as Neighbour
 from .scenario import Scenario as Scenario
-from .told import EventExplainer as EventExplainer
 from .vehicle import SimulatedVehicle as SimulatedVehicle
 from .world import REST_HEIGHT_M as REST_HEIGHT_M

@@ -199,10 +199,7 @@ class Renderer:
     ) -> Picture:
         """The picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = sample_count(length_px)
-        if count == 1 and all(len(poses) % 2 for poses in rows):
-            by_row = [plane_map(poses[len(poses) // 2][None]) for poses in rows]
-        else:
-            by_row = [plane_map(spread(poses, count)) for poses in rows]
+        by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         picture, box = self._optical(maps, motion_px, length_px)
         if self._glossy_half_m:

@@ -80,14 +80,3 @@ def test_lossy_link_is_the_same_for_a_seed() -> None:
     assert 5 < len(first) < 35
     assert answered(1) == first
     assert answered(2) != first
-
-
-def test_silence_at_a_given_time() -> None:
-    """The peer goes silent by the simulated clock and comes back."""
-    link = LinkOptions(silent_from_s=0.2, silent_for_s=0.1)
-    with hosted(link) as host, wired(host.uri) as mine:
-        for number, answers in ((1, True), (2, False), (3, True)):
-            mine.send(bytes((0xFC, number)))
-            host.serve()
-            assert (bytes((0xFC, number)) in received(mine)) == answers
-            host.advance(0.21 if number == 1 else 0.1)

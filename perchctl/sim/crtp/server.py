@@ -54,16 +54,12 @@ class LinkOptions:
         protocol_version: below 12 the supervisor port is missing (an old firmware).
         missing_log_variables: left out of the log table.
         loss_rate: share of packets lost, each way; drawn by `loss_seed`.
-        silent_from_s, silent_for_s: simulated time at which the peer goes silent, and
-            for how long. None means never.
     """
 
     protocol_version: int = PROTOCOL_VERSION
     missing_log_variables: tuple[str, ...] = ()
     loss_rate: float = 0.0
     loss_seed: int = 0
-    silent_from_s: float | None = None
-    silent_for_s: float = float("inf")
 
     def __post_init__(self) -> None:
         if not OLDEST_PROTOCOL_VERSION <= self.protocol_version <= PROTOCOL_VERSION:

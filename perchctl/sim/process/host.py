@@ -4,6 +4,7 @@ process of its own."""
 from __future__ import annotations
 
 import json
+import math
 import socket
 import sys
 import threading
@@ -259,9 +260,7 @@ class UdpEndpoint:
         self._random = np.random.default_rng([options.loss_seed, _STREAM])
         self._peer: Address | None = None
         self.heard: Callable[[float, Address, bytes], None] | None = None
-        self._silent: tuple[float, float] | None = None
-        if options.silent_from_s is not None:
-            self._silent = (options.silent_from_s, options.silent_from_s + options.silent_for_s)
+        self._silent = (math.inf, math.inf)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.setblocking(False)
@@ -314,9 +313,7 @@ class UdpEndpoint:
                 continue
 
     def _is_silent(self, t_s: float) -> bool:
-        return self._silent is not None and (
-            self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S
-        )
+        return self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S
 
     def _is_lost(self, t_s: float) -> bool:
         if self._bursts is not None and self._bursts.lost(t_s):

@@ -15,7 +15,7 @@ from perchctl.flight import fly_lockstep
 from perchctl.log import read_log
 from perchctl.mission import Event, EventKeeper, EventKind, Phase, Severity
 from perchctl.sim import Bursts, EventExplainer, Scenario, draw_scenario
-from perchctl.sim.told import LOSSES
+from perchctl.sim.explain import LOSSES
 from tests.helpers.flights import SEED, short_profile
 
 BURST = Scenario(camera_rate_hz=30.0, camera_burst=(10.0, 15))
