@@ -6,11 +6,10 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
-from perchctl.geometry import Array, make_T
+from perchctl.geometry import Array
 from perchctl.sim.optics import Picture
 from perchctl.sim.renderer import Renderer, Shot
 from perchctl.sim.scenario import Scenario
@@ -20,13 +19,8 @@ SCHEDULE_STREAM = 411
 JITTER_LIMIT_SIGMAS = 2.5
 
 
-class BodyState(Protocol):
-    """The part of the world's true state that the camera needs."""
-
-    @property
-    def position_m(self) -> Array: ...
-    @property
-    def R_world_body(self) -> Array: ...
+PoseAt = Callable[[float], Array]
+"""The body's pose T_world_body (4, 4) at a time."""
 
 
 class SimCamera:
@@ -44,7 +38,7 @@ class SimCamera:
     - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
     - mirrored: with `camera_mirrored` flipped left to right;
     - blank: with `camera_blank_rate` a blue screen in the place of the picture;
-    - given out again: at the receiver's own rate, where it has one (`perchctl.sim.camera`);
+    - given out again: at the receiver's own rate, where it has one (`Receiver`);
     - gone: nothing arrives at or after `camera_gone_at_s`.
     """
 
@@ -74,7 +68,7 @@ class SimCamera:
         """When the next exposure ends."""
         return self._first_s + self._index / self.scenario.camera_rate_hz + self._half_s
 
-    def advance(self, t_s: float, pose_at: Callable[[float], BodyState]) -> None:
+    def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
 
         `pose_at` is called with times within the exposures that ended since the last
@@ -95,7 +89,7 @@ class SimCamera:
             out.append(self._under_way.popleft())
         return self._receiver.given_out(out, self._t_s)
 
-    def _expose(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> None:
+    def _expose(self, middle_s: float, pose_at: PoseAt) -> None:
         s = self.scenario
         dropped = float(self._rng.random()) < s.camera_drop_rate
         jitter = max(-JITTER_LIMIT_SIGMAS, min(JITTER_LIMIT_SIGMAS, float(self._rng.normal())))
@@ -123,18 +117,15 @@ class SimCamera:
             self._last()
         self._receiver.develop()
 
-    def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Later:
+    def _picture(self, middle_s: float, pose_at: PoseAt) -> Later:
         """The poses are of now; the picture is made when it is looked at."""
 
         def T_world_cam_at(t_s: float) -> Array:
-            return self._T_world_cam(pose_at(t_s))
+            return np.asarray(pose_at(t_s) @ self._T_body_cam)
 
         index, renderer = self._index, self.renderer
         shots = self._shutter.shots(middle_s, T_world_cam_at, renderer.camera.size_px[1])
         return Later(lambda: renderer.expose(shots, frame_index=index))
-
-    def _T_world_cam(self, state: BodyState) -> Array:
-        return make_T(state.R_world_body, state.position_m) @ self._T_body_cam
 
 
 def _flipped(picture: Later) -> Later:

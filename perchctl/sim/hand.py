@@ -305,14 +305,6 @@ def _slow_noise(rng: np.random.Generator, n: int, memory_s: float) -> Array:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Held:
-    """The body, as the simulated camera asks for it."""
-
-    position_m: Array
-    R_world_body: Array
-
-
 def pictures(hand: Hand, profile: Profile, camera: CameraModel) -> Iterator[DeliveredFrame]:
     """The camera's frames in the order of their arrival, rendered as they are asked for."""
     renderer = Renderer(hand.scenario, camera, profile.target, hand.seed)
@@ -320,16 +312,15 @@ def pictures(hand: Hand, profile: Profile, camera: CameraModel) -> Iterator[Deli
     T_room_target = renderer.T_world_target
     T_cam_body = invert_T(hand.T_body_cam)
 
-    def held(t_s: float) -> _Held:
+    def T_room_body(t_s: float) -> Array:
         T_target_cam = T_target_cam_at(hand, t_s)
         # A larger print from farther away is the same picture.
         T_target_cam[:3, 3] /= 1.0 + hand.size_error
-        T = T_room_target @ T_target_cam @ T_cam_body
-        return _Held(T[:3, 3], T[:3, :3])
+        return np.asarray(T_room_target @ T_target_cam @ T_cam_body)
 
     period_s = 1.0 / hand.scenario.camera_rate_hz
     for k in range(1, math.ceil((hand.seconds + 0.3) / period_s)):
-        source.advance(k * period_s, held)
+        source.advance(k * period_s, T_room_body)
         yield from source.take()
 
 

@@ -6,9 +6,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
-import numpy as np
-
-from perchctl.geometry import Array, rotation_from_quaternion
+from perchctl.geometry import Array, make_T, rotation_from_quaternion
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
 from perchctl.sim.capture import CaptureSettings, SimCapture
@@ -22,19 +20,11 @@ _TICK_S = 1e-6  # less than a control period: an exposure is never passed over
 
 
 class PastPose(NamedTuple):
-    """Where the vehicle was, kept 500 times a second: arrays only for what an exposure asks."""
+    """Where the vehicle was, kept 500 times a second: an array only for what an exposure asks."""
 
     t_s: float
     place_m: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
-
-    @property
-    def position_m(self) -> Array:
-        return np.array(self.place_m)
-
-    @property
-    def R_world_body(self) -> Array:
-        return rotation_from_quaternion(self.quaternion)
 
 
 class SimulatedVehicle:
@@ -82,16 +72,16 @@ class SimulatedVehicle:
             if t_s >= due_s - exposed_s:
                 self._remember()
                 if t_s >= due_s:
-                    self.camera.advance(t_s, self._state_at)
+                    self.camera.advance(t_s, self._pose_at)
                     due_s = self.camera.next_s - _TICK_S
-        self.camera.advance(t_s, self._state_at)
+        self.camera.advance(t_s, self._pose_at)
 
     def step(self) -> None:
         """One control period, and the exposures that fall into it."""
         self.step_blindly()
         if self.camera is not None and self.watched:
             self._remember()
-            self.camera.advance(self.world.t_s, self._state_at)
+            self.camera.advance(self.world.t_s, self._pose_at)
 
     def step_blindly(self) -> None:
         """One control period without the camera, which somebody else exposes."""
@@ -111,8 +101,9 @@ class SimulatedVehicle:
         place_m = (world.x_m, world.y_m, world.z_m)
         self._past.append(PastPose(world.t_s, place_m, world.quaternion))
 
-    def _state_at(self, t_s: float) -> PastPose:
-        """The pose nearest to `t_s` in the recent past."""
+    def _pose_at(self, t_s: float) -> Array:
+        """T_world_body (4, 4) nearest to `t_s` in the recent past."""
         newest = self._past[-1]
         back = round((newest.t_s - t_s) / CONTROL_PERIOD_S)
-        return self._past[max(-len(self._past), -1 - max(0, back))]
+        pose = self._past[max(-len(self._past), -1 - max(0, back))]
+        return make_T(rotation_from_quaternion(pose.quaternion), pose.place_m)

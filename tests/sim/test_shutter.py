@@ -33,20 +33,17 @@ STILL = Scenario(
 SPEED_MPS, TURN_RADPS, BELOW_M = 0.3, 0.5, 0.3
 
 
-class State:
+def pose(t_s: float, turn_radps: float = 0.0) -> Array:
     """Under the target, moving along x (the picture's rows) and turning."""
-
-    def __init__(self, t_s: float, turn_radps: float) -> None:
-        x_m = SPEED_MPS * (t_s - 0.1)
-        self.position_m: Array = np.array([x_m, 0.0, STILL.ceiling_z_m - BELOW_M])
-        self.R_world_body: Array = rot_z(turn_radps * (t_s - 0.1))
+    place_m = (SPEED_MPS * (t_s - 0.1), 0.0, STILL.ceiling_z_m - BELOW_M)
+    return make_T(rot_z(turn_radps * (t_s - 0.1)), place_m)
 
 
 def first_frame(scenario: Scenario, turn_radps: float = 0.0) -> tuple[Picture, float]:
     """The first frame and its middle moment."""
     camera = SimCamera(scenario, Renderer(scenario, CAMERA, TargetConfig()))
     for step in range(1, 200):
-        camera.advance(step * CONTROL_PERIOD_S, lambda t: State(t, turn_radps))
+        camera.advance(step * CONTROL_PERIOD_S, lambda t: pose(t, turn_radps))
         if frames := camera.take():
             return frames[0].image, frames[0].t_exposure_s
     raise AssertionError("no frame")
@@ -54,9 +51,7 @@ def first_frame(scenario: Scenario, turn_radps: float = 0.0) -> tuple[Picture, f
 
 def at_once(t_s: float, turn_radps: float = 0.0) -> Picture:
     """The whole picture of one moment."""
-    state = State(t_s, turn_radps)
-    pose = make_T(state.R_world_body, state.position_m)
-    return Renderer(STILL, CAMERA, TargetConfig()).render([pose])
+    return Renderer(STILL, CAMERA, TargetConfig()).render([pose(t_s, turn_radps)])
 
 
 @pytest.mark.parametrize("first", ["top", "bottom"])
@@ -138,9 +133,9 @@ def test_a_frame_never_arrives_before_its_last_light() -> None:
     assert camera.exposed_s == pytest.approx(0.048)
     now_s = 0.0
 
-    def pose_at(t_s: float) -> State:
+    def pose_at(t_s: float) -> Array:
         assert now_s - camera.exposed_s - CONTROL_PERIOD_S <= t_s <= now_s + 1e-9
-        return State(t_s, 0.0)
+        return pose(t_s)
 
     arrived = []
     for step in range(1, 80):
@@ -161,7 +156,7 @@ def test_the_vehicle_remembers_as_far_back_as_a_frame_looks() -> None:
 
     def advance(t_s: float, pose_at: Any) -> None:
         def asked(at_s: float) -> Any:
-            oldest.append(abs(pose_at(at_s).t_s - at_s))
+            oldest.append(vehicle._past[0].t_s - at_s)
             return pose_at(at_s)
 
         seen(t_s, asked)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.calibration import profile_camera
-from perchctl.geometry import Array
+from perchctl.geometry import Array, make_T
 from perchctl.profile import TargetConfig, load_profile
 from perchctl.sim import (
     CONTROL_PERIOD_S,
@@ -29,14 +29,8 @@ from perchctl.sim.renderer import Shot
 from perchctl.vision import CameraModel
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    position_m: Array
-    R_world_body: Array
-
-
-def pose_at(t_s: float) -> State:
-    return State(np.array([0.1 * t_s, 0.0, 1.0]), np.eye(3))
+def pose_at(t_s: float) -> Array:
+    return make_T(np.eye(3), (0.1 * t_s, 0.0, 1.0))
 
 
 class Stub:
@@ -175,7 +169,7 @@ def test_poses_are_requested_within_the_last_exposure_only() -> None:
     now = 0.0
     requested = []
 
-    def watched(t_s: float) -> State:
+    def watched(t_s: float) -> Array:
         requested.append((t_s, now))
         return pose_at(t_s)
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from perchctl.errors import ConnectionFailed
-from perchctl.geometry import rpy_from_rotation
+from perchctl.geometry import Array, make_T, rpy_from_rotation
 from perchctl.sim.bursts import Bursts, radio_bursts
 from perchctl.sim.capture import SIMULATED_SYSTEM, CaptureServer
 from perchctl.sim.crtp.codec import Packet
@@ -213,7 +213,7 @@ class _PictureFeed:
 
     def _run(self) -> None:
         while (t_s := self._next_time()) is not None:
-            self._camera.advance(t_s, self._state_at)
+            self._camera.advance(t_s, self._pose_at)
             self._camera.develop()  # while it is under way: its latency is the whole way's
             arrived = self._camera.take()
             if arrived:
@@ -226,11 +226,12 @@ class _PictureFeed:
             self._waiting = 0
             return None if self._closed else self._past[-1].t_s
 
-    def _state_at(self, t_s: float) -> TrueState:
-        """The true state nearest to `t_s` of those still kept."""
+    def _pose_at(self, t_s: float) -> Array:
+        """T_world_body nearest to `t_s` of those still kept."""
         with self._changed:
             back = round((self._past[-1].t_s - t_s) / CONTROL_PERIOD_S)
-            return self._past[max(-len(self._past), -1 - max(0, back))]
+            state = self._past[max(-len(self._past), -1 - max(0, back))]
+        return make_T(state.R_world_body, state.position_m)
 
 
 # --- The link's carrier: one CRTP packet a UDP datagram, as cflib's `udp://` driver sends them ---
