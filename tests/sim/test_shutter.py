@@ -156,7 +156,7 @@ def test_the_vehicle_remembers_as_far_back_as_a_frame_looks() -> None:
 
     def advance(t_s: float, pose_at: Any) -> None:
         def asked(at_s: float) -> Any:
-            oldest.append(vehicle._past[0].t_s - at_s)
+            oldest.append(vehicle._past._poses[0][0] - at_s)
             return pose_at(at_s)
 
         seen(t_s, asked)

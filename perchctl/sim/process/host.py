@@ -8,7 +8,6 @@ import math
 import socket
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, TextIO
@@ -17,7 +16,7 @@ import cv2
 import numpy as np
 
 from perchctl.errors import ConnectionFailed
-from perchctl.geometry import Array, make_T, rpy_from_rotation
+from perchctl.geometry import Array, rpy_from_rotation
 from perchctl.sim.bursts import Bursts, radio_bursts
 from perchctl.sim.capture import SIMULATED_SYSTEM, CaptureServer
 from perchctl.sim.crtp.codec import Packet
@@ -25,8 +24,8 @@ from perchctl.sim.crtp.server import CrtpServer, LinkOptions
 from perchctl.sim.optics import Picture
 from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.vehicle import SimulatedVehicle
-from perchctl.sim.world import TrueState
+from perchctl.sim.vehicle import PastPoses, SimulatedVehicle
+from perchctl.sim.world import World
 
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
 _PAST_S = 1.0  # how far the picture may lag behind the physics
@@ -95,7 +94,7 @@ class VehicleHost:
         self.endpoint.serve(self.server, self.elapsed_s)
         if self._feed is not None:
             self.vehicle.step_blindly()
-            self._feed.add(self.vehicle.world.state())
+            self._feed.add(self.vehicle.world)
         else:
             self.vehicle.step()
             self._publish_arrived()
@@ -187,7 +186,7 @@ class _PictureFeed:
         assert vehicle.camera is not None
         self._camera = vehicle.camera
         self._stream = stream
-        self._past: deque[TrueState] = deque(maxlen=round(_PAST_S / CONTROL_PERIOD_S))
+        self._past = PastPoses(_PAST_S)
         self._changed = threading.Condition()
         self._closed = False
         self._waiting = 0
@@ -198,9 +197,9 @@ class _PictureFeed:
     def late_s(self) -> float:
         return self._waiting * CONTROL_PERIOD_S
 
-    def add(self, state: TrueState) -> None:
+    def add(self, world: World) -> None:
         with self._changed:
-            self._past.append(state)
+            self._past.add(world)
             self._waiting += 1
             if self._waiting >= _WAKE_EVERY:
                 self._changed.notify()
@@ -224,14 +223,11 @@ class _PictureFeed:
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._waiting >= _WAKE_EVERY)
             self._waiting = 0
-            return None if self._closed else self._past[-1].t_s
+            return None if self._closed else self._past.newest_s
 
     def _pose_at(self, t_s: float) -> Array:
-        """T_world_body nearest to `t_s` of those still kept."""
         with self._changed:
-            back = round((self._past[-1].t_s - t_s) / CONTROL_PERIOD_S)
-            state = self._past[max(-len(self._past), -1 - max(0, back))]
-        return make_T(state.R_world_body, state.position_m)
+            return self._past(t_s)
 
 
 # --- The link's carrier: one CRTP packet a UDP datagram, as cflib's `udp://` driver sends them ---
