@@ -3,6 +3,7 @@ process of its own."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import socket
@@ -45,25 +46,25 @@ class VehicleHost:
         self._steps = 0
         self.vehicle = self._new_vehicle(setup.scenario)
         self.server = CrtpServer(self.vehicle.firmware, setup.link)
-        self.endpoint = UdpEndpoint(setup.port, setup.link, radio_bursts(setup.scenario))
-        self.stream: MjpegServer | None = None
-        self.positions: CaptureServer | None = None
-        self._truth: TextIO | None = None
-        self._heard: TextIO | None = None
-        self._feed: _PictureFeed | None = None
-        try:
+        with contextlib.ExitStack() as opened:
+            use = opened.enter_context
+            bursts = radio_bursts(setup.scenario)
+            self.endpoint = use(contextlib.closing(UdpEndpoint(setup.port, setup.link, bursts)))
+            self.stream: MjpegServer | None = None
             if setup.camera is not None:
-                self.stream = MjpegServer(setup.http_port)
+                self.stream = use(contextlib.closing(MjpegServer(setup.http_port)))
+            self.positions: CaptureServer | None = None
             if setup.capture is not None:
-                self.positions = CaptureServer(setup.capture.names, setup.capture_port)
+                server = CaptureServer(setup.capture.names, setup.capture_port)
+                self.positions = use(contextlib.closing(server))
+            self._truth: TextIO | None = None
             if setup.truth_file is not None:
-                self._truth = setup.truth_file.open("w", encoding="utf-8")
+                self._truth = use(setup.truth_file.open("w", encoding="utf-8"))
+            self._heard: TextIO | None = None
             if setup.heard_file is not None:
-                self._heard = setup.heard_file.open("w", encoding="utf-8")
+                self._heard = use(setup.heard_file.open("w", encoding="utf-8"))
                 self.endpoint.heard = self._write_heard
-        except BaseException:
-            self.close()
-            raise
+            self._opened = opened.pop_all()
         self._feed = self._new_feed()
 
     @property
@@ -136,15 +137,9 @@ class VehicleHost:
         self._feed = self._new_feed()
 
     def close(self) -> None:
+        """Free the ports and close the files."""
         self._close_feed()
-        self.endpoint.close()
-        if self.stream is not None:
-            self.stream.close()
-        if self.positions is not None:
-            self.positions.close()
-        for file in (self._truth, self._heard):
-            if file is not None:
-                file.close()
+        self._opened.close()
 
     def _write_heard(self, t_s: float, address: Address, datagram: bytes) -> None:
         assert self._heard is not None
