@@ -60,7 +60,7 @@ class SimCamera:
 
     @property
     def exposed_s(self) -> float:
-        """From the first light on a frame to the last."""
+        """Time from the first light on a frame to the last, s."""
         return 2.0 * self._half_s
 
     @property
@@ -144,7 +144,7 @@ READOUT_MOMENTS = 5
 """Between them the camera's motion counts as straight: 5 ms for a read-out of 20 ms."""
 FLICKER_HZ = 100.0  # of lamps on a 50 Hz mains
 PUMPING_HZ = (0.4, 2.0)
-"""From and to which the automatic exposure may hunt."""
+"""Range of rates at which the automatic exposure may hunt."""
 
 
 class Shutter:
@@ -248,7 +248,7 @@ class Receiver:
         self._given = 0
 
     def develop(self) -> None:
-        """As `SimCamera.develop`."""
+        """Make the picture that is held: what it shows is about to change."""
         if self._newest is not None:
             self._newest.picture()
 

@@ -114,7 +114,7 @@ class CaptureSettings:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all rigid bodies, the vehicle's first."""
+        """The names of all rigid bodies, the vehicle's first."""
         return (self.body, *(other.name for other in self.others))
 
 
@@ -153,7 +153,7 @@ class SimCapture:
         self._under_way: deque[CaptureFrame] = deque()
 
     def lay(self, fault: CaptureFault, for_s: float = math.inf) -> None:
-        """From now on, for so long."""
+        """Begin a fault now, for so long."""
         self._faults.append((self._t_s, self._t_s + for_s, fault))
 
     def heal(self) -> None:
@@ -191,7 +191,7 @@ class SimCapture:
     def _bodies(
         self, world: World, noise: Array, faults: list[CaptureFault]
     ) -> dict[str, BodyPose]:
-        """By the name under which the capture has them."""
+        """All bodies by the name under which the capture has them."""
         if self._before and any(fault.frozen for fault in faults):
             return self._before
         settings = self.settings
@@ -263,7 +263,7 @@ def message(kind: int, body: bytes) -> bytes:
 
 
 def kind_of(request: bytes) -> int | None:
-    """None for what is too short to be one."""
+    """The kind of a message; None for what is too short to be one."""
     return int.from_bytes(request[:2], "little") if len(request) >= 4 else None
 
 
@@ -308,7 +308,7 @@ def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> byte
 
 
 SIMULATED_SYSTEM = "optitrack"
-"""As `motioncapture` calls it."""
+"""The system's name, as `motioncapture` calls it."""
 _HOST = "127.0.0.1"
 _POLL_S = 0.2
 _GONE_S = 3.0

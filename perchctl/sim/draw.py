@@ -110,7 +110,8 @@ def _neighbours(sim: SimulationConfig) -> tuple[Neighbour, ...]:
 
 
 def _imu_errors(sim: SimulationConfig, seed: int) -> dict[str, Any]:
-    """None along z, where the firmware's scale takes it out."""
+    """Biases of gyroscope and accelerometer; the latter has none along z, where the firmware's
+    scale would take it out."""
     rng = np.random.default_rng([seed, _IMU_STREAM])
     p, q, r = (math.radians(sim.gyro_bias_dps) * rng.uniform(-1.0, 1.0, size=3)).tolist()
     x, y = (GRAVITY_MPS2 * sim.acc_bias_g * rng.uniform(-1.0, 1.0, size=2)).tolist()

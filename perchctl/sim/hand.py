@@ -120,7 +120,7 @@ class Hand:
 def draw_hand(
     profile: Profile, part: MountingPart, seed: int, seconds: float | None = None
 ) -> Hand:
-    """Of one seed both parts have the same vehicle."""
+    """The hand of that seed; both parts of one seed have the same vehicle."""
     rng = np.random.default_rng([seed, HAND_STREAM])
     yaw, *tilt = np.radians(rng.uniform(-1.0, 1.0, 3) * (180.0, MOUNT_TILT_DEG, MOUNT_TILT_DEG))
     way, far = rng.uniform(-math.pi, math.pi), MOVED_M * math.sqrt(rng.uniform())
@@ -273,8 +273,8 @@ def attitudes(
     if errors:
         noise = rng.normal(size=rate.shape) * math.radians(GYRO_NOISE_DPS)
         step = math.radians(GYRO_STEP_DPS)
-        felt = rate / (1.0 + hand.gyro_scale) + hand.gyro_bias_radps + noise
-        rate = np.round(felt / step) * step
+        measured = rate / (1.0 + hand.gyro_scale) + hand.gyro_bias_radps + noise
+        rate = np.round(measured / step) * step
         slow = math.radians(ATTITUDE_NOISE_DEG) * _slow_noise(rng, len(t_s), ATTITUDE_MEMORY_S)
         rpy = rpy + hand.attitude_bias_rad + slow
         place = place + hand.scenario.estimate_noise_m * _slow_noise(rng, len(t_s), 0.3)
@@ -295,7 +295,7 @@ def attitudes(
 
 
 def _slow_noise(rng: np.random.Generator, n: int, memory_s: float) -> Array:
-    """Of unit spread, (n, 3), that forgets itself in `memory_s`."""
+    """Noise (n, 3) of unit spread that forgets itself in `memory_s`."""
     keep = math.exp(-TELEMETRY_S / memory_s)
     kicks = rng.normal(size=(n, 3)) * math.sqrt(1.0 - keep * keep)
     out = np.empty((n, 3))
@@ -331,7 +331,8 @@ def record_hand(
     positioned: bool = False,
     told: Callable[[], None] = lambda: None,
 ) -> MountingRecording:
-    """The whole part, through renderer and pipeline; `told` is called with each picture."""
+    """Record the whole part, through renderer and pipeline; `told` is called for each
+    picture."""
     pipeline = make_pipeline(camera_only_profile(profile), camera)
     state = PipelineState()
     poses, mirrored = [], 0
@@ -344,5 +345,5 @@ def record_hand(
         if (pose := best_pose(output, frame.t_arrival_s)) is not None:
             poses.append(pose)
         told()
-    felt, by = attitudes(hand, positioned), pose_basis(profile, camera)
-    return MountingRecording(hand.part, felt, tuple(poses), mirrored, by)
+    samples, by = attitudes(hand, positioned), pose_basis(profile, camera)
+    return MountingRecording(hand.part, samples, tuple(poses), mirrored, by)

@@ -123,7 +123,7 @@ def _met(q: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]
 
 
 def _all_rise(grid: RayGrid, to_plane: Array) -> bool:
-    """Whether every ray meets the plane. The rise is linear over the rays, so it is least
+    """True if every ray meets the plane. The rise is linear over the rays, so it is least
     on the outline."""
     rise = to_plane[2].astype(np.float32)
     return bool(grid.outline.dot(rise[:2]).min() + rise[2] >= LEAST_RISE)
@@ -161,7 +161,7 @@ class TileRays:
 
 
 def tile_rays(fine: RayGrid) -> TileRays:
-    """Of a whole picture's rays; between the nodes they are interpolated (1e-4 px)."""
+    """All rays of a picture; between the nodes they are interpolated (1e-4 px)."""
     xy = cv2.resize(fine.xy, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
     rows, cols = (n // COARSE_PX for n in xy.shape[:2])
     blocks = xy.reshape(rows, COARSE_PX, cols, COARSE_PX, 2).transpose(0, 2, 1, 3, 4)

@@ -55,7 +55,7 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""By so much the bank of noise is larger than a picture. Each frame has another part of it, 4225
+"""The bank of noise is larger than a picture by this. Each frame has another part of it, 4225
 of them until the first comes again; and so small a bank stays near to the processor."""
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
@@ -386,8 +386,8 @@ def blended(frame: Picture) -> Picture:
 
 STILL_PX = 0.005
 STEP = 2.0**-17
-"""Of the directions, and of the place in parts of its distance, to the next power of two: half
-a step moves no place of a picture of 400 px focal length by 0.01 px, most by 0.002 px."""
+"""Steps of the directions, and of the place in parts of its distance, to the next power of two:
+half a step moves no place of a picture of 400 px focal length by 0.01 px, most by 0.002 px."""
 
 
 def rounded(T_target_cam: Array) -> Array:

@@ -36,7 +36,7 @@ place by up to 0.03 px."""
 SAMPLING_SIGMA_PX = 1.0 / (PIXEL_WINDOW_TEXELS * math.sqrt(6.0))
 """Blur that bilinear sampling between texels adds to the pixel's own window."""
 FARTHEST_EDGE_TEXELS = 128
-"""Edges farther away than that are not told apart."""
+"""All edges farther away than that count as that far."""
 
 TILE_M = 2.0
 """The ceiling's texture repeats after this length."""
@@ -191,7 +191,7 @@ class Reach:
         return np.asarray(self.off_m - np.minimum(self.reach_m, 1.0) < side_m / 2.0)
 
     def within(self, box: Box) -> Reach:
-        """Of these tiles alone."""
+        """The part of these tiles alone."""
         return Reach(self.centres_m[box], self.off_m[box], self.reach_m[box])
 
 
@@ -327,7 +327,7 @@ class View:
     tiles: Tiles
 
     def hides(self, tiles: int) -> bool:
-        """Whether nothing else is seen in a picture of so many."""
+        """True if nothing else is seen in a picture of so many tiles."""
         return self.tiles.inner.size == tiles and bool(self.tiles.inner.all())
 
 
@@ -431,6 +431,6 @@ def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _full(nodes: Any) -> Any:
-    """Of values at the coarse nodes of a window, those at each pixel between its outermost."""
+    """Values at each pixel of a window, from those at its coarse nodes."""
     values = cv2.resize(nodes, None, fx=COARSE_PX, fy=COARSE_PX)
     return np.ascontiguousarray(values[COARSE_PX:-COARSE_PX, COARSE_PX:-COARSE_PX])

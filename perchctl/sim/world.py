@@ -61,7 +61,7 @@ _BIT = mujoco.mjtDisableBit
 _UNUSED_IN_THE_OPEN = int(
     _BIT.mjDSBL_CONTACT | _BIT.mjDSBL_CONSTRAINT | _BIT.mjDSBL_ACTUATION | _BIT.mjDSBL_EULERDAMP
 )
-"""Of a step's parts: what a body that touches nothing does not need."""
+"""Parts of a step that a body which touches nothing does not need."""
 _SIX = struct.Struct("6d")
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
@@ -303,7 +303,7 @@ class World:
         self.fz_mps2 = r02 * ax + r12 * ay + r22 * az
 
     def on_floor(self) -> bool:
-        """Whether the floor is touched."""
+        """True if the vehicle touches the floor."""
         if not self._data.ncon:
             return False
         return any(self._floor in pair for pair in self._data.contact.geom.tolist())

@@ -143,6 +143,7 @@ def test_parameter_answers_on_the_wire(client: Client) -> None:
     ident = struct.pack("<H", element.ident)
     assert client.ask(2, 1, ident) == ident + b"\x00\x02"
     assert client.ask(2, 1, b"\xff\xff") == b"\xff\xff\x02"
+    assert client.ask(2, 0, b"\x02\xff\xff") == b"\x02"
     assert client.ask(2, 3, b"\x07\xff\xff") == b"\x07\xff\xff\x02"
     toc = client.cf.param.toc
     assert toc.get_element_by_complete_name("posCtlPid.zKp").is_persistent()

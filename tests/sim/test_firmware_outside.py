@@ -230,7 +230,7 @@ def wrong_pitch_deg(rig: Rig) -> float:
 def readings(imu: Imu) -> list[tuple[float, ...]]:
     found = []
     for _ in SEVERAL:
-        due = [imu.feel((0.0, 0.0, G), (0.0, 0.0, 0.0)) for _ in range(IMU_EVERY)]
+        due = [imu.add((0.0, 0.0, G), (0.0, 0.0, 0.0)) for _ in range(IMU_EVERY)]
         assert due == [False] * (IMU_EVERY - 1) + [True]
         found.append(tuple(imu.read(pressed=False)))
     return found

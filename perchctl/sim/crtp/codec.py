@@ -75,7 +75,7 @@ class Number:
         return struct.calcsize("<" + self.letter)
 
     def pack(self, value: float) -> bytes:
-        """As C stores it: integers truncated and wrapped, floats rounded."""
+        """The bytes as C stores the value: integers truncated and wrapped, floats rounded."""
         if self.letter in "efd":
             return _pack_float(self.letter, value)
         bits = 8 * self.size

@@ -144,7 +144,8 @@ class CommandService:
 
 
 def _high_level(data: bytes) -> HighLevelCommand | None:
-    """None for a command this vehicle does not have (trajectories, spirals)."""
+    """The command of a packet on port 8; None for one that this vehicle does not have
+    (trajectories, spirals)."""
     command = data[0]
     if command == HL_STOP:
         return HlStop()

@@ -103,7 +103,7 @@ class Estimator:
             self.outside.position(position_m)
 
     def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
-        """The same with an attitude: w, x, y, z, body to world."""
+        """A measurement with an attitude: w, x, y, z, body to world."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.pose(position_m, quaternion)
@@ -114,14 +114,14 @@ class Estimator:
             setattr(self.outside, SETTINGS[name], value)
 
     def shift_accelerometer(self, z_mps2: float) -> None:
-        """From now on it reads so much more along z; only without a deck that is simulated by its
-        errors."""
+        """The accelerometer reads so much more along z from now on; only without a deck, which is
+        simulated by its errors."""
         if self._imu is not None:
             x, y, z = self._imu.acc_bias_mps2
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
-        """Of a state as `Covariance` counts them. A deck's is the position's
+        """The variance of a state as `Covariance` counts them. A deck's is the position's
         for all of them: it falls after a reset. Flow says nothing of the height, which a laser
         measures."""
         if self.outside is not None:
@@ -242,7 +242,7 @@ class Estimator:
         self, outside: OutsideFilter, imu: Imu, world: World, *, flying: bool, pressed: bool
     ) -> None:
         self._reset_if_due(outside)
-        if imu.feel(
+        if imu.add(
             (world.fx_mps2, world.fy_mps2, world.fz_mps2),
             (world.p_radps, world.q_radps, world.r_radps),
         ):
@@ -303,7 +303,7 @@ _START_VV, _START_AA = 1e-4, (GRAVITY_MPS2 * 0.01) ** 2
 
 
 def has_flow_errors(scenario: Scenario) -> bool:
-    """Whether the scenario's deck is any worse than the plain noise and drift."""
+    """True if the scenario's deck is any worse than the plain noise and drift."""
     return bool(
         scenario.flow_noise_radps
         or any(scenario.flow_bias_radps)
@@ -328,7 +328,7 @@ class FlowDeck:
         """The estimate is the truth again, but for the attitude."""
         self.position_error_m = (0.0, 0.0, 0.0)
         self.velocity_error_mps = (0.0, 0.0)
-        self._felt_mps2 = self._bias_mps2
+        self._tilt_mps2 = self._bias_mps2
         self._pv = self._pa = self._va = 0.0
         self._vv, self._aa = _START_VV, _START_AA
         self._range_noise = 0.0
@@ -336,11 +336,11 @@ class FlowDeck:
 
     @property
     def variance(self) -> float:
-        """Of the speed in x or y, (m/s)^2: that is what `kalman.varPX` holds (source)."""
+        """Variance of the speed in x or y, (m/s)^2: that is what `kalman.varPX` holds (source)."""
         return self._vv
 
     def sees(self, world: World) -> bool:
-        """Whether there is anything in view whose motion can be measured."""
+        """True if there is anything in view whose motion can be measured."""
         scenario = self._scenario
         if scenario.flow_reach_m is not None and world.z_m > scenario.flow_reach_m:
             return False
@@ -365,7 +365,7 @@ class FlowDeck:
 
     def _predict(self) -> None:
         (px, py, pz), (ex, ey) = self.position_error_m, self.velocity_error_mps
-        ax, ay = self._felt_mps2
+        ax, ay = self._tilt_mps2
         ex, ey = ex + ax * _DT_S, ey + ay * _DT_S
         self.position_error_m = (px + ex * _DT_S, py + ey * _DT_S, pz)
         self.velocity_error_mps = (ex, ey)
@@ -380,14 +380,14 @@ class FlowDeck:
         spread = self._vv + (height_m * _SIGMA_RADPS) ** 2
         kp, kv, ka = self._pv / spread, self._vv / spread, self._va / spread
         (px, py, pz), (ex, ey), (ax, ay) = (
-            self.position_error_m, self.velocity_error_mps, self._felt_mps2,
+            self.position_error_m, self.velocity_error_mps, self._tilt_mps2,
         )  # fmt: skip
         bx, by = self._scenario.flow_bias_radps
         ix = height_m * (bx + sigma * white_x) - ex
         iy = height_m * (by + sigma * white_y) - ey
         self.position_error_m = (px + kp * ix, py + kp * iy, pz)
         self.velocity_error_mps = (ex + kv * ix, ey + kv * iy)
-        self._felt_mps2 = (ax + ka * ix, ay + ka * iy)
+        self._tilt_mps2 = (ax + ka * ix, ay + ka * iy)
         self._aa -= ka * self._va
         self._pa -= ka * self._pv
         self._pv -= kv * self._pv

@@ -232,8 +232,10 @@ class Firmware:
         return 0.0
 
     def log_values(self, names: Iterable[str]) -> dict[str, float]:
-        """Those of a whole block. Errors as for one."""
-        return {name: self.log_value(name) for name in names}
+        """The values of a whole block, by name. Errors as for one."""
+        if self.log_overrides:
+            return {name: self.log_value(name) for name in names}
+        return {name: LIVE[name](self) if name in LIVE else self.log_value(name) for name in names}
 
     def get_parameter(self, name: str) -> float:
         """Raises KeyError for an unknown name."""

@@ -44,8 +44,8 @@ _GYRO_LEFT_RADPS = 5e-4
 """Bias about level axes that a real one has at its best: blind for 12 s of flight, a vehicle
 touched down 0.9 m aside (docs/firmware.md, "Target covered")."""
 _PRESSED_MPS2 = 0.03
-"""Of the accelerometer along z while the vehicle is pressed against a ceiling: blind, the height
-runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling")."""
+"""Error of the accelerometer along z while the vehicle is pressed against a ceiling: blind, the
+height runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling")."""
 
 
 class Reading(NamedTuple):
@@ -60,7 +60,7 @@ class Reading(NamedTuple):
 
 
 class Imu:
-    """`feel` takes a control period's truth; after `IMU_EVERY` of them `read` gives their mean.
+    """`add` takes a control period's truth; after `IMU_EVERY` of them `read` gives their mean.
 
     `gyro_bias_radps`, `acc_bias_mps2`: what is read too much, body axes; `acc_scale`: by how much
     the firmware divides.
@@ -79,10 +79,10 @@ class Imu:
         self._pressed_mps2 = _PRESSED_MPS2 if self._rng.uniform() < 0.5 else -_PRESSED_MPS2
         self._clear()
 
-    def feel(
+    def add(
         self, force_mps2: tuple[float, float, float], rates_radps: tuple[float, float, float]
     ) -> bool:
-        """The true specific force and rates, body axes. Whether a mean is due."""
+        """Take the true specific force and rates, body axes; True if a mean is due."""
         x, y, z = force_mps2
         p, q, r = rates_radps
         self._x += x
@@ -95,7 +95,7 @@ class Imu:
         return self._count == IMU_EVERY
 
     def read(self, *, pressed: bool) -> Reading:
-        """Their mean, with the errors."""
+        """The mean of what was added since the last reading, with the errors."""
         white = self._white
         if len(white) < 6:
             white = self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
@@ -149,17 +149,17 @@ class Covariance:
         self.forget()
 
     def forget(self) -> None:
-        """As after `kalman.resetEstimation`."""
+        """Begin anew, as after `kalman.resetEstimation`."""
         m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
         first = [m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3
         self.rows = [[first[i] if i == j else 0.0 for j in _STATES] for i in _STATES]
 
-    def grow(self, period_s: float, felt_mps2: tuple[float, float, float]) -> None:
-        """After a prediction. `felt_mps2`: specific force in world axes; an attitude that is wrong
+    def grow(self, period_s: float, force_mps2: tuple[float, float, float]) -> None:
+        """After a prediction. `force_mps2`: specific force in world axes; an attitude that is wrong
         sends it elsewhere."""
         x, y, z, u, v, w, a, b, c = self.rows
         t = period_s
-        sx, sy, sz = felt_mps2
+        sx, sy, sz = force_mps2
         sx, sy, sz = t * sx, t * sy, t * sz
         rows = self.rows = [
             [p + t * q for p, q in zip(x, u, strict=True)],
@@ -202,7 +202,7 @@ def _bounded(variance: float) -> float:
 
 _LEAST_SIGMA = 1e-4
 _REVERSION = 1e-3
-"""Of the attitude towards the initial one, each time while not in flight (source:
+"""Share of the way to the initial attitude, each time while not in flight (source:
 `attitudeReversion`)."""
 
 SETTINGS = {
@@ -229,7 +229,7 @@ class OutsideFilter:
         self.reset()
 
     def variance(self, state: int) -> float:
-        """Of a state: `Covariance` says which it is, and its units."""
+        """The variance of a state; `Covariance` says which it is, and its units."""
         return self._covariance.rows[state][state]
 
     def reset(self) -> None:
@@ -241,10 +241,10 @@ class OutsideFilter:
         self._initial: Quaternion = (math.cos(half), 0.0, 0.0, math.sin(half))
         self.quaternion = self._initial
 
-    def predict(self, felt: Reading, *, flying: bool) -> None:
+    def predict(self, reading: Reading, *, flying: bool) -> None:
         """`IMU_PERIOD_S` later. An estimate out of its bounds is reset."""
         t, half_s2 = IMU_PERIOD_S, 0.5 * IMU_PERIOD_S * IMU_PERIOD_S
-        force = fx, fy, fz = self._force(felt, flying=flying)
+        force = fx, fy, fz = self._force(reading, flying=flying)
         fz -= GRAVITY_MPS2
         x, y, z = self.position_m
         vx, vy, vz = self.velocity_mps
@@ -253,7 +253,7 @@ class OutsideFilter:
         )  # fmt: skip
         self.velocity_mps = (vx + t * fx, vy + t * fy, vz + t * fz)
         half = 0.5 * t
-        turn = (1.0, half * felt.p_radps, half * felt.q_radps, half * felt.r_radps)
+        turn = (1.0, half * reading.p_radps, half * reading.q_radps, half * reading.r_radps)
         w, x, y, z = normalized(multiplied(self.quaternion, turn))
         if not flying:
             keep, (a, _, _, d) = 1.0 - _REVERSION, self._initial
@@ -272,7 +272,7 @@ class OutsideFilter:
             self._correct(POSITION, self._innovation(measured_m), self.position_sigma_m)
 
     def pose(self, measured_m: Vector, measured: Quaternion) -> None:
-        """The same with an attitude, body to world."""
+        """A pose from outside: a position and an attitude, body to world."""
         self.position(measured_m)
         norm = math.sqrt(sum(v * v for v in measured))
         if not math.isfinite(norm) or norm < 0.5:
@@ -306,14 +306,14 @@ class OutsideFilter:
         turn = (1.0, 0.5 * a, 0.5 * b, 0.5 * c)
         self.quaternion = normalized(multiplied(turn, self.quaternion))
 
-    def _force(self, felt: Reading, *, flying: bool) -> Vector:
+    def _force(self, reading: Reading, *, flying: bool) -> Vector:
         """What is believed of the specific force, in world axes."""
         w, x, y, z = self.quaternion
-        az = felt.az_mps2
+        az = reading.az_mps2
         ux, uy, uz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
         if flying:
             return az * ux, az * uy, az * uz
-        ax, ay = felt.ax_mps2, felt.ay_mps2
+        ax, ay = reading.ax_mps2, reading.ay_mps2
         return (
             (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y - w * z) * ay + az * ux,
             2 * (x * y + w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + az * uy,

@@ -240,7 +240,7 @@ class UdpEndpoint:
     """The socket of a simulated vehicle, bound to loopback.
 
     Answers go to the requesting address. What the vehicle sends by itself goes to the
-    peer: the last address that sent anything but a scan's probe. `heard` is told of each
+    peer: the last address that sent anything but a scan's probe. `heard` is called with each
     datagram that is a packet, before anything is made of it: time, sender, bytes.
     """
 
