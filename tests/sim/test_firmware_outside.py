@@ -191,17 +191,6 @@ def test_what_is_no_number_does_no_harm(number: float) -> None:
     assert error_m(rig) < 0.01
 
 
-def test_the_same_flight_has_the_same_estimate() -> None:
-    def estimate(seed: int) -> float:
-        rig = outside_rig(seed=seed)
-        fed(rig, 0.3)
-        rig.run(1.0)
-        return rig.firmware.log_value("stateEstimate.x")
-
-    assert estimate(3) == estimate(3)
-    assert estimate(3) != estimate(4)
-
-
 # What the IMU's errors do, flying and standing -----------------------------------------
 
 
