@@ -3,10 +3,8 @@ from .bursts import radio_bursts as radio_bursts
 from .camera import DeliveredFrame as DeliveredFrame
 from .camera import SimCamera as SimCamera
 from .capture import MILLIMETRES_PER_M as MILLIMETRES_PER_M
-from .capture import SIMULATED_SYSTEM as SIMULATED_SYSTEM
 from .capture import CaptureFault as CaptureFault
 from .capture import CaptureSettings as CaptureSettings
-from .capture import LockstepCapture as LockstepCapture
 from .crtp.codec import Packet as Packet
 from .crtp.codec import Port as Port
 from .crtp.commands import CommandService as CommandService

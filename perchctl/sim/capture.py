@@ -21,6 +21,7 @@ from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.geometry import (
     Array,
     quaternion_from_rotation,
+    rot_z,
     rotation_from_quaternion,
     rotation_from_rpy,
 )
@@ -89,6 +90,7 @@ class CaptureSettings:
         delay_s, jitter_s: from an exposure to the frame's arrival; one sigma of it.
         position_noise_m, attitude_noise_rad: one sigma, each axis.
         axes: the capture's axes in the world's.
+        heading_rad, origin_m: of the simulator's world in the capture's.
         faults: (from s, to s, what), on the simulation's clock.
     """
 
@@ -102,6 +104,8 @@ class CaptureSettings:
     position_noise_m: float = 0.001
     attitude_noise_rad: float = 0.005
     axes: str = TRUE_AXES
+    heading_rad: float = 0.0
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     faults: tuple[tuple[float, float, CaptureFault], ...] = ()
     seed: int = 0
 
@@ -139,12 +143,17 @@ class SimCapture:
     outside its time. Frames never overtake each other.
     """
 
+    SYSTEM = "optitrack"
+    """The system's name, as `motioncapture` calls it."""
+
     def __init__(self, settings: CaptureSettings) -> None:
         self.settings = settings
         self._rng = np.random.default_rng([settings.seed, _STREAM])
         self._faults = list(settings.faults)
         self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
         self._p_body_rigid = np.asarray(settings.body_position_m)
+        self._R_capture_world = rot_z(settings.heading_rad)
+        self._origin_m = np.asarray(settings.origin_m)
         self._due_s = float(self._rng.random()) / settings.rate_hz
         self._t_s = 0.0
         self._arrival_s = -math.inf
@@ -188,6 +197,19 @@ class SimCapture:
             arrived.append(self._under_way.popleft())
         return arrived
 
+    def poll(self, now_s: float) -> CaptureFrame | None:
+        """The newest frame that has arrived since the last call: a flight in lockstep has this
+        capture as its `CaptureSource`."""
+        arrived = self.take()
+        return arrived[-1] if arrived else None
+
+    def problem(self, now_s: float) -> str | None:
+        """None: nothing is ever wrong with the connection."""
+        return None
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to close."""
+
     def _bodies(
         self, world: World, noise: Array, faults: list[CaptureFault]
     ) -> dict[str, BodyPose]:
@@ -210,9 +232,10 @@ class SimCapture:
 
     def _pose(self, place: Array, R: Array, noise: Array, faults: list[CaptureFault]) -> BodyPose:
         settings = self.settings
+        place = self._R_capture_world @ place + self._origin_m
         place = place + settings.position_noise_m * noise[:3]
         a, b, c = (float(v) for v in settings.attitude_noise_rad * noise[3:])
-        R = R @ rotation_from_rpy(a, b, c)
+        R = self._R_capture_world @ R @ rotation_from_rpy(a, b, c)
         axes, scale = settings.axes, 1.0
         for fault in faults:
             axes, scale = fault.axes or axes, scale * fault.scale
@@ -222,23 +245,6 @@ class SimCapture:
         if any(fault.mirrored for fault in faults):
             y = -y
         return BodyPose((x, y, z), quaternion_from_rotation(turn @ R @ turn.T))
-
-
-class LockstepCapture:
-    """The `CaptureSource` of a flight in lockstep: the newest frame wins."""
-
-    def __init__(self, capture: SimCapture) -> None:
-        self._capture = capture
-
-    def poll(self, now_s: float) -> CaptureFrame | None:
-        arrived = self._capture.take()
-        return arrived[-1] if arrived else None
-
-    def problem(self, now_s: float) -> str | None:
-        return None
-
-    def close(self) -> None:
-        return None
 
 
 # --- NatNet 3.1, in which OptiTrack's server speaks: what a client asks, and the answers --------
@@ -307,8 +313,6 @@ def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> byte
 # client on the same computer cannot connect.
 
 
-SIMULATED_SYSTEM = "optitrack"
-"""The system's name, as `motioncapture` calls it."""
 _HOST = "127.0.0.1"
 _POLL_S = 0.2
 _GONE_S = 3.0

@@ -24,6 +24,7 @@ from cflib.crazyflie.log import LogConfig
 from cflib.crtp.crtpstack import CRTPPacket
 
 import perchctl
+from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim import Scenario, SimProcess
 
 ROOT = str(Path(perchctl.__file__).resolve().parents[1])
@@ -42,6 +43,7 @@ BLOCKS = (
 READY, HL_RUNNING, HL_DONE, LOW_LEVEL, LOCKED = 0x020E, 0x011E, 0x031E, 0x021E, 0x0244
 FLYING_BIT, TUMBLED_BIT, LOCKED_BIT, CRASHED_BIT, HL_BIT = 1 << 4, 1 << 5, 1 << 6, 1 << 7, 1 << 8
 CAN_FLY_BIT, ARMED_BIT = 1 << 3, 1 << 1
+WEIGHT_N = 0.042 * GRAVITY_MPS2
 
 
 class Client:
@@ -231,6 +233,38 @@ class Pilot(Client):
         with self._news:
             arrived = self._news.wait_for(lambda: min(self._stamps) >= due_s, WAIT_S)
         assert arrived, f"no log data up to {due_s} s, only {self._stamps}"
+
+
+def height(pilot: Pilot) -> float:
+    """Where it truly is, m."""
+    return float(pilot.sim.truth()["position_m"][2])
+
+
+def heights(pilot: Pilot, since_s: float) -> list[tuple[float, float]]:
+    """(seconds since, estimated height), every 10 ms."""
+    return [(t - since_s, z) for t, z in pilot.log("stateEstimate.z", since_s)]
+
+
+def height_at(curve: list[tuple[float, float]], t_s: float) -> float:
+    return min(curve, key=lambda sample: abs(sample[0] - t_s))[1]
+
+
+def off(truth: dict[str, Any]) -> bool:
+    """The motors are; for `Pilot.until`."""
+    return bool(max(truth["motors"]) == 0)
+
+
+def locked(truth: dict[str, Any]) -> bool:
+    """The supervisor is; for `Pilot.until`."""
+    return bool(truth["supervisor_info"] & LOCKED_BIT)
+
+
+def raw(pilot: Pilot, thrust: int) -> None:
+    pilot.cf.commander.send_setpoint(0, 0, 0, thrust)
+
+
+def notify(pilot: Pilot) -> None:
+    pilot.cf.commander.send_notify_setpoint_stop()
 
 
 def read(pilot: Pilot, name: str) -> float:

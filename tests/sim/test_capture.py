@@ -15,7 +15,7 @@ from perchctl.errors import InvalidValue
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.positioning import CaptureFrame, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, LockstepCapture
+from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings
 from perchctl.sim.capture import SWAPPED_XY, TRUE_AXES, Y_UP, SimCapture
 
 STEP_S = 0.002
@@ -104,6 +104,8 @@ def test_axes_scale_and_world() -> None:
     assert seen(CaptureFault(axes=Y_UP)) == pytest.approx((x, z, -y))
     assert seen(settings=replace(EXACT, axes=SWAPPED_XY)) == pytest.approx((y, -x, z))
     assert seen(CaptureFault(scale=MILLIMETRES_PER_M)) == pytest.approx((300.0, -200.0, 500.0))
+    turned = replace(EXACT, heading_rad=math.pi / 2, origin_m=(1.0, 0.0, 0.0))
+    assert seen(settings=turned) == pytest.approx((1.0 - y, x, z))
     level = last(EXACT, CaptureFault(axes=Y_UP)).bodies["crazyflie"]
     assert level.quaternion == pytest.approx((1.0, 0.0, 0.0, 0.0))
 
@@ -152,16 +154,15 @@ def test_frozen_to_the_last_digit_swapped_gone_late_and_slow() -> None:
 
 def test_lockstep_hands_on_the_newest_once() -> None:
     capture, room = SimCapture(EXACT), Room()
-    source = LockstepCapture(capture)
     for _ in range(100):
         room.t_s += STEP_S
         capture.advance(room)
-    frame = source.poll(room.t_s)
+    frame = capture.poll(room.t_s)
     assert frame is not None
     assert room.t_s - frame.t_s < 1 / 120
-    assert source.poll(room.t_s) is None
-    assert source.problem(room.t_s) is None
-    source.close()
+    assert capture.poll(room.t_s) is None
+    assert capture.problem(room.t_s) is None
+    capture.close()
 
 
 @pytest.mark.parametrize("axes", ["xyz", "+x+y-z", "+x+x+y", "+x+y", ""])

@@ -12,9 +12,14 @@ from tests.helpers.crtp_rig import (
     LOCKED_BIT,
     READY,
     WAIT_S,
+    WEIGHT_N,
     Pilot,
+    height,
+    height_at,
+    heights,
+    notify,
+    raw,
 )
-from tests.sim.test_crtp_handover import WEIGHT_N, height, height_at, heights, notify, raw
 
 
 def test_release_in_position_mode_stops_at_thrust_min(pilot: Pilot) -> None:

@@ -8,40 +8,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
-from perchctl.geometry import GRAVITY_MPS2
 from tests.helpers.crtp_rig import (
     HL_BIT,
     HL_DONE,
     LOCKED_BIT,
     READY,
+    WEIGHT_N,
     Pilot,
+    height,
+    height_at,
+    heights,
+    notify,
+    off,
 )
 
-WEIGHT_N = 0.042 * GRAVITY_MPS2
 PACKET_S = 0.004  # a silence that swallows what is sent at its start
 LIFTED_M = 0.022  # 1 cm over the floor
 PRESSED_M = 2.5  # a setpoint above the ceiling at 2.2 m
-
-
-def off(truth: dict[str, Any]) -> bool:
-    return bool(max(truth["motors"]) == 0)
-
-
-def height(pilot: Pilot) -> float:
-    return float(pilot.sim.truth()["position_m"][2])
-
-
-def heights(pilot: Pilot, since_s: float) -> list[tuple[float, float]]:
-    """(seconds since, estimated height), every 10 ms."""
-    return [(t - since_s, z) for t, z in pilot.log("stateEstimate.z", since_s)]
-
-
-def height_at(curve: list[tuple[float, float]], t_s: float) -> float:
-    return min(curve, key=lambda sample: abs(sample[0] - t_s))[1]
 
 
 def lose(pilot: Pilot, send: Callable[[], None]) -> None:
@@ -49,14 +35,6 @@ def lose(pilot: Pilot, send: Callable[[], None]) -> None:
     pilot.sim.silence(PACKET_S)
     send()
     pilot.advance(0.01)
-
-
-def raw(pilot: Pilot, thrust: int) -> None:
-    pilot.cf.commander.send_setpoint(0, 0, 0, thrust)
-
-
-def notify(pilot: Pilot) -> None:
-    pilot.cf.commander.send_notify_setpoint_stop()
 
 
 def land(pilot: Pilot, height_m: float, duration_s: float) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from perchctl.errors import ConnectionFailed
 from perchctl.geometry import Array, rpy_from_rotation
 from perchctl.sim.bursts import Bursts, radio_bursts
-from perchctl.sim.capture import SIMULATED_SYSTEM, CaptureServer
+from perchctl.sim.capture import CaptureServer, SimCapture
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.server import CrtpServer, LinkOptions
 from perchctl.sim.optics import Picture
@@ -74,7 +74,7 @@ class VehicleHost:
     @property
     def capture(self) -> tuple[str, str] | None:
         """The motion capture's kind, as `motioncapture` calls it, and its address."""
-        return None if self.positions is None else (SIMULATED_SYSTEM, self.positions.host)
+        return None if self.positions is None else (SimCapture.SYSTEM, self.positions.host)
 
     @property
     def elapsed_s(self) -> float:
