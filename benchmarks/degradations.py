@@ -29,7 +29,7 @@ from common import CAMERA, camera_pose, in_view, marker_pose, renderer, rms, tab
 
 from perchctl.geometry import Array, wrap_rad
 from perchctl.sim import Renderer
-from perchctl.sim.shutter import Shutter
+from perchctl.sim.camera import Shutter
 
 NEAR_M = 0.25
 RANGES_M = (0.05, 1.2)

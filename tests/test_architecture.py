@@ -99,7 +99,7 @@ MOST_NAMES = {
     "profile": 55,
     "replay": 15,
     "report": 15,
-    "sim": 31,
+    "sim": 29,
     "target": 47,
     "track": 15,
     "vision": 50,

@@ -18,11 +18,9 @@ from perchctl.mission import Event, FlightReport, Operator, Phase, Tick, Watcher
 from perchctl.positioning import FeedThread, PositionFeed
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.sim import (
-    SIMULATED_SYSTEM,
     CaptureSettings,
     DeliveredFrame,
     EventExplainer,
-    LockstepCapture,
     Scenario,
     SimCamera,
     SimulatedVehicle,
@@ -294,8 +292,8 @@ def feed_lockstep(link: MockLink, profile: Profile) -> PositionFeed | None:
         return None
     if capture is None or config.by != "mocap":
         return None
-    config = config.model_copy(update={"system": SIMULATED_SYSTEM, "host": "sim"})
-    feed = PositionFeed(LockstepCapture(capture), link.external, config)
+    config = config.model_copy(update={"system": capture.SYSTEM, "host": "sim"})
+    feed = PositionFeed(capture, link.external, config)
     link.each(FeedThread.PERIOD_S, feed.turn)
     end_s = link.now_s + FIRST_FRAME_S
     while (place := feed.place()) is None:

@@ -41,7 +41,7 @@ class Bursts:
             self._until_s = from_s + float(self._rng.exponential(self._good_s))
 
     def lost(self, t_s: float) -> bool:
-        """Whether a packet of that time is lost."""
+        """True if a packet sent at that time is lost."""
         while t_s >= self._until_s:
             self._bad = not self._bad
             began_s = self._until_s
@@ -53,7 +53,7 @@ class Bursts:
 
 
 def radio_bursts(scenario: Scenario) -> Bursts | None:
-    """Those of a flight; None where its radio loses nothing."""
+    """The bursts of a flight; None where its radio loses nothing."""
     if not scenario.radio_loss:
         return None
     return Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)

@@ -6,30 +6,21 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
-from perchctl.geometry import Array, make_T
-from perchctl.sim.renderer import Renderer
+from perchctl.geometry import Array
+from perchctl.sim.optics import Picture
+from perchctl.sim.renderer import Renderer, Shot
 from perchctl.sim.scenario import Scenario
-from perchctl.sim.shutter import Shutter
-from perchctl.sim.surfaces import Picture
-
-__all__ = ["DeliveredFrame", "SimCamera"]
 
 SCHEDULE_STREAM = 411
 
 JITTER_LIMIT_SIGMAS = 2.5
 
 
-class BodyState(Protocol):
-    """The part of the world's true state that the camera needs."""
-
-    @property
-    def position_m(self) -> Array: ...
-    @property
-    def R_world_body(self) -> Array: ...
+PoseAt = Callable[[float], Array]
+"""The body's pose T_world_body (4, 4) at a time."""
 
 
 class SimCamera:
@@ -47,7 +38,7 @@ class SimCamera:
     - frozen: exposures from `camera_freeze_at_s` on show the last picture before;
     - mirrored: with `camera_mirrored` flipped left to right;
     - blank: with `camera_blank_rate` a blue screen in the place of the picture;
-    - given out again: at the receiver's own rate, where it has one (`perchctl.sim.camera`);
+    - given out again: at the receiver's own rate, where it has one (`Receiver`);
     - gone: nothing arrives at or after `camera_gone_at_s`.
     """
 
@@ -69,7 +60,7 @@ class SimCamera:
 
     @property
     def exposed_s(self) -> float:
-        """From the first light on a frame to the last."""
+        """Time from the first light on a frame to the last, s."""
         return 2.0 * self._half_s
 
     @property
@@ -77,7 +68,7 @@ class SimCamera:
         """When the next exposure ends."""
         return self._first_s + self._index / self.scenario.camera_rate_hz + self._half_s
 
-    def advance(self, t_s: float, pose_at: Callable[[float], BodyState]) -> None:
+    def advance(self, t_s: float, pose_at: PoseAt) -> None:
         """Take all exposures that end at or before `t_s`.
 
         `pose_at` is called with times within the exposures that ended since the last
@@ -98,7 +89,7 @@ class SimCamera:
             out.append(self._under_way.popleft())
         return self._receiver.given_out(out, self._t_s)
 
-    def _expose(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> None:
+    def _expose(self, middle_s: float, pose_at: PoseAt) -> None:
         s = self.scenario
         dropped = float(self._rng.random()) < s.camera_drop_rate
         jitter = max(-JITTER_LIMIT_SIGMAS, min(JITTER_LIMIT_SIGMAS, float(self._rng.normal())))
@@ -126,35 +117,84 @@ class SimCamera:
             self._last()
         self._receiver.develop()
 
-    def _picture(self, middle_s: float, pose_at: Callable[[float], BodyState]) -> Later:
+    def _picture(self, middle_s: float, pose_at: PoseAt) -> Later:
         """The poses are of now; the picture is made when it is looked at."""
 
         def T_world_cam_at(t_s: float) -> Array:
-            return self._T_world_cam(pose_at(t_s))
+            return np.asarray(pose_at(t_s) @ self._T_body_cam)
 
         index, renderer = self._index, self.renderer
-        if self._shutter.plain:
-            samples = self._T_world_cams(
-                [pose_at(t) for t in self._shutter.exposure_times(middle_s)]
-            )
-            return Later(lambda: renderer.render(samples, frame_index=index))
         shots = self._shutter.shots(middle_s, T_world_cam_at, renderer.camera.size_px[1])
         return Later(lambda: renderer.expose(shots, frame_index=index))
-
-    def _T_world_cam(self, state: BodyState) -> Array:
-        return make_T(state.R_world_body, state.position_m) @ self._T_body_cam
-
-    def _T_world_cams(self, states: list[BodyState]) -> Array:
-        """Of several, (n, 4, 4)."""
-        T = np.zeros((len(states), 4, 4))
-        T[:, 3, 3] = 1.0
-        for each, state in zip(T, states, strict=True):
-            each[:3, :3], each[:3, 3] = state.R_world_body, state.position_m
-        return T @ self._T_body_cam
 
 
 def _flipped(picture: Later) -> Later:
     return Later(lambda: np.ascontiguousarray(picture()[:, ::-1]))
+
+
+# --- When each row of a frame is exposed and in what light ---------------------------------------
+# A rolling shutter exposes its rows one after the other within the read-out time; an interlaced
+# camera takes two pictures a frame, half the frame's period apart, each with its own rows.
+
+
+LIGHT_STREAM = 412
+
+POSES_PER_EXPOSURE = 3
+READOUT_MOMENTS = 5
+"""Between them the camera's motion counts as straight: 5 ms for a read-out of 20 ms."""
+FLICKER_HZ = 100.0  # of lamps on a 50 Hz mains
+PUMPING_HZ = (0.4, 2.0)
+"""Range of rates at which the automatic exposure may hunt."""
+
+
+class Shutter:
+    """The scenario's shutter; same seed, same light."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._s = scenario
+        exposure_s = max(scenario.camera_exposure_s, 0.0)
+        self._half_exposure_s = exposure_s / 2.0
+        self._steps_s = (0.0,)  # of one row's exposure, from its middle
+        if self._half_exposure_s:
+            ends_s = -self._half_exposure_s, self._half_exposure_s
+            self._steps_s = tuple(np.linspace(*ends_s, POSES_PER_EXPOSURE).tolist())
+        self._apart_s = 0.0
+        if scenario.camera_fields != "progressive":
+            self._apart_s = 0.5 / scenario.camera_rate_hz
+        self.half_s = self._half_exposure_s + scenario.camera_readout_s / 2.0 + self._apart_s / 2.0
+        """Half the time from the first light on the frame to the last."""
+        rng = np.random.default_rng([scenario.seed, LIGHT_STREAM])
+        self._lamp_phase, self._hunt_phase = rng.uniform(0.0, 2.0 * math.pi, size=2)
+        self._hunt_hz = float(rng.uniform(*PUMPING_HZ))
+        # An exposure averages over the lamp's swing.
+        self._flicker = scenario.camera_flicker * float(np.sinc(FLICKER_HZ * exposure_s))
+
+    def shots(
+        self, middle_s: float, T_world_cam_at: Callable[[float], Array], height: int
+    ) -> list[Shot]:
+        """The frame's pictures in their order of time: two fields, or one."""
+        if not self._apart_s:
+            return [self._shot(middle_s, T_world_cam_at, height)]
+        half_s = self._apart_s / 2.0
+        return [self._shot(middle_s + d, T_world_cam_at, height) for d in (-half_s, half_s)]
+
+    def _shot(self, middle_s: float, T_world_cam_at: Callable[[float], Array], height: int) -> Shot:
+        readout_s = self._s.camera_readout_s
+        moments = [middle_s]
+        if readout_s:
+            delays = np.linspace(-readout_s / 2.0, readout_s / 2.0, READOUT_MOMENTS)
+            moments = [middle_s + float(d) for d in delays]
+        rows = tuple(tuple(T_world_cam_at(m + step_s) for step_s in self._steps_s) for m in moments)
+        row_times = middle_s + readout_s * (np.arange(height) / (height - 1) - 0.5)
+        return Shot(rows, self._light(row_times))
+
+    def _light(self, t_s: Array) -> Array | None:
+        s = self._s
+        if not (s.camera_flicker or s.camera_pumping):
+            return None
+        lamp = np.cos(2.0 * math.pi * FLICKER_HZ * t_s + self._lamp_phase)
+        hunt = np.sin(2.0 * math.pi * self._hunt_hz * t_s + self._hunt_phase)
+        return np.asarray((1.0 + self._flicker * lamp) * (1.0 + s.camera_pumping * hunt))
 
 
 # --- What a video receiver makes of the pictures that reach it: it repeats, and blanks, them ---
@@ -208,7 +248,7 @@ class Receiver:
         self._given = 0
 
     def develop(self) -> None:
-        """As `SimCamera.develop`."""
+        """Make the picture that is held: what it shows is about to change."""
         if self._newest is not None:
             self._newest.picture()
 

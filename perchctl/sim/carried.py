@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -77,18 +76,3 @@ class Way:
             for a, b in ((one.position_m, other.position_m), (one.rpy_rad, other.rpy_rad))
         )
         return place, rotation_from_rpy(*(float(angle) for angle in rpy))
-
-
-def lifted_and_turned(home: tuple[float, float, float], yaw_rad: float = 0.0) -> tuple[Stop, ...]:
-    """What `perchctl check --lift` asks for: up by 30 cm, turned by 90 deg, tilted forward and
-    aside, put back."""
-    x, y, z = home
-    up, tilt, quarter = (x, y, z + 0.3), math.radians(30.0), 0.5 * math.pi
-    return (
-        Stop(1.2, up, (0.0, 0.0, yaw_rad)),
-        Stop(1.5, up, (0.0, 0.0, yaw_rad + quarter)),
-        Stop(0.9, up, (0.0, tilt, yaw_rad + quarter)),
-        Stop(1.2, up, (tilt, 0.0, yaw_rad + quarter)),
-        Stop(1.5, up, (0.0, 0.0, yaw_rad)),
-        Stop(1.2, home, (0.0, 0.0, yaw_rad)),
-    )

@@ -120,7 +120,7 @@ class Hand:
 def draw_hand(
     profile: Profile, part: MountingPart, seed: int, seconds: float | None = None
 ) -> Hand:
-    """Of one seed both parts have the same vehicle."""
+    """The hand of that seed; both parts of one seed have the same vehicle."""
     rng = np.random.default_rng([seed, HAND_STREAM])
     yaw, *tilt = np.radians(rng.uniform(-1.0, 1.0, 3) * (180.0, MOUNT_TILT_DEG, MOUNT_TILT_DEG))
     way, far = rng.uniform(-math.pi, math.pi), MOVED_M * math.sqrt(rng.uniform())
@@ -273,8 +273,8 @@ def attitudes(
     if errors:
         noise = rng.normal(size=rate.shape) * math.radians(GYRO_NOISE_DPS)
         step = math.radians(GYRO_STEP_DPS)
-        felt = rate / (1.0 + hand.gyro_scale) + hand.gyro_bias_radps + noise
-        rate = np.round(felt / step) * step
+        measured = rate / (1.0 + hand.gyro_scale) + hand.gyro_bias_radps + noise
+        rate = np.round(measured / step) * step
         slow = math.radians(ATTITUDE_NOISE_DEG) * _slow_noise(rng, len(t_s), ATTITUDE_MEMORY_S)
         rpy = rpy + hand.attitude_bias_rad + slow
         place = place + hand.scenario.estimate_noise_m * _slow_noise(rng, len(t_s), 0.3)
@@ -295,7 +295,7 @@ def attitudes(
 
 
 def _slow_noise(rng: np.random.Generator, n: int, memory_s: float) -> Array:
-    """Of unit spread, (n, 3), that forgets itself in `memory_s`."""
+    """Noise (n, 3) of unit spread that forgets itself in `memory_s`."""
     keep = math.exp(-TELEMETRY_S / memory_s)
     kicks = rng.normal(size=(n, 3)) * math.sqrt(1.0 - keep * keep)
     out = np.empty((n, 3))
@@ -305,14 +305,6 @@ def _slow_noise(rng: np.random.Generator, n: int, memory_s: float) -> Array:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class _Held:
-    """The body, as the simulated camera asks for it."""
-
-    position_m: Array
-    R_world_body: Array
-
-
 def pictures(hand: Hand, profile: Profile, camera: CameraModel) -> Iterator[DeliveredFrame]:
     """The camera's frames in the order of their arrival, rendered as they are asked for."""
     renderer = Renderer(hand.scenario, camera, profile.target, hand.seed)
@@ -320,16 +312,15 @@ def pictures(hand: Hand, profile: Profile, camera: CameraModel) -> Iterator[Deli
     T_room_target = renderer.T_world_target
     T_cam_body = invert_T(hand.T_body_cam)
 
-    def held(t_s: float) -> _Held:
+    def T_room_body(t_s: float) -> Array:
         T_target_cam = T_target_cam_at(hand, t_s)
         # A larger print from farther away is the same picture.
         T_target_cam[:3, 3] /= 1.0 + hand.size_error
-        T = T_room_target @ T_target_cam @ T_cam_body
-        return _Held(T[:3, 3], T[:3, :3])
+        return np.asarray(T_room_target @ T_target_cam @ T_cam_body)
 
     period_s = 1.0 / hand.scenario.camera_rate_hz
     for k in range(1, math.ceil((hand.seconds + 0.3) / period_s)):
-        source.advance(k * period_s, held)
+        source.advance(k * period_s, T_room_body)
         yield from source.take()
 
 
@@ -340,7 +331,8 @@ def record_hand(
     positioned: bool = False,
     told: Callable[[], None] = lambda: None,
 ) -> MountingRecording:
-    """The whole part, through renderer and pipeline; `told` is called with each picture."""
+    """Record the whole part, through renderer and pipeline; `told` is called for each
+    picture."""
     pipeline = make_pipeline(camera_only_profile(profile), camera)
     state = PipelineState()
     poses, mirrored = [], 0
@@ -353,5 +345,5 @@ def record_hand(
         if (pose := best_pose(output, frame.t_arrival_s)) is not None:
             poses.append(pose)
         told()
-    felt, by = attitudes(hand, positioned), pose_basis(profile, camera)
-    return MountingRecording(hand.part, felt, tuple(poses), mirrored, by)
+    samples, by = attitudes(hand, positioned), pose_basis(profile, camera)
+    return MountingRecording(hand.part, samples, tuple(poses), mirrored, by)

@@ -2,7 +2,7 @@
 
 - A motor's voltage is its duty cycle times the battery's. Its speed follows that voltage
   with a lag, and its thrust is the curve at the voltage that belongs to the speed
-  (`perchctl.sim.powertrain`).
+  (`thrust_n`).
 - The lag is shorter the faster the motor turns. The voltage that keeps a motor at speed w is
   a w + b w^2, back EMF and the air's torque, so 1 / lag is proportional to a + 2 b w, and
   its square rises linearly with that voltage. A motor that hovers has the lag of 0.05 s of
@@ -13,7 +13,7 @@
   `MOTOR_COAST_S` is the value with which the fall after a lone notify, the landing, the
   take-offs and the attitude steps of that page come out nearest to what was measured,
   all at once.
-- The cell (`perchctl.sim.cell`) gives 4.4 A at full thrust. Current and sag are proportional
+- The cell (`Cell`) gives 4.4 A at full thrust. Current and sag are proportional
   to thrust: the voltages beside the duty cycles of that page lie on one line within 0.06 V,
   0.63 V from no thrust to full.
 """
@@ -21,11 +21,12 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
+from dataclasses import dataclass
 from math import cbrt, sqrt
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.sim.cell import RESISTANCE_OHM, Cell, CellKind
-from perchctl.sim.scenario import CONTROL_PERIOD_S
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 # --- One motor's thrust against its voltage: what the rotor gives, and what the firmware inverts
 # The curve is the firmware's own for the propellers of the Crazyflie 2.1+ (its platform
@@ -75,6 +76,103 @@ def thrust_n(volts: float) -> float:
     return C0 + volts * (C1 + volts * (C2 + volts * C3))
 
 
+# --- The cell that feeds the motors: charge, resting voltage, resistance, age -------------------
+# - Resting voltage by charge: the levels in tenths by which the firmware tells a battery's
+#   state (`perchctl.sim.firmware.power`) are a discharge curve of the Crazyflie's own cell.
+#   It is flat in the middle and falls ever faster below a tenth, where 24 s of hovering take
+#   0.7 V; what lies between 0 and 10 per cent is shaped as lithium polymer cells fall off.
+# - The voltage falls under load by the cell's resistance at once, and in an old or cold cell
+#   by some more within `SLOW_S`: ions that have to come from farther away.
+# - An old cell holds less charge and has more resistance; `knee` says at which part of the
+#   charge its steep end begins.
+
+
+CHARGE_C = 900.0
+"""250 mAh."""
+RESISTANCE_OHM = 0.143
+SLOW_S = 15.0
+KNEE = 0.1
+_CELL_CURVE: tuple[tuple[float, float], ...] = (
+    (-0.02, 2.5), (0.0, 3.0), (0.01, 3.3), (0.025, 3.52), (0.05, 3.67), (0.1, 3.78),
+    (0.2, 3.83), (0.3, 3.87), (0.4, 3.89), (0.5, 3.92), (0.6, 3.96), (0.7, 4.0),
+    (0.8, 4.04), (0.9, 4.1), (1.0, 4.2), (1.05, 4.3),
+)  # fmt: skip
+_CELL_ENDS = tuple(x for x, _ in _CELL_CURVE[1:])  # of its straight parts
+_EMPTY_V, _FULL_V = _CELL_CURVE[0][1], _CELL_CURVE[-1][1]
+
+
+@dataclass(frozen=True)
+class CellKind:
+    """Beside its resting voltage: the resistance that acts at once and the one that acts
+    slowly, the charge that an old cell still holds as a share, and where the steep end begins."""
+
+    resistance_ohm: float = RESISTANCE_OHM
+    slow_ohm: float = 0.0
+    charge: float = 1.0
+    knee: float = KNEE
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> CellKind:
+        """The cell of the scenario's vehicle."""
+        ohm = scenario.cell_resistance_ohm
+        return cls(
+            RESISTANCE_OHM if ohm is None else ohm,
+            scenario.cell_slow_ohm,
+            scenario.cell_charge,
+            scenario.cell_knee,
+        )
+
+
+class Cell:
+    """`rest_v` its resting voltage, `battery_v` under load."""
+
+    def __init__(self, rest_v: float, kind: CellKind) -> None:
+        self._kind = kind
+        self._left = _charge_at(rest_v, kind.knee)
+        self._offset_v = rest_v - _resting_v(self._left, kind.knee)
+        self._slow_v = 0.0
+        self._per_step = CONTROL_PERIOD_S / (CHARGE_C * kind.charge)
+        self._slowly = 1.0 - math.exp(-CONTROL_PERIOD_S / SLOW_S)
+        self._rest_v = self.battery_v = rest_v
+
+    @property
+    def rest_v(self) -> float:
+        return self._rest_v
+
+    @rest_v.setter
+    def rest_v(self, rest_v: float) -> None:
+        """Another voltage, and the charge as it was: it goes on to fall as it would have."""
+        self._offset_v += rest_v - self._rest_v
+        self._rest_v = rest_v
+
+    def step(self, current_a: float) -> float:
+        """The voltage under load after one control period of a current."""
+        kind = self._kind
+        self._left -= current_a * self._per_step
+        self._slow_v += self._slowly * (kind.slow_ohm * current_a - self._slow_v)
+        self._rest_v = rest_v = _resting_v(self._left, kind.knee) + self._offset_v
+        self.battery_v = rest_v - kind.resistance_ohm * current_a - self._slow_v
+        return self.battery_v
+
+
+def _resting_v(left: float, knee: float) -> float:
+    tenth = 0.1 * left / knee if left < knee else 0.1 + 0.9 * (left - knee) / (1.0 - knee)
+    i = bisect_right(_CELL_ENDS, tenth)
+    if i == len(_CELL_ENDS):
+        return _FULL_V
+    (x0, v0), (x1, v1) = _CELL_CURVE[i], _CELL_CURVE[i + 1]
+    return max(_EMPTY_V, v0 + (tenth - x0) * (v1 - v0) / (x1 - x0))
+
+
+def _charge_at(rest_v: float, knee: float) -> float:
+    """The charge that belongs to a resting voltage; at the curve's ends where it is beyond."""
+    low, high = 0.0, 1.05
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _resting_v(middle, knee) < rest_v else (low, middle)
+    return low
+
+
 # --- Four motors and the cell that feeds them: duty cycles in, newtons out ---
 
 
@@ -98,7 +196,7 @@ class Powertrain:
         self.cell = Cell(rest_v, kind or CellKind())
         self.battery_v = rest_v
         self.forces_n = (0.0, 0.0, 0.0, 0.0)
-        self.strength: Forces | None = None  # what is left of each motor's thrust; None: all
+        self.strength: Forces = (1.0, 1.0, 1.0, 1.0)  # what is left of each motor's thrust
         self._speeds_v = (0.0, 0.0, 0.0, 0.0)  # each as the voltage that would keep it
         self._down = 1.0 - math.exp(-CONTROL_PERIOD_S / MOTOR_COAST_S)
 
@@ -120,9 +218,8 @@ class Powertrain:
         f2 = C0 + v2 * (C1 + v2 * (C2 + v2 * C3)) if v2 > still else 0.0
         f3 = C0 + v3 * (C1 + v3 * (C2 + v3 * C3)) if v3 > still else 0.0
         f4 = C0 + v4 * (C1 + v4 * (C2 + v4 * C3)) if v4 > still else 0.0
-        if self.strength is not None:
-            s1, s2, s3, s4 = self.strength
-            f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
+        s1, s2, s3, s4 = self.strength
+        f1, f2, f3, f4 = s1 * f1, s2 * f2, s3 * f3, s4 * f4
         self.forces_n = forces = (f1, f2, f3, f4)
         self.battery_v = self.cell.step(_AMPERES_PER_N * (f1 + f2 + f3 + f4))
         return forces

@@ -3,11 +3,8 @@
 Every image pixel is a ray, traced to the ceiling's plane and looked up in
 textures; lens distortion lies in the rays, which are precomputed. The sheets' map
 is exact at each pixel of a tile in which they show an edge; other tiles are filled
-(`perchctl.sim.tiles`). The ceiling's is evaluated at every eighth and interpolated,
+(`perchctl.sim.sheets`). The ceiling's is evaluated at every eighth and interpolated,
 which errs by less than 0.01 px for lenses up to 90 degrees.
-
-Behind the renderer: what the lens makes of the pixels, the sheets on the ceiling, what an analogue
-link does to a picture, and the motion within one exposure.
 
 Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV.
 """
@@ -17,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from typing import Any
 
 import cv2
@@ -26,43 +22,32 @@ from numpy.typing import NDArray
 
 from perchctl.geometry import Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
-from perchctl.sim.gloss import shone_upon
-from perchctl.sim.pixels import Mean, defocused, lit, sample, vignetting
-from perchctl.sim.rays import (
+from perchctl.sim.optics import (
     COARSE_PX,
-    FINE_PX,
     LEAST_RISE,
-    RayGrid,
+    Picture,
+    lens_of,
     local_px_per_m,
     plane_map,
-    ray_grid,
     trace,
 )
-from perchctl.sim.scenario import Neighbour, Scenario
-from perchctl.sim.shutter import Shot, blended, woven
-from perchctl.sim.still import STILL_PX, Stills, rounded
-from perchctl.sim.surfaces import (
+from perchctl.sim.scenario import Scenario
+from perchctl.sim.sheets import (
     CEILING_TEXTURE_PX,
     SAMPLING_SIGMA_PX,
     TILE_M,
-    Ceiling,
-    Picture,
-    Sheet,
-    SheetTexture,
-)
-from perchctl.sim.tiles import (
     Box,
-    TileRays,
-    Tiles,
+    Ceiling,
+    Placed,
+    View,
+    beside,
     box_around,
-    box_of,
     by_tile,
     fill,
-    reach_of,
-    tile_rays,
-    tiles_of,
+    pixels_of,
+    printed_sheet,
+    shone_upon,
 )
-from perchctl.target import draw_target
 from perchctl.vision import CameraModel
 
 CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
@@ -70,7 +55,7 @@ CEILING_STREAM, NOISE_STREAM, FRAME_STREAM = 401, 402, 403
 
 FLOOR_GREY = 60
 _NOISE_ROOM_PX = 64
-"""By so much the bank of noise is larger than a picture. Each frame has another part of it, 4225
+"""The bank of noise is larger than a picture by this. Each frame has another part of it, 4225
 of them until the first comes again; and so small a bank stays near to the processor."""
 _PLAIN_PX = 1.5
 """Blur of the lens that the bare ceiling, drawn at half the size or less, does not show."""
@@ -78,6 +63,21 @@ _COVERING_SIGMA = 4.0
 """Noise, grey levels, under which nobody sees whether the ceiling is drawn at a quarter of the
 size or at half of it: these differ by a spread of 1.1 to 1.3."""
 _CENTER_TEXEL = CEILING_TEXTURE_PX / 2.0 - 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One field, or a whole frame.
+
+    Attributes:
+        rows: camera poses T_world_cam (4, 4) over the exposure, at equal steps from its
+            beginning to its end; of rows at equal distances from the first to the last.
+            A single entry: all rows at once.
+        light: factor of each row's brightness (height,); None for an even 1.
+    """
+
+    rows: tuple[tuple[Array, ...], ...]
+    light: Array | None = None
 
 
 class Renderer:
@@ -111,7 +111,7 @@ class Renderer:
         self._glossy_half_m = 0.0
         if own and scenario.gloss > 0.0:
             self._glossy_half_m = own[0].sheet.drawing.sheet_side_m / 2.0
-        self._stills = Stills()
+        self._still: tuple[bytes, float, Picture] | None = None
         self.move_target(scenario.target_xy_m)
         self._ceiling = Ceiling(np.random.default_rng([self.seed, CEILING_STREAM]))
         lens = lens_of(camera)
@@ -123,7 +123,7 @@ class Renderer:
 
     def move_target(self, xy_m: tuple[float, float]) -> None:
         """The target's centre is there from now on."""
-        self._stills.forget()
+        self._still = None
         scenario = self.scenario
         z_m = scenario.ceiling_z_m + scenario.target_above_ceiling_m
         turn = rotation_from_rpy(*scenario.target_tilt_rad, 0.0) @ rot_z(scenario.target_yaw_rad)
@@ -179,13 +179,18 @@ class Renderer:
         length_px = path_length_px(motion_px)
         sigma = self.scenario.camera_defocus_px if defocus_px is None else defocus_px
         if length_px < STILL_PX and len(rows) == 1:
-            pose = rounded(rows[0][len(rows[0]) // 2])
-            motion_px, still = np.zeros((5, 1, 2)), [pose[None]]
-            make = partial(self._projected, still, motion_px, 0.0, sigma)
-            picture = self._stills.picture(pose, sigma, make)
+            picture = self._at_rest(rounded(rows[0][len(rows[0]) // 2]), sigma)
         else:
             picture = self._projected(rows, motion_px, length_px, sigma)
         return picture if shot.light is None else lit(picture, shot.light)
+
+    def _at_rest(self, pose: Array, sigma_px: float) -> Picture:
+        """The picture of a camera that does not move; the last one is kept."""
+        key, last = pose.tobytes(), self._still
+        if last is None or last[:2] != (key, sigma_px):
+            picture = self._projected([pose[None]], np.zeros((5, 1, 2)), 0.0, sigma_px)
+            last = self._still = (key, sigma_px, picture)
+        return last[2]
 
     # -- through the lens ---------------------------------------------------
 
@@ -194,10 +199,7 @@ class Renderer:
     ) -> Picture:
         """The picture at poses T_target_cam, of each row (n, 4, 4)."""
         count = sample_count(length_px)
-        if count == 1 and all(len(poses) % 2 for poses in rows):
-            by_row = [plane_map(poses[len(poses) // 2][None]) for poses in rows]
-        else:
-            by_row = [plane_map(spread(poses, count)) for poses in rows]
+        by_row = [plane_map(spread(poses, count)) for poses in rows]
         maps = by_row[0] if len(rows) == 1 else np.stack(by_row, axis=1)
         picture, box = self._optical(maps, motion_px, length_px)
         if self._glossy_half_m:
@@ -280,18 +282,14 @@ class Renderer:
         places = np.divmod(wanted, into.shape[1])
         top, left = (each.start for each in view.box)
         grid = self._tiles.of((places[0] + top) * whole.shape[1] + places[1] + left)
-        value, alpha = Mean(len(maps)), Mean(len(maps))
-        for each in maps:
-            texels = trace(grid, to_texels @ each)[0].reshape(-1, COARSE_PX**2, 2)
-            value.add(sample(texture.value, texels))
-            if len(outline):
-                alpha.add(sample(texture.alpha, texels[: len(outline)]))
-        pixels = value.result()
+        texels = [trace(grid, to_texels @ each)[0].reshape(-1, COARSE_PX**2, 2) for each in maps]
+        pixels = mean_of([sample(texture.value, each) for each in texels])
         if len(outline):
+            alpha = mean_of([sample(texture.alpha, each[: len(outline)]) for each in texels])
             on = pixels[: len(outline)]
             rows, cols = (axis[: len(outline)] for axis in places)
             behind = into[rows, cols].view(np.uint8)
-            rest: Any = cv2.multiply(behind, cv2.bitwise_not(alpha.result()), scale=1.0 / 255.0)
+            rest: Any = cv2.multiply(behind, cv2.bitwise_not(alpha), scale=1.0 / 255.0)
             on[:] = cv2.add(rest, on)
         into[places] = pixels.view(np.uint64)
 
@@ -323,150 +321,85 @@ class Renderer:
         bank = np.rint(rng.standard_normal(size, np.float32) * np.float32(sigma))
         across = _NOISE_ROOM_PX + 1
         places = np.stack(np.divmod(rng.permutation(across**2), across), axis=1).tolist()
-        return (_bytes(bank), _bytes(-bank)), places
+        more, less = (np.clip(grey, 0.0, 255.0).astype(np.uint8) for grey in (bank, -bank))
+        return (more, less), places
 
 
-def _bytes(grey: NDArray[np.float32]) -> Picture:
-    return np.clip(grey, 0.0, 255.0).astype(np.uint8)
+# --- Sums, look-ups and shading of whole pictures ------------------------------------------------
 
 
-# --- What a camera's lens makes of its pixels, for all pictures and all flights alike; pure ----
+def mean_of(pictures: Sequence[Picture]) -> Picture:
+    """Their mean, rounded once."""
+    if len(pictures) == 1:
+        return pictures[0]
+    total: Any = pictures[0].astype(np.uint16)
+    for picture in pictures[1:]:
+        total = cv2.add(total, picture, dtype=cv2.CV_16U)
+    return np.asarray(cv2.convertScaleAbs(total, alpha=1.0 / len(pictures)), np.uint8)
 
 
-@dataclass(frozen=True, eq=False)
-class Lens:
-    """`coarse` the rays of every eighth pixel, `tiles` of all of them; `shade` the relative light
-    (height, width), 255 for all of it; `places` rays (3, 5) to the picture's middle and into its
-    quarters; `focal_px` the mean of both directions."""
-
-    coarse: RayGrid
-    tiles: TileRays
-    shade: Picture
-    places: Array
-    focal_px: float
+def sample(texture: Picture, texels: Any, border: int = cv2.BORDER_CONSTANT) -> Picture:
+    """Bilinear look-up at `texels` (h, w, 2) float32; 0 outside, or repeating."""
+    remap: Any = cv2.remap  # its stub denies that the second map may be None
+    return np.asarray(remap(texture, texels, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
 
 
-def lens_of(camera: CameraModel) -> Lens:
-    """The camera's; flights share it, since its rays take longer than 20 pictures."""
-    return _lens(*camera.contents)
+def defocused(picture: Picture, sigma_px: float, box: Box) -> None:
+    """Blurs the tiles of `box`, and what is so near to them that it shows a part of their blur."""
+    reach = math.ceil(3.0 * sigma_px) + 1
+    near, far = pixels_of(box, reach), pixels_of(box, 2 * reach)
+    blurred = cv2.GaussianBlur(picture[far], (0, 0), sigma_px)
+    top, left = (a.start - b.start for a, b in zip(near, far, strict=True))
+    into = picture[near]
+    into[:] = blurred[top : top + into.shape[0], left : left + into.shape[1]]
 
 
-@lru_cache(maxsize=2)
-def _lens(size_px: tuple[int, int], model: str, K: bytes, dist: bytes) -> Lens:
-    camera = CameraModel(size_px, np.frombuffer(K).reshape(3, 3), np.frombuffer(dist), model)
-    fine, coarse = ray_grid(camera, FINE_PX), ray_grid(camera, COARSE_PX)
-    focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
-    shade = vignetting(fine, size_px)
-    return Lens(coarse, tile_rays(fine), shade, _five_places(coarse), focal_px)
+def lit(picture: Picture, light: NDArray[np.float64]) -> Picture:
+    """The picture with each row's brightness multiplied by `light` (height,)."""
+    factor = np.broadcast_to(light.astype(np.float32)[:, None], picture.shape)
+    return np.asarray(cv2.multiply(picture, np.ascontiguousarray(factor), dtype=cv2.CV_8U))
 
 
-def _five_places(coarse: RayGrid) -> Array:
-    rows, cols = coarse.xy.shape[:2]
-    places = [(rows // 2, cols // 2)] + [
-        (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
-    ]
-    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
+def woven(pictures: Sequence[Picture], top_first: bool) -> Picture:
+    """The frame of two fields in their order of time; a single picture is the frame."""
+    if len(pictures) == 1:
+        return pictures[0]
+    top, bottom = pictures if top_first else (pictures[1], pictures[0])
+    frame = top.copy()
+    frame[1::2] = bottom[1::2]
+    return frame
 
 
-# --- Sheets on the ceiling, and where each is seen in one exposure -----------------------------
+def blended(frame: Picture) -> Picture:
+    """What a converter makes of a woven frame that averages its fields: each row with the
+    mean of its neighbours, which are of the other field."""
+    rows = np.pad(frame, ((1, 1), (0, 0)), mode="edge").astype(np.uint16)
+    return np.asarray((rows[:-2] + 2 * rows[1:-1] + rows[2:] + 2) // 4, np.uint8)
 
 
-@dataclass(frozen=True, eq=False)
-class Placed:
-    """A sheet, and how (3, 3) the own target's plane maps to its: None for the own."""
-
-    sheet: Sheet
-    plane: Array | None = None
-
-    def seen_from(self, nodes: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The coarse nodes (rows, columns, 2) in this sheet's axes, m."""
-        if self.plane is None:
-            return nodes
-        turn, shift = self.plane[:2, :2].T, self.plane[:2, 2]
-        return np.asarray(nodes @ turn.astype(np.float32) + shift.astype(np.float32))
-
-    def view(self, nodes: NDArray[np.float32], length_px: float) -> View | None:
-        """At the coarse nodes (rows, columns, 2), in the own target's axes; `length_px` is the
-        longest way of the picture within the exposure. None where the sheet is out of view."""
-        moved = self.seen_from(nodes)
-        side_m = self.sheet.drawing.sheet_side_m
-        reach = reach_of(moved, length_px)
-        box = box_of(reach.near(side_m))
-        if box is None:
-            return None
-        j, i = ((each.start + each.stop - 1) // 2 + 1 for each in box)
-        texture = self.sheet.texture(local_px_per_m(moved, j, i, COARSE_PX))
-        return View(self, texture, box, tiles_of(reach.within(box), texture, side_m))
+# --- A camera that does not move: its picture before noise is made once ------------------------
+# On the floor and under the magnet the vehicle stirs by less than any picture shows. Where the
+# picture moves by less than `STILL_PX` within the exposure, its pose is rounded; the same rounded
+# pose has the same picture. That is so whichever of the others are looked at, as their bytes must
+# not hang on it.
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """A sheet in one exposure, in the picture's `box` of tiles."""
-
-    placed: Placed
-    texture: SheetTexture
-    box: Box
-    tiles: Tiles
-
-    def hides(self, tiles: int) -> bool:
-        """Whether nothing else is seen in a picture of so many."""
-        return self.tiles.inner.size == tiles and bool(self.tiles.inner.all())
+STILL_PX = 0.005
+STEP = 2.0**-17
+"""Steps of the directions, and of the place in parts of its distance, to the next power of two:
+half a step moves no place of a picture of 400 px focal length by 0.01 px, most by 0.002 px."""
 
 
-def beside(neighbour: Neighbour, own: TargetConfig) -> Placed:
-    """Another vehicle's target; what the neighbour leaves open is as on the own."""
-    large = {} if neighbour.large_id is None else {"id": neighbour.large_id}
-    small = {} if neighbour.small_id is None else {"id": neighbour.small_id}
-    target = TargetConfig(
-        large=own.large.model_copy(update=large), small=own.small.model_copy(update=small)
-    )
-    to_own = make_T(rot_z(neighbour.yaw_rad), (*neighbour.xy_m, 0.0))
-    plane = np.delete(np.delete(invert_T(to_own), 2, axis=0), 2, axis=1)
-    return Placed(printed_sheet(target.model_dump_json()), plane)
+def rounded(T_target_cam: Array) -> Array:
+    """The pose (4, 4) of a still camera."""
+    steps = np.full((3, 4), STEP)
+    steps[:, 3] *= 2.0 ** np.floor(np.log2(max(abs(float(T_target_cam[2, 3])), 1e-3)))
+    T = np.eye(4)
+    T[:3] = np.rint(T_target_cam[:3] / steps) * steps
+    return T
 
 
-@lru_cache(maxsize=4)
-def printed_sheet(target_json: str) -> Sheet:
-    """The sheet of a target; its textures cost more than a second, and flights share them."""
-    return Sheet(draw_target(TargetConfig.model_validate_json(target_json)))
-
-
-# --- Faults of an analogue video link: lines that tremble, hum bars, torn and lost lines -------
-
-
-LINE_JITTER_PX = 1.2
-HUM_GREY = 18.0
-TEAR_PX = 30.0
-TEARS_PER_FRAME = 1.5
-SNOW_LINES_PER_FRAME = 12.0
-"""Means at full strength."""
-
-
-def spoil(image: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
-    height, width = image.shape
-    shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)
-    for _ in range(rng.poisson(TEARS_PER_FRAME * strength)):
-        start, length = int(rng.integers(height)), int(rng.integers(4, 40))
-        # A torn band comes back to its place over its length, as the receiver's line lock does.
-        band = slice(start, min(start + length, height))
-        fade = np.linspace(1.0, 0.0, length)[: band.stop - band.start]
-        shift[band] += rng.normal(0.0, TEAR_PX * strength) * fade
-    cols, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
-    cols = cols + shift[:, None].astype(np.float32)
-    out = cv2.remap(image, cols, rows.astype(np.float32), cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_REPLICATE).astype(np.float32)  # fmt: skip
-    phase, bars = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.7, 2.5)
-    hum = np.sin(2.0 * np.pi * bars * np.arange(height) / height + phase)
-    out += (HUM_GREY * strength * hum)[:, None].astype(np.float32)
-    for _ in range(rng.poisson(SNOW_LINES_PER_FRAME * strength)):
-        row, left = int(rng.integers(height)), int(rng.integers(width))
-        length = int(min(rng.exponential(0.3 * width) + 1.0, width - float(left)))
-        out[row, left : left + length] = rng.uniform(0.0, 255.0, size=length)
-    return np.clip(np.rint(out), 0.0, 255.0).astype(np.uint8)
-
-
-# --- Motion within one exposure: how many poses it needs, and its blur as a kernel; pure -------
+# --- Motion within one exposure: how many poses it needs, and its blur as a kernel --------------
 
 
 SHARP_MOTION_PX = 0.25
@@ -526,3 +459,38 @@ def line_kernel(motion_px: Array) -> NDArray[np.float32] | None:
         weights = np.outer([1.0 - fy, fy], [1.0 - fx, fx])
         kernel[j + half : j + half + 2, i + half : i + half + 2] += weights.astype(np.float32)
     return np.asarray(kernel / kernel.sum(), np.float32)
+
+
+# --- Faults of an analogue video link: lines that tremble, hum bars, torn and lost lines -------
+
+
+LINE_JITTER_PX = 1.2
+HUM_GREY = 18.0
+TEAR_PX = 30.0
+TEARS_PER_FRAME = 1.5
+SNOW_LINES_PER_FRAME = 12.0
+"""Means at full strength."""
+
+
+def spoil(image: NDArray[np.uint8], strength: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """The picture as a receiver shows it; `strength` 0 (clean) .. 1 (about to be lost)."""
+    height, width = image.shape
+    shift = np.asarray(rng.standard_normal(height) * LINE_JITTER_PX * strength)
+    for _ in range(rng.poisson(TEARS_PER_FRAME * strength)):
+        start, length = int(rng.integers(height)), int(rng.integers(4, 40))
+        # A torn band comes back to its place over its length, as the receiver's line lock does.
+        band = slice(start, min(start + length, height))
+        fade = np.linspace(1.0, 0.0, length)[: band.stop - band.start]
+        shift[band] += rng.normal(0.0, TEAR_PX * strength) * fade
+    cols, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
+    cols = cols + shift[:, None].astype(np.float32)
+    out = cv2.remap(image, cols, rows.astype(np.float32), cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_REPLICATE).astype(np.float32)  # fmt: skip
+    phase, bars = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.7, 2.5)
+    hum = np.sin(2.0 * np.pi * bars * np.arange(height) / height + phase)
+    out += (HUM_GREY * strength * hum)[:, None].astype(np.float32)
+    for _ in range(rng.poisson(SNOW_LINES_PER_FRAME * strength)):
+        row, left = int(rng.integers(height)), int(rng.integers(width))
+        length = int(min(rng.exponential(0.3 * width) + 1.0, width - float(left)))
+        out[row, left : left + length] = rng.uniform(0.0, 255.0, size=length)
+    return np.clip(np.rint(out), 0.0, 255.0).astype(np.uint8)

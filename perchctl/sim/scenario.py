@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 CONTROL_PERIOD_S = 0.002
@@ -24,6 +22,16 @@ class Neighbour:
     yaw_rad: float = 0.0
     large_id: int | None = None
     small_id: int | None = None
+
+
+@dataclass(frozen=True)
+class Gust:
+    """A single gust: a door, a passer-by, an air conditioner that starts. It blows from `start_s`
+    for `length_s`, at the most with `peak_mps` (world axes)."""
+
+    start_s: float
+    length_s: float
+    peak_mps: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -53,8 +61,8 @@ class Scenario:
         camera_blank_rate: share of pictures that are a blue screen.
         camera_mirrored: it gives its pictures flipped left to right.
         drift_mps: drift of the state estimate, world axes.
-        draught_mps: the wind with its smooth gusts (`perchctl.sim.world`).
-        gusts: single ones beside it (`perchctl.sim.scenario`).
+        draught_mps: the wind with its smooth gusts (`perchctl.sim.wind`).
+        gusts: single ones beside it.
         ceiling_suction: share of thrust gained with the rotors' plane at the ceiling.
         magnet_force_n: pull the magnet can hold.
         first_contact_force_n: pull at the first contact; None means the same.
@@ -70,14 +78,14 @@ class Scenario:
         parameters: the firmware's, where they differ from its release at boot.
         gyro_bias_radps, acc_bias_mps2: what the gyroscope, after the firmware has taken out what it
             found on the ground, and the accelerometer, before the firmware scales it to 1 g, read
-            too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.imu`).
+            too much; body axes, of a vehicle without a deck (`perchctl.sim.firmware.outside`).
         target_above_ceiling_m: the target's plane lies so far above what the gear meets.
         target_tilt_rad: the target's turns about the world's x and y, after its heading.
         gloss: peak of the lamp's reflection in the print, in whites of the paper; `lamp_m` the
             lamp's place (`perchctl.sim.gloss`).
         flow_noise_radps, flow_bias_radps: of the flow deck's readings, the latter in x and y.
         flow_reach_m: above this it sees no flow; None: it always does.
-        bare_floors: x, y and radius of patches without texture (`perchctl.sim.flow_deck`).
+        bare_floors: x, y and radius of patches without texture (`perchctl.sim.firmware.estimator`).
         radio_loss, radio_burst_s: share of the time in which no packet passes, and how long
             such a time lasts on average (`perchctl.sim.bursts`).
         capture_holes_s: begin and length of the times in which a motion capture does not see
@@ -151,32 +159,3 @@ class Scenario:
     gyro_bias_radps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     acc_bias_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     extra: dict[str, float] = field(default_factory=dict)
-
-
-# --- Single gusts: a door, a passer-by, an air conditioner that starts -------------------------
-# Each is the "one minus cosine" by which gusts are modelled in aviation (MIL-F-8785C): smooth
-# from nothing to its peak and back, once.
-
-
-Vector = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Gust:
-    """Blows from `start_s` for `length_s`, at the most with `peak_mps` (world axes)."""
-
-    start_s: float
-    length_s: float
-    peak_mps: Vector
-
-
-def blown(gusts: Sequence[Gust], t_s: float) -> Vector:
-    """What all of them add to the wind at that time, m/s."""
-    x = y = z = 0.0
-    for gust in gusts:
-        phase = (t_s - gust.start_s) / gust.length_s
-        if 0.0 < phase < 1.0:
-            share = 0.5 * (1.0 - math.cos(2.0 * math.pi * phase))
-            px, py, pz = gust.peak_mps
-            x, y, z = x + share * px, y + share * py, z + share * pz
-    return (x, y, z)

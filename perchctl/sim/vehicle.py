@@ -4,38 +4,45 @@ time."""
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
 
-import numpy as np
-
-from perchctl.geometry import Array, rotation_from_quaternion
+from perchctl.geometry import Array, make_T, rotation_from_quaternion
 from perchctl.profile import TargetConfig
 from perchctl.sim.camera import SimCamera
-from perchctl.sim.capture.settings import CaptureSettings
-from perchctl.sim.capture.system import SimCapture
+from perchctl.sim.capture import CaptureSettings, SimCapture
 from perchctl.sim.firmware import Firmware
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 from perchctl.sim.world import World
 from perchctl.vision import CameraModel
 
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
 _TICK_S = 1e-6  # less than a control period: an exposure is never passed over
 
 
-class PastPose(NamedTuple):
-    """Where the vehicle was, kept 500 times a second: arrays only for what an exposure asks."""
+class PastPoses:
+    """Where a vehicle was within the last `kept_s`, 500 times a second; called with a time it
+    gives the nearest T_world_body (4, 4)."""
 
-    t_s: float
-    place_m: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
+    def __init__(self, kept_s: float) -> None:
+        self._poses: deque[tuple[float, Vector, Quaternion]] = deque(
+            maxlen=int(kept_s / CONTROL_PERIOD_S) + 8
+        )
+
+    def add(self, world: World) -> None:
+        """The pose of now."""
+        self._poses.append((world.t_s, (world.x_m, world.y_m, world.z_m), world.quaternion))
 
     @property
-    def position_m(self) -> Array:
-        return np.array(self.place_m)
+    def newest_s(self) -> float:
+        """The time of the last pose."""
+        return self._poses[-1][0]
 
-    @property
-    def R_world_body(self) -> Array:
-        return rotation_from_quaternion(self.quaternion)
+    def __call__(self, t_s: float) -> Array:
+        back = round((self.newest_s - t_s) / CONTROL_PERIOD_S)
+        _, place_m, quaternion = self._poses[max(-len(self._poses), -1 - max(0, back))]
+        return make_T(rotation_from_quaternion(quaternion), place_m)
 
 
 class SimulatedVehicle:
@@ -59,9 +66,7 @@ class SimulatedVehicle:
         self.capture = None if capture is None else SimCapture(capture)
         self.watched = True  # somebody takes the camera's pictures; no others are made
         # The past that an exposure may need.
-        exposed_s = 0.0 if self.camera is None else self.camera.exposed_s
-        steps = int(exposed_s / CONTROL_PERIOD_S) + 8
-        self._past: deque[PastPose] = deque(maxlen=steps)
+        self._past = PastPoses(0.0 if self.camera is None else self.camera.exposed_s)
 
     @property
     def t_s(self) -> float:
@@ -81,18 +86,18 @@ class SimulatedVehicle:
             self.step_blindly()
             t_s = self.world.t_s
             if t_s >= due_s - exposed_s:
-                self._remember()
+                self._past.add(self.world)
                 if t_s >= due_s:
-                    self.camera.advance(t_s, self._state_at)
+                    self.camera.advance(t_s, self._past)
                     due_s = self.camera.next_s - _TICK_S
-        self.camera.advance(t_s, self._state_at)
+        self.camera.advance(t_s, self._past)
 
     def step(self) -> None:
         """One control period, and the exposures that fall into it."""
         self.step_blindly()
         if self.camera is not None and self.watched:
-            self._remember()
-            self.camera.advance(self.world.t_s, self._state_at)
+            self._past.add(self.world)
+            self.camera.advance(self.world.t_s, self._past)
 
     def step_blindly(self) -> None:
         """One control period without the camera, which somebody else exposes."""
@@ -106,14 +111,3 @@ class SimulatedVehicle:
         if self.camera is not None:
             self.camera.develop()
             self.camera.renderer.move_target(xy_m)
-
-    def _remember(self) -> None:
-        world = self.world
-        place_m = (world.x_m, world.y_m, world.z_m)
-        self._past.append(PastPose(world.t_s, place_m, world.quaternion))
-
-    def _state_at(self, t_s: float) -> PastPose:
-        """The pose nearest to `t_s` in the recent past."""
-        newest = self._past[-1]
-        back = round((newest.t_s - t_s) / CONTROL_PERIOD_S)
-        return self._past[max(-len(self._past), -1 - max(0, back))]

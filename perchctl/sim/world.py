@@ -5,20 +5,20 @@ origin on the floor under the start. One `World.step` is one `CONTROL_PERIOD_S`.
 
 Assumptions of the model, each with its source:
 
-- Motors: `perchctl.sim.powertrain`; their battery: `perchctl.sim.cell`; the curve between a
-  motor's voltage and its thrust: `perchctl.sim.powertrain`.
+- Motors, their battery, and the curve between a motor's voltage and its thrust:
+  `perchctl.sim.powertrain`.
 - Drag is linear in the airspeed. Of a Crazyflie's four rotors 9.2e-7 N/(m/s) level and
   10.3e-7 vertically a rad/s of their summed speed have been identified (Foerster, ETH
   Zurich, 2015); lifting 42 g they turn at 7600 rad/s together (2.9e-8 N/(rad/s)^2
   each), which makes 0.007 and 0.008. The camera, its board and the gear are some
   10 cm^2 of bluff body (c_d 1.2): 0.0015 more at 1 m/s. The rounded sums are `DRAG_*`.
 - A draught is a wind whose speed steady part and smooth gusts reach together, at two
-  standard deviations of the gusts (`perchctl.sim.world`).
+  standard deviations of the gusts (`perchctl.sim.wind`).
 - Near the ceiling the rotors pull themselves towards it, `Scenario.ceiling_suction` of their
   thrust at the ceiling itself. With 0.1 it is within 0.6 per cent of the thrust what momentum
   theory with a ceiling gives, and benches with rotors of this size (23 mm) measured (Hsiao and
   Chirarattananon, arXiv 1905.04632), for gears of 3 cm and more: 2 per cent in contact.
-- The magnet: `perchctl.sim.world`. The gear's tip is a flat disc, so a held vehicle
+- The magnet: `Magnet`. The gear's tip is a flat disc, so a held vehicle
   hangs level and friction keeps the tip in its place.
 """
 
@@ -47,9 +47,9 @@ from perchctl.geometry import (
     rpy_from_rotation,
 )
 from perchctl.sim.carried import Stop, Way
-from perchctl.sim.cell import RESISTANCE_OHM, CellKind
-from perchctl.sim.powertrain import Powertrain
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario, blown
+from perchctl.sim.powertrain import CellKind, Powertrain
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.wind import Wind
 
 ARM_M = 0.046  # hub to motor axis, X configuration
 YAW_TORQUE_M = 0.006  # N.m of reaction per N of thrust
@@ -61,7 +61,7 @@ _BIT = mujoco.mjtDisableBit
 _UNUSED_IN_THE_OPEN = int(
     _BIT.mjDSBL_CONTACT | _BIT.mjDSBL_CONSTRAINT | _BIT.mjDSBL_ACTUATION | _BIT.mjDSBL_EULERDAMP
 )
-"""Of a step's parts: what a body that touches nothing does not need."""
+"""Parts of a step that a body which touches nothing does not need."""
 _SIX = struct.Struct("6d")
 _SQRT_HALF = math.sqrt(0.5)
 _WIND_EVERY = 10  # the wind is evaluated every 20 ms
@@ -110,9 +110,8 @@ class World:
         self._reach_m = math.dist(scenario.gear_body_m, (0.0, 0.0, 0.0)) + MAGNET_RANGE_M
         self._suction = scenario.ceiling_suction
         self._steps = 0
-        self.powertrain = Powertrain(scenario.battery_rest_v, _cell_of(scenario))
-        if min(scenario.motor_strength) < 1.0:
-            self.powertrain.strength = scenario.motor_strength
+        self.powertrain = Powertrain(scenario.battery_rest_v, CellKind.of(scenario))
+        self.powertrain.strength = scenario.motor_strength
         self._wind_mps = (0.0, 0.0, 0.0)
         self._wind = Wind(scenario)
         self._held = False
@@ -201,22 +200,13 @@ class World:
     def state(self) -> TrueState:
         """The true state as arrays."""
         ceiling_n, floor = self.contacts()
-        vectors = np.array(
-            (
-                (self.x_m, self.y_m, self.z_m),
-                (self.vx_mps, self.vy_mps, self.vz_mps),
-                (self.p_radps, self.q_radps, self.r_radps),
-                (self.fx_mps2, self.fy_mps2, self.fz_mps2),
-            )
-        )
-        position, velocity, rates, force = vectors
         return TrueState(
             self.t_s,
-            position,
-            velocity,
+            np.array((self.x_m, self.y_m, self.z_m)),
+            np.array((self.vx_mps, self.vy_mps, self.vz_mps)),
             rotation_from_quaternion(self.quaternion),
-            rates,
-            force,
+            np.array((self.p_radps, self.q_radps, self.r_radps)),
+            np.array((self.fx_mps2, self.fy_mps2, self.fz_mps2)),
             ceiling_n,
             floor,
             self.magnet_engaged,
@@ -313,7 +303,7 @@ class World:
         self.fz_mps2 = r02 * ax + r12 * ay + r22 * az
 
     def on_floor(self) -> bool:
-        """Whether the floor is touched."""
+        """True if the vehicle touches the floor."""
         if not self._data.ncon:
             return False
         return any(self._floor in pair for pair in self._data.contact.geom.tolist())
@@ -330,16 +320,6 @@ class World:
                 mujoco.mj_contactForce(self._model, self._data, i, wrench)
                 ceiling_n += float(wrench[0])
         return ceiling_n, floor
-
-
-def _cell_of(scenario: Scenario) -> CellKind:
-    ohm = scenario.cell_resistance_ohm
-    return CellKind(
-        RESISTANCE_OHM if ohm is None else ohm,
-        scenario.cell_slow_ohm,
-        scenario.cell_charge,
-        scenario.cell_knee,
-    )
 
 
 # --- The rigid bodies as a MuJoCo model: floor, ceiling, and the vehicle with its gear ---------
@@ -452,59 +432,3 @@ class Magnet:
         elif self.engaged and gap_m > 2 * MAGNET_TOUCH_M:
             self.engaged = False
             self._came_off = True
-
-
-# --- The draught in the room: a steady part with smooth gusts, together up to a given speed ----
-
-
-_TERMS = 5
-_SLOWEST_HZ, _FASTEST_HZ = 0.05, 1.0
-_STEADY = 0.7  # the steady part of the draught's speed
-_SHARES = (0.15, 0.15, 0.1)  # standard deviation of the gusts over that speed: x, y, z
-_STREAM = 1
-
-_Terms = tuple[tuple[float, float, float], ...]
-
-
-class Wind:
-    """`Scenario.draught_mps` is the speed that the smooth gusts reach at two standard deviations;
-    single ones (`Scenario.gusts`) are added."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        draught = scenario.draught_mps
-        x, y, z = draught
-        self._mean = (_STEADY * x, _STEADY * y, _STEADY * z)
-        speed_mps = math.hypot(*draught)
-        rng = np.random.default_rng([scenario.seed, _STREAM])
-        self._still = speed_mps == 0.0
-        self._single = scenario.gusts
-        self._gusts = tuple(_draw(rng, share * speed_mps) for share in _SHARES)
-
-    def at(self, t_s: float) -> tuple[float, float, float]:
-        """The wind at t, m/s, world axes; exactly zero in still air."""
-        if self._single:
-            steady, more = self._smooth(t_s), blown(self._single, t_s)
-            return (steady[0] + more[0], steady[1] + more[1], steady[2] + more[2])
-        return self._smooth(t_s)
-
-    def _smooth(self, t_s: float) -> tuple[float, float, float]:
-        if self._still:
-            return (0.0, 0.0, 0.0)
-        x, y, z = self._mean
-        gust_x, gust_y, gust_z = self._gusts
-        return (x + _sum(gust_x, t_s), y + _sum(gust_y, t_s), z + _sum(gust_z, t_s))
-
-
-def _draw(rng: np.random.Generator, sigma_mps: float) -> _Terms:
-    """(amplitude m/s, pulsation rad/s, phase) of each sine."""
-    amplitude = sigma_mps * math.sqrt(2.0 / _TERMS)
-    hz = np.exp(rng.uniform(math.log(_SLOWEST_HZ), math.log(_FASTEST_HZ), _TERMS))
-    phases = rng.uniform(0.0, 2.0 * math.pi, _TERMS)
-    return tuple(
-        (amplitude, 2.0 * math.pi * float(f), float(phase))
-        for f, phase in zip(hz, phases, strict=True)
-    )
-
-
-def _sum(terms: _Terms, t_s: float) -> float:
-    return sum(a * math.sin(w * t_s + phase) for a, w, phase in terms)

@@ -16,7 +16,7 @@ from perchctl.check import Verdict, compared
 from perchctl.commands import app
 from perchctl.flight import wall_date
 from perchctl.profile import PositioningConfig
-from perchctl.sim.capture.settings import SWAPPED_XY, TRUE_AXES, Y_UP, axes_matrix
+from perchctl.sim.capture import SWAPPED_XY, TRUE_AXES, Y_UP, axes_matrix
 from tests.check.test_hand import recorded
 from tests.helpers.checks import NO_CAMERA, NOWHERE
 

@@ -15,9 +15,10 @@ from perchctl.check import Row, Verdict, hand
 from perchctl.geometry import Array, rot_z, rotation_from_rpy
 from perchctl.positioning import BodyPose, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.sim.carried import Stop, Way, lifted_and_turned
+from perchctl.sim.carried import Stop, Way
 from perchctl.vehicle import Telemetry
 from tests.helpers.capture import TURNS, UPRIGHT, named_up
+from tests.helpers.carried import lifted_and_turned
 from tests.helpers.mission import telemetry
 
 CONFIG = PositioningConfig(by="mocap", host="lab", body="cf2")

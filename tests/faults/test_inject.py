@@ -26,7 +26,7 @@ from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import Phase, PlannerState
 from perchctl.profile import TargetConfig
 from perchctl.sim import CaptureSettings, Neighbour, Scenario, most_thrust_n
-from perchctl.sim.firmware.commands import RawSetpoint
+from perchctl.sim.firmware.controller import Setpoint
 
 CAMERA = load_calibration("example_640x480.yaml")
 SCENARIO = Scenario(seed=2, camera_rate_hz=0.01, target_xy_m=(0.1, 0.2))
@@ -252,7 +252,7 @@ def test_a_vehicle_that_starts_again_stops_its_motors_and_time_goes_on() -> None
     rig.vehicle.each = times_s.append
     rig.wait(0.1)
     for thrust in (0, 30000, 30000):
-        firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, thrust))
+        firmware.low_level(Setpoint.raw(0.0, 0.0, 0.0, thrust))
         rig.wait(0.3)
     assert max(firmware.motors) > 0.0
     rig.injector.begin_now()

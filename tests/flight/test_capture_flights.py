@@ -13,7 +13,7 @@ from perchctl.errors import ConnectionFailed, SafetyAbort
 from perchctl.mission import Outcome, Phase
 from perchctl.profile.positioning import MOST_LATENCY_S
 from perchctl.sim import MILLIMETRES_PER_M, CaptureFault
-from perchctl.sim.capture.settings import SWAPPED_XY, Y_UP, OtherBody
+from perchctl.sim.capture import SWAPPED_XY, Y_UP, OtherBody
 from tests.helpers.flights import Flown, fly_short
 
 MOCAP = {"positioning.by": "mocap"}

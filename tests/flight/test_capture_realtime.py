@@ -26,7 +26,7 @@ from perchctl.calibration import load_calibration
 from perchctl.log import read_log
 from perchctl.profile import find_calibration, load_profile
 from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, SimProcess, draw_scenario
-from perchctl.sim.capture.settings import Y_UP
+from perchctl.sim.capture import Y_UP
 from tests.helpers.capture import compared
 from tests.helpers.flights import ROOT, SEED, SHORT, short_profile
 

@@ -25,8 +25,8 @@ from perchctl.mission import Phase
 from perchctl.profile import CameraConfig, Profile
 from perchctl.sim import SimulatedVehicle, draw_hand, draw_scenario, record_hand
 from perchctl.sim.hand import pictures
+from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.shared import HostSetup
 from perchctl.vision import Frame
 from tests.helpers.flights import SEED, fly_short, short_profile
 

@@ -13,7 +13,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.flight.clock import SIM_PATIENCE_S, SLOW, SLOW_S, SimulatedClock
 from perchctl.sim import CLOCK_MARGIN_S, CONTROL_PERIOD_S, SharedTime
 from perchctl.sim.process.child import Runner
-from perchctl.sim.process.shared import LOOP_PATIENCE_S
+from perchctl.sim.process.handle import LOOP_PATIENCE_S
 
 PERIOD_S = 0.02
 STEP_S = CONTROL_PERIOD_S

@@ -6,18 +6,28 @@ cflib's threads are waited for with bounded events; simulated time moves only by
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import struct
 import threading
-from collections.abc import Callable
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import cflib.crtp
+import cv2
+import numpy as np
 import pytest
 from cflib.crazyflie import Crazyflie
 from cflib.crazyflie.log import LogConfig
 from cflib.crtp.crtpstack import CRTPPacket
 
+import perchctl
+from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim import Scenario, SimProcess
+
+ROOT = str(Path(perchctl.__file__).resolve().parents[1])
 
 WAIT_S = 10.0
 CONNECTED_S = 60.0  # all tables, where a busy machine gives it a tenth of a core
@@ -33,6 +43,7 @@ BLOCKS = (
 READY, HL_RUNNING, HL_DONE, LOW_LEVEL, LOCKED = 0x020E, 0x011E, 0x031E, 0x021E, 0x0244
 FLYING_BIT, TUMBLED_BIT, LOCKED_BIT, CRASHED_BIT, HL_BIT = 1 << 4, 1 << 5, 1 << 6, 1 << 7, 1 << 8
 CAN_FLY_BIT, ARMED_BIT = 1 << 3, 1 << 1
+WEIGHT_N = 0.042 * GRAVITY_MPS2
 
 
 class Client:
@@ -224,6 +235,38 @@ class Pilot(Client):
         assert arrived, f"no log data up to {due_s} s, only {self._stamps}"
 
 
+def height(pilot: Pilot) -> float:
+    """Where it truly is, m."""
+    return float(pilot.sim.truth()["position_m"][2])
+
+
+def heights(pilot: Pilot, since_s: float) -> list[tuple[float, float]]:
+    """(seconds since, estimated height), every 10 ms."""
+    return [(t - since_s, z) for t, z in pilot.log("stateEstimate.z", since_s)]
+
+
+def height_at(curve: list[tuple[float, float]], t_s: float) -> float:
+    return min(curve, key=lambda sample: abs(sample[0] - t_s))[1]
+
+
+def off(truth: dict[str, Any]) -> bool:
+    """The motors are; for `Pilot.until`."""
+    return bool(max(truth["motors"]) == 0)
+
+
+def locked(truth: dict[str, Any]) -> bool:
+    """The supervisor is; for `Pilot.until`."""
+    return bool(truth["supervisor_info"] & LOCKED_BIT)
+
+
+def raw(pilot: Pilot, thrust: int) -> None:
+    pilot.cf.commander.send_setpoint(0, 0, 0, thrust)
+
+
+def notify(pilot: Pilot) -> None:
+    pilot.cf.commander.send_notify_setpoint_stop()
+
+
 def read(pilot: Pilot, name: str) -> float:
     """From the vehicle, not from cflib's memory of it."""
     group, _, short = name.partition(".")
@@ -249,3 +292,34 @@ def kept(pilot: Pilot, name: str, value: float) -> None:
         if read(pilot, name) == pytest.approx(value):
             return
     raise AssertionError(f"{name} is not {value:g}")
+
+
+def log_block(name: str, variables: dict[str, str], period_ms: int = 10) -> LogConfig:
+    block = LogConfig(name=name, period_in_ms=period_ms)
+    for variable, ctype in variables.items():
+        block.add_variable(variable, ctype)
+    return block
+
+
+@contextlib.contextmanager
+def wired(uri: str) -> Iterator[socket.socket]:
+    """A socket to a vehicle's link: one datagram, one packet."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
+        mine.connect(("127.0.0.1", int(uri.rsplit(":", 1)[1])))
+        mine.setblocking(False)
+        yield mine
+
+
+def pictures_of(url: str, count: int) -> list[np.ndarray]:
+    """The first pictures of a stream, decoded."""
+    pictures = []
+    with urllib.request.urlopen(url, timeout=WAIT_S) as answer:
+        assert answer.headers.get_content_type() == "multipart/x-mixed-replace"
+        while len(pictures) < count:
+            line = answer.readline()
+            if line.lower().startswith(b"content-length:"):
+                length = int(line.split(b":")[1])
+                answer.readline()
+                raw = np.frombuffer(answer.read(length), np.uint8)
+                pictures.append(cv2.imdecode(raw, cv2.IMREAD_UNCHANGED))
+    return pictures

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from perchctl.sim import CONTROL_PERIOD_S, Firmware, Scenario
-from perchctl.sim.firmware.commands import HlTakeoff, LowLevelCommand, PositionCommand
+from perchctl.sim.firmware.controller import Setpoint
+from perchctl.sim.firmware.planner import HlTakeoff
 from perchctl.sim.world import World
 
 STREAM_PERIOD_S = 0.02
@@ -18,7 +19,7 @@ class Rig:
     world: World
     firmware: Firmware
 
-    def run(self, seconds: float, stream: LowLevelCommand | None = None) -> list[float]:
+    def run(self, seconds: float, stream: Setpoint | None = None) -> list[float]:
         """Advance, streaming a setpoint at 50 Hz; the true heights on the way."""
         heights = []
         every = round(STREAM_PERIOD_S / CONTROL_PERIOD_S)
@@ -50,7 +51,7 @@ class Rig:
         self.run(2.5 + settle_s)
 
     def hold(self, seconds: float = 2.0, z_m: float = 0.8) -> None:
-        self.run(seconds, PositionCommand(0.0, 0.0, z_m, 0.0))
+        self.run(seconds, Setpoint.position(0.0, 0.0, z_m, 0.0))
 
 
 def make_rig(*, booted: bool = True, **conditions: Any) -> Rig:

@@ -14,12 +14,6 @@ from perchctl.vision import Frame
 from tests.helpers.target_picture import CAMERA
 
 
-class State:
-    def __init__(self, T: Array) -> None:
-        self.position_m: Array = T[:3, 3]
-        self.R_world_body: Array = T[:3, :3]
-
-
 class Pass:
     """A camera `below_m` under the target, moving and turning evenly; PAL unless told
     otherwise. Its frames have their true middle moment for a time."""
@@ -55,7 +49,7 @@ class Pass:
         step = given = 0
         while given < count:
             step += 1
-            camera.advance(step * CONTROL_PERIOD_S, lambda t: State(self.T_world_cam(t)))
+            camera.advance(step * CONTROL_PERIOD_S, self.T_world_cam)
             for frame in camera.take():
                 given += 1
                 yield Frame(frame.index, frame.t_exposure_s, frame.image, frame.t_arrival_s)

@@ -21,7 +21,8 @@ from perchctl.link.connection import send_packets
 from perchctl.link.encode import ARM, LAND_TIMES, UNLOCK_THRUST, encode
 from perchctl.sim import CommandService, Packet
 from perchctl.sim.crtp.codec import MAX_DATA
-from perchctl.sim.firmware.commands import HlLand, PositionCommand, RawSetpoint
+from perchctl.sim.firmware.controller import Setpoint
+from perchctl.sim.firmware.planner import HlLand
 from perchctl.vehicle import (
     Command,
     EmergencyStop,
@@ -175,12 +176,12 @@ def test_the_lockstep_vehicle_decodes_what_cflib_sends(command: Command) -> None
         (Idle(), []),
         (
             PositionSetpoint(0.25, -0.5, 1.5, math.pi / 2),
-            [("low_level", (PositionCommand(0.25, -0.5, 1.5, 90.0),))],
+            [("low_level", (Setpoint.position(0.25, -0.5, 1.5, 90.0),))],
         ),
-        (RawThrust(40000), [("low_level", (RawSetpoint(0.0, 0.0, 0.0, 40000),))]),
+        (RawThrust(40000), [("low_level", (Setpoint.raw(0.0, 0.0, 0.0, 40000),))]),
         (
             RawThrust(40000, math.pi / 8.0, -math.pi / 4.0),
-            [("low_level", (RawSetpoint(22.5, -45.0, 0.0, 40000),))],
+            [("low_level", (Setpoint.raw(22.5, -45.0, 0.0, 40000),))],
         ),
         (
             Land(-0.25, 3.0),

@@ -26,7 +26,7 @@ from perchctl.mission.budget import floor_of, needs_of, outlook, watched
 from perchctl.mission.energy import CURVE, Floor, left_s, loaded_v, resting_v
 from perchctl.profile import Profile, load_profile
 from perchctl.sim import CONTROL_PERIOD_S
-from perchctl.sim.cell import Cell, CellKind
+from perchctl.sim.powertrain import Cell, CellKind
 from perchctl.vehicle import FULL_THRUST
 from tests.helpers.mission import (
     FINE_BATTERY,

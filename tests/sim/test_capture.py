@@ -15,9 +15,8 @@ from perchctl.errors import InvalidValue
 from perchctl.geometry import quaternion_from_rotation, rotation_from_rpy
 from perchctl.positioning import CaptureFrame, Placed
 from perchctl.profile import PositioningConfig
-from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings, LockstepCapture
-from perchctl.sim.capture.settings import SWAPPED_XY, TRUE_AXES, Y_UP, OtherBody
-from perchctl.sim.capture.system import SimCapture
+from perchctl.sim import MILLIMETRES_PER_M, CaptureFault, CaptureSettings
+from perchctl.sim.capture import SWAPPED_XY, TRUE_AXES, Y_UP, SimCapture
 
 STEP_S = 0.002
 EXACT = CaptureSettings(position_noise_m=0.0, attitude_noise_rad=0.0, jitter_s=0.0)
@@ -153,29 +152,17 @@ def test_frozen_to_the_last_digit_swapped_gone_late_and_slow() -> None:
     assert len(slow) == pytest.approx(20, abs=2)
 
 
-def test_other_bodies_stand_or_swing() -> None:
-    others = (
-        OtherBody("target", (0.0, 0.0, 2.2)),
-        OtherBody("hand", (1.0, 0.0, 1.0), (0.2, 0.0, 0.0), 1.0),
-    )
-    frames = watched(SimCapture(replace(EXACT, others=others)), 1.0, Room())
-    assert {frame.bodies["target"].position_m for frame in frames} == {(0.0, 0.0, 2.2)}
-    x = [frame.bodies["hand"].position_m[0] for frame in frames]
-    assert (min(x), max(x)) == pytest.approx((0.8, 1.2), abs=0.01)
-
-
 def test_lockstep_hands_on_the_newest_once() -> None:
     capture, room = SimCapture(EXACT), Room()
-    source = LockstepCapture(capture)
     for _ in range(100):
         room.t_s += STEP_S
         capture.advance(room)
-    frame = source.poll(room.t_s)
+    frame = capture.poll(room.t_s)
     assert frame is not None
     assert room.t_s - frame.t_s < 1 / 120
-    assert source.poll(room.t_s) is None
-    assert source.problem(room.t_s) is None
-    source.close()
+    assert capture.poll(room.t_s) is None
+    assert capture.problem(room.t_s) is None
+    capture.close()
 
 
 @pytest.mark.parametrize("axes", ["xyz", "+x+y-z", "+x+x+y", "+x+y", ""])

@@ -13,9 +13,9 @@ import pytest
 
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.positioning import BodyPose, CaptureFrame
-from perchctl.sim import SIMULATED_SYSTEM, CaptureFault, CaptureSettings, Scenario, SimProcess
-from perchctl.sim.capture import natnet
-from perchctl.sim.capture.server import CaptureServer
+from perchctl.sim import CaptureFault, CaptureSettings, Scenario, SimProcess
+from perchctl.sim import capture as natnet
+from perchctl.sim.capture import CaptureServer, SimCapture
 
 WAIT_S = 10.0
 NAMES = ("crazyflie", "target")
@@ -35,7 +35,7 @@ class Reader:
     def __init__(self, host: str) -> None:
         library = pytest.importorskip("motioncapture", reason="needs the extra [mocap]")
         name, port = host.split(":")
-        self._client = library.connect(SIMULATED_SYSTEM, {"hostname": name, "port_command": port})
+        self._client = library.connect(SimCapture.SYSTEM, {"hostname": name, "port_command": port})
         self._news = threading.Condition()
         self._bodies: dict[str, Any] = {}
         threading.Thread(target=self._run, daemon=True).start()
@@ -94,7 +94,7 @@ def test_clients_that_have_gone_are_forgotten() -> None:
 
 
 def test_a_hidden_body_is_told_from_one_at_the_origin() -> None:
-    frame = natnet.frame(7, NAMES, CaptureFrame(1.3, {"target": SEEN.bodies["target"]}))
+    frame = natnet.frame_message(7, NAMES, CaptureFrame(1.3, {"target": SEEN.bodies["target"]}))
     kind, length = struct.unpack_from("<HH", frame)
     assert (kind, length) == (natnet.FRAME, len(frame) - 4)
     bodies = [struct.unpack_from("<i3f4ffh", frame, 4 + 16 + 38 * i) for i in range(2)]
@@ -124,7 +124,7 @@ def test_the_library_reads_the_room_of_the_vehicle_s_process() -> None:
     scenario = Scenario(extra={"external_position": 1.0})
     with SimProcess.start(scenario, "stepped", capture=CaptureSettings()) as sim:
         assert sim.capture is not None
-        assert sim.capture[0] == SIMULATED_SYSTEM
+        assert sim.capture[0] == SimCapture.SYSTEM
         first, second = Reader(sim.capture[1]), Reader(sim.capture[1])
         sim.set_pose((0.2, 0.1, 0.6), (0.0, 0.0, 1.0), hold=True)
         sim.advance(0.1)

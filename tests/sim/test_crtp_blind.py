@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from cflib.crazyflie.log import LogConfig
 
-from tests.helpers.crtp_rig import WAIT_S, Pilot, kept
+from tests.helpers.crtp_rig import WAIT_S, Pilot, kept, read
 
 NO_DECK = {"external_position": 1.0}
 SIGHT_S = 0.034
@@ -39,7 +39,7 @@ class Variances:
         pilot.cf.log.add_config(self.block)
         self.block.data_received_cb.add_callback(self._take)
         started = threading.Event()
-        self.block.started_cb.add_callback(lambda _block, _on: started.set())
+        self.block.started_cb.add_callback(lambda log_block, _on: started.set())
         self.block.start()
         assert started.wait(WAIT_S)  # from when on its samples are counted
 
@@ -55,7 +55,7 @@ class Variances:
         now = self.now()
         return max(now["varPX"], now["varPY"], now["varPZ"])
 
-    def _take(self, stamp_ms: int, data: dict[str, float], _block: Any) -> None:
+    def _take(self, stamp_ms: int, data: dict[str, float], log_block: Any) -> None:
         with self._news:
             self._stamp_ms, self._data = stamp_ms, data
             self._news.notify_all()
@@ -163,6 +163,7 @@ def test_pressed_and_blind_the_height_runs_away(bare: Pilot, variances: Variance
 
 def test_after_a_reset_the_first_position_is_believed(bare: Pilot, variances: Variances) -> None:
     """Variance 100 m^2 level and 1 m^2 in height, whatever `kalman.initial*` says (source)."""
+    assert read(bare, "deck.bcFlow2") == 0.0
     bare.stream(1.0, sights(bare), SIGHT_S)
     initial = {"initialX": 0.4, "initialY": -0.3, "initialZ": 0.1, "initialYaw": 0.5}
     try:
@@ -191,3 +192,47 @@ def test_after_a_reset_the_first_position_is_believed(bare: Pilot, variances: Va
     finally:
         for name in initial:
             set_to(bare, f"kalman.{name}", 0.0)
+    assert read(bare.fresh(), "deck.bcFlow2") == 1.0
+
+
+# What is sent is believed -------------------------------------------------------------
+
+
+def send_truth(pilot: Pilot) -> None:
+    x, y, z = pilot.sim.truth()["position_m"]
+    pilot.cf.extpos.send_extpos(x, y, z)
+
+
+def test_it_takes_off_by_positions_and_falls_for_false_ones(bare: Pilot) -> None:
+    bare.stream(0.5, lambda: send_truth(bare))
+    bare.unlock()
+
+    def hold() -> None:
+        send_truth(bare)
+        bare.hold(0.5)
+
+    bare.stream(3.0, hold)
+    x, y, z = bare.sim.truth()["position_m"]
+    assert z == pytest.approx(0.5, abs=0.15)
+    assert math.hypot(x, y) < 0.05
+    for axis, value in zip("xyz", (x, y, z), strict=True):
+        assert bare.now(f"stateEstimate.{axis}") == pytest.approx(value, abs=0.02)
+
+    def lie() -> None:
+        x, y, z = bare.sim.truth()["position_m"]
+        bare.cf.extpos.send_extpos(x + 0.5, y, z)
+        bare.hold(0.5)
+
+    bare.stream(3.0, lie)
+    assert bare.sim.truth()["position_m"][0] == pytest.approx(-0.5, abs=0.1)
+
+
+def test_a_pose_turns_the_heading(bare: Pilot) -> None:
+    half = math.radians(20.0)
+
+    def send() -> None:
+        x, y, z = bare.sim.truth()["position_m"]
+        bare.cf.extpos.send_extpose(x, y, z, 0.0, 0.0, math.sin(half), math.cos(half))
+
+    bare.stream(1.5, send)
+    assert bare.now("stateEstimate.yaw") == pytest.approx(40.0, abs=1.5)

@@ -12,9 +12,14 @@ from tests.helpers.crtp_rig import (
     LOCKED_BIT,
     READY,
     WAIT_S,
+    WEIGHT_N,
     Pilot,
+    height,
+    height_at,
+    heights,
+    notify,
+    raw,
 )
-from tests.sim.test_crtp_handover import WEIGHT_N, height, height_at, heights, notify, raw
 
 
 def test_release_in_position_mode_stops_at_thrust_min(pilot: Pilot) -> None:
@@ -126,20 +131,20 @@ class DutyCycle:
 
     def __init__(self, pilot: Pilot) -> None:
         self.values: list[int] = []
-        self._block = LogConfig(name="duty", period_in_ms=10)
-        self._block.add_variable("motor.m1", "uint16_t")
-        pilot.cf.log.add_config(self._block)
+        self.log_block = LogConfig(name="duty", period_in_ms=10)
+        self.log_block.add_variable("motor.m1", "uint16_t")
+        pilot.cf.log.add_config(self.log_block)
         started = threading.Event()
-        self._block.started_cb.add_callback(lambda _block, _on: started.set())
-        self._block.data_received_cb.add_callback(
-            lambda _stamp, data, _block: self.values.append(int(data["motor.m1"]))
+        self.log_block.started_cb.add_callback(lambda log_block, _on: started.set())
+        self.log_block.data_received_cb.add_callback(
+            lambda _stamp, data, log_block: self.values.append(int(data["motor.m1"]))
         )
-        self._block.start()
+        self.log_block.start()
         assert started.wait(WAIT_S)
 
     def close(self) -> None:
-        self._block.stop()
-        self._block.delete()
+        self.log_block.stop()
+        self.log_block.delete()
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.helpers.crtp_rig import HL_BIT, LOW_LEVEL, READY, Pilot
-
-
-def height(pilot: Pilot) -> float:
-    return float(pilot.sim.truth()["position_m"][2])
+from tests.helpers.crtp_rig import HL_BIT, LOW_LEVEL, READY, Pilot, height, notify, off, raw
 
 
 def lowest_after(pilot: Pilot, seconds: float, send: Callable[[], None]) -> float:
@@ -27,27 +23,27 @@ def test_first_raw_burst_in_flight_is_a_cut(pilot: Pilot) -> None:
     """Row "Thrust is forced to 0 until one packet with thrust 0": a motor cut within 7 ms."""
     pilot.cf.high_level_commander.takeoff(0.6, 2.0)  # never unlocked
     pilot.advance(4.0)
-    pilot.cf.commander.send_setpoint(0, 0, 0, 50000)
-    assert pilot.until(lambda t: max(t["motors"]) == 0, 0.1) <= 0.007
-    pilot.stream(0.3, lambda: pilot.cf.commander.send_setpoint(0, 0, 0, 50000))
+    raw(pilot, 50000)
+    assert pilot.until(off, 0.1) <= 0.007
+    pilot.stream(0.3, lambda: raw(pilot, 50000))
     assert pilot.motors_off()
 
 
 def test_a_zero_packet_in_flight_is_a_cut(pilot: Pilot) -> None:
     """Row "A zero packet in flight is itself a cut"."""
     pilot.fly_to(0.6, 0.5)
-    pilot.cf.commander.send_setpoint(0, 0, 0, 0)
-    assert pilot.until(lambda t: max(t["motors"]) == 0, 0.1) <= 0.007
+    raw(pilot, 0)
+    assert pilot.until(off, 0.1) <= 0.007
 
 
 def test_unlock_without_notify_blocks_the_take_off(pilot: Pilot) -> None:
     """Row "without the notify, an HL take-off shows HL active but the motors stay at 0"."""
-    pilot.cf.commander.send_setpoint(0, 0, 0, 0)
+    raw(pilot, 0)
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
     pilot.advance(1.8)
     assert pilot.info & HL_BIT
     assert pilot.motors_off()
-    pilot.cf.commander.send_notify_setpoint_stop()
+    notify(pilot)
     pilot.cf.high_level_commander.takeoff(0.5, 2.0)
     pilot.advance(3.0)
     assert height(pilot) > 0.3
@@ -58,7 +54,7 @@ def test_raw_thrust_limits(pilot: Pilot) -> None:
     pilot.unlock()
     pilot.sim.set_pose((0, 0, 0.5), hold=True)
     for sent, flown in ((999, 0), (1000, 1000), (30000, 30000), (60000, 60000), (65535, 60000)):
-        pilot.stream(0.1, lambda sent=sent: pilot.cf.commander.send_setpoint(0, 0, 0, sent))
+        pilot.stream(0.1, lambda sent=sent: raw(pilot, sent))
         assert pilot.now("stabilizer.thrust") == flown
     pilot.sim.let_go()
 
@@ -80,7 +76,7 @@ def test_raw_burst_gains_little(pilot: Pilot) -> None:
     pilot.sim.set_battery(4.2)
     pilot.stream(4.0, lambda: pilot.hold(0.8))  # the compensation has met the change
     before_m = height(pilot)
-    pilot.stream(0.5, lambda: pilot.cf.commander.send_setpoint(0, 0, 0, 60000))
+    pilot.stream(0.5, lambda: raw(pilot, 60000))
     assert height(pilot) - before_m == pytest.approx(0.058, abs=0.01)
     assert pilot.sim.truth()["velocity_mps"][2] == pytest.approx(0.25, abs=0.02)
 
@@ -92,7 +88,7 @@ def test_position_controller_pushes_harder_than_raw(pilot: Pilot) -> None:
     pilot.stream(3.0, lambda: pilot.hold(3.0))
     pressed_n = pilot.sim.truth()["ceiling_force_n"]
     assert pilot.now("stabilizer.thrust") == pytest.approx(65_535, abs=1)
-    pilot.stream(1.0, lambda: pilot.cf.commander.send_setpoint(0, 0, 0, 60000))
+    pilot.stream(1.0, lambda: raw(pilot, 60000))
     assert 0.0 < pilot.sim.truth()["ceiling_force_n"] < pressed_n
 
 
@@ -251,7 +247,7 @@ def test_a_flying_battery_sags_and_recovers(pilot: Pilot) -> None:
     pilot.fly_to(0.5, 0.5)
     loaded_v = pilot.now("pm.vbat")
     pilot.cf.commander.send_stop_setpoint()
-    pilot.cf.commander.send_notify_setpoint_stop()
+    notify(pilot)
     pilot.advance(3.0)
     assert pilot.now("pm.vbat") > loaded_v + 0.2
 
@@ -261,7 +257,7 @@ def test_the_minimal_perch(pilot: Pilot) -> None:
     pilot.perch()
     assert pilot.sim.truth()["gear_miss_m"] < 0.01
     pilot.cf.commander.send_stop_setpoint()
-    pilot.cf.commander.send_notify_setpoint_stop()
+    notify(pilot)
     pilot.advance(3.0)
     assert pilot.info == READY
     assert pilot.sim.truth()["magnet_engaged"]

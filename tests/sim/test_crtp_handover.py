@@ -7,42 +7,27 @@ on the real firmware, and the tolerance is what the model misses it by at most.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable
-from typing import Any
 
 import pytest
 
-from perchctl.geometry import GRAVITY_MPS2
 from tests.helpers.crtp_rig import (
     HL_BIT,
     HL_DONE,
     LOCKED_BIT,
     READY,
+    WEIGHT_N,
     Pilot,
+    height,
+    height_at,
+    heights,
+    notify,
+    off,
 )
 
-WEIGHT_N = 0.042 * GRAVITY_MPS2
 PACKET_S = 0.004  # a silence that swallows what is sent at its start
 LIFTED_M = 0.022  # 1 cm over the floor
 PRESSED_M = 2.5  # a setpoint above the ceiling at 2.2 m
-
-
-def off(truth: dict[str, Any]) -> bool:
-    return bool(max(truth["motors"]) == 0)
-
-
-def height(pilot: Pilot) -> float:
-    return float(pilot.sim.truth()["position_m"][2])
-
-
-def heights(pilot: Pilot, since_s: float) -> list[tuple[float, float]]:
-    """(seconds since, estimated height), every 10 ms."""
-    return [(t - since_s, z) for t, z in pilot.log("stateEstimate.z", since_s)]
-
-
-def height_at(curve: list[tuple[float, float]], t_s: float) -> float:
-    return min(curve, key=lambda sample: abs(sample[0] - t_s))[1]
 
 
 def lose(pilot: Pilot, send: Callable[[], None]) -> None:
@@ -50,14 +35,6 @@ def lose(pilot: Pilot, send: Callable[[], None]) -> None:
     pilot.sim.silence(PACKET_S)
     send()
     pilot.advance(0.01)
-
-
-def raw(pilot: Pilot, thrust: int) -> None:
-    pilot.cf.commander.send_setpoint(0, 0, 0, thrust)
-
-
-def notify(pilot: Pilot) -> None:
-    pilot.cf.commander.send_notify_setpoint_stop()
 
 
 def land(pilot: Pilot, height_m: float, duration_s: float) -> None:
@@ -156,16 +133,6 @@ def test_landing_turns_to_yaw_0_unless_it_is_to_be_kept(
     notify(pilot)
     pilot.advance(2.98)
     assert pilot.now("stateEstimate.yaw") == pytest.approx(end_deg, abs=3)
-
-
-def test_the_first_generation_of_land_turns_to_yaw_0(pilot: Pilot) -> None:
-    """Row "without `yaw=None` turn the vehicle to yaw 0": port 8, command 2 has no yaw (source)."""
-    pilot.fly_to(0.8, 1.0)
-    pilot.stream(4.0, lambda: pilot.cf.commander.send_position_setpoint(0, 0, 0.8, 90), 0.05)
-    pilot.send(8, 0, struct.pack("<BBff", 2, 0, 0.0, 3.0))
-    notify(pilot)
-    pilot.advance(2.98)
-    assert pilot.now("stateEstimate.yaw") == pytest.approx(0, abs=4)
 
 
 def test_take_off_turns_to_yaw_0_unless_it_is_to_be_kept(pilot: Pilot) -> None:
@@ -293,12 +260,6 @@ def test_the_level_out_dips(
     curve = [z for t, z in heights(pilot, last_s) if t < 2.0]
     assert min(curve) == pytest.approx(dip_m, abs=0.02)
     assert curve[-1] == pytest.approx(end_m, abs=0.02)
-
-
-# --- On the ceiling ---------------------------------------------------------------
-
-
-# --- Thrust command, duty cycle and voltage ---------------------------------------
 
 
 # --- Losses -----------------------------------------------------------------------

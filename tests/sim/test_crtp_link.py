@@ -130,8 +130,6 @@ def test_parameters_are_set_and_read_back(client: Client) -> None:
     assert float(param.get_value(name)) == 1.0
     assert float(_await_value(client, name, lambda: param.set_value(name, "0.5"))) == 0.5
     assert float(_await_value(client, name, lambda: param.request_param_update(name))) == 0.5
-    param.set_value_raw(name, 0x06, 0.75)  # by name, without an answer that cflib uses
-    assert float(_await_value(client, name, lambda: param.request_param_update(name))) == 0.75
     _await_value(client, name, lambda: param.set_value(name, "1.0"))
     with pytest.raises(AttributeError, match="read-only"):
         param.set_value("deck.bcFlow2", "0")
@@ -145,33 +143,8 @@ def test_parameter_answers_on_the_wire(client: Client) -> None:
     ident = struct.pack("<H", element.ident)
     assert client.ask(2, 1, ident) == ident + b"\x00\x02"
     assert client.ask(2, 1, b"\xff\xff") == b"\xff\xff\x02"
+    assert client.ask(2, 0, b"\x02\xff\xff") == b"\x02"
     assert client.ask(2, 3, b"\x07\xff\xff") == b"\x07\xff\xff\x02"
-
-
-def test_persistent_parameters(client: Client) -> None:
-    """Port 2 channel 3: extended types, default values, storing and clearing."""
-    param = client.cf.param
-    name = "posCtlPid.zKp"
-    assert param.toc.get_element_by_complete_name(name).is_persistent()
-    assert not param.toc.get_element_by_complete_name("stabilizer.stop").is_persistent()
-
-    def call(method: Any) -> Any:
-        done = threading.Event()
-        results: list[Any] = []
-
-        def take(_: str, result: Any) -> None:
-            results.append(result)
-            done.set()
-
-        method(name, callback=take)
-        assert done.wait(WAIT_S)
-        return results[0]
-
-    assert call(param.get_default_value) == 2.0
-    assert call(param.persistent_get_state) == (False, 2.0, None)
-    _await_value(client, name, lambda: param.set_value(name, "2.5"))
-    assert call(param.persistent_store) is True
-    assert call(param.persistent_get_state) == (True, 2.0, 2.5)
-    assert call(param.persistent_clear) is True
-    assert call(param.persistent_get_state) == (False, 2.0, None)
-    _await_value(client, name, lambda: param.set_value(name, "2.0"))
+    toc = client.cf.param.toc
+    assert toc.get_element_by_complete_name("posCtlPid.zKp").is_persistent()
+    assert not toc.get_element_by_complete_name("stabilizer.stop").is_persistent()

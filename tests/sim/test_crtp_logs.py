@@ -13,8 +13,7 @@ import pytest
 from cflib.crazyflie.mem import MemoryElement
 
 from perchctl.sim import SimProcess
-from tests.helpers.crtp_client import _block
-from tests.helpers.crtp_rig import READY, WAIT_S, Client, Pilot
+from tests.helpers.crtp_rig import READY, WAIT_S, Client, Pilot, log_block
 
 
 @pytest.fixture
@@ -29,7 +28,7 @@ def clean(client: Client) -> Iterator[Client]:
 
 def test_log_data_have_period_and_stamp(sim: SimProcess, clean: Client) -> None:
     """Row "Log data: block id, 3-byte ms timestamp, data", with conversion on the way."""
-    block = _block("p", {"pm.vbat": "FP16", "pm.vbatMV": "uint16_t", "acc.z": "float"}, 50)
+    block = log_block("p", {"pm.vbat": "FP16", "pm.vbatMV": "uint16_t", "acc.z": "float"}, 50)
     clean.cf.log.add_config(block)
     stamps: list[int] = []
     data: list[dict[str, float]] = []
@@ -62,14 +61,14 @@ def test_log_data_have_period_and_stamp(sim: SimProcess, clean: Client) -> None:
 def test_log_limits_are_known_to_cflib(clean: Client) -> None:
     """Rows "Unknown log variable: KeyError. Too large a log block: AttributeError"."""
     with pytest.raises(KeyError):
-        clean.cf.log.add_config(_block("u", {"no.such": "float"}))
+        clean.cf.log.add_config(log_block("u", {"no.such": "float"}))
     too_large = {f"kalman.q{i}": "float" for i in range(4)} | {
         f"stateEstimate.{n}": "float" for n in "xyz"
     }
     with pytest.raises(AttributeError):
-        clean.cf.log.add_config(_block("l", too_large))
+        clean.cf.log.add_config(log_block("l", too_large))
     with pytest.raises(AttributeError):
-        clean.cf.log.add_config(_block("s", {"acc.z": "float"}, 2550))
+        clean.cf.log.add_config(log_block("s", {"acc.z": "float"}, 2550))
 
 
 def _create(client: Client, ident: int, count: int, ctype: int = 7) -> int:
@@ -104,7 +103,7 @@ def test_blocks_longer_than_one_packet(sim: SimProcess, clean: Client) -> None:
     """Create and append V2: 13 two-byte variables need a second packet."""
     names = [f"stateEstimateZ.{n}" for n in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
     names += ["pm.vbatMV", "motor.m1", "motor.m2", "supervisor.info"]
-    block = _block("long", dict.fromkeys(names, "uint16_t"))
+    block = log_block("long", dict.fromkeys(names, "uint16_t"))
     clean.cf.log.add_config(block)
     got: list[dict[str, float]] = []
     started, arrived = threading.Event(), threading.Event()
@@ -133,21 +132,13 @@ def test_memories(client: Client) -> None:
     assert eeprom.elements["radio_address"] == 0xE7E7E7E7E7
 
 
-def test_memory_is_read_and_written_in_chunks(client: Client) -> None:
+def test_memory_is_read_in_chunks(client: Client) -> None:
     """Port 4: 24 bytes a packet, an address beyond the end is refused."""
-    (tester,) = client.cf.mem.get_mems(MemoryElement.TYPE_MEMORY_TESTER)
-    done = threading.Event()
-    tester.read_data(5, 100, lambda _: done.set())
-    assert done.wait(WAIT_S)
-    assert tester.readValidationSuccess
-    (trajectory,) = client.cf.mem.get_mems(MemoryElement.TYPE_TRAJ)
-    written = threading.Event()
-    client.cf.mem.mem_write_cb.add_callback(lambda *_: written.set())
-    client.cf.mem.write(trajectory, 10, bytes(range(60)))
-    assert written.wait(WAIT_S)
-    head = struct.pack("<BI", trajectory.id, 10)
-    assert client.ask(4, 1, head + b"\x05") == head + b"\x00\x00\x01\x02\x03\x04"
-    beyond = struct.pack("<BI", trajectory.id, trajectory.size - 2)
+    (deck,) = client.cf.mem.get_mems(MemoryElement.TYPE_1W)
+    head = struct.pack("<BI", deck.id, 0)
+    assert client.ask(4, 1, head + b"\x01") == head + b"\x00\xeb"
+    assert client.ask(4, 1, head + b"\x19") == head + bytes((errno.EACCES,))
+    beyond = struct.pack("<BI", deck.id, deck.size - 2)
     assert client.ask(4, 1, beyond + b"\x05") == beyond + bytes((errno.EACCES,))
 
 

@@ -19,8 +19,7 @@ import pytest
 from perchctl.errors import ConnectionFailed, InvalidValue
 from perchctl.sim import CONTROL_PERIOD_S, Packet, Port, Scenario, SimProcess
 from perchctl.sim.process.child import MAX_LAG_S, Runner
-from tests.helpers.crtp_process import ROOT, WAIT_S, wired
-from tests.helpers.crtp_rig import Client
+from tests.helpers.crtp_rig import ROOT, WAIT_S, Client, wired
 
 
 def eventually(condition: Callable[[], bool], limit_s: float = WAIT_S) -> bool:
@@ -213,7 +212,7 @@ _PARENT = """
 import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
-from perchctl.sim.process.shared import HostSetup
+from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.process.handle import SimProcess
 from perchctl.sim.process.host import VehicleHost
 started = []

@@ -13,8 +13,7 @@ from cflib.utils.power_switch import PowerSwitch
 from perchctl.errors import InvalidValue
 from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.crtp.server import LinkOptions
-from tests.helpers.crtp_client import _block
-from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot
+from tests.helpers.crtp_rig import LOCKED_BIT, READY, Client, Pilot, log_block
 
 
 @pytest.fixture
@@ -66,22 +65,20 @@ def test_an_exception_in_a_with_block_drops_the_vehicle(
 
 def test_old_firmware_has_no_supervisor_port(toc_cache: str) -> None:
     """Row "Protocol < 12": supervisor port missing, old channels work, bit field reads 0."""
-    link = LinkOptions(protocol_version=10, missing_log_variables=("supervisor.info",))
+    link = LinkOptions(protocol_version=11, missing_log_variables=("supervisor.info",))
     with SimProcess.start(pace="stepped", link=link) as process:
         process.advance(1.0)
         client = Client(process.uri, toc_cache)
         assert client.connect()
         try:
-            assert client.cf.platform.get_protocol_version() == 10
+            assert client.cf.platform.get_protocol_version() == 11
             with pytest.warns(UserWarning, match="protocol version 12"):
                 assert client.cf.supervisor.read_bitfield() == 0
             client.send(9, 0, b"\x0c")
             assert client.echo(4)
             assert client.ask(13, 0, b"\x01\x01") == b"\x01\x01\x01"  # arming, the old way
-            name = "posCtlPid.zKp"  # extended types by the old command
-            assert client.cf.param.toc.get_element_by_complete_name(name).is_persistent()
             with pytest.raises(KeyError):
-                client.cf.log.add_config(_block("s", {"supervisor.info": "uint16_t"}))
+                client.cf.log.add_config(log_block("s", {"supervisor.info": "uint16_t"}))
             with pytest.warns(UserWarning, match="protocol version 12"):
                 client.cf.supervisor.send_emergency_stop()
             process.advance(0.5)
@@ -117,7 +114,7 @@ def test_a_silent_peer_is_never_reported(pilot: Pilot) -> None:
     assert lost == []
 
 
-@pytest.mark.parametrize("wrong", [{"protocol_version": 3}, {"loss_rate": 1.5}])
+@pytest.mark.parametrize("wrong", [{"protocol_version": 10}, {"loss_rate": 1.5}])
 def test_options_are_checked(wrong: dict[str, Any]) -> None:
     with pytest.raises(InvalidValue, match="choose"):
         LinkOptions(**wrong)

@@ -14,10 +14,10 @@ import pytest
 
 from perchctl.errors import ConnectionFailed
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.child import main
+from perchctl.sim.process.__main__ import main
+from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.shared import HostSetup
-from tests.helpers.crtp_process import ROOT, WAIT_S, _parts, wired
+from tests.helpers.crtp_rig import ROOT, WAIT_S, pictures_of, wired
 
 
 def received(mine: socket.socket) -> list[bytes]:
@@ -41,7 +41,7 @@ def test_standalone_runs_until_ctrl_c() -> None:
         uri = process.stdout.readline().split()[1]
         stream = process.stdout.readline().split()[1]
         assert uri.startswith("udp://127.0.0.1:")
-        assert len(_parts(stream, 1)) == 1
+        assert len(pictures_of(stream, 1)) == 1
         process.send_signal(signal.SIGINT)
         assert process.wait(WAIT_S) == 0
 
@@ -80,14 +80,3 @@ def test_lossy_link_is_the_same_for_a_seed() -> None:
     assert 5 < len(first) < 35
     assert answered(1) == first
     assert answered(2) != first
-
-
-def test_silence_at_a_given_time() -> None:
-    """The peer goes silent by the simulated clock and comes back."""
-    link = LinkOptions(silent_from_s=0.2, silent_for_s=0.1)
-    with hosted(link) as host, wired(host.uri) as mine:
-        for number, answers in ((1, True), (2, False), (3, True)):
-            mine.send(bytes((0xFC, number)))
-            host.serve()
-            assert (bytes((0xFC, number)) in received(mine)) == answers
-            host.advance(0.21 if number == 1 else 0.1)

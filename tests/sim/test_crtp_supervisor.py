@@ -20,17 +20,13 @@ from tests.helpers.crtp_rig import (
     READY,
     TUMBLED_BIT,
     Pilot,
+    locked,
+    notify,
+    off,
+    raw,
 )
 
 UPDATE_S = 0.04  # 25 Hz
-
-
-def locked(truth: dict[str, object]) -> bool:
-    return bool(int(str(truth["supervisor_info"])) & LOCKED_BIT)
-
-
-def off(truth: dict[str, tuple[int, ...]]) -> bool:
-    return max(truth["motors"]) == 0
 
 
 # --- Supervisor -------------------------------------------------------------------
@@ -72,7 +68,7 @@ def test_flying_clears_two_seconds_after_the_motors_stop(pilot: Pilot) -> None:
     """Row "flying = a motor was above idle in the last 2.0 s"."""
     pilot.fly_to(0.3, 0.5, AIRBORNE_S)
     pilot.cf.commander.send_stop_setpoint()
-    pilot.cf.commander.send_notify_setpoint_stop()
+    notify(pilot)
     took_s = pilot.until(lambda t: not t["supervisor_info"] & FLYING_BIT, 3.0)
     assert took_s == pytest.approx(2.02, abs=0.06)
 
@@ -179,7 +175,7 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
     pilot.fly_to(0.3, 0.5, AIRBORNE_S)
     since_s = pilot.t_s
     pilot.cf.commander.send_stop_setpoint()
-    pilot.cf.commander.send_notify_setpoint_stop()
+    notify(pilot)
     assert pilot.until(off, 0.1) <= 0.007
     pilot.until(lambda t: t["supervisor_info"] == READY, 4.0)
     assert pilot.t_s - since_s == pytest.approx(2.06, abs=0.1)
@@ -194,7 +190,7 @@ def test_stop_and_notify_is_ready_again(pilot: Pilot) -> None:
 def test_the_farewell_packet_drops_a_flying_vehicle(pilot: Pilot) -> None:
     """Row "close_link() sends send_setpoint(0,0,0,0)": falls at once and locks."""
     pilot.fly_to(0.8, 0.5, AIRBORNE_S)
-    pilot.cf.commander.send_setpoint(0, 0, 0, 0)
+    raw(pilot, 0)
     assert pilot.until(off, 0.1) <= 0.007
     pilot.advance(3.0)
     assert pilot.sim.truth()["floor_contact"]
@@ -206,9 +202,9 @@ def test_the_farewell_packet_when_perched(pilot: Pilot, wait_s: float, locks: bo
     """Row "perched, it locks when the flying bit is still set (1 s after), not 4 s after"."""
     pilot.perch()
     pilot.cf.commander.send_stop_setpoint()
-    pilot.cf.commander.send_notify_setpoint_stop()
+    notify(pilot)
     pilot.advance(wait_s)
-    pilot.cf.commander.send_setpoint(0, 0, 0, 0)
+    raw(pilot, 0)
     pilot.advance(6.0)
     assert bool(pilot.info & LOCKED_BIT) == locks
     assert pilot.sim.truth()["magnet_engaged"]
@@ -263,7 +259,7 @@ def test_hl_without_notify_is_not_flown(pilot: Pilot) -> None:
 def test_hl_after_notify_flies(pilot: Pilot) -> None:
     """Row "With notify first it flies"."""
     pilot.fly_to(0.8, 1.0, AIRBORNE_S)
-    pilot.cf.commander.send_notify_setpoint_stop()
+    notify(pilot)
     pilot.cf.high_level_commander.go_to(0, 0, 1.2, 0, 2.0)
     pilot.advance(6.0)
     assert pilot.info == HL_DONE

@@ -16,7 +16,7 @@ from perchctl.profile import data_file
 from perchctl.sim import Scenario, SimProcess
 from perchctl.sim.process.host import MjpegServer
 from perchctl.vision import CameraModel
-from tests.helpers.crtp_process import WAIT_S, _parts
+from tests.helpers.crtp_rig import WAIT_S, pictures_of
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,8 @@ def test_newest_picture_wins_for_several_clients() -> None:
             server.publish(np.full((48, 64), grey, np.uint8))
         results: list[list[np.ndarray]] = []
         watchers = [
-            threading.Thread(target=lambda: results.append(_parts(server.url, 1))) for _ in range(3)
+            threading.Thread(target=lambda: results.append(pictures_of(server.url, 1)))
+            for _ in range(3)
         ]
         for watcher in watchers:
             watcher.start()
@@ -65,7 +66,7 @@ def test_a_taken_http_port_is_a_clear_error() -> None:
 def test_the_vehicles_picture_is_streamed(camera: CameraModel) -> None:
     """In real time, rendering in its own thread; a stock reader opens it too."""
     with SimProcess.start(Scenario(seed=1), "realtime", camera=camera) as sim:
-        pictures = _parts(sim.stream_url, 3)
+        pictures = pictures_of(sim.stream_url, 3)
         width, height = camera.size_px
         assert all(p.shape == (height, width) for p in pictures)
         assert all(p.std() > 3.0 for p in pictures)
@@ -80,9 +81,9 @@ def test_the_vehicles_picture_is_streamed(camera: CameraModel) -> None:
 def test_stepped_pictures_come_with_the_time(camera: CameraModel) -> None:
     with SimProcess.start(Scenario(seed=1), "stepped", camera=camera) as sim:
         sim.advance(0.3)
-        (first,) = _parts(sim.stream_url, 1)
-        (again,) = _parts(sim.stream_url, 1)
+        (first,) = pictures_of(sim.stream_url, 1)
+        (again,) = pictures_of(sim.stream_url, 1)
         assert np.array_equal(first, again)
         sim.advance(0.1)
-        (later,) = _parts(sim.stream_url, 1)
+        (later,) = pictures_of(sim.stream_url, 1)
         assert not np.array_equal(first, later)

@@ -1,4 +1,4 @@
-"""Firmware facts "Raw thrust", "Thrust budget", "Setpoint modes", "Signs and units"."""
+"""What the firmware model does beyond the rows that tests/sim/test_crtp_*.py show through cflib."""
 
 from __future__ import annotations
 
@@ -6,40 +6,28 @@ import math
 
 import pytest
 
-from perchctl.sim import REST_HEIGHT_M
-from perchctl.sim.firmware.commands import (
-    HlGoTo,
-    HlLand,
-    HlTakeoff,
-    HoverCommand,
-    PositionCommand,
-    RawSetpoint,
-    StopCommand,
-    VelocityWorldCommand,
-    ZDistanceCommand,
-)
-from perchctl.vehicle import HL_ACTIVE, HL_FINISHED
-from tests.helpers.firmware_rig import PERFECT, make_rig
+from perchctl.sim.firmware.controller import Setpoint
+from perchctl.sim.firmware.planner import HlLand, HlStop, HlTakeoff
+from perchctl.vehicle import CAN_FLY, CRASHED, LOCKED, TUMBLED
+from tests.helpers.firmware_rig import PERFECT, Rig, make_rig
 
-HERE = PositionCommand(0.0, 0.0, 0.8, 0.0)
-FULL_RAW = RawSetpoint(0.0, 0.0, 0.0, 60000)
+READY, LOCK = 0x020E, 0x0244
+HERE = Setpoint.position(0.0, 0.0, 0.8, 0.0)
+FULL_RAW = Setpoint.raw(0.0, 0.0, 0.0, 60000)
 
 
-# Raw thrust -------------------------------------------------------------------------
-
-
-def test_a_first_raw_burst_without_a_zero_packet_is_a_cut() -> None:
-    rig = make_rig()
+def flying(**conditions: float) -> Rig:
+    """Holding 0.8 m on low-level position setpoints."""
+    rig = make_rig(**conditions)
     rig.take_off()
     rig.hold()
-    rig.firmware.low_level(FULL_RAW)
-    assert rig.run_until(lambda: rig.motors_off, 0.1) <= 0.007
+    return rig
 
 
 def test_a_zero_packet_in_flight_is_a_cut_but_unlocks() -> None:
     rig = make_rig()
     rig.take_off()
-    rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
+    rig.firmware.low_level(Setpoint.raw(0.0, 0.0, 0.0, 0))
     rig.run(0.006)
     assert rig.motors_off
     rig.firmware.low_level(FULL_RAW)
@@ -47,128 +35,13 @@ def test_a_zero_packet_in_flight_is_a_cut_but_unlocks() -> None:
     assert not rig.motors_off
 
 
-def test_unlock_without_notify_keeps_the_motors_off_in_a_take_off() -> None:
-    rig = make_rig()
-    rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
-    rig.firmware.high_level(HlTakeoff(0.5, 2.0))
-    rig.run(0.4)
-    assert rig.info & HL_ACTIVE
-    assert rig.motors_off
-
-
 def test_the_unlock_is_forgotten_at_boot() -> None:
     rig = make_rig()
-    rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
+    rig.firmware.low_level(Setpoint.raw(0.0, 0.0, 0.0, 0))
     rig.firmware.reboot()
     rig.run(0.3)
     rig.run(0.1, FULL_RAW)
     assert rig.motors_off
-
-
-@pytest.mark.parametrize(
-    ("sent", "flown"), [(999, 0.0), (1000, 1000.0), (30000, 30000.0), (65535, 60000.0)]
-)
-def test_raw_thrust_is_limited(sent: int, flown: float) -> None:
-    rig = make_rig()
-    rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
-    rig.run(0.02, RawSetpoint(0.0, 0.0, 0.0, sent))
-    assert rig.firmware.log_value("stabilizer.thrust") == flown
-
-
-def test_the_largest_raw_burst_gains_what_was_measured() -> None:
-    rig = make_rig()
-    rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
-    rig.firmware.notify_setpoint_stop()
-    rig.take_off(settle_s=8.0)
-    rig.world.battery_rest_v = 4.2  # the facts' battery is fresh
-    rig.run(2.0)  # the compensation of the voltage has met the change
-    before = rig.world.z_m
-    rig.run(0.5, FULL_RAW)
-    assert rig.world.z_m - before == pytest.approx(0.058, abs=0.007)
-    assert rig.world.vz_mps == pytest.approx(0.25, abs=0.0125)
-
-
-def test_hover_command_at_42_g() -> None:
-    rig = make_rig(**PERFECT)
-    rig.take_off(settle_s=8.0)
-    assert rig.firmware.log_value("stabilizer.thrust") == pytest.approx(56200, rel=0.005)
-
-
-def test_a_position_setpoint_above_the_ceiling_presses_harder_than_a_raw_burst() -> None:
-    forces = []
-    for command in (PositionCommand(0.0, 0.0, 1.5, 0.0), FULL_RAW):
-        rig = make_rig(ceiling_z_m=1.0, no_target=True, **PERFECT)
-        rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
-        rig.firmware.notify_setpoint_stop()
-        rig.take_off(0.9)
-        rig.run(2.0, command)
-        forces.append(rig.world.state().ceiling_force_n)
-    assert forces[0] > forces[1] + 0.02
-    assert forces[1] > 0.01
-
-
-# Setpoint modes ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("mass_kg", "command", "dip_to_m", "within_m"),
-    [
-        (0.042, HoverCommand(0.0, 0.0, 0.0, 0.8), 0.47, 0.0235),
-        # Both modes reset the same loops and hold the height in the same way, so one
-        # dip lies between the two that were measured.
-        (0.042, ZDistanceCommand(0.0, 0.0, 0.0, 0.8), 0.45, 0.045),
-        (0.030, HoverCommand(0.0, 0.0, 0.0, 0.8), 0.74, 0.01),
-    ],
-)
-def test_changing_mode_from_position_dips(
-    mass_kg: float, command: HoverCommand | ZDistanceCommand, dip_to_m: float, within_m: float
-) -> None:
-    rig = make_rig(mass_kg=mass_kg)
-    rig.take_off()
-    rig.hold(3.0)
-    assert min(rig.run(3.0, command)) == pytest.approx(dip_to_m, abs=within_m)
-
-
-def test_hover_to_velocity_falls_to_the_floor() -> None:
-    rig = make_rig()
-    rig.take_off()
-    rig.run(6.0, HoverCommand(0.0, 0.0, 0.0, 0.8))
-    assert rig.world.z_m > 0.7
-    heights = rig.run(3.0, VelocityWorldCommand(0.0, 0.0, 0.0, 0.0))
-    assert min(heights) < REST_HEIGHT_M + 0.005
-
-
-def test_high_level_to_position_does_not_dip() -> None:
-    rig = make_rig()
-    rig.take_off(settle_s=5.0)
-    before = rig.world.z_m
-    assert min(rig.run(1.0, HERE)) > before - 0.03
-
-
-def test_the_level_out_resets_as_well() -> None:
-    rig = make_rig()
-    rig.take_off()
-    rig.hold(3.0)
-    before = rig.world.z_m
-    assert min(rig.run(1.4)) < before - 0.1
-
-
-@pytest.mark.parametrize(("mass_kg", "first_lift_s"), [(0.042, 1.5), (0.030, 0.75)])
-def test_high_level_take_off_lifts_late(mass_kg: float, first_lift_s: float) -> None:
-    rig = make_rig(mass_kg=mass_kg)
-    rig.firmware.high_level(HlTakeoff(0.5, 2.0))
-    seen_s = rig.run_until(lambda: rig.world.z_m > REST_HEIGHT_M + 0.005, 3.0)
-    assert seen_s == pytest.approx(first_lift_s, abs=0.16)
-
-
-def test_high_level_take_off_is_finished_by_the_clock() -> None:
-    rig = make_rig()
-    rig.firmware.high_level(HlTakeoff(0.5, 2.0))
-    rig.run(1.95)
-    assert not rig.info & HL_FINISHED
-    rig.run(0.1)
-    assert rig.info & HL_FINISHED
-    assert rig.world.z_m == pytest.approx(0.25, abs=0.02)  # of 0.5 m, and 0.23 m at 2.0 s
 
 
 def test_high_level_landing_ends_on_the_floor_with_the_motors_off() -> None:
@@ -190,91 +63,102 @@ def test_a_landing_of_a_landing_and_a_take_off_in_flight_are_refused() -> None:
     assert not rig.firmware.planner.command(HlLand(0.0, 1.0), rig.firmware.t_s)
 
 
-# Signs and units --------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("command", [HERE, HlGoTo(0.0, 0.0, 0.8, 0.0, 2.0, False)])
-def test_position_yaw_is_degrees_and_high_level_yaw_radians(
-    command: PositionCommand | HlGoTo,
-) -> None:
-    rig = make_rig(mass_kg=0.030, **PERFECT)
-    rig.take_off()
-    if isinstance(command, HlGoTo):
-        rig.firmware.high_level(HlGoTo(0.3, 0.2, 0.8, 0.5, 2.0, False))
-        rig.run(4.0)
-    else:
-        rig.run(4.0, PositionCommand(0.3, 0.2, 0.8, math.degrees(0.5)))
-    assert rig.firmware.log_value("stateEstimate.yaw") == pytest.approx(28.6, abs=1.5)
-    state = rig.world.state()
-    assert state.position_m[:2] == pytest.approx([0.3, 0.2], abs=0.04)
-    assert math.atan2(state.R_world_body[1, 0], state.R_world_body[0, 0]) > 0.4
-
-
-def test_relative_go_to_offsets_in_world_axes() -> None:
-    rig = make_rig(mass_kg=0.030, **PERFECT)
-    rig.take_off()
-    rig.firmware.high_level(HlGoTo(0.0, 0.0, 0.8, math.pi / 2, 2.0, False))
-    rig.run(4.0)
-    rig.firmware.high_level(HlGoTo(0.4, 0.0, 0.0, 0.0, 2.0, True))
-    rig.run(4.0)
-    assert rig.world.state().position_m[:2] == pytest.approx([0.4, 0.0], abs=0.05)
-    assert rig.firmware.log_value("stateEstimate.yaw") == pytest.approx(90.0, abs=2.0)
-
-
-def test_hover_velocity_is_in_body_axes() -> None:
-    rig = make_rig(mass_kg=0.030, **PERFECT)
-    rig.take_off()
-    rig.run(4.0, PositionCommand(0.0, 0.0, 0.8, 90.0))
-    rig.run(2.0, HoverCommand(0.3, 0.0, 0.0, 0.8))
-    state = rig.world.state()
-    assert state.velocity_mps[1] == pytest.approx(0.3, abs=0.08)
-    assert abs(state.velocity_mps[0]) < 0.08
-    rig.run(2.0, HoverCommand(0.0, 0.3, 0.0, 0.8))
-    assert rig.world.vx_mps == pytest.approx(-0.3, abs=0.08)
-
-
-def test_hover_yaw_rate_is_counter_clockwise_degrees() -> None:
-    rig = make_rig(mass_kg=0.030, **PERFECT)
-    rig.take_off()
-    rig.run(1.0, HoverCommand(0.0, 0.0, 40.0, 0.8))
-    assert 25.0 < rig.firmware.log_value("stateEstimate.yaw") < 42.0
-
-
-def test_raw_yaw_rate_is_clockwise() -> None:
-    rig = make_rig(mass_kg=0.030, **PERFECT)
-    rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
-    rig.firmware.notify_setpoint_stop()
-    rig.take_off()
-    rig.run(1.0, RawSetpoint(0.0, 0.0, 60.0, 41000))
-    assert rig.firmware.log_value("stateEstimate.yaw") == pytest.approx(-48.0, abs=1.0)
-
-
-def test_raw_pitch_and_roll_signs() -> None:
-    rig = make_rig(mass_kg=0.030, **PERFECT)
-    rig.firmware.low_level(RawSetpoint(0.0, 0.0, 0.0, 0))
-    rig.firmware.notify_setpoint_stop()
-    rig.take_off()
-    # The attitude loop's integral overshoots by half a degree later on.
-    rig.run(0.35, RawSetpoint(0.0, 10.0, 0.0, 41000))
-    assert rig.firmware.log_value("stateEstimate.pitch") == pytest.approx(-9.6, abs=0.3)
-    assert rig.world.vx_mps > 0.2
-    rig.run(2.0, HERE)
-    rig.run(0.35, RawSetpoint(10.0, 0.0, 0.0, 41000))
-    assert rig.firmware.log_value("stateEstimate.roll") == pytest.approx(9.6, abs=0.3)
-    assert rig.world.vy_mps < -0.15
-
-
 def test_velocity_is_in_world_axes_and_moves_up() -> None:
     rig = make_rig(mass_kg=0.030, **PERFECT)
     rig.take_off()
-    rig.run(4.0, PositionCommand(0.0, 0.0, 0.8, 90.0))
-    rig.run(2.5, VelocityWorldCommand(0.3, 0.0, 0.1, 0.0))
+    rig.run(4.0, Setpoint.position(0.0, 0.0, 0.8, 90.0))
+    rig.run(2.5, Setpoint.velocity(0.3, 0.0, 0.1, 0.0))
     assert rig.world.vx_mps == pytest.approx(0.3, abs=0.08)
     assert rig.world.vz_mps == pytest.approx(0.1, abs=0.06)
 
 
-def test_a_stop_setpoint_is_no_thrust() -> None:
+@pytest.mark.parametrize("stream", [None, HERE])
+def test_nothing_locks_later_when_nothing_is_sent_after_a_disarm_in_flight(
+    stream: Setpoint | None,
+) -> None:
     rig = make_rig()
     rig.take_off()
-    rig.run(0.006, StopCommand())
-    assert rig.firmware.log_value("stabilizer.thrust") == 0.0
+    rig.run(0.1, stream)
+    rig.firmware.arm(False)
+    rig.run(0.042)
+    seen = set()
+    for _ in range(2000):
+        rig.run(0.02)
+        assert rig.motors_off
+        seen.add(rig.info)
+    assert not any(info & LOCKED for info in seen)
+    assert rig.info == READY
+    assert rig.world.state().floor_contact
+    rig.firmware.high_level(HlTakeoff(0.5, 2.0))
+    rig.run(2.5)
+    assert rig.world.z_m > 0.3
+
+
+def test_stop_parameter_is_an_emergency_stop() -> None:
+    rig = flying()
+    rig.firmware.set_parameter("stabilizer.stop", 1)
+    rig.run(0.1)
+    assert rig.info == LOCK
+
+
+def test_high_level_stop_cuts_the_motors() -> None:
+    rig = make_rig()
+    rig.take_off()
+    rig.firmware.high_level(HlStop())
+    rig.run(0.02)
+    assert rig.motors_off
+
+
+@pytest.mark.parametrize(("height_m", "after_s"), [(0.8, 0.45), (1.5, 0.7)])
+def test_put_on_its_back_in_flight_falls_and_crashes(height_m: float, after_s: float) -> None:
+    rig = make_rig()
+    rig.take_off(height_m)
+    here = Setpoint.position(0.0, 0.0, height_m, 0.0)
+    rig.run(2.0, here)
+    rig.world.set_pose((0.0, 0.0, height_m), (math.pi, 0.0, 0.0))
+    seen_s = 0.0
+    while not rig.info & CRASHED and seen_s < 2.0:
+        rig.run(0.02, here)
+        seen_s += 0.02
+    assert seen_s == pytest.approx(after_s, abs=0.1)
+    rig.run(0.5)
+    assert rig.motors_off
+    assert rig.world.state().R_world_body[2, 2] < -0.5
+    assert not rig.info & LOCKED
+    rig.world.set_pose((0.0, 0.0, 0.012))
+    rig.run(0.5)
+    assert rig.firmware.recover_from_crash() == (True, True)
+    assert rig.run_until(lambda: bool(rig.info & CAN_FLY), 1.0) == pytest.approx(0.12, abs=0.045)
+    rig.run(40.0)  # the setpoints of the flight that crashed spin nothing
+    assert rig.info == READY
+    assert rig.motors_off
+
+
+@pytest.mark.parametrize(("roll_rad", "after_s"), [(1.2, 1.0), (2.5, 0.1)])
+def test_tumble_rule(roll_rad: float, after_s: float) -> None:
+    rig = flying()
+    rig.world.set_pose((0.0, 0.0, 0.8), (roll_rad, 0.0, 0.0), hold=True)
+    seen_s = 0.0
+    while not rig.info & CRASHED and seen_s < 2.0:
+        rig.run(0.02, HERE)
+        seen_s += 0.02
+    assert seen_s == pytest.approx(after_s + 0.05, abs=0.07)
+
+
+def test_falling_is_no_tumble() -> None:
+    rig = flying(ceiling_z_m=9.0)
+    rig.world.set_pose((0.0, 0.0, 8.0))
+    rig.firmware.low_level(Setpoint())
+    rig.firmware.notify_setpoint_stop()
+    rig.run(0.9)
+    assert not rig.info & TUMBLED
+    assert rig.world.vz_mps < -5.0
+
+
+def test_a_grounded_vehicle_on_its_back_cannot_fly() -> None:
+    rig = make_rig()
+    rig.world.set_pose((0.0, 0.0, 0.5), (3.14, 0.0, 0.0), hold=True)
+    rig.run(0.3)
+    assert not rig.info & CAN_FLY
+    rig.run(0.5, Setpoint.hover(0.0, 0.0, 0.0, 0.5))
+    assert rig.motors_off

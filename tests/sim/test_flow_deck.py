@@ -12,8 +12,7 @@ import pytest
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
 from perchctl.sim import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.firmware.estimator import Estimator
-from perchctl.sim.flow_deck import FlowDeck, has_flow_errors
+from perchctl.sim.firmware.estimator import Estimator, FlowDeck, has_flow_errors
 from perchctl.sim.world import World
 
 GOOD = {"flow_noise_radps": 0.06}

@@ -13,7 +13,7 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.geometry import Array, invert_T, make_T, rot_z, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
-from perchctl.sim.gloss import SLOPE, lobe
+from perchctl.sim.sheets import SLOPE, lobe
 from perchctl.vision import CameraModel
 from tests.sim.test_renderer import CEILING, PLUMB_BOB, XY, camera_pose
 from tests.sim.test_renderer import scenario as level

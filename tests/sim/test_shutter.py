@@ -19,8 +19,9 @@ from perchctl.sim import (
     SimulatedVehicle,
     draw_scenario,
 )
-from perchctl.sim.shutter import FLICKER_HZ, Shutter, blended
-from perchctl.sim.surfaces import Picture
+from perchctl.sim.camera import FLICKER_HZ, Shutter
+from perchctl.sim.optics import Picture
+from perchctl.sim.renderer import blended
 from perchctl.vision import CameraModel
 
 K = np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]])
@@ -32,20 +33,17 @@ STILL = Scenario(
 SPEED_MPS, TURN_RADPS, BELOW_M = 0.3, 0.5, 0.3
 
 
-class State:
+def pose(t_s: float, turn_radps: float = 0.0) -> Array:
     """Under the target, moving along x (the picture's rows) and turning."""
-
-    def __init__(self, t_s: float, turn_radps: float) -> None:
-        x_m = SPEED_MPS * (t_s - 0.1)
-        self.position_m: Array = np.array([x_m, 0.0, STILL.ceiling_z_m - BELOW_M])
-        self.R_world_body: Array = rot_z(turn_radps * (t_s - 0.1))
+    place_m = (SPEED_MPS * (t_s - 0.1), 0.0, STILL.ceiling_z_m - BELOW_M)
+    return make_T(rot_z(turn_radps * (t_s - 0.1)), place_m)
 
 
 def first_frame(scenario: Scenario, turn_radps: float = 0.0) -> tuple[Picture, float]:
     """The first frame and its middle moment."""
     camera = SimCamera(scenario, Renderer(scenario, CAMERA, TargetConfig()))
     for step in range(1, 200):
-        camera.advance(step * CONTROL_PERIOD_S, lambda t: State(t, turn_radps))
+        camera.advance(step * CONTROL_PERIOD_S, lambda t: pose(t, turn_radps))
         if frames := camera.take():
             return frames[0].image, frames[0].t_exposure_s
     raise AssertionError("no frame")
@@ -53,9 +51,7 @@ def first_frame(scenario: Scenario, turn_radps: float = 0.0) -> tuple[Picture, f
 
 def at_once(t_s: float, turn_radps: float = 0.0) -> Picture:
     """The whole picture of one moment."""
-    state = State(t_s, turn_radps)
-    pose = make_T(state.R_world_body, state.position_m)
-    return Renderer(STILL, CAMERA, TargetConfig()).render([pose])
+    return Renderer(STILL, CAMERA, TargetConfig()).render([pose(t_s, turn_radps)])
 
 
 @pytest.mark.parametrize("first", ["top", "bottom"])
@@ -137,9 +133,9 @@ def test_a_frame_never_arrives_before_its_last_light() -> None:
     assert camera.exposed_s == pytest.approx(0.048)
     now_s = 0.0
 
-    def pose_at(t_s: float) -> State:
+    def pose_at(t_s: float) -> Array:
         assert now_s - camera.exposed_s - CONTROL_PERIOD_S <= t_s <= now_s + 1e-9
-        return State(t_s, 0.0)
+        return pose(t_s)
 
     arrived = []
     for step in range(1, 80):
@@ -160,7 +156,7 @@ def test_the_vehicle_remembers_as_far_back_as_a_frame_looks() -> None:
 
     def advance(t_s: float, pose_at: Any) -> None:
         def asked(at_s: float) -> Any:
-            oldest.append(abs(pose_at(at_s).t_s - at_s))
+            oldest.append(vehicle._past._poses[0][0] - at_s)
             return pose_at(at_s)
 
         seen(t_s, asked)
@@ -171,12 +167,6 @@ def test_the_vehicle_remembers_as_far_back_as_a_frame_looks() -> None:
     assert max(oldest) < CONTROL_PERIOD_S
 
 
-def test_the_default_camera_is_plain() -> None:
-    """Its pictures come by the same way as ever."""
-    assert Shutter(draw_scenario(Profile(), 3)).plain
-    assert draw_scenario(Profile(), 3).extra == {}
-
-
 def test_the_profile_decides() -> None:
     profile = Profile.model_validate(
         {"simulation": {
@@ -185,7 +175,6 @@ def test_the_profile_decides() -> None:
         }}
     )  # fmt: skip
     drawn, plain = draw_scenario(profile, 3), draw_scenario(Profile(), 3)
-    assert not Shutter(drawn).plain
     assert drawn == replace(
         plain, camera_fields="bottom", camera_blended=True, camera_readout_s=0.018,
         camera_flicker=0.1, camera_pumping=0.2, extra={"analogue": 0.3},

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -12,34 +13,38 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from perchctl.geometry import Array
-from perchctl.profile import TargetConfig
-from perchctl.sim import CONTROL_PERIOD_S, Renderer, Scenario, SimCamera, SimulatedVehicle
+from perchctl.calibration import profile_camera
+from perchctl.geometry import Array, make_T
+from perchctl.profile import TargetConfig, load_profile
+from perchctl.sim import (
+    CONTROL_PERIOD_S,
+    Renderer,
+    Scenario,
+    SimCamera,
+    SimulatedVehicle,
+    draw_scenario,
+)
 from perchctl.sim.camera import DeliveredFrame
+from perchctl.sim.renderer import Shot
 from perchctl.vision import CameraModel
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    position_m: Array
-    R_world_body: Array
-
-
-def pose_at(t_s: float) -> State:
-    return State(np.array([0.1 * t_s, 0.0, 1.0]), np.eye(3))
+def pose_at(t_s: float) -> Array:
+    return make_T(np.eye(3), (0.1 * t_s, 0.0, 1.0))
 
 
 class Stub:
     """Stands for the renderer: a picture of its index and of the pose at mid-exposure."""
 
+    camera = SimpleNamespace(size_px=(2, 2))
+
     def __init__(self) -> None:
         self.rendered: list[int] = []
 
-    def render(
-        self, T_world_cam_samples: Sequence[Array], defocus_px: Any = None, frame_index: int = 0
-    ) -> Any:
+    def expose(self, shots: Sequence[Shot], frame_index: int = 0) -> Any:
         self.rendered.append(frame_index)
-        middle = T_world_cam_samples[len(T_world_cam_samples) // 2]
+        (poses,) = shots[0].rows
+        middle = poses[len(poses) // 2]
         return np.array([[frame_index, round(middle[0, 3] * 1e6)]])
 
 
@@ -154,13 +159,6 @@ def test_a_camera_frozen_from_the_start_shows_its_first_picture() -> None:
     assert len(stub.rendered) == 1
 
 
-def test_take_gives_each_frame_once() -> None:
-    camera = SimCamera(Scenario(), cast(Renderer, Stub()))
-    camera.advance(1.0, pose_at)
-    assert len(camera.take()) > 20
-    assert camera.take() == []
-
-
 def test_another_seed_has_another_phase() -> None:
     first = [run(Scenario(seed=s), 0.3)[0][0].t_exposure_s for s in range(5)]
     assert len({round(t, 6) for t in first}) == 5
@@ -171,7 +169,7 @@ def test_poses_are_requested_within_the_last_exposure_only() -> None:
     now = 0.0
     requested = []
 
-    def watched(t_s: float) -> State:
+    def watched(t_s: float) -> Array:
         requested.append((t_s, now))
         return pose_at(t_s)
 
@@ -230,3 +228,25 @@ def test_a_picture_shows_the_target_where_it_was(receiver_hz: float | None) -> N
     same = [(t_s, np.array_equal(a, b)) for (t_s, a), (_, b) in zip(*pictures, strict=True)]
     assert any(not equal for _, equal in same)
     assert all(equal == (t_s < 0.496) for t_s, equal in same)
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.02], ids=["global shutter", "rolling shutter"])
+def test_time_in_leaps_shows_what_time_in_steps_shows(readout_s: float) -> None:
+    """A picture shows the way during its exposure, however the vehicle's time is made to pass."""
+    profile = load_profile("sim")
+    scenario = replace(draw_scenario(profile, 3), camera_readout_s=readout_s)
+    leaping, stepping = (
+        SimulatedVehicle(scenario, profile_camera(profile.camera), TargetConfig()) for _ in range(2)
+    )
+    pictures: list[list[bytes]] = [[], []]
+    for vehicle in (leaping, stepping):
+        vehicle.world.set_pose((0.0, 0.0, 1.2), velocity_mps=(0.4, -0.3, 0.0))
+    for k in range(1, 21):
+        leaping.advance_to(0.02 * k)
+        while stepping.t_s < 0.02 * k - 1e-3:
+            stepping.step()
+        for vehicle, seen in zip((leaping, stepping), pictures, strict=True):
+            assert vehicle.camera is not None
+            seen += [np.asarray(frame.image).tobytes() for frame in vehicle.camera.take()]
+    assert len(pictures[0]) >= 6
+    assert pictures[0] == pictures[1]

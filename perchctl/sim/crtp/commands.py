@@ -7,31 +7,18 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
-from perchctl.sim.crtp.codec import MAX_DATA, Packet, Port, Status
-from perchctl.sim.firmware.commands import (
-    HighLevelCommand,
-    HlGoTo,
-    HlLand,
-    HlStop,
-    HlTakeoff,
-    HoverCommand,
-    LowLevelCommand,
-    PositionCommand,
-    RawSetpoint,
-    StopCommand,
-    VelocityWorldCommand,
-    ZDistanceCommand,
-)
+from perchctl.sim.crtp.codec import Packet, Port, Status
+from perchctl.sim.firmware.controller import Setpoint
+from perchctl.sim.firmware.planner import HighLevelCommand, HlGoTo, HlLand, HlStop, HlTakeoff
 
 if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware
 
 # Port 8.
-HL_SET_GROUP, HL_TAKEOFF, HL_LAND, HL_STOP, HL_GO_TO = 0, 1, 2, 3, 4
-HL_TAKEOFF_2, HL_LAND_2, HL_GO_TO_2 = 7, 8, 12
+HL_SET_GROUP, HL_STOP, HL_TAKEOFF_2, HL_LAND_2, HL_GO_TO_2 = 0, 3, 7, 8, 12
 # Port 9.
 GET_STATE, ARM, RECOVER, EMERGENCY_STOP, WATCHDOG = 0x0C, 0x01, 0x02, 0x03, 0x04
 REPLY = 0x80
@@ -40,39 +27,21 @@ _LOC_EMERGENCY_STOP, _LOC_WATCHDOG, _LOC_POSE = 3, 4, 8
 _NOTIFY_STOP = 0
 
 
-def raw(data: bytes) -> RawSetpoint:
+def _raw(data: bytes) -> Setpoint:
     """Port 3: ``<fffH``; cflib negates the pitch on its way out."""
     roll, pitch, yaw_rate, thrust = struct.unpack_from("<fffH", data)
-    return RawSetpoint(roll, -pitch, yaw_rate, thrust)
+    return Setpoint.raw(roll, -pitch, yaw_rate, thrust)
 
 
-def _hover(data: bytes, sign: float = 1.0) -> LowLevelCommand:
-    vx, vy, rate, z = struct.unpack_from("<ffff", data)
-    return HoverCommand(vx, vy, sign * rate, z)
-
-
-def _velocity(data: bytes, sign: float = 1.0) -> LowLevelCommand:
-    vx, vy, vz, rate = struct.unpack_from("<ffff", data)
-    return VelocityWorldCommand(vx, vy, vz, sign * rate)
-
-
-def _z_distance(data: bytes, sign: float = 1.0) -> LowLevelCommand:
-    roll, pitch, rate, z = struct.unpack_from("<ffff", data)
-    return ZDistanceCommand(roll, pitch, sign * rate, z)
-
-
-# The first generation of these setpoints had the yaw rate's sign the other way round.
-_GENERIC: dict[int, Callable[[bytes], LowLevelCommand]] = {
-    0: lambda data: StopCommand(),
-    1: lambda data: _velocity(data, -1.0),
-    2: lambda data: _z_distance(data, -1.0),
-    5: lambda data: _hover(data, -1.0),
-    7: lambda data: PositionCommand(*struct.unpack_from("<ffff", data)),
-    8: _velocity,
-    9: _z_distance,
-    10: _hover,
-    11: raw,  # manual, by angles
+_GENERIC: dict[int, Callable[[bytes], Setpoint]] = {
+    0: lambda data: Setpoint(),
+    7: lambda data: Setpoint.position(*struct.unpack_from("<ffff", data)),
+    8: lambda data: Setpoint.velocity(*struct.unpack_from("<ffff", data)),
+    9: lambda data: Setpoint.z_distance(*struct.unpack_from("<ffff", data)),
+    10: lambda data: Setpoint.hover(*struct.unpack_from("<ffff", data)),
+    11: _raw,  # manual, by angles
 }
+"""Port 7: setpoints by their type, as cflib sends them since protocol 11."""
 
 
 class CommandService:
@@ -81,7 +50,6 @@ class CommandService:
     def __init__(self, firmware: Firmware, protocol_version: int) -> None:
         self.firmware = firmware
         self._has_supervisor_port = protocol_version >= 12
-        self._has_go_to_2 = protocol_version >= 8
         self._groups = 0
         self._handlers: dict[int, Callable[[Packet], list[Packet]]] = {
             Port.COMMANDER: self._commander,
@@ -92,9 +60,10 @@ class CommandService:
         }
 
     def handle(self, packet: Packet) -> list[Packet]:
-        """Packets too short for their command are passed over, as the firmware does."""
+        """The answers to one packet. What is too short for its command is passed over, as the
+        firmware does."""
         handler = self._handlers.get(packet.port)
-        if handler is None or (not packet.data):
+        if handler is None or not packet.data:
             return []
         try:
             return handler(packet)
@@ -106,11 +75,12 @@ class CommandService:
         return bytes(self.firmware.arm(do_arm))
 
     def recover(self) -> bytes:
+        """(success, recovered) as bytes; shared with the platform port."""
         return bytes(self.firmware.recover_from_crash())
 
     def _commander(self, packet: Packet) -> list[Packet]:
         if packet.channel == 0:
-            self._low_level(raw(packet.data))
+            self._low_level(_raw(packet.data))
         return []
 
     def _generic(self, packet: Packet) -> list[Packet]:
@@ -122,27 +92,22 @@ class CommandService:
             self.firmware.notify_setpoint_stop(remain_ms / 1000.0)
         return []
 
+    def _low_level(self, setpoint: Setpoint) -> None:
+        values = (getattr(setpoint, name) for name in Setpoint.__slots__)
+        if _all_finite(value for value in values if isinstance(value, float)):
+            self.firmware.low_level(setpoint)
+
     def _high_level(self, packet: Packet) -> list[Packet]:
-        data = packet.data
-        status = Status.OK
+        data, status = packet.data, Status.OK
         if data[0] == HL_SET_GROUP:
             self._groups = data[1]
-        elif data[0] == HL_GO_TO_2 and not self._has_go_to_2:
+        elif (command := _high_level(data)) is None:
             status = Status.ENOEXEC
-        else:
-            command = _high_level(data)
-            if command is None:
-                status = Status.ENOEXEC
-            elif self._for_us(data[1]) and _all_finite(command):
+        elif data[1] == 0 or data[1] & self._groups:
+            values = vars(command).values()
+            if _all_finite(value for value in values if value is not None):
                 self.firmware.high_level(command)
         return [Packet(Port.HIGH_LEVEL, 0, data[:3].ljust(3, b"\0") + bytes((status,)))]
-
-    def _low_level(self, command: LowLevelCommand) -> None:
-        if _all_finite(command):
-            self.firmware.low_level(command)
-
-    def _for_us(self, mask: int) -> bool:
-        return mask == 0 or bool(mask & self._groups)
 
     def _localization(self, packet: Packet) -> list[Packet]:
         data = packet.data
@@ -179,31 +144,21 @@ class CommandService:
 
 
 def _high_level(data: bytes) -> HighLevelCommand | None:
-    """None for a command this vehicle does not have (trajectories, spirals)."""
+    """The command of a packet on port 8; None for one that this vehicle does not have
+    (trajectories, spirals)."""
     command = data[0]
     if command == HL_STOP:
         return HlStop()
-    if command in (HL_TAKEOFF, HL_LAND):
-        height, duration = struct.unpack_from("<ff", data, 2)
-        # The first generation always turns to yaw 0 (source).
-        return (HlTakeoff if command == HL_TAKEOFF else HlLand)(height, duration, 0.0)
     if command in (HL_TAKEOFF_2, HL_LAND_2):
         height, yaw, keep_yaw, duration = struct.unpack_from("<ff?f", data, 2)
-        cls = HlTakeoff if command == HL_TAKEOFF_2 else HlLand
-        return cls(height, duration, None if keep_yaw else yaw)
-    if command in (HL_GO_TO, HL_GO_TO_2):
-        at = 4 if command == HL_GO_TO_2 else 3  # the second one has a flag for straight lines
-        x, y, z, yaw, duration = struct.unpack_from("<fffff", data, at)
+        kind = HlTakeoff if command == HL_TAKEOFF_2 else HlLand
+        return kind(height, duration, None if keep_yaw else yaw)
+    if command == HL_GO_TO_2:  # data[3] is a flag for straight lines
+        x, y, z, yaw, duration = struct.unpack_from("<fffff", data, 4)
         return HlGoTo(x, y, z, yaw, duration, bool(data[2]))
     return None
 
 
-def _all_finite(command: LowLevelCommand | HighLevelCommand) -> bool:
+def _all_finite(values: Iterable[float]) -> bool:
     """Numbers that are none would poison the controller for good: such packets are dropped."""
-    values = vars(command).values()
-    return all(math.isfinite(v) for v in values if isinstance(v, float))
-
-
-def link_source() -> bytes:
-    """The answer to a link-source request (port 15, channel 1)."""
-    return b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
+    return all(map(math.isfinite, values))

@@ -11,8 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from perchctl.sim.crtp.codec import BY_CTYPE, BY_LOG_CODE, Number, Packet, Port, Status
-from perchctl.sim.crtp.toc import Toc
+from perchctl.sim.crtp.codec import BY_CTYPE, BY_LOG_CODE, Number, Packet, Port, Status, Toc
 
 if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware
@@ -22,8 +21,8 @@ MAX_BLOCKS = 16
 MAX_VARIABLES = 128
 PERIOD_UNIT_S = 0.010
 _TOC, _SETTINGS, _DATA = 0, 1, 2
-_CREATE, _APPEND, _DELETE, _START, _STOP, _RESET, _CREATE_V2, _APPEND_V2 = range(8)
-_MEMORY_ID = 255  # in the first protocol: an address instead of a variable
+_DELETE, _START, _STOP, _RESET, _CREATE_V2, _APPEND_V2 = range(2, 8)
+_ENTRY_BYTES = 3
 _EPS_S = 1e-6
 
 
@@ -43,12 +42,12 @@ class LogService:
 
     def __init__(self, firmware: Firmware, missing: Collection[str] = ()) -> None:
         self._firmware = firmware
-        entries = {
-            name: _log_code(ctype)
+        codes = {
+            name: BY_CTYPE[ctype].log_code
             for name, ctype in firmware.LOG_VARIABLES.items()
             if name not in missing
         }
-        self.toc = Toc(Port.LOG, entries, bytes((MAX_BLOCKS, MAX_VARIABLES)))
+        self.toc = Toc(Port.LOG, codes, bytes((MAX_BLOCKS, MAX_VARIABLES)))
         self._blocks: dict[int, _Block] = {}
 
     def rebooted(self, firmware: Firmware, *, keep_blocks: bool = False) -> None:
@@ -61,12 +60,10 @@ class LogService:
                 block.due_s = firmware.t_s + block.period_s
 
     def handle(self, packet: Packet) -> list[Packet]:
-        if not packet.data:
-            return []
+        """The answers to one packet."""
         if packet.channel == _TOC:
-            answer = self.toc.answer(packet.data)
-            return [answer] if answer is not None else []
-        if packet.channel != _SETTINGS:
+            return self.toc.handle(packet)
+        if packet.channel != _SETTINGS or not packet.data:
             return []
         command, ident = packet.data[0], packet.data[1] if len(packet.data) > 1 else 0
         status, extra = self._settings(command, ident, packet.data[2:])
@@ -87,19 +84,19 @@ class LogService:
         if command == _RESET:
             self._blocks.clear()
             return Status.OK, []
-        if command in (_CREATE, _CREATE_V2):
+        if command == _CREATE_V2:
             if block is not None:
                 return Status.EEXIST, []
             if len(self._blocks) >= MAX_BLOCKS:
                 return Status.ENOMEM, []
             self._blocks[ident] = _Block()
-            return self._append(self._blocks[ident], rest, wide=command == _CREATE_V2), []
-        if command not in (_APPEND, _APPEND_V2, _DELETE, _START, _STOP):
+            return self._append(self._blocks[ident], rest), []
+        if command not in (_APPEND_V2, _DELETE, _START, _STOP):
             return Status.ENOEXEC, []
         if block is None:
             return Status.ENOENT, []
-        if command in (_APPEND, _APPEND_V2):
-            return self._append(block, rest, wide=command == _APPEND_V2), []
+        if command == _APPEND_V2:
+            return self._append(block, rest), []
         if command == _START:
             return Status.OK, self._start(ident, block, rest[0] if rest else 0)
         block.due_s = None
@@ -107,17 +104,15 @@ class LogService:
             del self._blocks[ident]
         return Status.OK, []
 
-    def _append(self, block: _Block, rest: bytes, *, wide: bool) -> Status:
+    def _append(self, block: _Block, rest: bytes) -> Status:
         """Adds variables until one does not fit; an incomplete last entry is ignored.
 
         cflib leaves one stray byte at the end of a full packet.
         """
-        width = 3 if wide else 2
-        for at in range(0, len(rest) - width + 1, width):
+        for at in range(0, len(rest) - _ENTRY_BYTES + 1, _ENTRY_BYTES):
             number = BY_LOG_CODE.get(rest[at] & 0x0F)
-            ident = int.from_bytes(rest[at + 1 : at + width], "little")
-            name = self.toc.name(ident)
-            if name is None or number is None or (not wide and ident == _MEMORY_ID):
+            name = self.toc.name(rest[at + 1 : at + _ENTRY_BYTES])
+            if name is None or number is None:
                 return Status.ENOENT
             if block.size + number.size > MAX_BLOCK_BYTES:
                 return Status.E2BIG
@@ -139,10 +134,3 @@ class LogService:
         read = self._firmware.log_value
         body = b"".join(number.pack(read(name)) for name, number in block.variables)
         return Packet(Port.LOG, _DATA, head + body)
-
-
-def _log_code(ctype: str) -> int:
-    code = BY_CTYPE[ctype].log_code
-    if code is None:
-        raise ValueError(f"{ctype} is no type of a log variable")
-    return code

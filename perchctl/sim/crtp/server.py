@@ -6,15 +6,16 @@ an unmodified cflib sends is answered as in docs/firmware.md, "Connect sequence"
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from perchctl.errors import InvalidValue
-from perchctl.sim.crtp.codec import MAX_DATA, Packet, Port
-from perchctl.sim.crtp.commands import CommandService, link_source
+from perchctl.sim.crtp.codec import MAX_DATA, Packet, Port, Status
+from perchctl.sim.crtp.commands import CommandService
 from perchctl.sim.crtp.log import LogService
-from perchctl.sim.crtp.mem import MemService
 from perchctl.sim.crtp.param import ParamService
 from perchctl.vehicle import CAN_FLY, CRASHED, LOCKED
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from perchctl.sim.firmware import Firmware
 
 PROTOCOL_VERSION = 12
-OLDEST_PROTOCOL_VERSION = 4  # before it, tables had another layout
+OLDEST_PROTOCOL_VERSION = 11
 FIRMWARE_VERSION = "2026.08"
 DEVICE_TYPE = "C21B"
 _ECHO, _SOURCE, _SINK, _NULL = 0, 1, 2, 3
@@ -31,6 +32,7 @@ _SYSTEM_ON, _RESET = 0x03, 0xF0
 _COMMAND, _VERSION = 0, 1
 _CONTINUOUS_WAVE, _ARM, _RECOVER, _NOTIFICATION = 0, 1, 2, 3
 _GET_PROTOCOL, _GET_FIRMWARE, _GET_DEVICE = 0, 1, 2
+_LINK_SOURCE = b"Bitcraze Crazyflie".ljust(MAX_DATA, b"\0")
 _BOOT_TEXT = (
     "SYS: ----------------------------\n"
     "SYS: Crazyflie 2.1 is up and running!\n"
@@ -52,16 +54,12 @@ class LinkOptions:
         protocol_version: below 12 the supervisor port is missing (an old firmware).
         missing_log_variables: left out of the log table.
         loss_rate: share of packets lost, each way; drawn by `loss_seed`.
-        silent_from_s, silent_for_s: simulated time at which the peer goes silent, and
-            for how long. None means never.
     """
 
     protocol_version: int = PROTOCOL_VERSION
     missing_log_variables: tuple[str, ...] = ()
     loss_rate: float = 0.0
     loss_seed: int = 0
-    silent_from_s: float | None = None
-    silent_for_s: float = float("inf")
 
     def __post_init__(self) -> None:
         if not OLDEST_PROTOCOL_VERSION <= self.protocol_version <= PROTOCOL_VERSION:
@@ -82,7 +80,7 @@ class CrtpServer:
         self._firmware = firmware
         self._version = version
         self._log = LogService(firmware, options.missing_log_variables)
-        self._param = ParamService(firmware, version)
+        self._param = ParamService(firmware)
         self._mem = MemService()
         self._commands = CommandService(firmware, version)
         self._console: deque[Packet] = deque(maxlen=64)
@@ -118,7 +116,7 @@ class CrtpServer:
         return packets + self._log.due()
 
     def reboot(self) -> None:
-        """Start the firmware again; log blocks are lost, stored parameters are kept."""
+        """Start the firmware again; log blocks are lost."""
         self._firmware.reboot()
         self._restarted(keep_blocks=False)
 
@@ -129,7 +127,7 @@ class CrtpServer:
 
     def _restarted(self, *, keep_blocks: bool) -> None:
         self._log.rebooted(self._firmware, keep_blocks=keep_blocks)
-        self._param.rebooted(self._firmware)
+        self._param.firmware = self._firmware
         self._commands.firmware = self._firmware
         self._info = 0
         self._print(_BOOT_TEXT)
@@ -143,7 +141,7 @@ class CrtpServer:
         if packet.channel == _ECHO:
             return [packet]
         if packet.channel == _SOURCE:
-            return [Packet(Port.LINK, _SOURCE, link_source())]
+            return [Packet(Port.LINK, _SOURCE, _LINK_SOURCE)]
         if packet.channel == _SINK:
             return []
         # Null packets: a scan's probe, and the power commands of the radio chip.
@@ -177,3 +175,78 @@ class CrtpServer:
         if answer is None:
             return []
         return [Packet(Port.PLATFORM, packet.channel, bytes((command,)) + answer)]
+
+
+# --- The memory port: which memories the vehicle has, and what is in them ----------------------
+
+
+_INFO, _READ = 0, 1
+_MEM_VERSION, _MEM_COUNT, _MEM_DETAILS = 0, 1, 2
+_CHUNK = 24
+I2C, ONE_WIRE = 0x00, 0x01
+
+
+@dataclass(frozen=True)
+class _Memory:
+    kind: int
+    content: bytes
+    serial: bytes = bytes(8)
+
+
+class MemService:
+    """The EEPROM with the radio's settings and the flow deck's 1-wire memory, to be read."""
+
+    def __init__(self) -> None:
+        serial = bytes.fromhex("0D2F4C1BA0000055")
+        self._memories = (
+            _Memory(I2C, _eeprom().ljust(8192, b"\xff")),
+            _Memory(ONE_WIRE, _flow_deck().ljust(112, b"\xff"), serial),
+        )
+
+    def handle(self, packet: Packet) -> list[Packet]:
+        """The answer to one packet; writing has none."""
+        data = packet.data
+        answer = b""
+        if packet.channel == _INFO and data:
+            answer = self._info(data)
+        elif packet.channel == _READ and len(data) >= 6:
+            answer = self._read(data)
+        return [Packet(Port.MEM, packet.channel, answer)] if answer else []
+
+    def _info(self, data: bytes) -> bytes:
+        if data[0] == _MEM_VERSION:
+            return bytes((_MEM_VERSION, 1))
+        if data[0] == _MEM_COUNT:
+            return bytes((_MEM_COUNT, len(self._memories)))
+        if data[0] != _MEM_DETAILS or len(data) < 2:
+            return b""
+        if data[1] >= len(self._memories):
+            return data[:2]
+        memory = self._memories[data[1]]
+        return data[:2] + struct.pack("<BI", memory.kind, len(memory.content)) + memory.serial
+
+    def _read(self, data: bytes) -> bytes:
+        ident, at, length = struct.unpack_from("<BIB", data)
+        content = self._memories[ident].content if ident < len(self._memories) else b""
+        if length > _CHUNK or at + length > len(content):
+            return data[:5] + bytes((Status.EACCES,))
+        return data[:5] + bytes((Status.OK,)) + content[at : at + length]
+
+
+def _eeprom() -> bytes:
+    """The radio's settings, version 1: channel 80, 2 Mbit/s, address E7E7E7E7E7."""
+    body = b"0xBC" + struct.pack("<BBBffBI", 1, 80, 2, 0.0, 0.0, 0xE7, 0xE7E7E7E7)
+    return body + bytes((sum(body) % 256,))
+
+
+def _flow_deck() -> bytes:
+    """A deck's description: header, then board name and revision, each with a CRC."""
+    header = struct.pack("<BIBB", 0xEB, 0, 0xBC, 0x0F)
+    name, revision = b"bcFlow2", b"A"
+    body = bytes((1, len(name))) + name + bytes((2, len(revision))) + revision
+    elements = bytes((0, len(body))) + body
+    return _with_crc(header) + _with_crc(elements)
+
+
+def _with_crc(data: bytes) -> bytes:
+    return data + bytes((zlib.crc32(data) & 0xFF,))

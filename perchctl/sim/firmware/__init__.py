@@ -1,6 +1,5 @@
 """The Crazyflie's firmware, release 2026.08, as far as its answers can be seen."""
 
-from perchctl.sim.firmware.toc import Parameter
-from perchctl.sim.firmware.vehicle import Firmware
+from perchctl.sim.firmware.firmware import Firmware
 
-__all__ = ["Firmware", "Parameter"]
+__all__ = ["Firmware"]

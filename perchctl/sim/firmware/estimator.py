@@ -1,7 +1,7 @@
 """The state estimate: the truth with the errors of a flow deck or of motion capture.
 
 Drift runs from the moment the motors first turn; what a flow deck adds on a bad floor or high
-above it is in `perchctl.sim.flow_deck`. A vehicle without a deck (scenario
+above it is `FlowDeck`. A vehicle without a deck (scenario
 `extra["external_position"]`) has what it is sent from outside instead, which counts with
 parameter `stabilizer.estimator` = 2: `perchctl.sim.firmware.outside`.
 
@@ -18,17 +18,24 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.sim.firmware.controller import Estimate, cap_deg
-from perchctl.sim.firmware.covariance import POSITION
-from perchctl.sim.firmware.imu import Imu
-from perchctl.sim.firmware.outside import SETTINGS, OutsideFilter, Quaternion, Vector
-from perchctl.sim.flow_deck import FlowDeck, has_flow_errors
+from perchctl.sim.firmware.outside import (
+    POSITION,
+    SETTINGS,
+    Imu,
+    OutsideFilter,
+    Quaternion,
+    Vector,
+)
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+
+if TYPE_CHECKING:
+    from perchctl.sim.world import World
 
 _STREAM = 2
 _DEG = 180.0 / math.pi
@@ -46,24 +53,6 @@ _ACC_CUTOFF_HZ = 30.0
 _NO_BIAS = (0.0, 0.0, 0.0)
 _ATTITUDE_GAIN = CONTROL_PERIOD_S / _ATTITUDE_MEMORY_S
 _VARIANCE_START, _VARIANCE_FALL_S, _VARIANCE_FLOOR = 100.0, 0.1, 2e-5
-
-
-class Sensed(Protocol):
-    """The part of `World` that an estimator may read."""
-
-    x_m: float
-    y_m: float
-    z_m: float
-    vx_mps: float
-    vy_mps: float
-    vz_mps: float
-    p_radps: float
-    q_radps: float
-    r_radps: float
-    fx_mps2: float
-    fy_mps2: float
-    fz_mps2: float
-    quaternion: tuple[float, float, float, float]
 
 
 class Estimator:
@@ -96,7 +85,6 @@ class Estimator:
         self._reset_due = True
         self._reset_s = 0.0
         self._rng.uniform()  # keeps the flights of all seeds as they were
-        self.external_count = 0
         self.hears_outside = True
         self.spoil: Callable[[Estimate], None] | None = None  # a fault's, upon each estimate
 
@@ -109,15 +97,13 @@ class Estimator:
             self._flow.reset()
 
     def external_position(self, position_m: Vector) -> None:
-        """One measurement from outside; counted always, used by a vehicle without a deck."""
-        self.external_count += 1
+        """One measurement from outside; only a vehicle without a deck uses it."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.position(position_m)
 
     def external_pose(self, position_m: Vector, quaternion: Quaternion) -> None:
-        """The same with an attitude: w, x, y, z, body to world."""
-        self.external_count += 1
+        """A measurement with an attitude: w, x, y, z, body to world."""
         if self.outside is not None and self.hears_outside:
             self._reset_if_due(self.outside)
             self.outside.pose(position_m, quaternion)
@@ -128,14 +114,14 @@ class Estimator:
             setattr(self.outside, SETTINGS[name], value)
 
     def shift_accelerometer(self, z_mps2: float) -> None:
-        """From now on it reads so much more along z; only without a deck that is simulated by its
-        errors."""
+        """The accelerometer reads so much more along z from now on; only without a deck, which is
+        simulated by its errors."""
         if self._imu is not None:
             x, y, z = self._imu.acc_bias_mps2
             self._imu.acc_bias_mps2 = (x, y, z + z_mps2)
 
     def variance(self, t_s: float, state: int = POSITION) -> float:
-        """Of a state as `perchctl.sim.firmware.covariance` counts them. A deck's is the position's
+        """The variance of a state as `Covariance` counts them. A deck's is the position's
         for all of them: it falls after a reset. Flow says nothing of the height, which a laser
         measures."""
         if self.outside is not None:
@@ -148,7 +134,7 @@ class Estimator:
 
     def update(
         self,
-        world: Sensed,
+        world: World,
         t_s: float,
         *,
         flown: bool,
@@ -196,7 +182,7 @@ class Estimator:
             az + lag * ((world.fz_mps2 + acc_bias[2]) * unit + shake * n6 - az),
         )
 
-    def _integrate(self, world: Sensed) -> tuple[float, float, float, float]:
+    def _integrate(self, world: World) -> tuple[float, float, float, float]:
         """The attitude after one more control period of turning."""
         truth = world.quaternion
         if self.gyro is None:
@@ -216,28 +202,20 @@ class Estimator:
         return (scale * nw, scale * nx, scale * ny, scale * nz)
 
     def _walk(self) -> None:
+        """Position and velocity noise, a step later: each keeps a share of what it was."""
         sigma = self._scenario.estimate_noise_m
         if len(self._white) < 12:
             self._white = self._rng.standard_normal(_BATCH).tolist()
-        take = self._white.pop
-        keep = self._position_keep
-        kick = sigma * math.sqrt(1.0 - keep * keep)
-        x, y, z = self._position_noise
-        self._position_noise = (
-            keep * x + kick * take(),
-            keep * y + kick * take(),
-            keep * z + kick * take(),
-        )
-        keep = self._velocity_keep
-        kick = _VELOCITY_NOISE_PER_S * sigma * math.sqrt(1.0 - keep * keep)
-        x, y, z = self._velocity_noise
-        self._velocity_noise = (
-            keep * x + kick * take(),
-            keep * y + kick * take(),
-            keep * z + kick * take(),
-        )
+        self._position_noise = self._walked(self._position_noise, self._position_keep, sigma)
+        sigma *= _VELOCITY_NOISE_PER_S
+        self._velocity_noise = self._walked(self._velocity_noise, self._velocity_keep, sigma)
 
-    def _move_by_deck(self, world: Sensed, *, flown: bool) -> None:
+    def _walked(self, noise: Vector, keep: float, sigma: float) -> Vector:
+        take, kick = self._white.pop, sigma * math.sqrt(1.0 - keep * keep)
+        x, y, z = noise
+        return keep * x + kick * take(), keep * y + kick * take(), keep * z + kick * take()
+
+    def _move_by_deck(self, world: World, *, flown: bool) -> None:
         drift = self._scenario.drift_mps
         dx = dy = dz = 0.0
         if flown:
@@ -261,10 +239,10 @@ class Estimator:
             now.vx_mps, now.vy_mps = now.vx_mps + ex, now.vy_mps + ey
 
     def _move_outside(
-        self, outside: OutsideFilter, imu: Imu, world: Sensed, *, flying: bool, pressed: bool
+        self, outside: OutsideFilter, imu: Imu, world: World, *, flying: bool, pressed: bool
     ) -> None:
         self._reset_if_due(outside)
-        if imu.feel(
+        if imu.add(
             (world.fx_mps2, world.fy_mps2, world.fz_mps2),
             (world.p_radps, world.q_radps, world.r_radps),
         ):
@@ -277,3 +255,149 @@ class Estimator:
         if self._reset_due:
             self._reset_due = False
             outside.reset()
+
+
+# --- The flow deck ---------------------------------------------------------------------------
+# What a flow deck's estimate is off by, as an estimate minus the truth.
+#
+# A Kalman filter of position, velocity and the acceleration that an attitude which is off by a
+# little would feign, the same for x and y, in the form of its error. Its gains are those of the
+# firmware's own numbers (`stdDev` of a flow reading, `procNoiseAcc_xy`, `measNoiseGyro`; source),
+# so it averages flow as long as a real one does: for a second or two. What leads it astray:
+#
+# - The sensor counts motion in tenths of a pixel of 0.717 / 35 rad, each 10 ms (source): rounding
+#   alone is 0.06 rad/s, of which a part is made up for by the next count. The firmware takes two
+#   counts, 0.41 rad/s, for what a reading is off by. An angular speed is made a speed by the
+#   height, so the position walks the more the higher it is.
+# - The vehicle's own turning is taken out by the gyroscope: what that is off by is taken for flow.
+#   Times the height it is a drift.
+# - It needs texture. Where all that it sees (42 deg) is bare floor it sees nothing, and above
+#   `Scenario.flow_reach_m`. Then the attitude's error alone is summed up, twice, as in
+#   docs/firmware.md, "The target as the only positioning system".
+# - The height is measured by a laser. Its error is that which the firmware counts on: 2.5 mm, and
+#   from 2.5 m on more by a factor of 80 within 1.5 m (source).
+#
+# A flow sensor measures speeds only: when it sees again, the speed is right within seconds, and
+# the position comes back no farther than the filter can tell from that.
+
+
+_FLOW_STREAM = 15
+_EVERY = 5  # control periods between two readings: 100 Hz
+_DT_S = _EVERY * CONTROL_PERIOD_S
+_FLOW_BATCH = 1024
+_LEAST_HEIGHT_M = 0.1
+"""The firmware takes no height for less (source)."""
+_VIEW_PER_M = math.tan(math.radians(21.0))
+"""Half the width of what the sensor sees, a metre of height."""
+_BIAS_MPS2 = 0.0125
+"""What an attitude that is a little off feigns. Level accelerations are not looked at in flight:
+vibration is nothing to the speed in x and y (source)."""
+_SIGMA_RADPS = 2 * 0.1 * (0.71674 / 35) / _DT_S
+_SPEED_DENSITY = 0.5**2 * 1e-3
+_TURN_DENSITY = (GRAVITY_MPS2 * 0.1) ** 2 * 1e-3
+"""What the filter counts on: of a reading of flow; of `procNoiseAcc_xy` and
+`measNoiseGyro_rollpitch` at 1 kHz, the variance's growth in a second."""
+_RANGE_SIGMA_M, _RANGE_FROM_M, _RANGE_RATE_PER_M = 0.0025, 2.5, math.log(80.0) / 1.5
+_RANGE_MEMORY_S = 0.1
+_START_VV, _START_AA = 1e-4, (GRAVITY_MPS2 * 0.01) ** 2
+
+
+def has_flow_errors(scenario: Scenario) -> bool:
+    """True if the scenario's deck is any worse than the plain noise and drift."""
+    return bool(
+        scenario.flow_noise_radps
+        or any(scenario.flow_bias_radps)
+        or scenario.flow_reach_m is not None
+        or scenario.bare_floors
+    )
+
+
+class FlowDeck:
+    """`position_error_m` (3) and `velocity_error_mps` (2), world axes."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._rng = np.random.default_rng([scenario.seed, _FLOW_STREAM])
+        angle = float(self._rng.uniform(-math.pi, math.pi))
+        self._bias_mps2 = (_BIAS_MPS2 * math.cos(angle), _BIAS_MPS2 * math.sin(angle))
+        self._white: list[float] = []
+        self._range_keep = math.exp(-_DT_S / _RANGE_MEMORY_S)
+        self.reset()
+
+    def reset(self) -> None:
+        """The estimate is the truth again, but for the attitude."""
+        self.position_error_m = (0.0, 0.0, 0.0)
+        self.velocity_error_mps = (0.0, 0.0)
+        self._tilt_mps2 = self._bias_mps2
+        self._pv = self._pa = self._va = 0.0
+        self._vv, self._aa = _START_VV, _START_AA
+        self._range_noise = 0.0
+        self._steps = 0
+
+    @property
+    def variance(self) -> float:
+        """Variance of the speed in x or y, (m/s)^2: that is what `kalman.varPX` holds (source)."""
+        return self._vv
+
+    def sees(self, world: World) -> bool:
+        """True if there is anything in view whose motion can be measured."""
+        scenario = self._scenario
+        if scenario.flow_reach_m is not None and world.z_m > scenario.flow_reach_m:
+            return False
+        view_m = world.z_m * _VIEW_PER_M
+        return not any(
+            math.hypot(world.x_m - x_m, world.y_m - y_m) + view_m < radius_m
+            for x_m, y_m, radius_m in scenario.bare_floors
+        )
+
+    def step(self, world: World) -> None:
+        """One control period of flight."""
+        self._steps += 1
+        if self._steps % _EVERY:
+            return
+        if len(self._white) < 3:
+            self._white = self._rng.standard_normal(_FLOW_BATCH).tolist()
+        take = self._white.pop
+        self._predict()
+        if self.sees(world):
+            self._measure(world.z_m, take(), take())
+        self._range(world.z_m, take())
+
+    def _predict(self) -> None:
+        (px, py, pz), (ex, ey) = self.position_error_m, self.velocity_error_mps
+        ax, ay = self._tilt_mps2
+        ex, ey = ex + ax * _DT_S, ey + ay * _DT_S
+        self.position_error_m = (px + ex * _DT_S, py + ey * _DT_S, pz)
+        self.velocity_error_mps = (ex, ey)
+        self._pv += _DT_S * (self._vv + self._pa)
+        self._pa += _DT_S * self._va
+        self._vv += _DT_S * (2.0 * self._va + _DT_S * self._aa + _SPEED_DENSITY)
+        self._va += _DT_S * self._aa
+        self._aa += _DT_S * _TURN_DENSITY
+
+    def _measure(self, z_m: float, white_x: float, white_y: float) -> None:
+        height_m, sigma = max(z_m, _LEAST_HEIGHT_M), self._scenario.flow_noise_radps
+        spread = self._vv + (height_m * _SIGMA_RADPS) ** 2
+        kp, kv, ka = self._pv / spread, self._vv / spread, self._va / spread
+        (px, py, pz), (ex, ey), (ax, ay) = (
+            self.position_error_m, self.velocity_error_mps, self._tilt_mps2,
+        )  # fmt: skip
+        bx, by = self._scenario.flow_bias_radps
+        ix = height_m * (bx + sigma * white_x) - ex
+        iy = height_m * (by + sigma * white_y) - ey
+        self.position_error_m = (px + kp * ix, py + kp * iy, pz)
+        self.velocity_error_mps = (ex + kv * ix, ey + kv * iy)
+        self._tilt_mps2 = (ax + ka * ix, ay + ka * iy)
+        self._aa -= ka * self._va
+        self._pa -= ka * self._pv
+        self._pv -= kv * self._pv
+        self._va -= kv * self._va
+        self._vv -= kv * self._vv
+
+    def _range(self, z_m: float, white: float) -> None:
+        """More than the plain noise has: the part that grows with the distance."""
+        sigma_m = _RANGE_SIGMA_M * math.exp(_RANGE_RATE_PER_M * (min(z_m, 5.0) - _RANGE_FROM_M))
+        keep = self._range_keep
+        self._range_noise = keep * self._range_noise + math.sqrt(1.0 - keep * keep) * white
+        x_m, y_m, _ = self.position_error_m
+        self.position_error_m = (x_m, y_m, sigma_m * self._range_noise)

@@ -7,25 +7,202 @@ axis alone, so that drag and draught go unfelt; otherwise along all three, and t
 drawn to the initial one. A position corrects position, velocity and attitude, by what the
 covariance says each has to do with it; so a tilt is learnt from the slide that it makes, and a
 heading from manoeuvres, a little. Nothing here looks at the truth. What leads the estimate astray
-are the sensors' errors (`perchctl.sim.firmware.imu`) and whatever is sent: late, false or in
-millimetres, it is believed as `locSrv.extPosStdDev` and `locSrv.extQuatStdDev` say. There is no
-gate (source).
+are the sensors' errors (`Imu`) and whatever is sent: late, false or in millimetres, it is believed
+as `locSrv.extPosStdDev` and `locSrv.extQuatStdDev` say. There is no gate (source).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from perchctl.geometry import GRAVITY_MPS2
-from perchctl.sim.firmware.covariance import ATTITUDE, POSITION, Covariance
-from perchctl.sim.firmware.imu import IMU_PERIOD_S, Reading
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z
 
+# --- What the gyroscope and the accelerometer read, as the estimator gets it: means of 100 a second
+# Their errors are those of the trial in docs/firmware.md, "Target as position": white noise, that
+# sums up to a random walk of attitude and velocity, and a bias. On the ground the firmware takes
+# the gyroscope's mean for its bias and scales the accelerometer to 1 g (source); what the scenario
+# gives as bias of the gyroscope is what that leaves.
+
+
+IMU_EVERY = 5
+"""Control periods from one mean to the next."""
+IMU_PERIOD_S = IMU_EVERY * CONTROL_PERIOD_S
+
+_IMU_STREAM = 12
+_IMU_BATCH = 1536
+_SAMPLES = 1000.0 * IMU_PERIOD_S  # of a real one, in each mean
+_GYRO_NOISE_RADPS = math.radians(0.1) / math.sqrt(_SAMPLES)
+_ACC_NOISE_MPS2 = 0.01 * GRAVITY_MPS2 / math.sqrt(_SAMPLES)
+_GYRO_LEFT_RADPS = 5e-4
+"""Bias about level axes that a real one has at its best: blind for 12 s of flight, a vehicle
+touched down 0.9 m aside (docs/firmware.md, "Target covered")."""
+_PRESSED_MPS2 = 0.03
+"""Error of the accelerometer along z while the vehicle is pressed against a ceiling: blind, the
+height runs away by 0.1 to 0.2 m/s (docs/firmware.md, "Blind at the ceiling")."""
+
+
+class Reading(NamedTuple):
+    """Body axes."""
+
+    ax_mps2: float
+    ay_mps2: float
+    az_mps2: float
+    p_radps: float
+    q_radps: float
+    r_radps: float
+
+
+class Imu:
+    """`add` takes a control period's truth; after `IMU_EVERY` of them `read` gives their mean.
+
+    `gyro_bias_radps`, `acc_bias_mps2`: what is read too much, body axes; `acc_scale`: by how much
+    the firmware divides.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._rng = np.random.default_rng([scenario.seed, _IMU_STREAM])
+        self._white: list[float] = []
+        angle = float(self._rng.uniform(-math.pi, math.pi))
+        p, q, r = scenario.gyro_bias_radps
+        self.gyro_bias_radps = (
+            p + _GYRO_LEFT_RADPS * math.cos(angle), q + _GYRO_LEFT_RADPS * math.sin(angle), r,
+        )  # fmt: skip
+        self.acc_bias_mps2 = x, y, z = scenario.acc_bias_mps2
+        self.acc_scale = math.hypot(x, y, GRAVITY_MPS2 + z) / GRAVITY_MPS2
+        self._pressed_mps2 = _PRESSED_MPS2 if self._rng.uniform() < 0.5 else -_PRESSED_MPS2
+        self._clear()
+
+    def add(
+        self, force_mps2: tuple[float, float, float], rates_radps: tuple[float, float, float]
+    ) -> bool:
+        """Take the true specific force and rates, body axes; True if a mean is due."""
+        x, y, z = force_mps2
+        p, q, r = rates_radps
+        self._x += x
+        self._y += y
+        self._z += z
+        self._p += p
+        self._q += q
+        self._r += r
+        self._count += 1
+        return self._count == IMU_EVERY
+
+    def read(self, *, pressed: bool) -> Reading:
+        """The mean of what was added since the last reading, with the errors."""
+        white = self._white
+        if len(white) < 6:
+            white = self._white = self._rng.standard_normal(_IMU_BATCH).tolist()
+        take = white.pop
+        (bx, by, bz), (bp, bq, br) = self.acc_bias_mps2, self.gyro_bias_radps
+        if pressed:
+            bz += self._pressed_mps2
+        share, unit = 1.0 / self._count, 1.0 / self.acc_scale
+        noise, turn = _ACC_NOISE_MPS2, _GYRO_NOISE_RADPS
+        mean = Reading(
+            unit * (share * self._x + bx + noise * take()),
+            unit * (share * self._y + by + noise * take()),
+            unit * (share * self._z + bz + noise * take()),
+            share * self._p + bp + turn * take(),
+            share * self._q + bq + turn * take(),
+            share * self._r + br + turn * take(),
+        )
+        self._clear()
+        return mean
+
+    def _clear(self) -> None:
+        self._x = self._y = self._z = self._p = self._q = self._r = 0.0
+        self._count = 0
+
+
+# --- What the estimate knows of its own errors --------------------------------------------------
+
+
+POSITION, VELOCITY, ATTITUDE = 0, 3, 6
+"""Where each begins among the nine states, x first."""
+
+_FIRST_M, _FIRST_HEIGHT_M, _FIRST_MPS, _FIRST_RAD = 100.0, 1.0, 0.01, 0.01
+"""Standard deviations after a reset (source: `stdDevInitial*`)."""
+_MOST, _LEAST = 100.0, 1e-6
+_NOISE_PER_S = (0.0, 0.0, 0.0, 2.5e-4, 2.5e-4, 1e-3, 1e-5, 1e-5, 1e-5)
+"""(m/s)^2 and rad^2 a second: `kalman.pNAcc_xy` 0.5 m/s^2, `pNAcc_z` 1 m/s^2 and `mNGyro_*`
+0.1 rad/s, each added as one of 1000 steps a second (source)."""
+_STATES = range(9)
+
+
+class Covariance:
+    """What the estimate knows of its own errors: position, velocity and attitude, with all that
+    one says about another. SI, radians, world axes; `rows[i][j]` is symmetric.
+
+    As in the firmware (source: `kalman_core`), but for the axes: velocity and attitude errors are
+    the world's here and the body's there, which is the same for a vehicle that is nearly level.
+    """
+
+    def __init__(self) -> None:
+        self.rows: list[list[float]] = []
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as after `kalman.resetEstimation`."""
+        m2, height_m2 = min(_FIRST_M**2, _MOST), _FIRST_HEIGHT_M**2
+        first = [m2, m2, height_m2] + [_FIRST_MPS**2] * 3 + [_FIRST_RAD**2] * 3
+        self.rows = [[first[i] if i == j else 0.0 for j in _STATES] for i in _STATES]
+
+    def grow(self, period_s: float, force_mps2: tuple[float, float, float]) -> None:
+        """After a prediction. `force_mps2`: specific force in world axes; an attitude that is wrong
+        sends it elsewhere."""
+        x, y, z, u, v, w, a, b, c = self.rows
+        t = period_s
+        sx, sy, sz = force_mps2
+        sx, sy, sz = t * sx, t * sy, t * sz
+        rows = self.rows = [
+            [p + t * q for p, q in zip(x, u, strict=True)],
+            [p + t * q for p, q in zip(y, v, strict=True)],
+            [p + t * q for p, q in zip(z, w, strict=True)],
+            [p + sz * q - sy * r for p, q, r in zip(u, b, c, strict=True)],
+            [p + sx * q - sz * r for p, q, r in zip(v, c, a, strict=True)],
+            [p + sy * q - sx * r for p, q, r in zip(w, a, b, strict=True)],
+            a, b, c,
+        ]  # fmt: skip
+        for row in rows:
+            x_, y_, z_, u_, v_, w_, a_, b_, c_ = row
+            row[0], row[1], row[2] = x_ + t * u_, y_ + t * v_, z_ + t * w_
+            row[3] = u_ + sz * b_ - sy * c_
+            row[4] = v_ + sx * c_ - sz * a_
+            row[5] = w_ + sy * a_ - sx * b_
+        for i in _STATES:
+            rows[i][i] = _bounded(rows[i][i] + t * _NOISE_PER_S[i])
+
+    def measure(self, state: int, variance: float) -> list[float]:
+        """One state was measured with this variance: what to add to each of the nine for every
+        unit that the measurement is more than the estimate."""
+        rows = self.rows
+        row_of = rows[state]
+        spread = row_of[state] + variance
+        gains = [p / spread for p in row_of]
+        for i in _STATES:
+            gain = gains[i]
+            row = rows[i] = [p - gain * q for p, q in zip(rows[i], row_of, strict=True)]
+            row[i] = _bounded(row[i])
+        return gains
+
+
+def _bounded(variance: float) -> float:
+    return _LEAST if variance < _LEAST else _MOST if variance > _MOST else variance
+
+
+# --- The filter ----------------------------------------------------------------------------------
+
+
 _LEAST_SIGMA = 1e-4
 _REVERSION = 1e-3
-"""Of the attitude towards the initial one, each time while not in flight (source:
+"""Share of the way to the initial attitude, each time while not in flight (source:
 `attitudeReversion`)."""
 
 SETTINGS = {
@@ -52,7 +229,7 @@ class OutsideFilter:
         self.reset()
 
     def variance(self, state: int) -> float:
-        """Of a state: `perchctl.sim.firmware.covariance` says which it is, and its units."""
+        """The variance of a state; `Covariance` says which it is, and its units."""
         return self._covariance.rows[state][state]
 
     def reset(self) -> None:
@@ -64,10 +241,10 @@ class OutsideFilter:
         self._initial: Quaternion = (math.cos(half), 0.0, 0.0, math.sin(half))
         self.quaternion = self._initial
 
-    def predict(self, felt: Reading, *, flying: bool) -> None:
+    def predict(self, reading: Reading, *, flying: bool) -> None:
         """`IMU_PERIOD_S` later. An estimate out of its bounds is reset."""
         t, half_s2 = IMU_PERIOD_S, 0.5 * IMU_PERIOD_S * IMU_PERIOD_S
-        force = fx, fy, fz = self._force(felt, flying=flying)
+        force = fx, fy, fz = self._force(reading, flying=flying)
         fz -= GRAVITY_MPS2
         x, y, z = self.position_m
         vx, vy, vz = self.velocity_mps
@@ -76,7 +253,7 @@ class OutsideFilter:
         )  # fmt: skip
         self.velocity_mps = (vx + t * fx, vy + t * fy, vz + t * fz)
         half = 0.5 * t
-        turn = (1.0, half * felt.p_radps, half * felt.q_radps, half * felt.r_radps)
+        turn = (1.0, half * reading.p_radps, half * reading.q_radps, half * reading.r_radps)
         w, x, y, z = normalized(multiplied(self.quaternion, turn))
         if not flying:
             keep, (a, _, _, d) = 1.0 - _REVERSION, self._initial
@@ -95,7 +272,7 @@ class OutsideFilter:
             self._correct(POSITION, self._innovation(measured_m), self.position_sigma_m)
 
     def pose(self, measured_m: Vector, measured: Quaternion) -> None:
-        """The same with an attitude, body to world."""
+        """A pose from outside: a position and an attitude, body to world."""
         self.position(measured_m)
         norm = math.sqrt(sum(v * v for v in measured))
         if not math.isfinite(norm) or norm < 0.5:
@@ -129,14 +306,14 @@ class OutsideFilter:
         turn = (1.0, 0.5 * a, 0.5 * b, 0.5 * c)
         self.quaternion = normalized(multiplied(turn, self.quaternion))
 
-    def _force(self, felt: Reading, *, flying: bool) -> Vector:
+    def _force(self, reading: Reading, *, flying: bool) -> Vector:
         """What is believed of the specific force, in world axes."""
         w, x, y, z = self.quaternion
-        az = felt.az_mps2
+        az = reading.az_mps2
         ux, uy, uz = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
         if flying:
             return az * ux, az * uy, az * uz
-        ax, ay = felt.ax_mps2, felt.ay_mps2
+        ax, ay = reading.ax_mps2, reading.ay_mps2
         return (
             (1 - 2 * (y * y + z * z)) * ax + 2 * (x * y - w * z) * ay + az * ux,
             2 * (x * y + w * z) * ax + (1 - 2 * (x * x + z * z)) * ay + az * uy,

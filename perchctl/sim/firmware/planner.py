@@ -3,14 +3,48 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from perchctl.geometry import wrap_rad
-from perchctl.sim.firmware.commands import HighLevelCommand, HlGoTo, HlLand, HlStop, HlTakeoff
-from perchctl.sim.firmware.setpoint import MODE_OFF, MODE_POSITION, Setpoint
+from perchctl.sim.firmware.controller import MODE_POSITION, Setpoint
 
 IDLE, FLYING, LANDING = 0, 1, 3
 Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class HlTakeoff:
+    """Absolute height; `yaw_rad` None keeps the current heading."""
+
+    height_m: float
+    duration_s: float
+    yaw_rad: float | None = None
+
+
+@dataclass(frozen=True)
+class HlLand(HlTakeoff):
+    """As a take-off, and the plan ends with the motors off."""
+
+
+@dataclass(frozen=True)
+class HlGoTo:
+    """`relative` offsets are in world axes (firmware fact)."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_rad: float
+    duration_s: float
+    relative: bool
+
+
+@dataclass(frozen=True)
+class HlStop:
+    """The plan ends at once, and the motors stop."""
+
+
+HighLevelCommand = HlTakeoff | HlGoTo | HlStop
 
 
 class AxisState(NamedTuple):
@@ -69,14 +103,15 @@ class Planner:
         self._duration_s = 0.0
         self._axes: tuple[Polynomial, ...] = ()
         self._now = [AxisState(0.0)] * 4
-        self._told: tuple[Place, Place, float] | None = None  # since, unless a plan was flown
+        self._start: tuple[Place, Place, float] | None = None  # since, unless a plan was flown
 
     @property
     def active(self) -> bool:
         return self.state != IDLE
 
     def finished(self, t_s: float) -> bool:
-        """By the clock, not by height (docs/firmware.md, "Setpoint modes")."""
+        """True if the plan is over: by the clock, not by height (docs/firmware.md, "Setpoint
+        modes")."""
         return self.state == IDLE or t_s - self._begin_s >= self._duration_s
 
     def stop(self) -> None:
@@ -88,22 +123,22 @@ class Planner:
             self.stop()
         self.blocked = blocked
 
-    def tell_state(
+    def start_from(
         self,
         position_m: tuple[float, float, float],
         velocity_mps: tuple[float, float, float],
         yaw_rad: float,
     ) -> None:
         """New plans begin here."""
-        self._told = (position_m, velocity_mps, yaw_rad)
+        self._start = (position_m, velocity_mps, yaw_rad)
 
     def _begin(self) -> list[AxisState]:
         """Where a new plan begins: the last setpoint, or the estimate while idle."""
-        if self._told is not None:
-            position_m, velocity_mps, yaw_rad = self._told
+        if self._start is not None:
+            position_m, velocity_mps, yaw_rad = self._start
             axes = zip(position_m, velocity_mps, strict=True)
             self._now = [*(AxisState(p, v) for p, v in axes), AxisState(yaw_rad)]
-            self._told = None
+            self._start = None
         return self._now
 
     def command(self, command: HighLevelCommand, t_s: float) -> bool:
@@ -128,18 +163,22 @@ class Planner:
         if self.state == LANDING and self.finished(t_s):
             self.state = IDLE
         if self.state == IDLE:
-            return Setpoint(MODE_OFF)
+            return Setpoint()
         x, y, z, yaw = self._now = [axis.at(t_s - self._begin_s) for axis in self._axes]
-        self._told = None
+        self._start = None
         return Setpoint(
             MODE_POSITION,
-            (x.value, y.value, z.value),
-            (x.rate, y.rate, z.rate),
-            (0.0, 0.0, math.degrees(yaw.value)),
-            math.degrees(yaw.rate),
+            x.value,
+            y.value,
+            z.value,
+            x.rate,
+            y.rate,
+            z.rate,
+            yaw_deg=math.degrees(yaw.value),
+            yaw_rate_dps=math.degrees(yaw.rate),
         )
 
-    def _vertical(self, command: HlTakeoff | HlLand, t_s: float) -> None:
+    def _vertical(self, command: HlTakeoff, t_s: float) -> None:
         x, y, z, yaw = self._begin()
         heading = wrap_rad(yaw.value)
         turn = 0.0 if command.yaw_rad is None else wrap_rad(command.yaw_rad - heading)
@@ -152,7 +191,7 @@ class Planner:
 
     def _go_to(self, command: HlGoTo, t_s: float) -> None:
         if self.active:
-            self._now, self._told = [axis.at(t_s - self._begin_s) for axis in self._axes], None
+            self._now, self._start = [axis.at(t_s - self._begin_s) for axis in self._axes], None
         x, y, z, yaw = self._begin()
         goal = (command.x_m, command.y_m, command.z_m, command.yaw_rad)
         if command.relative:

@@ -1,12 +1,76 @@
-"""The battery as the power management reports it: voltage, level, and the low-power state."""
+"""Motors and battery as the firmware sees them: duty cycles, the battery's state, health tests."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-BATTERY, LOW_POWER = 0, 3
+import numpy as np
+
+from perchctl.sim.powertrain import FULL_COMMAND, MOTOR_FORCE_N, THRUST_MIN_N, motor_v
+from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+
+Motors = tuple[float, float, float, float]
+MOTORS_OFF: Motors = (0.0, 0.0, 0.0, 0.0)
+
+# --- Power distribution: four thrust requests in, four duty cycles (PWM) out -------------------
+# In the firmware's order (source: power distribution, motor driver and stabiliser of release
+# 2026.08): the battery's voltage is compensated by the inverted thrust curve first, then what
+# exceeds the full duty cycle is taken off all four. More than 0.12 N may so be requested of one
+# motor, and is given while the battery suffices: a yaw step at hover costs no height
+# (docs/firmware.md, "Yaw step").
+
+SUPPLY_AT_BOOT_V = 4.2
+SUPPLY_FILTER = 0.01  # of each sample, at `SUPPLY_RATE_HZ`
+SUPPLY_RATE_HZ = 1000.0
+SUPPLY_LEAST_V = 2.0  # below this the reading is taken for broken: no thrust
+THRUST_MIN = FULL_COMMAND * THRUST_MIN_N / MOTOR_FORCE_N
+
+_KEEP = (1.0 - SUPPLY_FILTER) ** (SUPPLY_RATE_HZ * CONTROL_PERIOD_S)
+_N_PER_COMMAND = MOTOR_FORCE_N / FULL_COMMAND
+
+
+class MotorDriver:
+    """`requested`: the duty cycles before the cap (`motor.m1req`)."""
+
+    def __init__(self) -> None:
+        self.requested: Motors = MOTORS_OFF
+        # Low-passed with 0.1 s: the compensation meets a sagging battery late.
+        self._supply_v = SUPPLY_AT_BOOT_V
+
+    def pwm(self, requests: Motors, battery_v: float) -> Motors:
+        """Duty cycles 0..65535 for thrust requests; `MOTORS_OFF` itself when all are 0."""
+        self._supply_v = supply_v = battery_v + _KEEP * (self._supply_v - battery_v)
+        if requests is MOTORS_OFF or supply_v < SUPPLY_LEAST_V:
+            self.requested = MOTORS_OFF
+            return MOTORS_OFF
+        scale = FULL_COMMAND / supply_v
+        m1, m2, m3, m4 = requests
+        p1 = scale * motor_v(_N_PER_COMMAND * m1) if m1 >= THRUST_MIN else 0.0
+        p2 = scale * motor_v(_N_PER_COMMAND * m2) if m2 >= THRUST_MIN else 0.0
+        p3 = scale * motor_v(_N_PER_COMMAND * m3) if m3 >= THRUST_MIN else 0.0
+        p4 = scale * motor_v(_N_PER_COMMAND * m4) if m4 >= THRUST_MIN else 0.0
+        self.requested = pwm = (p1, p2, p3, p4)
+        most = max(pwm)
+        if most == 0.0:
+            return MOTORS_OFF
+        if most > FULL_COMMAND:
+            # Attitude comes before thrust: all four give way together.
+            excess = most - FULL_COMMAND
+            return (
+                max(0.0, p1 - excess),
+                max(0.0, p2 - excess),
+                max(0.0, p3 - excess),
+                max(0.0, p4 - excess),
+            )
+        return pwm
+
+
+# --- The battery as the power management reports it: voltage, level, low-power state -----------
+
+
+ON_BATTERY, LOW_POWER = 0, 3
 LOW_DELAY_S = 5.0
-_FILTER = 0.2  # at 25 Hz
+_BATTERY_FILTER = 0.2  # at 25 Hz
 # Voltages at which the level leaves 0, 10, ... 90 per cent.
 _LEVELS_V = (3.00, 3.78, 3.83, 3.87, 3.89, 3.92, 3.96, 4.00, 4.04, 4.10)
 
@@ -16,7 +80,7 @@ class PowerMonitor:
 
     def __init__(self, battery_v: float) -> None:
         self.battery_v = battery_v
-        self.state = BATTERY
+        self.state = ON_BATTERY
         self._fine_s = 0.0
 
     @property
@@ -24,7 +88,104 @@ class PowerMonitor:
         return 10 * max(0, sum(self.battery_v >= v for v in _LEVELS_V) - 1)
 
     def update(self, t_s: float, battery_v: float, parameters: Mapping[str, float]) -> None:
-        self.battery_v += _FILTER * (battery_v - self.battery_v)
+        self.battery_v += _BATTERY_FILTER * (battery_v - self.battery_v)
         if self.battery_v >= parameters["pm.lowVoltage"]:
             self._fine_s = t_s
-        self.state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else BATTERY
+        self.state = LOW_POWER if t_s - self._fine_s > LOW_DELAY_S else ON_BATTERY
+
+
+# --- The firmware's own tests of propellers and battery (docs/firmware.md, "Health tests") ------
+
+
+PROPELLERS, BATTERY = "startPropTest", "startBatTest"
+REST_S, ON_S, PERIOD_S, SENSED_S = 0.1, 0.05, 1.0, 0.1
+BATTERY_S = 0.05
+PROPELLER_PWM, BATTERY_PWM = float(FULL_COMMAND), 40000.0
+MOST_SAG_V = 0.70
+FINISHED = 1 << 7
+DEAD_G2 = 0.01  # `variance` of a motor that does not turn
+SAMPLES = 100  # of the accelerometer; their squares are summed, not averaged
+_STREAM = 9
+_NOISE_G = 0.004
+
+
+def _steps(seconds: float) -> int:
+    return round(seconds / CONTROL_PERIOD_S)
+
+
+class Health:
+    """`testing` is the parameter that began what runs now, or empty.
+
+    `variance` holds x and y of each motor, g^2 summed over `SAMPLES`.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._shake_g = scenario.propeller_shake_g
+        self._rng = np.random.default_rng([scenario.seed, _STREAM])
+        self._step = 0
+        self._samples: list[tuple[float, float]] = []
+        self._idle_v = self._least_v = 0.0
+        self.testing = ""
+        self.variance = [(0.0, 0.0)] * 4
+        self.motor_pass = self.battery_pass = self.motor_tests = 0
+        self.sag_v = 0.0
+
+    def start(self, test: str) -> None:
+        self.testing, self._step, self._samples = test, 0, []
+        if test == PROPELLERS:
+            self.motor_pass = 0
+        else:
+            self.battery_pass = 0
+
+    def pwm(
+        self, forces_n: Sequence[float], battery_v: float, parameters: Mapping[str, float]
+    ) -> Motors:
+        """The duty cycles of one control period, given what the motors do and the battery has."""
+        if self._step == 0:
+            self._idle_v = self._least_v = battery_v
+        step = self._step
+        self._step += 1
+        if self.testing == BATTERY:
+            return self._battery(step, battery_v)
+        return self._propellers(step - _steps(REST_S), forces_n, parameters)
+
+    def _battery(self, step: int, battery_v: float) -> Motors:
+        self._least_v = min(self._least_v, battery_v)
+        if step < _steps(BATTERY_S):
+            return (BATTERY_PWM,) * 4
+        self.sag_v = self._idle_v - self._least_v
+        self.battery_pass = int(self.sag_v <= MOST_SAG_V)
+        self.testing = ""
+        return MOTORS_OFF
+
+    def _propellers(
+        self, step: int, forces_n: Sequence[float], parameters: Mapping[str, float]
+    ) -> Motors:
+        """`step` counts from the first motor's start; before it the noise is measured."""
+        motor, within = divmod(step, _steps(PERIOD_S))
+        if step < 0:
+            return MOTORS_OFF
+        if motor == 4:
+            self._judge(parameters)
+            return MOTORS_OFF
+        if within < _steps(SENSED_S):
+            shake_g = self._shake_g[motor] * forces_n[motor] / MOTOR_FORCE_N
+            x_g, y_g = self._rng.normal(0.0, np.hypot(shake_g, _NOISE_G), 2).tolist()
+            self._samples.append((x_g, y_g))
+        elif self._samples:
+            x, y = (SAMPLES * float(np.var(axis)) for axis in zip(*self._samples, strict=True))
+            self.variance[motor] = (x, y)
+            self._samples = []
+        on = within < _steps(ON_S)
+        one, two, three, four = (PROPELLER_PWM if on and m == motor else 0.0 for m in range(4))
+        return (one, two, three, four) if on else MOTORS_OFF
+
+    def _judge(self, parameters: Mapping[str, float]) -> None:
+        """Without a threshold, as released, no motor's bit is set."""
+        high = parameters["health.propTestThreshold"]
+        for motor, (x, y) in enumerate(self.variance):
+            if high and DEAD_G2 <= x + y <= high:
+                self.motor_pass |= 1 << motor
+        self.motor_pass |= FINISHED
+        self.motor_tests += 1
+        self.testing = ""

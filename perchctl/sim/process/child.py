@@ -1,38 +1,29 @@
-"""The child process: runs the vehicle that the parent describes, or one started by hand.
-
-``python -m perchctl.sim.process --port 19850`` runs one in the foreground.
-"""
+"""The child process: runs the vehicle that the parent describes."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
 import os
 import select
 import signal
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import cv2
 
-from perchctl.calibration import load_calibration
 from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
-from perchctl.profile import data_file
-from perchctl.sim.capture.natnet import COMMAND_PORT
-from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
-from perchctl.sim.process.host import VehicleHost
-from perchctl.sim.process.shared import (
+from perchctl.sim.capture import CaptureFault
+from perchctl.sim.process.handle import (
     CLOCK_MARGIN_S,
     LOOP_PATIENCE_S,
     START_TIMEOUT_S,
-    HostSetup,
     SharedTime,
 )
-from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
+from perchctl.sim.process.host import VehicleHost
+from perchctl.sim.scenario import CONTROL_PERIOD_S
 
 
 def serve_parent() -> None:
@@ -52,52 +43,6 @@ def serve_parent() -> None:
         stream_url = host.stream.url if host.stream is not None else ""
         channel.send((host.uri, stream_url, host.capture))
         Runner(host, channel, realtime=realtime, linger_s=setup.linger_s, shared=shared).run()
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """A simulated vehicle in the foreground, in real time, until Ctrl-C."""
-    parser = argparse.ArgumentParser(
-        prog="python -m perchctl.sim.process",
-        description="A simulated Crazyflie on udp://, its camera on http://, until Ctrl-C.",
-    )
-    parser.add_argument("--port", type=int, default=19850, help="UDP port of the vehicle")
-    parser.add_argument("--http-port", type=int, default=8080, help="port of the camera's stream")
-    parser.add_argument(
-        "--capture",
-        action="store_true",
-        help=f"no deck; motion capture on 127.0.0.1:{COMMAND_PORT}, as OptiTrack's",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="seed of noise and drops")
-    options = parser.parse_args(arguments)
-
-    calibration = data_file("calib", "example_640x480")
-    setup = HostSetup(
-        scenario=Scenario(
-            seed=options.seed, extra={"external_position": 1.0} if options.capture else {}
-        ),
-        capture=CaptureSettings(seed=options.seed) if options.capture else None,
-        camera=load_calibration(calibration) if calibration is not None else None,
-        port=options.port,
-        http_port=options.http_port,
-        capture_port=COMMAND_PORT if options.capture else 0,
-    )
-    # A shell starts what runs in its background with Ctrl-C ignored, and children inherit that.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        host = VehicleHost(setup, live=True)
-    except PerchError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    with contextlib.closing(host):
-        stream = host.stream.url if host.stream is not None else "none"
-        positions = " ".join(host.capture or ("none",))
-        print(
-            f"vehicle {host.uri}\ncamera  {stream}\ncapture {positions}\nCtrl-C ends it",
-            flush=True,
-        )
-        with contextlib.suppress(KeyboardInterrupt):
-            Runner(host, None, realtime=True, linger_s=0.0).run()
-    return 0
 
 
 # --- How time passes in the simulated vehicle's process, and when it ends ----------------------
@@ -144,7 +89,7 @@ class Runner:
         self._calls: dict[str, Callable[..., Any]] = {
             "advance": self._advance,
             "truth": host.truth,
-            "set_pose": self._set_pose,
+            "set_pose": lambda **where: host.vehicle.world.set_pose(**where),
             "carry": lambda stops: host.vehicle.world.carry(stops),
             "let_go": lambda: host.vehicle.world.let_go(),
             "silence": lambda duration_s: host.endpoint.silence(host.elapsed_s, duration_s),
@@ -241,9 +186,6 @@ class Runner:
             raise RuntimeError("only a stepped vehicle can be advanced")
         self._host.advance(dt_s)
         return self._host.elapsed_s
-
-    def _set_pose(self, **where: Any) -> None:
-        self._host.vehicle.world.set_pose(**where)
 
     def _set_battery(self, rest_v: float) -> None:
         self._host.vehicle.world.battery_rest_v = rest_v

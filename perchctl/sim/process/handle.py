@@ -2,7 +2,7 @@
 
 `SimProcess` is the handle in the process that flies, `child` runs in the other one. The
 child does not share its terminal's Ctrl-C and outlives a killed parent by a few seconds
-(`runner`), as a real vehicle would.
+(`child`), as a real vehicle would.
 """
 
 from __future__ import annotations
@@ -13,10 +13,12 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, get_args
+from typing import IO, Any, Literal, get_args
+
+import numpy as np
 
 from perchctl.children import (
     Channel,
@@ -30,12 +32,91 @@ from perchctl.children import (
 )
 from perchctl.errors import ConnectionFailed, InvalidValue, PerchError, TimedOut
 from perchctl.profile import TargetConfig
-from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
+from perchctl.sim.capture import CaptureFault, CaptureSettings
 from perchctl.sim.carried import Stop
 from perchctl.sim.crtp.server import LinkOptions
-from perchctl.sim.process.shared import LINGER_S, START_TIMEOUT_S, HostSetup, Pace, SharedTime
 from perchctl.sim.scenario import Scenario
 from perchctl.vision import CameraModel
+
+CLOCK_MARGIN_S = 0.02
+"""Simulated time may run so far past the moment that the flight loop waits for."""
+LOOP_PATIENCE_S = 2.0
+"""The simulator waits so long, on the wall's clock, for a loop that gives no sign of life."""
+
+
+class SharedTime:
+    """Two numbers in a file that both processes map.
+
+    `reached_s` is how far simulated time has come; the simulator writes it. `limit_s` is how far
+    it may go; the flight writes it, and infinity lets time run freely. Without a file they belong
+    to one process.
+    """
+
+    def __init__(self, file: Path | None = None) -> None:
+        if file is None:
+            self._values = np.array([0.0, math.inf])
+        else:
+            self._values = np.memmap(file, np.float64, "r+")
+
+    @classmethod
+    def create(cls, file: Path) -> SharedTime:
+        np.array([0.0, math.inf]).tofile(file)
+        return cls(file)
+
+    @property
+    def reached_s(self) -> float:
+        return float(self._values[0])
+
+    @reached_s.setter
+    def reached_s(self, t_s: float) -> None:
+        self._values[0] = t_s
+
+    @property
+    def limit_s(self) -> float:
+        return float(self._values[1])
+
+    @limit_s.setter
+    def limit_s(self, t_s: float) -> None:
+        self._values[1] = t_s
+
+
+# --- Messages between the process that flies and the simulated vehicle's, and their settings ---
+
+
+Pace = Literal["realtime", "stepped"]
+START_TIMEOUT_S = 30.0
+LINGER_S = 12.0
+
+
+@dataclass(frozen=True)
+class HostSetup:
+    """How the simulated vehicle's process is set up.
+
+    `camera` None: no camera and no stream; `capture` None: no motion capture. Ports 0: chosen
+    by the operating system.
+    `truth_file`: JSON lines of the true state, 50 a simulated second, also after the
+    parent has ended. `heard_file`: JSON lines of every packet that arrived, and who had sent it.
+    `linger_s`: how long the vehicle then runs on, in wall-clock time. `time_file`: a
+    `SharedTime` of the parent's; None: time runs freely.
+    """
+
+    scenario: Scenario = field(default_factory=Scenario)
+    pace: Pace = "realtime"
+    camera: CameraModel | None = None
+    target: TargetConfig | None = None
+    capture: CaptureSettings | None = None
+    link: LinkOptions = field(default_factory=LinkOptions)
+    port: int = 0
+    http_port: int = 0
+    capture_port: int = 0
+    truth_file: Path | None = None
+    heard_file: Path | None = None
+    linger_s: float = LINGER_S
+    time_file: Path | None = None
+
+
+# --- The handle --------------------------------------------------------------------------------
+
 
 ANSWER_TIMEOUT_S = 15.0
 SLOWEST_PACE = 20.0
@@ -77,42 +158,17 @@ class SimProcess:
         scenario: Scenario | None = None,
         pace: Pace = "realtime",
         *,
-        camera: CameraModel | None = None,
-        target: TargetConfig | None = None,
-        capture: CaptureSettings | None = None,
-        link: LinkOptions | None = None,
-        port: int = 0,
-        http_port: int = 0,
-        capture_port: int = 0,
-        truth_file: Path | None = None,
-        heard_file: Path | None = None,
-        linger_s: float = LINGER_S,
         timeout_s: float = START_TIMEOUT_S,
+        **settings: Any,
     ) -> SimProcess:
         """Start the vehicle and wait, for at most `timeout_s`, until it answers.
 
-        Ports 0 are chosen by the operating system. `truth_file` receives JSON lines of
-        `truth()`, 50 a simulated second, `heard_file` of the packets that arrive: time, sender
-        and bytes in hex. `linger_s` is how long the vehicle runs on after
-        this process has gone. Raises `ConnectionFailed` when the child ends or does not
-        come up, `InvalidValue` for an unknown pace.
+        `settings` are further fields of `HostSetup`. Raises `ConnectionFailed` when the child
+        ends or does not come up, `InvalidValue` for an unknown pace.
         """
         if pace not in get_args(Pace):
             raise InvalidValue(f"pace {pace!r} is unknown, choose 'realtime' or 'stepped'")
-        setup = HostSetup(
-            scenario=scenario or Scenario(),
-            pace=pace,
-            camera=camera,
-            target=target,
-            capture=capture,
-            link=link or LinkOptions(),
-            port=port,
-            http_port=http_port,
-            capture_port=capture_port,
-            truth_file=str(truth_file) if truth_file is not None else None,
-            heard_file=str(heard_file) if heard_file is not None else None,
-            linger_s=linger_s,
-        )
+        setup = HostSetup(scenario or Scenario(), pace, **settings)
         # Both processes have mapped the file once the child has answered.
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
             shared = SharedTime.create(file := Path(folder, "time"))

@@ -3,30 +3,30 @@ process of its own."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import socket
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any, TextIO
 
 import cv2
 import numpy as np
 
 from perchctl.errors import ConnectionFailed
-from perchctl.geometry import rpy_from_rotation
+from perchctl.geometry import Array, rpy_from_rotation
 from perchctl.sim.bursts import Bursts, radio_bursts
-from perchctl.sim.capture.server import SIMULATED_SYSTEM, CaptureServer
+from perchctl.sim.capture import CaptureServer, SimCapture
 from perchctl.sim.crtp.codec import Packet
 from perchctl.sim.crtp.server import CrtpServer, LinkOptions
-from perchctl.sim.process.shared import HostSetup
+from perchctl.sim.optics import Picture
+from perchctl.sim.process.handle import HostSetup
 from perchctl.sim.scenario import CONTROL_PERIOD_S, Scenario
-from perchctl.sim.surfaces import Picture
-from perchctl.sim.vehicle import SimulatedVehicle
-from perchctl.sim.world import TrueState
+from perchctl.sim.vehicle import PastPoses, SimulatedVehicle
+from perchctl.sim.world import World
 
 TRUTH_EVERY = 10  # control periods between two lines of the truth file
 _PAST_S = 1.0  # how far the picture may lag behind the physics
@@ -46,25 +46,25 @@ class VehicleHost:
         self._steps = 0
         self.vehicle = self._new_vehicle(setup.scenario)
         self.server = CrtpServer(self.vehicle.firmware, setup.link)
-        self.endpoint = UdpEndpoint(setup.port, setup.link, radio_bursts(setup.scenario))
-        self.stream: MjpegServer | None = None
-        self.positions: CaptureServer | None = None
-        self._truth: TextIO | None = None
-        self._heard: TextIO | None = None
-        self._feed: _PictureFeed | None = None
-        try:
+        with contextlib.ExitStack() as opened:
+            use = opened.enter_context
+            bursts = radio_bursts(setup.scenario)
+            self.endpoint = use(contextlib.closing(UdpEndpoint(setup.port, setup.link, bursts)))
+            self.stream: MjpegServer | None = None
             if setup.camera is not None:
-                self.stream = MjpegServer(setup.http_port)
+                self.stream = use(contextlib.closing(MjpegServer(setup.http_port)))
+            self.positions: CaptureServer | None = None
             if setup.capture is not None:
-                self.positions = CaptureServer(setup.capture.names, setup.capture_port)
+                server = CaptureServer(setup.capture.names, setup.capture_port)
+                self.positions = use(contextlib.closing(server))
+            self._truth: TextIO | None = None
             if setup.truth_file is not None:
-                self._truth = Path(setup.truth_file).open("w", encoding="utf-8")  # noqa: SIM115
+                self._truth = use(setup.truth_file.open("w", encoding="utf-8"))
+            self._heard: TextIO | None = None
             if setup.heard_file is not None:
-                self._heard = Path(setup.heard_file).open("w", encoding="utf-8")  # noqa: SIM115
+                self._heard = use(setup.heard_file.open("w", encoding="utf-8"))
                 self.endpoint.heard = self._write_heard
-        except BaseException:
-            self.close()
-            raise
+            self._opened = opened.pop_all()
         self._feed = self._new_feed()
 
     @property
@@ -74,7 +74,7 @@ class VehicleHost:
     @property
     def capture(self) -> tuple[str, str] | None:
         """The motion capture's kind, as `motioncapture` calls it, and its address."""
-        return None if self.positions is None else (SIMULATED_SYSTEM, self.positions.host)
+        return None if self.positions is None else (SimCapture.SYSTEM, self.positions.host)
 
     @property
     def elapsed_s(self) -> float:
@@ -95,7 +95,7 @@ class VehicleHost:
         self.endpoint.serve(self.server, self.elapsed_s)
         if self._feed is not None:
             self.vehicle.step_blindly()
-            self._feed.add(self.vehicle.world.state())
+            self._feed.add(self.vehicle.world)
         else:
             self.vehicle.step()
             self._publish_arrived()
@@ -137,15 +137,9 @@ class VehicleHost:
         self._feed = self._new_feed()
 
     def close(self) -> None:
+        """Free the ports and close the files."""
         self._close_feed()
-        self.endpoint.close()
-        if self.stream is not None:
-            self.stream.close()
-        if self.positions is not None:
-            self.positions.close()
-        for file in (self._truth, self._heard):
-            if file is not None:
-                file.close()
+        self._opened.close()
 
     def _write_heard(self, t_s: float, address: Address, datagram: bytes) -> None:
         assert self._heard is not None
@@ -187,7 +181,7 @@ class _PictureFeed:
         assert vehicle.camera is not None
         self._camera = vehicle.camera
         self._stream = stream
-        self._past: deque[TrueState] = deque(maxlen=round(_PAST_S / CONTROL_PERIOD_S))
+        self._past = PastPoses(_PAST_S)
         self._changed = threading.Condition()
         self._closed = False
         self._waiting = 0
@@ -198,9 +192,9 @@ class _PictureFeed:
     def late_s(self) -> float:
         return self._waiting * CONTROL_PERIOD_S
 
-    def add(self, state: TrueState) -> None:
+    def add(self, world: World) -> None:
         with self._changed:
-            self._past.append(state)
+            self._past.add(world)
             self._waiting += 1
             if self._waiting >= _WAKE_EVERY:
                 self._changed.notify()
@@ -213,7 +207,7 @@ class _PictureFeed:
 
     def _run(self) -> None:
         while (t_s := self._next_time()) is not None:
-            self._camera.advance(t_s, self._state_at)
+            self._camera.advance(t_s, self._pose_at)
             self._camera.develop()  # while it is under way: its latency is the whole way's
             arrived = self._camera.take()
             if arrived:
@@ -224,13 +218,11 @@ class _PictureFeed:
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._waiting >= _WAKE_EVERY)
             self._waiting = 0
-            return None if self._closed else self._past[-1].t_s
+            return None if self._closed else self._past.newest_s
 
-    def _state_at(self, t_s: float) -> TrueState:
-        """The true state nearest to `t_s` of those still kept."""
+    def _pose_at(self, t_s: float) -> Array:
         with self._changed:
-            back = round((self._past[-1].t_s - t_s) / CONTROL_PERIOD_S)
-            return self._past[max(-len(self._past), -1 - max(0, back))]
+            return self._past(t_s)
 
 
 # --- The link's carrier: one CRTP packet a UDP datagram, as cflib's `udp://` driver sends them ---
@@ -248,7 +240,7 @@ class UdpEndpoint:
     """The socket of a simulated vehicle, bound to loopback.
 
     Answers go to the requesting address. What the vehicle sends by itself goes to the
-    peer: the last address that sent anything but a scan's probe. `heard` is told of each
+    peer: the last address that sent anything but a scan's probe. `heard` is called with each
     datagram that is a packet, before anything is made of it: time, sender, bytes.
     """
 
@@ -260,9 +252,7 @@ class UdpEndpoint:
         self._random = np.random.default_rng([options.loss_seed, _STREAM])
         self._peer: Address | None = None
         self.heard: Callable[[float, Address, bytes], None] | None = None
-        self._silent: tuple[float, float] | None = None
-        if options.silent_from_s is not None:
-            self._silent = (options.silent_from_s, options.silent_from_s + options.silent_for_s)
+        self._silent = (math.inf, math.inf)
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.setblocking(False)
@@ -270,9 +260,7 @@ class UdpEndpoint:
             self.socket.bind(("127.0.0.1", port))
         except OSError as error:
             self.socket.close()
-            raise ConnectionFailed(
-                f"UDP port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
-            ) from None
+            raise _taken("UDP", port, error) from None
         self.port = int(self.socket.getsockname()[1])
 
     def close(self) -> None:
@@ -317,9 +305,7 @@ class UdpEndpoint:
                 continue
 
     def _is_silent(self, t_s: float) -> bool:
-        return self._silent is not None and (
-            self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S
-        )
+        return self._silent[0] - _EPS_S <= t_s < self._silent[1] - _EPS_S
 
     def _is_lost(self, t_s: float) -> bool:
         if self._bursts is not None and self._bursts.lost(t_s):
@@ -339,51 +325,60 @@ _WAIT_S = 0.5
 _CLIENT_TIMEOUT_S = 5.0
 
 
-class _Newest:
-    """The newest picture; encoded once, by the first client that requests it."""
+class MjpegServer:
+    """Serves the newest of the published pictures on loopback.
 
-    def __init__(self) -> None:
+    `port` 0 lets the operating system choose. Raises ConnectionFailed when it is taken.
+    """
+
+    def __init__(self, port: int = 0) -> None:
         self._changed = threading.Condition()
-        self._encoding = threading.Lock()
         self._image: Picture | None = None
         self._number = 0
-        self._encoded: tuple[int, bytes] = (0, b"")
         self.closed = False
+        try:
+            self._server = _HttpServer(port, self)
+        except OSError as error:
+            raise _taken("TCP", port, error) from None
+        self.url = f"http://127.0.0.1:{self._server.server_address[1]}{PATH}"
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
+        )
+        self._thread.start()
 
-    def put(self, image: Picture) -> None:
+    def publish(self, image: Picture) -> None:
+        """Grey uint8 (h, w). Costs nothing while nobody watches."""
         with self._changed:
             self._image = image
             self._number += 1
             self._changed.notify_all()
 
+    def after(self, number: int) -> tuple[int, Picture] | None:
+        """The newest picture and its number if that is above `number`; None when none came for a
+        while."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
+            if self._image is None or self._number <= number:
+                return None
+            return self._number, self._image
+
     def close(self) -> None:
+        """End all streams and free the port."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
-
-    def after(self, number: int) -> tuple[int, bytes] | None:
-        """The first picture newer than `number`, as JPEG; None when none came for a while."""
-        with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._number > number, _WAIT_S)
-            newest, image = self._number, self._image
-        if image is None or newest <= number:
-            return None
-        with self._encoding:
-            if self._encoded[0] < newest:
-                ok, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-                if not ok:
-                    return None
-                self._encoded = (newest, jpeg.tobytes())
-            return self._encoded
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
 
 
-class _Server(ThreadingHTTPServer):
+class _HttpServer(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
     allow_reuse_address = True
 
-    def __init__(self, port: int) -> None:
-        self.newest = _Newest()
+    def __init__(self, port: int, pictures: MjpegServer) -> None:
+        self.pictures = pictures
         super().__init__(("127.0.0.1", port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -394,7 +389,7 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     timeout = _CLIENT_TIMEOUT_S
-    server: _Server
+    server: _HttpServer
 
     def do_GET(self) -> None:
         if self.path.split("?", 1)[0] != PATH:
@@ -405,48 +400,24 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         self.wfile.flush()
-        number = 0
-        while not self.server.newest.closed:
-            answer = self.server.newest.after(number)
-            if answer is None:
+        pictures, number = self.server.pictures, 0
+        while not pictures.closed:
+            newer = pictures.after(number)
+            if newer is None:
                 continue
-            number, jpeg = answer
-            self.wfile.write(
-                f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\n"
-                f"Content-Length: {len(jpeg)}\r\n\r\n".encode()
-                + jpeg
-                + b"\r\n"
+            number, image = newer
+            _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+            jpeg = encoded.tobytes()
+            head = (
+                f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
             )
+            self.wfile.write(head.encode() + jpeg + b"\r\n")
 
     def log_message(self, format: str, *args: Any) -> None:
         """Requests are not worth a line on the terminal."""
 
 
-class MjpegServer:
-    """Serves the newest of the published pictures on loopback.
-
-    `port` 0 lets the operating system choose. Raises ConnectionFailed when it is taken.
-    """
-
-    def __init__(self, port: int = 0) -> None:
-        try:
-            self._server = _Server(port)
-        except OSError as error:
-            raise ConnectionFailed(
-                f"TCP port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
-            ) from None
-        self.url = f"http://127.0.0.1:{self._server.server_address[1]}{PATH}"
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True
-        )
-        self._thread.start()
-
-    def publish(self, image: Picture) -> None:
-        """Grey uint8 (h, w). Costs nothing while nobody watches."""
-        self._server.newest.put(image)
-
-    def close(self) -> None:
-        self._server.newest.close()
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
+def _taken(kind: str, port: int, error: OSError) -> ConnectionFailed:
+    return ConnectionFailed(
+        f"{kind} port {port} on 127.0.0.1 cannot be used ({error.strerror}): choose another"
+    )

@@ -1,4 +1,4 @@
-"""What seeds draw in the named worlds."""
+"""What seeds draw in the named worlds, and that nothing moves where one condition is taken away."""
 
 from __future__ import annotations
 
@@ -146,3 +146,14 @@ def test_holes_do_not_overlap_and_last_as_long_as_is_said() -> None:
         holes = draw_scenario(load_profile("extreme"), seed).capture_holes_s
         assert all(length_s == 1.0 for _, length_s in holes)
         assert all(b[0] > a[0] + a[1] for a, b in itertools.pairwise(holes))
+
+
+@pytest.mark.parametrize("frames", [None, (0, 0), (9, 9), (8, 9)])
+def test_lost_frames_leave_what_is_drawn_after_them(frames: tuple[int, int] | None) -> None:
+    profile = load_profile("sim")
+    without = profile.model_copy(
+        update={"simulation": profile.simulation.model_copy(update={"camera_burst_frames": frames})}
+    )
+    for seed in range(20):
+        whole = asdict(draw_scenario(profile, seed)) | {"camera_burst": None}
+        assert asdict(draw_scenario(without, seed)) | {"camera_burst": None} == whole

@@ -1,7 +1,6 @@
-"""Thrust command to duty cycle: the curve, the battery, the cap.
-
-docs/firmware.md, "Thrust to PWM".
-"""
+"""The motors and their battery: thrust command to duty cycle by the curve, the battery and the cap
+(docs/firmware.md, "Thrust to PWM"); and a cell that is a real one: flat, then steep, weaker when
+old, slow when cold."""
 
 from __future__ import annotations
 
@@ -9,10 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from perchctl.sim import MOTOR_FORCE_N
-from perchctl.sim.firmware.motors import MOTORS_OFF, THRUST_MIN, MotorDriver
-from perchctl.sim.powertrain import FULL_COMMAND, STANDSTILL_V, motor_v, thrust_n
+from perchctl.sim import CONTROL_PERIOD_S, MOTOR_FORCE_N
+from perchctl.sim.firmware.power import _LEVELS_V, MOTORS_OFF, THRUST_MIN, MotorDriver
+from perchctl.sim.powertrain import (
+    FULL_COMMAND,
+    STANDSTILL_V,
+    Cell,
+    CellKind,
+    motor_v,
+    thrust_n,
+)
 
+HOVER_A = 3.8
 # Command, duty cycle, battery under that load.
 MEASURED = [
     (65535, 58090, 3.47), (56200, 53150, 3.55), (40200, 43350, 3.70), (31900, 37450, 3.75),
@@ -90,3 +97,57 @@ def test_the_cap_takes_the_excess_off_all_four_duty_cycles() -> None:
 def test_a_battery_that_cannot_be_read_gives_no_thrust() -> None:
     driver = settled(1.9)
     assert driver.pwm((40000.0,) * 4, 1.9) is MOTORS_OFF
+
+
+def after(cell: Cell, seconds: float, current_a: float = HOVER_A) -> float:
+    for _ in range(round(seconds / CONTROL_PERIOD_S)):
+        cell.step(current_a)
+    return cell.rest_v
+
+
+def test_each_tenth_of_the_charge_ends_at_the_firmwares_level() -> None:
+    cell = Cell(4.2, CellKind())
+    tenth_s = 90.0 / HOVER_A
+    for level_v in reversed(_LEVELS_V[1:]):
+        assert after(cell, tenth_s) == pytest.approx(level_v, abs=0.002)
+    assert after(cell, tenth_s) == pytest.approx(3.0, abs=0.02)
+
+
+def test_it_falls_ever_faster_towards_its_end() -> None:
+    cell = Cell(3.87, CellKind())
+    fallen_v = [cell.rest_v - after(cell, 10.0) for _ in range(7)]
+    assert fallen_v[-1] > 8 * fallen_v[0]
+
+
+def test_an_old_cell_empties_faster_and_sags_more() -> None:
+    new, old = Cell(4.1, CellKind()), Cell(4.1, CellKind(resistance_ohm=0.2, charge=0.5))
+    after(new, 40.0)
+    after(old, 20.0)
+    assert old.rest_v == pytest.approx(new.rest_v, abs=1e-6)
+    assert new.rest_v - new.battery_v == pytest.approx(0.143 * HOVER_A)
+    assert old.rest_v - old.battery_v == pytest.approx(0.2 * HOVER_A)
+
+
+def test_a_slow_resistance_shows_within_seconds_and_recovers() -> None:
+    cell = Cell(4.1, CellKind(slow_ohm=0.05))
+    after(cell, 0.1)
+    assert cell.rest_v - cell.battery_v == pytest.approx(0.143 * HOVER_A, abs=0.005)
+    after(cell, 60.0)
+    assert cell.rest_v - cell.battery_v == pytest.approx(0.193 * HOVER_A, abs=0.005)
+    after(cell, 60.0, 0.0)
+    assert cell.battery_v == pytest.approx(cell.rest_v, abs=0.005)
+
+
+def test_a_voltage_that_is_set_leaves_the_charge_as_it_is() -> None:
+    fine, fallen = Cell(4.1, CellKind()), Cell(4.1, CellKind())
+    fallen.rest_v -= 0.4
+    assert fallen.rest_v == pytest.approx(3.7)
+    assert after(fine, 20.0) - after(fallen, 20.0) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("rest_v", [3.3, 3.6, 3.85, 4.0, 4.2])
+@pytest.mark.parametrize("knee", [0.07, 0.1, 0.15])
+def test_it_starts_at_the_resting_voltage_that_is_asked_for(rest_v: float, knee: float) -> None:
+    cell = Cell(rest_v, CellKind(knee=knee))
+    assert cell.rest_v == cell.battery_v == rest_v
+    assert after(cell, CONTROL_PERIOD_S) == pytest.approx(rest_v, abs=1e-3)

@@ -1,4 +1,4 @@
-"""What a simulated scenario did to a flight, told with the event that it led to: a newcomer
+"""What a simulated scenario did to a flight, said with the event that it led to: a newcomer
 who sees the target lost should not look for the fault in the program."""
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ import math
 from perchctl.geometry import GRAVITY_MPS2
 from perchctl.mission import NO_PICTURE_TEXT, Event, EventKind
 from perchctl.sim.bursts import Bursts
-from perchctl.sim.cell import RESISTANCE_OHM
+from perchctl.sim.powertrain import RESISTANCE_OHM
 from perchctl.sim.scenario import Scenario
 
 LOSSES = ("estimate-lost", "align-lost", "ascend-lost", "camera-gone")
@@ -29,7 +29,7 @@ _TELEMETRY = "telemetry is"
 
 
 class EventExplainer:
-    """Asked for each event of one flight, in order."""
+    """Explains the events of one flight; call it with each of them, in order."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
@@ -37,7 +37,8 @@ class EventExplainer:
         self._bursts = Bursts(scenario.seed, scenario.radio_loss, scenario.radio_burst_s)
 
     def __call__(self, event: Event, t_s: float) -> str:
-        """In a few words, or the empty string. `t_s` is the event's time in the simulation."""
+        """What the scenario did, in a few words, or the empty string. `t_s` is the event's time in
+        the simulation."""
         scenario = self._scenario
         if self._lacks_pictures(event):
             return self._why_no_pictures(t_s)

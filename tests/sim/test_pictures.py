@@ -1,4 +1,5 @@
-"""Tiles that are filled with one grey look as if each pixel had been looked up."""
+"""What makes pictures quick leaves them as true: tiles of one grey, noise from a bank, a blur of
+some tiles only, and one picture for a camera at rest."""
 
 from __future__ import annotations
 
@@ -11,15 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import perchctl.sim.renderer as placed
-import perchctl.sim.renderer as rendering
+import perchctl.sim.sheets as sheets
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Neighbour, Renderer, Scenario
-from perchctl.sim.pixels import defocused
-from perchctl.sim.shutter import Shot
-from perchctl.sim.surfaces import SheetTexture
-from perchctl.sim.tiles import Reach, Tiles, pixels_of, tiles_of
+from perchctl.sim.renderer import Shot, defocused, rounded
+from perchctl.sim.sheets import Reach, SheetTexture, Tiles, pixels_of, tiles_of
 from perchctl.vision import CameraModel
 
 K = np.array([[380.0, 0.0, 321.5], [0.0, 380.6, 238.2], [0.0, 0.0, 1.0]])
@@ -61,7 +59,7 @@ def test_even_tiles_are_what_their_pixels_are(
     renderer: Renderer, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quick = renderer.render(EXPOSURES[name])
-    monkeypatch.setattr(placed, "tiles_of", each_pixel)
+    monkeypatch.setattr(sheets, "tiles_of", each_pixel)
     renderer.move_target(SCENE.target_xy_m)  # no picture of before is kept
     assert np.array_equal(quick, renderer.render(EXPOSURES[name]))
 
@@ -71,23 +69,9 @@ def test_so_they_are_with_a_rolling_shutter(
 ) -> None:
     rows = tuple((pose(0.25, 0.01 * k, 0.0, 0.02 * k),) for k in range(5))
     quick = renderer.expose([Shot(rows)])
-    monkeypatch.setattr(placed, "tiles_of", each_pixel)
+    monkeypatch.setattr(sheets, "tiles_of", each_pixel)
     renderer.move_target(SCENE.target_xy_m)  # no picture of before is kept
     assert np.array_equal(quick, renderer.expose([Shot(rows)]))
-
-
-def test_most_of_a_near_sheet_is_even(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    shares = []
-
-    def watched(reach: Reach, texture: SheetTexture, side_m: float) -> Tiles:
-        found = tiles_of(reach, texture, side_m)
-        shares.append(float(found.even.mean()))
-        return found
-
-    monkeypatch.setattr(placed, "tiles_of", watched)
-    renderer.move_target(SCENE.target_xy_m)
-    renderer.render(EXPOSURES["nothing but paper"])
-    assert max(shares) > 0.6
 
 
 def test_noise_has_its_spread_and_no_memory() -> None:
@@ -103,27 +87,6 @@ def test_noise_has_its_spread_and_no_memory() -> None:
         assert abs((noise[:, 1:] * noise[:, :-1]).mean()) < 0.01 * 36.0
         assert abs((noise[1:] * noise[:-1]).mean()) < 0.01 * 36.0
     assert abs((one * other).mean()) < 0.01 * 36.0
-
-
-@pytest.mark.parametrize("below_m", [0.3, 1.0, 1.7])
-def test_noise_covers_that_the_ceiling_is_drawn_at_a_quarter_of_the_size(
-    below_m: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = replace(SCENE, no_target=True, neighbours=())
-    half = Renderer(scene, CAMERA, TargetConfig()).render([pose(below_m)]).astype(float)
-    monkeypatch.setattr(rendering, "_COVERING_SIGMA", 0.0)
-    quarter = Renderer(scene, CAMERA, TargetConfig()).render([pose(below_m)]).astype(float)
-    assert 0.0 < (half - quarter).std() < 1.5
-    assert abs((half - quarter).mean()) < 0.1
-    assert abs(half.std() / quarter.std() - 1.0) < 0.02
-
-
-def test_4225_frames_have_noise_of_their_own() -> None:
-    noisy = Renderer(replace(SCENE, camera_noise_sigma=6.0), CAMERA, TargetConfig())
-    paper = EXPOSURES["nothing but paper"]
-    pictures = {noisy.render(paper, frame_index=k).tobytes() for k in range(0, 4225, 65)}
-    assert len(pictures) == 65
-    assert noisy.render(paper, frame_index=4225).tobytes() in pictures
 
 
 SPAN = st.tuples(st.integers(0, 9), st.integers(1, 6))
@@ -145,3 +108,55 @@ def test_a_blur_of_some_tiles_is_that_of_the_whole_picture_there(
     far = np.ones(sharp.shape, np.bool_)
     far[pixels_of(box, 8)] = False
     assert np.array_equal(picture[far], sharp[far])
+
+
+# A camera at rest ---------------------------------------------------------------------
+
+
+STIRRED = Scenario(ceiling_z_m=2.0, camera_noise_sigma=3.0)
+
+
+def exposed(below_m: float, stir: float, *, moving: bool = False) -> list[Array]:
+    """The poses of an exposure; `stir` in m and rad."""
+    far = 0.02 if moving else 0.0
+    return [
+        make_T(rotation_from_rpy(0.02 + stir, 0.1, 0.5 + k * far), (stir, 0.01, 2.0 - below_m))
+        for k in range(3)
+    ]
+
+
+def test_no_picture_hangs_on_those_before() -> None:
+    """Which of them are looked at is the flight's affair, and no other bytes may follow from it."""
+    stirring = [exposed(0.6, 3e-6 * k) for k in range(8)]
+    all_seen = Renderer(STIRRED, CAMERA, TargetConfig())
+    frames = [all_seen.render(poses, frame_index=7) for poses in stirring]
+    for poses, frame in zip(stirring, frames, strict=True):
+        alone = Renderer(STIRRED, CAMERA, TargetConfig())
+        assert np.array_equal(alone.render(poses, frame_index=7), frame)
+
+
+@pytest.mark.parametrize("below_m", [0.02, 0.3, 2.0])
+def test_a_rounded_pose_shows_each_place_where_it_is(below_m: float) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        T = make_T(
+            rotation_from_rpy(*rng.uniform(-0.3, 0.3, 3)),
+            (*rng.uniform(-0.5, 0.5, 2) * below_m, -below_m),
+        )
+        points = np.array([[*rng.uniform(-0.5, 0.5, 2) * below_m, 0.0] for _ in range(9)])
+        seen = [(points - t[:3, 3]) @ t[:3, :3] for t in (T, rounded(T))]
+        one, other = (400.0 * cam[:, :2] / cam[:, 2:] for cam in seen)
+        within = (np.abs(one) < (400.0, 300.0)).all(axis=1)
+        assert np.abs(one - other)[within].max(initial=0.0) < 0.01
+
+
+def test_without_noise_a_kept_picture_is_nobody_s_to_spoil() -> None:
+    renderer = Renderer(replace(STIRRED, camera_noise_sigma=0.0), CAMERA, TargetConfig())
+    first = renderer.render(exposed(1.0, 0.0))
+    kept = first.copy()
+    first[:] = 0
+    assert np.array_equal(renderer.render(exposed(1.0, 0.0)), kept)
+    moved = renderer.render(exposed(1.0, 0.0, moving=True))
+    renderer.move_target((0.1, 0.0))
+    assert not np.array_equal(moved, kept)
+    assert not np.array_equal(renderer.render(exposed(1.0, 0.0)), kept)

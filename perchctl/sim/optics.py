@@ -1,9 +1,13 @@
-"""View rays of a camera and where they meet the target's plane; pure."""
+"""A camera's optics: its pixels' view rays, where they meet the target's plane, and its shade.
+
+Pixel (0, 0) is the centre of the top-left pixel, as in OpenCV. Pure.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -12,8 +16,11 @@ from numpy.typing import NDArray
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel
 
+Picture = NDArray[np.uint8]
+
 FINE_PX, COARSE_PX = 2, 8
-"""Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks."""
+"""Distances of the nodes of the two ray grids; the image is padded to whole coarse blocks, tiles
+that have a coarse node in their centre each."""
 
 FAR_AWAY_M = 1e4
 """The coordinates given to rays that miss the plane."""
@@ -116,7 +123,7 @@ def _met(q: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]
 
 
 def _all_rise(grid: RayGrid, to_plane: Array) -> bool:
-    """Whether every ray meets the plane. The rise is linear over the rays, so it is least
+    """True if every ray meets the plane. The rise is linear over the rays, so it is least
     on the outline."""
     rise = to_plane[2].astype(np.float32)
     return bool(grid.outline.dot(rise[:2]).min() + rise[2] >= LEAST_RISE)
@@ -129,3 +136,82 @@ def local_px_per_m(nodes: NDArray[np.float32], row: int, col: int, stride: int) 
     b = (nodes[row + 1, col] - nodes[row - 1, col]).astype(np.float64)
     area = abs(a[0] * b[1] - a[1] * b[0])
     return 2.0 * stride / math.sqrt(max(area, 1e-12))
+
+
+# --- What a lens makes of its pixels, for all pictures and all flights alike --------------------
+
+
+VIGNETTING_EXPONENT = 0.6
+"""Relative light is (1 + tan^2(angle))^-exponent; 2 would be the cos^4 law of a
+bare lens, real ones correct most of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class TileRays:
+    """Rays of all pixels, tile by tile: xy (tiles, 64, 2), down (tiles, 8)."""
+
+    xy: NDArray[np.float32]
+    down: NDArray[np.float32]
+    outline: NDArray[np.float32]
+
+    def of(self, tiles: NDArray[np.intp]) -> RayGrid:
+        """Eight rows of eight rays for each of these tiles."""
+        xy = self.xy.take(tiles, axis=0).reshape(-1, COARSE_PX, 2)
+        return RayGrid(1, xy, self.down.take(tiles, axis=0).ravel(), self.outline)
+
+
+def tile_rays(fine: RayGrid) -> TileRays:
+    """All rays of a picture; between the nodes they are interpolated (1e-4 px)."""
+    xy = cv2.resize(fine.xy, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
+    rows, cols = (n // COARSE_PX for n in xy.shape[:2])
+    blocks = xy.reshape(rows, COARSE_PX, cols, COARSE_PX, 2).transpose(0, 2, 1, 3, 4)
+    down = np.arange(rows * COARSE_PX) * ((fine.down[2] - fine.down[1]) / FINE_PX)
+    by_tile = np.repeat(down.reshape(rows, 1, COARSE_PX), cols, axis=1)
+    return TileRays(
+        np.ascontiguousarray(blocks, np.float32).reshape(rows * cols, COARSE_PX**2, 2),
+        np.asarray(by_tile, np.float32).reshape(rows * cols, COARSE_PX),
+        fine.outline,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """`coarse` the rays of every eighth pixel, `tiles` of all of them; `shade` the relative light
+    (height, width), 255 for all of it; `places` rays (3, 5) to the picture's middle and into its
+    quarters; `focal_px` the mean of both directions."""
+
+    coarse: RayGrid
+    tiles: TileRays
+    shade: Picture
+    places: Array
+    focal_px: float
+
+
+def lens_of(camera: CameraModel) -> Lens:
+    """The camera's; flights share it, since its rays take longer than 20 pictures."""
+    return _lens(*camera.contents)
+
+
+@lru_cache(maxsize=2)
+def _lens(size_px: tuple[int, int], model: str, K: bytes, dist: bytes) -> Lens:
+    camera = CameraModel(size_px, np.frombuffer(K).reshape(3, 3), np.frombuffer(dist), model)
+    fine, coarse = ray_grid(camera, FINE_PX), ray_grid(camera, COARSE_PX)
+    focal_px = float(camera.K[0, 0] + camera.K[1, 1]) / 2.0
+    shade = vignetting(fine, size_px)
+    return Lens(coarse, tile_rays(fine), shade, _five_places(coarse), focal_px)
+
+
+def _five_places(coarse: RayGrid) -> Array:
+    rows, cols = coarse.xy.shape[:2]
+    places = [(rows // 2, cols // 2)] + [
+        (r, c) for r in (rows // 5, 4 * rows // 5) for c in (cols // 5, 4 * cols // 5)
+    ]
+    return np.array([[*coarse.xy[r, c], 1.0] for r, c in places], np.float64).T
+
+
+def vignetting(fine: RayGrid, size_px: tuple[int, int]) -> Picture:
+    """The lens's relative light, 255 for all of it; (height, width)."""
+    r2 = (fine.rays[:2] ** 2).sum(axis=0)
+    light = (255.0 * (1.0 + r2) ** -VIGNETTING_EXPONENT).astype(np.float32)
+    full = cv2.resize(light, None, fx=FINE_PX, fy=FINE_PX)[FINE_PX:-FINE_PX, FINE_PX:-FINE_PX]
+    return np.asarray(np.rint(full[: size_px[1], : size_px[0]]), np.uint8)

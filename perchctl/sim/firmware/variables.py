@@ -1,12 +1,20 @@
-"""The tables of log variables and parameters a Crazyflie announces.
+"""The log variables and parameters that a Crazyflie announces, and what they read and set.
 
-Groups and names follow the real firmware's; each table is filled up to the measured
-size (docs/firmware.md, "Link": 385 log variables, 257 parameters).
+Groups and names follow the real firmware's; of the log variables only those that a vehicle which
+perches has a use for. Each table is filled up to the measured size (docs/firmware.md, "Link": 385
+log variables, 257 parameters).
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+from perchctl.sim.firmware.controller import Controller
+from perchctl.sim.firmware.outside import ATTITUDE, POSITION, VELOCITY
 
 LOG_COUNT = 385
 PARAMETER_COUNT = 257
@@ -17,8 +25,6 @@ _LOG_GROUPS: dict[str, str] = {
     "stabilizer": "float: roll pitch yaw thrust rtStab; uint32_t: intToOut",
     "acc": "float: x y z",
     "gyro": "float: x y z xVariance yVariance zVariance; int16_t: xRaw yRaw zRaw",
-    "baro": "float: asl temp pressure",
-    "mag": "float: x y z",
     "pm": "float: vbat extVbat extCurr; uint16_t: vbatMV extVbatMV extCurrMV;"
     " float: chargeCurrent; int8_t: state; uint8_t: batteryLevel",
     "supervisor": "uint16_t: info",
@@ -28,48 +34,17 @@ _LOG_GROUPS: dict[str, str] = {
     " q0 q1 q2 q3 rtUpdate rtPred rtFinal rtApnd rtRej",
     "motor": "uint16_t: m1 m2 m3 m4; int32_t: m1req m2req m3req m4req",
     "ctrltarget": "float: x y z vx vy vz ax ay az roll pitch yaw",
-    "ctrltargetZ": "int16_t: x y z vx vy vz ax ay az",
     "controller": "float: cmd_thrust cmd_roll cmd_pitch cmd_yaw r_roll r_pitch r_yaw accelz"
     " actuatorThrust roll pitch yaw rollRate pitchRate yawRate; int16_t: ctr_yaw",
     "radio": "uint8_t: rssi isConnected; uint16_t: numRxBc numRxUc",
     "stateEstimateZ": "int16_t: x y z vx vy vz ax ay az; uint32_t: quat;"
     " int16_t: rateRoll ratePitch rateYaw",
-    "posCtl": "float: targetVX targetVY targetVZ targetX targetY targetZ bodyVX bodyVY bodyX"
-    " bodyY Xp Xi Xd Xff Yp Yi Yd Yff Zp Zi Zd Zff VXp VXi VXd VXff VYp VYi VYd VYff"
-    " VZp VZi VZd VZff",
-    "pid_attitude": "float: roll_outP roll_outI roll_outD roll_outFF pitch_outP pitch_outI"
-    " pitch_outD pitch_outFF yaw_outP yaw_outI yaw_outD yaw_outFF",
-    "pid_rate": "float: roll_outP roll_outI roll_outD roll_outFF pitch_outP pitch_outI"
-    " pitch_outD pitch_outFF yaw_outP yaw_outI yaw_outD yaw_outFF",
-    "ctrlMel": "float: cmd_thrust cmd_roll cmd_pitch cmd_yaw r_roll r_pitch r_yaw accelz"
-    " zdx zdy zdz i_err_x i_err_y i_err_z",
-    "ctrlINDI": "float: cmd_thrust cmd_roll cmd_pitch cmd_yaw r_roll r_pitch r_yaw u_act_dot_p"
-    " u_act_dot_q u_act_dot_r du_p du_q du_r ang_accel_ref_p ang_accel_ref_q ang_accel_ref_r"
-    " rate_d_p rate_d_q rate_d_r uf_p uf_q uf_r Omega_f_p Omega_f_q Omega_f_r n_p n_q n_r",
-    "ctrlBrescianini": "float: thrust tau_x tau_y tau_z",
-    "ctrlLee": "float: KR_x KR_y KR_z Kw_x Kw_y Kw_z thrustSI torquex torquey torquez rpyx rpyy"
-    " rpyz rpydx rpydy rpydz omegax omegay omegaz omegarx omegary omegarz",
-    "kalman_pred": "float: predNX predNY measNX measNY",
-    "sensfusion6": "float: qw qx qy qz gravityX gravityY gravityZ accZbase; uint8_t: isInit"
-    " isCalibrated",
     "range": "uint16_t: front back up left right zrange",
-    "motion": "uint8_t: motion; int16_t: deltaX deltaY; uint16_t: shutter; uint8_t: maxRaw"
-    " minRaw Rawsum outlierCount squal; float: std",
     "locSrv": "float: x y z qx qy qz qw; uint16_t: tick",
     "locSrvZ": "uint16_t: tick",
-    "tdoa2": "float: d7-0 d0-1 d1-2 d2-3 d3-4 d4-5 d5-6 d6-7 cc0 cc1 cc2 cc3 cc4 cc5 cc6 cc7",
-    "lighthouse": "uint8_t: validAngles; float: rawAngle0x rawAngle0y rawAngle1x rawAngle1y"
-    " angle0x angle0y angle1x angle1y x y z delta; uint16_t: bsAvailable bsReceive bsActive"
-    " bsCalUd bsCalCon bsCalVal bsGeoVal; uint8_t: status comSync width0 width1",
-    "extrx": "uint16_t: ch0 ch1 ch2 ch3; float: thrust roll pitch yaw",
-    "outlierf": "int32_t: lhWin; int32_t: bucket0 bucket1 bucket2 bucket3 bucket4 accLev errD",
-    "crtp": "uint16_t: rxRate txRate",
     "health": "float: motorVarXM1 motorVarYM1 motorVarXM2 motorVarYM2 motorVarXM3 motorVarYM3"
     " motorVarXM4 motorVarYM4; uint8_t: motorPass batteryPass; float: batterySag;"
     " uint16_t: motorTestCount",
-    "DTR_P2P": "uint8_t: rx_state tx_state",
-    "usd": "float: spiWrBps spiReBps fatWrBps",
-    "activeMarker": "uint8_t: btSns",
 }
 
 # group -> "ctype: name=default ..."; "*" persistent, "!" read-only.
@@ -185,3 +160,144 @@ def _typed(text: str) -> list[tuple[str, list[str]]]:
 
 LOG_VARIABLES: dict[str, str] = _log_table()
 PARAMETERS: dict[str, Parameter] = _parameter_table()
+
+
+# --- Where each live log variable comes from; all others read 0 --------------------------------
+
+
+Getter = Callable[[Any], float]
+"""Reads the value off a `Firmware`."""
+_AXES = "xyz"
+_ANGLES = ("roll", "pitch", "yaw")
+
+
+def _field(path: str, scale: float = 1.0) -> Getter:
+    read = attrgetter(path)
+    return lambda firmware: scale * float(read(firmware))
+
+
+def _item(path: str, *places: int) -> Getter:
+    """An element of a sequence, or of one within it."""
+    read = attrgetter(path)
+
+    def get(firmware: Any) -> float:
+        value = read(firmware)
+        for place in places:
+            value = value[place]
+        return float(value)
+
+    return get
+
+
+def _duty_cycle(path: str, motor: int) -> Getter:
+    read = _item(path, motor)
+    return lambda firmware: float(int(read(firmware)))
+
+
+def _variance(state: int) -> Getter:
+    return lambda firmware: firmware.estimator.variance(firmware.t_s, state)
+
+
+def _range_mm(firmware: Any) -> float:
+    """What a deck measures of the height."""
+    return 1000.0 * max(0.0, firmware.world.z_m) if firmware.estimator.outside is None else 0.0
+
+
+def _live() -> dict[str, Getter]:
+    getters: dict[str, Getter] = {
+        "pm.vbat": _field("power.battery_v"),
+        "pm.vbatMV": _field("power.battery_v", 1000.0),
+        "pm.state": _field("power.state"),
+        "pm.batteryLevel": _field("power.level_percent"),
+        "supervisor.info": _field("supervisor_info"),
+        "sys.canfly": _field("supervisor.motors_allowed"),
+        "sys.isFlying": _field("supervisor.is_flying"),
+        "sys.isTumbled": _field("supervisor.tumbled"),
+        "stabilizer.thrust": _field("controller.thrust"),
+        "controller.cmd_thrust": _field("controller.thrust"),
+        "controller.actuatorThrust": _field("controller.thrust"),
+        "controller.accelz": _item("estimator.acc_g", 2),
+        "radio.rssi": _field("scenario.rssi_dbm", -1.0),
+        "radio.isConnected": lambda firmware: 1.0,
+        "kalman.inFlight": _field("supervisor.is_flying"),
+        "range.zrange": _range_mm,
+        "locSrvZ.tick": _field("external_tick_ms"),
+        "health.motorPass": _field("health.motor_pass"),
+        "health.motorTestCount": _field("health.motor_tests"),
+        "health.batteryPass": _field("health.battery_pass"),
+        "health.batterySag": _field("health.sag_v"),
+    }
+    for i, axis in enumerate(_AXES):
+        place, speed = f"estimator.now.{axis}_m", f"estimator.now.v{axis}_mps"
+        getters |= {
+            f"stateEstimate.{axis}": _field(place),
+            f"stateEstimate.v{axis}": _field(speed),
+            f"kalman.state{axis.upper()}": _field(place),
+            f"kalman.stateP{axis.upper()}": _field(speed),
+            f"stateEstimateZ.{axis}": _field(place, 1000.0),
+            f"stateEstimateZ.v{axis}": _field(speed, 1000.0),
+            f"kalman.var{axis.upper()}": _variance(POSITION + i),
+            f"kalman.varP{axis.upper()}": _variance(VELOCITY + i),
+            f"kalman.varD{i}": _variance(ATTITUDE + i),
+            f"acc.{axis}": _item("estimator.acc_g", i),
+            f"gyro.{axis}": _field(f"estimator.now.gyro_{axis}_dps"),
+            f"ctrltarget.{axis}": _field(f"flown_setpoint.{axis}_m"),
+            f"ctrltarget.v{axis}": _field(f"flown_setpoint.v{axis}_mps"),
+        }
+    for i, (angle, axis, sign) in enumerate(zip(_ANGLES, _AXES, (1, -1, 1), strict=True)):
+        getters |= {
+            f"stateEstimate.{angle}": _field(f"estimator.now.{angle}_deg"),
+            f"stabilizer.{angle}": _field(f"estimator.now.{angle}_deg"),
+            f"ctrltarget.{angle}": _field(f"flown_setpoint.{angle}_deg"),
+            f"controller.{angle}": _field(f"controller.desired_{angle}_deg"),
+            f"controller.cmd_{angle}": _item("controller.outputs", i),
+            f"controller.r_{angle}": _field(f"estimator.now.gyro_{axis}_dps", math.radians(sign)),
+        }
+    for i, part in enumerate("wxyz"):
+        getters[f"stateEstimate.q{part}"] = _item("world.quaternion", i)
+        getters[f"kalman.q{i}"] = _item("world.quaternion", i)
+    for i in range(4):
+        getters[f"motor.m{i + 1}"] = _duty_cycle("motors", i)
+        getters[f"motor.m{i + 1}req"] = _duty_cycle("driver.requested", i)
+        getters[f"health.motorVarXM{i + 1}"] = _item("health.variance", i, 0)
+        getters[f"health.motorVarYM{i + 1}"] = _item("health.variance", i, 1)
+    return getters
+
+
+LIVE: dict[str, Getter] = _live()
+
+
+# --- Parameters that reach into the controller: the gains and limits of its loops --------------
+
+
+_LOOPS = {
+    "posCtlPid": {axis: axis for axis in ("x", "y", "z")},
+    "velCtlPid": {axis: axis for axis in ("vx", "vy", "vz")},
+    "pid_attitude": {f"{axis}_": axis for axis in ("roll", "pitch", "yaw")},
+    "pid_rate": {f"{axis}_": f"{axis}_rate" for axis in ("roll", "pitch", "yaw")},
+}
+_GAINS = {
+    f"{group}.{prefix}{gain if prefix.endswith('_') else gain.capitalize()}": (loop, gain)
+    for group, loops in _LOOPS.items()
+    for prefix, loop in loops.items()
+    for gain in ("kp", "ki", "kd")
+}
+_LIMITS = {
+    "posCtlPid.rLimit": "roll_max_deg",
+    "posCtlPid.pLimit": "pitch_max_deg",
+    "posCtlPid.xVelMax": "x_speed_max_mps",
+    "posCtlPid.yVelMax": "y_speed_max_mps",
+    "posCtlPid.zVelMax": "z_speed_max_mps",
+    "posCtlPid.thrustBase": "thrust_base",
+    "posCtlPid.thrustMin": "thrust_min",
+}
+
+
+def apply_parameter(controller: Controller, name: str, value: float) -> None:
+    """Put a parameter's value where the controller uses it; others change nothing."""
+    if name in _GAINS:
+        loop, gain = _GAINS[name]
+        setattr(getattr(controller, loop), gain, value)
+    elif name in _LIMITS:
+        setattr(controller, _LIMITS[name], value)
+        controller.limits_changed()

@@ -1,0 +1,428 @@
+"""A simulated motion-capture system: what it is like, what goes wrong in it, what its cameras see
+of the simulated vehicle, when that arrives, and its server on loopback."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from perchctl.errors import ConnectionFailed, InvalidValue
+from perchctl.geometry import (
+    Array,
+    quaternion_from_rotation,
+    rot_z,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+)
+from perchctl.positioning import BodyPose, CaptureFrame
+
+if TYPE_CHECKING:
+    from perchctl.sim.world import World
+
+_STREAM = 13
+_JITTER_LIMIT_SIGMAS = 3.0
+_AXES = re.compile(r"([+-])([xyz])([+-])([xyz])([+-])([xyz])")
+TRUE_AXES = "+x+y+z"
+Y_UP = "+x+z-y"
+"""The capture's second axis is up, as some systems have it out of the box."""
+SWAPPED_XY = "+y-x+z"
+"""The capture's axes lie a quarter turn from those along which its bodies were defined."""
+MILLIMETRES_PER_M = 1000.0
+
+
+@dataclass(frozen=True)
+class OtherBody:
+    """A rigid body that is not the vehicle, and stands still."""
+
+    name: str
+    position_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class CaptureFault:
+    """What is wrong for a time; as it stands, nothing.
+
+    Attributes:
+        occluded: the vehicle's body is not seen.
+        frozen: all bodies stay where they were seen last, to the last digit.
+        gone: no frame is sent.
+        swapped: the vehicle's body and the first other one have changed names.
+        scale: of all positions; 1000 is millimetres.
+        mirrored: positions with y's sign turned, as a left-handed program sends them.
+        axes: the capture's axes in the world's, such as `+x+z-y`; None: as in the settings.
+        late_s: more than the settings' delay.
+        rate_hz: at most so many frames a second.
+    """
+
+    occluded: bool = False
+    frozen: bool = False
+    gone: bool = False
+    swapped: bool = False
+    scale: float = 1.0
+    mirrored: bool = False
+    axes: str | None = None
+    late_s: float = 0.0
+    rate_hz: float = math.inf
+
+    def __post_init__(self) -> None:
+        if self.axes is not None:
+            axes_matrix(self.axes)
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """A motion-capture system as a lab has it; SI, its world that of the state estimate.
+
+    Attributes:
+        body: the vehicle's rigid body, `body_*` its axes and origin in the vehicle's axes.
+        rate_hz: of its cameras.
+        delay_s, jitter_s: from an exposure to the frame's arrival; one sigma of it.
+        position_noise_m, attitude_noise_rad: one sigma, each axis.
+        axes: the capture's axes in the world's.
+        heading_rad, origin_m: of the simulator's world in the capture's.
+        faults: (from s, to s, what), on the simulation's clock.
+    """
+
+    body: str = "crazyflie"
+    body_rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    body_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    others: tuple[OtherBody, ...] = (OtherBody("wand", (1.2, -0.9, 0.05)),)
+    rate_hz: float = 120.0
+    delay_s: float = 0.01
+    jitter_s: float = 0.0005
+    position_noise_m: float = 0.001
+    attitude_noise_rad: float = 0.005
+    axes: str = TRUE_AXES
+    heading_rad: float = 0.0
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    faults: tuple[tuple[float, float, CaptureFault], ...] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        axes_matrix(self.axes)
+        if not self.rate_hz > 0.0:
+            raise InvalidValue(f"a motion capture at {self.rate_hz:g} Hz sees nothing")
+        if len(set(self.names)) < len(self.names):
+            raise InvalidValue(f"two rigid bodies have one name: {', '.join(self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all rigid bodies, the vehicle's first."""
+        return (self.body, *(other.name for other in self.others))
+
+
+def axes_matrix(axes: str) -> Array:
+    """(3, 3): world vector to the capture's. Errors: InvalidValue for what is no right-handed
+    set of axes."""
+    parts = _AXES.fullmatch(axes)
+    matrix = np.zeros((3, 3))
+    if parts is not None:
+        for row in range(3):
+            sign, axis = parts.group(2 * row + 1), parts.group(2 * row + 2)
+            matrix[row, "xyz".index(axis)] = 1.0 if sign == "+" else -1.0
+    if round(float(np.linalg.det(matrix))) != 1:
+        raise InvalidValue(f"axes {axes!r} are none; right-handed ones are such as {Y_UP!r}")
+    return matrix
+
+
+class SimCapture:
+    """Exposes at `rate_hz`; same settings and flight, same frames.
+
+    Each exposure draws the same random numbers whatever is wrong, so a fault changes no frame
+    outside its time. Frames never overtake each other.
+    """
+
+    SYSTEM = "optitrack"
+    """The system's name, as `motioncapture` calls it."""
+
+    def __init__(self, settings: CaptureSettings) -> None:
+        self.settings = settings
+        self._rng = np.random.default_rng([settings.seed, _STREAM])
+        self._faults = list(settings.faults)
+        self._R_body_rigid = rotation_from_rpy(*settings.body_rpy_rad)
+        self._p_body_rigid = np.asarray(settings.body_position_m)
+        self._R_capture_world = rot_z(settings.heading_rad)
+        self._origin_m = np.asarray(settings.origin_m)
+        self._due_s = float(self._rng.random()) / settings.rate_hz
+        self._t_s = 0.0
+        self._arrival_s = -math.inf
+        self._delivered_s = -math.inf
+        self._before: dict[str, BodyPose] = {}
+        self._under_way: deque[CaptureFrame] = deque()
+
+    def lay(self, fault: CaptureFault, for_s: float = math.inf) -> None:
+        """Begin a fault now, for so long."""
+        self._faults.append((self._t_s, self._t_s + for_s, fault))
+
+    def heal(self) -> None:
+        """Nothing is wrong any more."""
+        self._faults.clear()
+
+    def advance(self, world: World) -> None:
+        """Called each control period: exposes if it is time to."""
+        self._t_s = t_s = world.t_s
+        if t_s < self._due_s - 1e-9:
+            return
+        self._due_s += 1.0 / self.settings.rate_hz
+        noise = self._rng.standard_normal((len(self.settings.names), 6))
+        jitter = float(np.clip(self._rng.normal(), -_JITTER_LIMIT_SIGMAS, _JITTER_LIMIT_SIGMAS))
+        faults = [fault for since_s, to_s, fault in self._faults if since_s <= t_s < to_s]
+        bodies = self._bodies(world, noise, faults)
+        least_s = 1.0 / min([math.inf, *(fault.rate_hz for fault in faults)])
+        if any(fault.gone for fault in faults) or t_s - self._delivered_s < least_s - 1e-9:
+            return
+        self._delivered_s = t_s
+        delay_s = self.settings.delay_s + jitter * self.settings.jitter_s
+        arrival_s = t_s + max(0.0, delay_s) + sum(fault.late_s for fault in faults)
+        self._arrival_s = max(arrival_s, self._arrival_s)
+        if any(fault.occluded for fault in faults):
+            bodies = {n: pose for n, pose in bodies.items() if n != self.settings.body}
+        self._under_way.append(CaptureFrame(self._arrival_s, bodies))
+
+    def take(self) -> list[CaptureFrame]:
+        """The frames that arrived by the time of the last `advance`, oldest first, once."""
+        arrived = []
+        while self._under_way and self._under_way[0].t_s <= self._t_s + 1e-9:
+            arrived.append(self._under_way.popleft())
+        return arrived
+
+    def poll(self, now_s: float) -> CaptureFrame | None:
+        """The newest frame that has arrived since the last call: a flight in lockstep has this
+        capture as its `CaptureSource`."""
+        arrived = self.take()
+        return arrived[-1] if arrived else None
+
+    def problem(self, now_s: float) -> str | None:
+        """None: nothing is ever wrong with the connection."""
+        return None
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to close."""
+
+    def _bodies(
+        self, world: World, noise: Array, faults: list[CaptureFault]
+    ) -> dict[str, BodyPose]:
+        """All bodies by the name under which the capture has them."""
+        if self._before and any(fault.frozen for fault in faults):
+            return self._before
+        settings = self.settings
+        R = rotation_from_quaternion(world.quaternion)
+        place = np.array((world.x_m, world.y_m, world.z_m)) + R @ self._p_body_rigid
+        seen = [self._pose(place, R @ self._R_body_rigid, noise[0], faults)]
+        seen += [
+            self._pose(np.asarray(other.position_m), np.eye(3), white, faults)
+            for other, white in zip(settings.others, noise[1:], strict=True)
+        ]
+        names = list(settings.names)
+        if any(fault.swapped for fault in faults) and len(names) > 1:
+            names[:2] = names[1], names[0]
+        self._before = dict(zip(names, seen, strict=True))
+        return self._before
+
+    def _pose(self, place: Array, R: Array, noise: Array, faults: list[CaptureFault]) -> BodyPose:
+        settings = self.settings
+        place = self._R_capture_world @ place + self._origin_m
+        place = place + settings.position_noise_m * noise[:3]
+        a, b, c = (float(v) for v in settings.attitude_noise_rad * noise[3:])
+        R = self._R_capture_world @ R @ rotation_from_rpy(a, b, c)
+        axes, scale = settings.axes, 1.0
+        for fault in faults:
+            axes, scale = fault.axes or axes, scale * fault.scale
+        turn = axes_matrix(axes)
+        # A system defines a body's axes along its own: a level body's attitude is none at all.
+        x, y, z = (scale * float(v) for v in turn @ place)
+        if any(fault.mirrored for fault in faults):
+            y = -y
+        return BodyPose((x, y, z), quaternion_from_rotation(turn @ R @ turn.T))
+
+
+# --- NatNet 3.1, in which OptiTrack's server speaks: what a client asks, and the answers --------
+# Little-endian; each message begins with its kind and the length of what follows. Of a frame only
+# the rigid bodies are filled in; a client steps over the empty lists.
+
+
+CONNECT, SERVER_INFO, ASK_MODELS, MODELS, FRAME = 0, 1, 4, 5, 7
+COMMAND_PORT = 1510
+_VERSION = bytes((3, 1, 0, 0))
+_NAME_BYTES = 256
+_TICKS_HZ = 1_000_000
+_RIGID_BODY = 1
+_TRACKED = 1
+_NO_PARENT = -1
+_EMPTY = struct.pack("<i", 0)
+_UNSEEN = BodyPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+
+
+def message(kind: int, body: bytes) -> bytes:
+    return struct.pack("<HH", kind, len(body)) + body
+
+
+def kind_of(request: bytes) -> int | None:
+    """The kind of a message; None for what is too short to be one."""
+    return int.from_bytes(request[:2], "little") if len(request) >= 4 else None
+
+
+def server_info(data_port: int) -> bytes:
+    """The answer to `CONNECT`: frames will come to that port of the client's, by unicast."""
+    name = b"perchctl".ljust(_NAME_BYTES, b"\0")
+    where = struct.pack("<QH?4B", _TICKS_HZ, data_port, False, 0, 0, 0, 0)
+    return message(SERVER_INFO, name + _VERSION + _VERSION + where)
+
+
+def models(names: Sequence[str]) -> bytes:
+    """The answer to `ASK_MODELS`: rigid bodies, numbered from 1, their origins unmoved."""
+    body = struct.pack("<i", len(names))
+    for number, name in enumerate(names, 1):
+        body += struct.pack("<i", _RIGID_BODY) + name.encode() + b"\0"
+        body += struct.pack("<ii3f", number, _NO_PARENT, 0.0, 0.0, 0.0) + _EMPTY  # no markers
+    return message(MODELS, body)
+
+
+def frame_message(number: int, names: Sequence[str], seen: CaptureFrame) -> bytes:
+    """One frame; a body that is not in it is marked as not tracked."""
+    parts = [struct.pack("<i", number), _EMPTY, _EMPTY]  # marker sets, other markers
+    parts.append(struct.pack("<i", len(names)))
+    for index, name in enumerate(names, 1):
+        pose = seen.bodies.get(name)
+        w, x, y, z = (pose or _UNSEEN).quaternion
+        place = (pose or _UNSEEN).position_m
+        tracked = 0 if pose is None else _TRACKED
+        parts.append(struct.pack("<i3f4ffh", index, *place, x, y, z, w, 0.0, tracked))
+    parts += [_EMPTY] * 4  # skeletons, labelled markers, force plates, devices
+    ticks = round(seen.t_s * _TICKS_HZ)
+    parts.append(struct.pack("<IId3Qh", 0, 0, seen.t_s, ticks, ticks, ticks, 0) + _EMPTY)
+    return message(FRAME, b"".join(parts))
+
+
+# --- The server on loopback --------------------------------------------------------------------
+# The simulated motion capture's server on loopback, read by `motioncapture` as OptiTrack's.
+#
+# Of the systems that package reads without a vendor's machine this one hands a frame on the
+# soonest: VRPN's client looks only every 10 ms, Qualisys's binds one fixed port, so that a second
+# client on the same computer cannot connect.
+
+
+_HOST = "127.0.0.1"
+_POLL_S = 0.2
+_GONE_S = 3.0
+_MOST_CLIENTS = 32
+
+
+@dataclass
+class _Client:
+    """`refused_s`: since when nobody listens there."""
+
+    socket: socket.socket
+    refused_s: float | None = None
+
+
+class CaptureServer:
+    """Answers clients in a thread of its own; `publish` sends a frame to each at once.
+
+    `port` 0 lets the operating system choose. Raises ConnectionFailed when it is taken.
+    """
+
+    def __init__(
+        self, names: Sequence[str], port: int = 0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._names = tuple(names)
+        self._clock = clock
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.settimeout(_POLL_S)
+        try:
+            self._socket.bind((_HOST, port))
+        except OSError as error:
+            self._socket.close()
+            raise ConnectionFailed(
+                f"UDP port {port} on {_HOST} cannot be used ({error.strerror}): choose another"
+            ) from None
+        self.host = f"{_HOST}:{self._socket.getsockname()[1]}"
+        self._clients: list[_Client] = []
+        self._lock = threading.Lock()
+        self._count = 0
+        self._closed = False
+        self._thread = threading.Thread(target=self._answer, name="capture-server", daemon=True)
+        self._thread.start()
+
+    def publish(self, seen: CaptureFrame) -> None:
+        """Costs next to nothing while nobody is connected."""
+        self._count += 1
+        with self._lock:
+            if not self._clients:
+                return
+            datagram = frame_message(self._count, self._names, seen)
+            for client in self._clients:
+                self._send(client, datagram)
+            for client in [c for c in self._clients if self._is_gone(c)]:
+                client.socket.close()
+                self._clients.remove(client)
+
+    def close(self) -> None:
+        self._closed = True
+        self._thread.join()
+        self._socket.close()
+        with self._lock:
+            for client in self._clients:
+                client.socket.close()
+            self._clients.clear()
+
+    def _send(self, client: _Client, datagram: bytes) -> None:
+        try:
+            client.socket.send(datagram)
+        except ConnectionRefusedError:  # told of the frame before: not bound yet, or no longer
+            if client.refused_s is None:
+                client.refused_s = self._clock()
+            with contextlib.suppress(OSError):
+                client.socket.send(datagram)
+        except OSError:  # a full buffer: a frame is lost, as on any network
+            return
+        else:
+            client.refused_s = None
+
+    def _is_gone(self, client: _Client) -> bool:
+        return client.refused_s is not None and self._clock() - client.refused_s > _GONE_S
+
+    def _answer(self) -> None:
+        while not self._closed:
+            try:
+                request, address = self._socket.recvfrom(2048)
+            except OSError:  # nothing for a while, or a client that has gone
+                continue
+            kind = kind_of(request)
+            with contextlib.suppress(OSError):
+                if kind == CONNECT:
+                    self._socket.sendto(server_info(self._admit(address[0])), address)
+                elif kind == ASK_MODELS:
+                    self._socket.sendto(models(self._names), address)
+
+    def _admit(self, host: str) -> int:
+        """A port of the client's own: several on one computer could not share one."""
+        with self._lock:
+            taken = {client.socket.getpeername()[1] for client in self._clients}
+            while (port := _free_port()) in taken:
+                pass
+            out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            out.setblocking(False)
+            out.connect((host, port))
+            self._clients.append(_Client(out))
+            if len(self._clients) > _MOST_CLIENTS:
+                self._clients.pop(0).socket.close()
+        return port
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("", 0))
+        port: int = probe.getsockname()[1]
+        return port
