@@ -94,7 +94,7 @@ def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise NotFound(f"{path} is not there: name a recording of calibrate --mount") from None
+        raise NotFound(f"{path} is not there: name a recording of calibrate mount") from None
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise InvalidValue(f"{path} cannot be read: {why}") from None
@@ -105,10 +105,10 @@ def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
         except (KeyError, TypeError, ValueError, RecursionError) as error:
             what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
             raise InvalidValue(
-                f"{path}, line {number} is no line of a recording of calibrate --mount: {what}"
+                f"{path}, line {number} is no line of a recording of calibrate mount: {what}"
             ) from None
     if not parts:
-        raise InvalidValue(f"{path} is empty: name a recording of calibrate --mount")
+        raise InvalidValue(f"{path} is empty: name a recording of calibrate mount")
     return tuple(
         MountingRecording(p.part, tuple(p.attitudes), tuple(p.poses), p.mirrored, p.seen_by)
         for p in parts

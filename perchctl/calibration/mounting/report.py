@@ -173,7 +173,7 @@ def _notes(c: MountingReport) -> list[str]:
 
 
 def mounting_record(c: MountingReport) -> dict[str, Any]:
-    """The measured part of the object of `calibrate --mount --json`; null is not measured."""
+    """The measured part of the object of `calibrate mount --json`; null is not measured."""
     m, mount = c.measured, c.profile.camera.mount
     return {
         "rpy_deg": _listed(m.rpy_deg),
