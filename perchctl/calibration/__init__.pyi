@@ -18,11 +18,13 @@ from .live import polled as polled
 from .mounting.capture import MountingTape as MountingTape
 from .mounting.capture import VehicleSensors as VehicleSensors
 from .mounting.capture import capture as capture
+from .mounting.carry import solve_carry as solve_carry
 from .mounting.eye import Eye as Eye
 from .mounting.eye import best_pose as best_pose
 from .mounting.eye import camera_only_profile as camera_only_profile
 from .mounting.eye import is_seen_mirrored as is_seen_mirrored
 from .mounting.eye import pose_basis as pose_basis
+from .mounting.pivot import solve_pivot as solve_pivot
 from .mounting.plot import draw_mounting as draw_mounting
 from .mounting.recording import AttitudeSample as AttitudeSample
 from .mounting.recording import MountingPart as MountingPart
@@ -30,10 +32,3 @@ from .mounting.recording import MountingRecording as MountingRecording
 from .mounting.recording import read_recordings as read_recordings
 from .mounting.recording import write_recordings as write_recordings
 from .mounting.report import MountingReport as MountingReport
-from .mounting.report import keys_text as keys_text
-from .mounting.report import mounting_lines as mounting_lines
-from .mounting.report import mounting_record as mounting_record
-from .mounting.solve import solve_carry as solve_carry
-from .mounting.solve import solve_pivot as solve_pivot
-from .mounting.turns import rotation_matrices as rotation_matrices
-from .mounting.turns import rotation_vectors as rotation_vectors

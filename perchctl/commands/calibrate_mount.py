@@ -27,9 +27,6 @@ from perchctl.calibration import (
     MountingTape,
     VehicleSensors,
     capture,
-    keys_text,
-    mounting_lines,
-    mounting_record,
     pose_basis,
     profile_camera,
     read_recordings,
@@ -186,7 +183,7 @@ def mount(
     if part is not None:
         again += ["--part", part]
     measured = solved(vehicle, recordings)
-    for line in mounting_lines(measured):
+    for line in measured.lines():
         tell(line)
     if true is not None:
         tell(_truth_line(true))
@@ -207,10 +204,10 @@ def mount(
         say(f"drew {picture}")
     code = 0 if problem is None else problem.exit_code
     if not as_json:
-        print(keys_text(measured))
+        print(measured.keys_text())
         return code
     kept = logs or ([log] if log.exists() and not truth else [])
-    record = mounting_record(measured) | ({} if true is None else {"true": true})
+    record = measured.record() | ({} if true is None else {"true": true})
     record |= {
         "recordings": [str(path) for path in kept],
         "report": picture and str(picture),

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
@@ -17,18 +18,14 @@ pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 from perchctl.calibration import (
     MountingRecording,
     MountingReport,
-    keys_text,
-    mounting_lines,
-    mounting_record,
     read_recordings,
     solve_carry,
     solve_pivot,
     write_recordings,
 )
-from perchctl.calibration.mounting.report import KEYS, turn_between_deg, written_gear_cam_m
-from perchctl.calibration.mounting.result import Carried
+from perchctl.calibration.mounting.carry import Carried
 from perchctl.commands import app, calibrate_mount
-from perchctl.geometry import Array, rpy_from_rotation
+from perchctl.geometry import Array
 from perchctl.profile import Mounting, load_profile
 from tests.helpers.mounting import hand, seen
 
@@ -40,6 +37,7 @@ camera:
     rpy_deg: [0, 0, 0]  # as it was built
 """
 SEED = 1
+KEYS = ("rpy_deg", "latency_s", "gear_cam_m")
 
 
 def mount(*words: str | Path) -> Result:
@@ -185,7 +183,7 @@ def test_both_parts_measure_all_and_say_what_was_written_before(
     record = json.loads(result.stdout)
     truth = hand("carry", SEED)
     R = Mounting(rpy_deg=tuple(record["rpy_deg"])).T_body_cam[:3, :3]
-    assert turn_between_deg(R, truth.T_body_cam[:3, :3]) < 0.5
+    assert np.degrees(Rotation.from_matrix(R.T @ truth.T_body_cam[:3, :3]).magnitude()) < 0.5
     assert record["latency_s"] == pytest.approx(truth.latency_s, abs=0.008)
     assert record["gear_cam_m"] == pytest.approx(truth.gear_cam_m, abs=0.0012)
     assert set(record["sigma"]) == set(record["written"]) == set(KEYS)
@@ -226,7 +224,8 @@ def test_write_puts_the_numbers_into_the_profile_and_keeps_its_comments(
     assert list(profile.camera.mount.rpy_deg) == pytest.approx(record["rpy_deg"], abs=0.005)
     assert profile.camera.latency_s == pytest.approx(record["latency_s"], abs=5e-5)
     # What a flight rests on: the tip from the camera, in the camera's axes.
-    assert written_gear_cam_m(profile) == pytest.approx(record["gear_cam_m"], abs=3e-5)
+    written = MountingReport(profile, None, None).written_gear_cam_m
+    assert written == pytest.approx(record["gear_cam_m"], abs=3e-5)
 
 
 def test_the_pivot_alone_leaves_the_turn_open(place: Path, logs: dict[str, Path]) -> None:
@@ -310,14 +309,13 @@ def test_numbers_stand_where_the_profile_is_gone_meanwhile(
 
 def test_the_carry_alone_says_that_the_gear_is_still_to_do() -> None:
     turned = Mounting(rpy_deg=(0.0, 0.0, 90.0)).T_body_cam[:3, :3]
-    assert turn_between_deg(turned, np.eye(3)) == pytest.approx(90.0)
     c = MountingReport(load_profile("crazyflie"), carried(turned), None)
-    lines = "\n".join(mounting_lines(c))
+    lines = "\n".join(c.lines())
     assert "0 0 90 +-" in lines
     assert "you wrote 0 0 0: 90.0 deg away" in lines
     assert "you wrote 80: within that" in lines
     assert "do the pivot as well" in lines
-    assert keys_text(c) == "camera.mount.rpy_deg: [0, 0, 90]\ncamera.latency_s: 0.0803"
+    assert c.keys_text() == "camera.mount.rpy_deg: [0, 0, 90]\ncamera.latency_s: 0.0803"
 
 
 def test_a_latency_that_flights_measure_stays_so() -> None:
@@ -325,8 +323,8 @@ def test_a_latency_that_flights_measure_stays_so() -> None:
     camera = profile.camera.model_copy(update={"latency_s": "measured"})
     c = MountingReport(profile.model_copy(update={"camera": camera}), carried(np.eye(3)), None)
     assert "camera.latency_s" not in c.profile_values()
-    assert mounting_record(c)["written"]["latency_s"] is None
-    assert "you wrote measured: each flight measures it" in "\n".join(mounting_lines(c))
+    assert c.record()["written"]["latency_s"] is None
+    assert "you wrote measured: each flight measures it" in "\n".join(c.lines())
 
 
 def test_a_place_is_taken_only_where_it_is_known_better_than_by_a_ruler() -> None:
@@ -337,20 +335,17 @@ def test_a_place_is_taken_only_where_it_is_known_better_than_by_a_ruler() -> Non
         )  # fmt: skip
         c = MountingReport(load_profile("crazyflie"), known, None)
         assert ("camera.mount.position_m" in c.profile_values()) is taken
-        assert ("the profile's is kept" in "\n".join(mounting_lines(c))) is not taken
+        assert ("the profile's is kept" in "\n".join(c.lines())) is not taken
 
 
 def carried(R: Array) -> Carried:
     """A solution with that turn."""
-    none, three = np.zeros((0, 3)), (0.05, 0.05, 0.05)
-    x, y, z = np.degrees(rpy_from_rotation(R))
+    none = np.zeros((0, 3))
     return Carried(
-        R_body_cam=R, rpy_deg=(x, y, z), rpy_sigma_deg=three,
-        turn_cov_rad2=np.eye(3) * np.radians(0.05) ** 2, latency_s=0.0803, latency_sigma_s=0.001,
-        jitter_s=0.004, target_rpy_deg=three, target_rpy_sigma_deg=three,
-        gyro_bias_radps=np.zeros(3), attitude_bias_rad=np.zeros(3), cam_body_m=None,
+        R_body_cam=R, turn_cov_rad2=np.eye(3) * np.radians(0.05) ** 2, latency_s=0.0803,
+        latency_sigma_s=0.001, jitter_s=0.004, attitude_bias_rad=np.zeros(3), cam_body_m=None,
         cam_body_sigma_m=None, t_s=np.zeros(0), residual_rad=none, counted=np.zeros(0),
-        body_rpy_rad=none, poses=0,
+        body_rpy_rad=none,
     )  # fmt: skip
 
 

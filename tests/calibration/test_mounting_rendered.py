@@ -7,6 +7,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
     MountingPart,
@@ -16,7 +17,6 @@ from perchctl.calibration import (
     draw_mounting,
     is_seen_mirrored,
     profile_camera,
-    rotation_vectors,
     solve_carry,
     solve_pivot,
 )
@@ -43,8 +43,8 @@ def test_a_mounting_is_measured_from_pictures() -> None:
     carry, pivot = _few_pictures("carry", 21.5), _few_pictures("pivot", 13.0)
     np.testing.assert_array_equal(carry.T_body_cam, pivot.T_body_cam)
     carried = solve_carry(record_hand(carry, profile(), camera))
-    turned = rotation_vectors((carried.R_body_cam @ carry.T_body_cam[:3, :3].T)[None])
-    assert np.degrees(np.linalg.norm(turned)) < 0.15
+    turned = Rotation.from_matrix(carried.R_body_cam @ carry.T_body_cam[:3, :3].T)
+    assert np.degrees(turned.magnitude()) < 0.15
     assert abs(carried.latency_s - carry.latency_s) < 3e-3
     pivoted = solve_pivot(record_hand(pivot, profile(), camera))
     off = np.array(pivoted.gear_cam_m) - pivot.gear_cam_m
@@ -69,7 +69,7 @@ def test_a_picture_is_seen_as_it_is_and_mirrored_as_such() -> None:
             if pose is not None and not flipped:
                 T_target_cam = T_target_cam_at(held, frame.t_exposure_s)
                 R_off = pose.rotation_cam_target @ T_target_cam[:3, :3]
-                assert np.linalg.norm(rotation_vectors(R_off[None])) < 0.02
+                assert Rotation.from_matrix(R_off).magnitude() < 0.02
                 place_m = -T_target_cam[:3, :3].T @ T_target_cam[:3, 3]
                 np.testing.assert_allclose(pose.position_cam_target_m, place_m, atol=4e-3)
                 assert pose.covariance is not None

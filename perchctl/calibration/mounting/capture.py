@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 from perchctl.calibration.live import Moment, polled
 from perchctl.calibration.mounting.eye import Eye
+from perchctl.calibration.mounting.motion import MIRRORED, missing
 from perchctl.calibration.mounting.recording import (
     AttitudeSample,
     MountingPart,
     MountingRecording,
     SeenPose,
 )
-from perchctl.calibration.mounting.solve import MIRRORED, missing
 from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.vision import Frame

@@ -5,9 +5,9 @@ from __future__ import annotations
 import zlib
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.turns import cross_matrix, rotation_matrices
 from perchctl.camera import HealthState, assess_frame
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.profile import Profile
@@ -107,7 +107,7 @@ def best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
         cov = J @ cov @ J.T
     return SeenPose(
         t_s=t_s,
-        rotation_cam_target=rotation_matrices(pose.rvec_rad) @ R_MARKER_TARGET,
+        rotation_cam_target=Rotation.from_rotvec(pose.rvec_rad).as_matrix() @ R_MARKER_TARGET,
         position_cam_target_m=pose.tvec_m,
         covariance=cov if cov is not None and np.isfinite(cov).all() else None,
     )
@@ -123,9 +123,9 @@ def _uncertainty(pose: MarkerPose) -> float:
 
 
 def _left_jacobian(v: Array) -> Array:
-    """Change (3, 3) of a small turn on the left of the rotation with its vector v (3,)."""
+    """Change (3, 3) of a small rotation on the left of the one with the vector v (3,)."""
     angle = float(np.linalg.norm(v))
-    K = cross_matrix(v)
+    K = np.cross(np.eye(3), v)
     if angle < 1e-6:
         return np.asarray(np.eye(3) + 0.5 * K)
     a = (1.0 - np.cos(angle)) / angle**2

@@ -8,13 +8,14 @@ import math
 import numpy as np
 from matplotlib.axes import Axes
 
-from perchctl.calibration.mounting.report import MountingReport, mounting_lines
-from perchctl.calibration.mounting.result import IN_95, Carried, Pivoted
+from perchctl.calibration.mounting.carry import COUNTS_LITTLE, Carried
+from perchctl.calibration.mounting.pivot import Pivoted
+from perchctl.calibration.mounting.report import MountingReport
+from perchctl.calibration.mounting.robust import IN_95
 from perchctl.geometry import Array
 from perchctl.plot import BLUE, GREEN, GREY, GRID, ORANGE, VERMILLION, new_figure, save_png
 
 WIDTH_IN, ROW_IN, TOP_IN = 12.0, 3.5, 3.4
-COUNTS_LITTLE = 0.2
 _AXES = (BLUE, ORANGE, GREEN)
 _WIDEST = 99.0  # percentile that still fits on an axis: the outliers lie beyond
 
@@ -26,7 +27,7 @@ def draw_mounting(c: MountingReport) -> bytes:
     figure = new_figure(WIDTH_IN, sum(heights_in))
     halves = figure.subfigures(len(heights_in), 1, squeeze=False, height_ratios=heights_in)[:, 0]
     top = halves[0].add_gridspec(1, 2, width_ratios=(1.6, 1.0))
-    _numbers(halves[0].add_subplot(top[0, 0]), mounting_lines(c))
+    _numbers(halves[0].add_subplot(top[0, 0]), c.lines())
     _from_above(halves[0].add_subplot(top[0, 1]), c)
     for half, part in zip(halves[1:], rows, strict=True):
         title = _carry_title(part) if isinstance(part, Carried) else _pivot_title(part)
@@ -115,7 +116,7 @@ def _above(p_m: Array) -> tuple[float, float]:
 
 def _carry_title(c: Carried) -> str:
     jitter_ms = 1e3 * IN_95 * c.jitter_s
-    return f"Carry: {c.poses} pictures, single ones {jitter_ms:.0f} ms later or earlier"
+    return f"Carry: {len(c.t_s)} pictures, single ones {jitter_ms:.0f} ms later or earlier"
 
 
 def _pivot_title(p: Pivoted) -> str:
