@@ -14,7 +14,6 @@ from matplotlib.figure import Figure, SubFigure
 from perchctl.calibration.board.adjust import PARAMETERS
 from perchctl.calibration.board.predict import limit_mm, ray_errors_px
 from perchctl.calibration.board.result import Calibration, Level
-from perchctl.geometry import Array
 from perchctl.plot import (
     BLACK,
     BLUE,
@@ -39,7 +38,6 @@ _ARROW_SHARE = 0.06  # of the width: the largest residual's arrow
 _MOST_NAMES = 45
 _MOST_LINES = 22  # of what was left out
 LIMIT_LOW = 0.5  # mm: the axis reaches down to it
-_LOOP_SHARE, _LINE_SHARE = 0.3, 0.04  # of the width
 
 
 def draw_calibration(calibration: Calibration) -> bytes:
@@ -108,42 +106,15 @@ def _coverage(ax: Axes, calibration: Calibration) -> None:
     *_, each = ray_errors_px(calibration.camera, calibration.covariance)
     error = np.ma.masked_invalid(each.reshape(13, 17))
     x, y = np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 13)
-    dots = np.concatenate([view.corners_px for view in calibration.seen])
     with catch_warnings():
         simplefilter("ignore", UserWarning)  # there may be no line at all
-        contours = ax.contour(x, y, error, levels=(0.1, 0.3, 1, 3, 10))
-    contours.remove()  # drawn by hand, without those that tell nothing
-    for value, found in zip(contours.levels, contours.allsegs, strict=True):
-        lines = [line for line in found if len(line) and _tells(line, w)]
-        for line in lines:
-            ax.plot(*line.T, color=BLACK, linewidth=0.8, alpha=0.7)
-        if lines:
-            _label(ax, f"{value:g} px", max(lines, key=len), dots, (w, h))
+        lines = ax.contour(x, y, error, levels=(0.1, 0.3, 1, 3, 10), colors=BLACK, alpha=0.7)
+    ax.clabel(lines, fmt="%g px", fontsize=8)
     covered = 100 * calibration.covered.mean()
     ax.set_title(
         f"Coverage {covered:.0f} %: orange is uncovered; lines: 95 % error of a ray", fontsize=10
     )
     _frame(ax, w, h)
-
-
-def _tells(line: Array, width_px: int) -> bool:
-    """A small closed line (n, 2) is the noise of a level that the error has everywhere, and a
-    very short one is hardly seen."""
-    closed = bool((line[0] == line[-1]).all())
-    least = _LOOP_SHARE if closed else _LINE_SHARE
-    return float(np.ptp(line, axis=0).max()) > least * width_px
-
-
-def _label(ax: Axes, text: str, line: Array, dots: Array, size_px: tuple[int, int]) -> None:
-    """On the line (n, 2), where the fewest dots are, within the frame."""
-    margin = 0.06 * size_px[0]
-    inside = np.clip(line, margin, np.array(size_px) - margin)
-    if (inside == line).all(axis=1).any():
-        inside = line[(inside == line).all(axis=1)]
-    apart = np.linalg.norm(inside[:, None] - dots[None], axis=2).min(axis=1)
-    x, y = inside[int(np.argmax(apart))]
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.9, "pad": 1.0}
-    ax.text(x, y, text, fontsize=8, ha="center", va="center", bbox=box, zorder=5, clip_on=True)
 
 
 def _residuals(ax: Axes, calibration: Calibration) -> None:
