@@ -198,42 +198,44 @@ def feed(attitudes: tuple[AttitudeSample, ...], film: _Film) -> Callable[[], lis
     return arrived
 
 
+def recorded(
+    tape: MountingTape,
+    film: _Film,
+    looks: _Looks,
+    sensors: VehicleSensors | None = None,
+    until_s: float = np.inf,
+) -> list[Moment]:
+    """Fill the tape from the film, by its own clock; the moments that were shown."""
+    moments: list[Moment] = []
+    sensors = sensors or VehicleSensors()
+    capture(
+        tape, film, looks, sensors, moments.append, film.clock, film.sleep,
+        lambda: film.now_s > until_s,
+    )  # fmt: skip
+    return moments
+
+
 def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
     whole = seen(hand("carry", seconds=LEAST_S["carry"] + 3.0))
-    film, tape, moments = _Film(), MountingTape("carry"), []
-    capture(
-        tape, film, _Looks(whole.poses), VehicleSensors(feed(whole.attitudes, film)),
-        moments.append, film.clock, film.sleep,
-    )  # fmt: skip
+    film, tape = _Film(), MountingTape("carry")
+    sensors = VehicleSensors(feed(whole.attitudes, film))
+    moments = recorded(tape, film, _Looks(whole.poses), sensors)
     assert film.now_s == pytest.approx(LEAST_S["carry"], abs=0.5)
     assert moments[-1].advice.startswith("enough")
+    assert moments[-1].line == f"carry: {moments[-1].advice}"
     assert ("missing", "nothing", None) in moments[-1].rows
     texts = [text for moment in moments for _, text, _ in moment.rows]
     assert any(text.startswith(("yaw:", "longer:")) for text in texts)
     assert tape.recording().poses[:100] == whole.poses[:100]
 
 
-def test_the_advice_names_what_is_in_the_way_first() -> None:
-    film, moments = _Film(), []
-    ended = lambda: film.now_s > 2.0  # noqa: E731
-    capture(
-        MountingTape("pivot"),
-        film,
-        _Looks(()),
-        VehicleSensors(),
-        moments.append,
-        film.clock,
-        film.sleep,
-        ended,
-    )
-    assert moments[-1].advice == "no target in view"
-    film = _Film()
-    capture(
-        MountingTape("pivot"), film, _Looks((), mirrored=True), VehicleSensors(), moments.append,
-        film.clock, film.sleep, ended,
-    )  # fmt: skip
-    assert "mirrored" in moments[-1].advice
-    assert "camera.mirrored" in moments[-1].advice
+@pytest.mark.parametrize(
+    ("mirrored", "words"), [(False, "no target in view"), (True, "camera.mirrored")]
+)
+def test_the_advice_names_what_is_in_the_way_first(mirrored: bool, words: str) -> None:
+    looks = _Looks((), mirrored)
+    moments = recorded(MountingTape("pivot"), _Film(), looks, until_s=2.0)
+    assert words in moments[-1].advice
 
 
 class _Receiver(_Film):
@@ -255,26 +257,19 @@ class _SeesEachNew(_Looks):
 
 
 def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
-    looks, moments = _SeesEachNew(seen(hand("pivot")).poses), []
-    film, tape = _Receiver(), MountingTape("pivot")
-    ended = lambda: film.now_s > 4.0  # noqa: E731
-    capture(tape, film, looks, VehicleSensors(), moments.append, film.clock, film.sleep, ended)
+    looks, tape = _SeesEachNew(seen(hand("pivot")).poses), MountingTape("pivot")
+    moments = recorded(tape, _Receiver(), looks, until_s=4.0)
     assert {share for m in moments for name, _, share in m.rows if name == "target"} == {1.0}
     assert len(moments) == len(tape.poses) == pytest.approx(20, abs=2)
     film = _Receiver(stuck_s=1.0)
-    capture(
-        MountingTape("pivot"), film, looks, VehicleSensors(), lambda _: None, film.clock, film.sleep
-    )
+    recorded(MountingTape("pivot"), film, looks)
     assert film.now_s == pytest.approx(MOST_S, abs=1.0), "and it ends though none is new"
 
 
 def test_a_mirrored_picture_ends_it_soon() -> None:
-    film, tape = _Film(), MountingTape("carry")
+    film = _Film()
     with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
-        capture(
-            tape, film, _Looks((), mirrored=True), VehicleSensors(), lambda _: None, film.clock,
-            film.sleep,
-        )  # fmt: skip
+        recorded(MountingTape("carry"), film, _Looks((), mirrored=True))
     assert film.now_s < 5.0
 
 
@@ -298,34 +293,18 @@ def test_pictures_become_poses_or_are_counted_as_mirrored() -> None:
 
 def test_nobody_records_for_ever() -> None:
     film = _Film()
-    capture(
-        MountingTape("pivot"),
-        film,
-        _Looks(()),
-        VehicleSensors(),
-        lambda _: None,
-        film.clock,
-        film.sleep,
-    )
+    recorded(MountingTape("pivot"), film, _Looks(()))
     assert film.now_s == pytest.approx(MOST_S, abs=1.0)
 
 
 def test_a_camera_or_a_vehicle_that_goes_ends_it_and_the_tape_keeps_what_was() -> None:
     whole = seen(hand("pivot"))
-    film, tape = _Film(ends_s=3.0), MountingTape("pivot")
+    tape = MountingTape("pivot")
     with pytest.raises(TimedOut, match="camera:0 is unplugged"):
-        capture(
-            tape,
-            film,
-            _Looks(whole.poses),
-            VehicleSensors(),
-            lambda _: None,
-            film.clock,
-            film.sleep,
-        )
+        recorded(tape, _Film(ends_s=3.0), _Looks(whole.poses))
     assert len(tape.poses) > 20
-    film, tape = _Film(flooding=True), MountingTape("pivot")
+    tape = MountingTape("pivot")
     silent = VehicleSensors(problem=lambda now_s: "nothing heard for 2 s" if now_s > 1.0 else None)
     with pytest.raises(TimedOut, match="the vehicle is gone: nothing heard for 2 s"):
-        capture(tape, film, _Looks(whole.poses), silent, lambda _: None, film.clock, film.sleep)
+        recorded(tape, _Film(flooding=True), _Looks(whole.poses), silent)
     assert tape
