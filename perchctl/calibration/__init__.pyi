@@ -20,9 +20,6 @@ from .mounting.capture import VehicleSensors as VehicleSensors
 from .mounting.capture import capture as capture
 from .mounting.carry import solve_carry as solve_carry
 from .mounting.eye import Eye as Eye
-from .mounting.eye import best_pose as best_pose
-from .mounting.eye import camera_only_profile as camera_only_profile
-from .mounting.eye import is_seen_mirrored as is_seen_mirrored
 from .mounting.eye import pose_basis as pose_basis
 from .mounting.pivot import solve_pivot as solve_pivot
 from .mounting.plot import draw_mounting as draw_mounting

@@ -16,11 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
     AttitudeSample,
+    Eye,
     MountingPart,
     MountingRecording,
-    best_pose,
-    camera_only_profile,
-    is_seen_mirrored,
     pose_basis,
 )
 from perchctl.camera import unmirror_frame
@@ -30,7 +28,7 @@ from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
-from perchctl.vision import CameraModel, Frame, PipelineState, make_pipeline, step
+from perchctl.vision import CameraModel, Frame
 
 HAND_STREAM = 430
 SECONDS: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
@@ -341,17 +339,13 @@ def record_hand(
     told: Callable[[], None] = lambda: None,
 ) -> MountingRecording:
     """The whole part, through renderer and pipeline; `told` is called with each picture."""
-    pipeline = make_pipeline(camera_only_profile(profile), camera)
-    state = PipelineState()
-    poses, mirrored = [], 0
+    eye = Eye(profile, camera, live=False)
+    poses = []
     for frame in pictures(hand, profile, camera):
         picture = Frame(frame.index, frame.t_arrival_s, frame.image, frame.t_arrival_s, "whole")
         if profile.camera.mirrored:
             picture = unmirror_frame(picture)
-        state, output = step(state, picture, None, pipeline)
-        mirrored += is_seen_mirrored(output)
-        if (pose := best_pose(output, frame.t_arrival_s)) is not None:
-            poses.append(pose)
+        poses += eye.look(picture)
         told()
     felt, by = attitudes(hand, positioned), pose_basis(profile, camera)
-    return MountingRecording(hand.part, felt, tuple(poses), mirrored, by)
+    return MountingRecording(hand.part, felt, tuple(poses), eye.mirrored, by)

@@ -10,19 +10,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
+    Eye,
     MountingPart,
     MountingReport,
-    best_pose,
-    camera_only_profile,
     draw_mounting,
-    is_seen_mirrored,
     profile_camera,
     solve_carry,
     solve_pivot,
 )
 from perchctl.sim import draw_hand, record_hand
 from perchctl.sim.hand import Hand, T_target_cam_at, pictures
-from perchctl.vision import Frame, PipelineState, make_pipeline, step
+from perchctl.vision import Frame
 from tests.helpers.mounting import profile
 
 SEED = 4
@@ -54,23 +52,19 @@ def test_a_mounting_is_measured_from_pictures() -> None:
     assert draw_mounting(MountingReport(profile(), carried, pivoted)).startswith(b"\x89PNG")
 
 
-def test_a_picture_is_seen_as_it_is_and_mirrored_as_such() -> None:
-    held = _few_pictures("carry", 3.0)
-    pipeline = make_pipeline(camera_only_profile(profile()), profile_camera(profile().camera))
-    for flipped in (False, True):
-        state, mirrored, poses = PipelineState(), 0, 0
-        for frame in islice(pictures(held, profile(), pipeline.camera), 4):
-            image = np.ascontiguousarray(frame.image[:, ::-1]) if flipped else frame.image
-            t_s = frame.t_arrival_s
-            state, output = step(state, Frame(frame.index, t_s, image, t_s), None, pipeline)
-            mirrored += is_seen_mirrored(output)
-            pose = best_pose(output, t_s)
-            poses += pose is not None
-            if pose is not None and not flipped:
-                T_target_cam = T_target_cam_at(held, frame.t_exposure_s)
-                R_off = pose.rotation_cam_target @ T_target_cam[:3, :3]
-                assert Rotation.from_matrix(R_off).magnitude() < 0.02
-                place_m = -T_target_cam[:3, :3].T @ T_target_cam[:3, 3]
-                np.testing.assert_allclose(pose.position_cam_target_m, place_m, atol=4e-3)
-                assert pose.covariance is not None
-        assert (mirrored, poses) == ((4, 0) if flipped else (0, 4))
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_picture_is_seen_as_it_is_and_mirrored_as_such(flipped: bool) -> None:
+    held, camera = _few_pictures("carry", 3.0), profile_camera(profile().camera)
+    eye, poses = Eye(profile(), camera, live=False), []
+    for frame in islice(pictures(held, profile(), camera), 4):
+        image = np.ascontiguousarray(frame.image[:, ::-1]) if flipped else frame.image
+        found = eye.look(Frame(frame.index, frame.t_arrival_s, image, frame.t_arrival_s))
+        poses += found
+        for pose in found:
+            T_target_cam = T_target_cam_at(held, frame.t_exposure_s)
+            R_off = pose.rotation_cam_target @ T_target_cam[:3, :3]
+            assert Rotation.from_matrix(R_off).magnitude() < 0.02
+            place_m = -T_target_cam[:3, :3].T @ T_target_cam[:3, 3]
+            np.testing.assert_allclose(pose.position_cam_target_m, place_m, atol=4e-3)
+            assert pose.covariance is not None
+    assert (eye.mirrored, len(poses)) == ((4, 0) if flipped else (0, 4))

@@ -35,7 +35,9 @@ class Eye:
     """
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
-        self._pipeline = make_pipeline(camera_only_profile(profile), camera)
+        # A pipeline that knows nothing of how the camera is mounted.
+        bare = camera_profile(profile).model_copy(update={"pose": profile.pose})
+        self._pipeline = make_pipeline(bare, camera)
         self._live = live
         self._state = PipelineState()
         self._fields = FieldState()
@@ -58,26 +60,13 @@ class Eye:
         seen = []
         for picture in found:
             self._state, output = step(self._state, picture, None, self._pipeline)
-            self._remember(output)
-            pose = best_pose(output, picture.t_s)
+            self.mirrored += output.detections.mirrored and not output.poses
+            named = ((name, output.detections.get(name)) for name in MARKERS)
+            self.outlines = tuple((name, d.corners_px) for name, d in named if d is not None)
+            pose = _best_pose(output, picture.t_s)
             if pose is not None:
                 seen.append(pose)
         return seen
-
-    def _remember(self, output: PipelineOutput) -> None:
-        self.mirrored += is_seen_mirrored(output)
-        found = ((name, output.detections.get(name)) for name in MARKERS)
-        self.outlines = tuple((name, d.corners_px) for name, d in found if d is not None)
-
-
-# --- From what the pipeline saw in a picture to a recording's pose -----------------------------
-
-
-def camera_only_profile(profile: Profile) -> Profile:
-    """The profile with the camera in the place of vehicle and gear: for a pipeline that knows
-    nothing of how the camera is mounted."""
-    bare = camera_profile(profile)
-    return bare.model_copy(update={"pose": profile.pose})
 
 
 def pose_basis(profile: Profile, camera: CameraModel) -> str:
@@ -89,7 +78,7 @@ def pose_basis(profile: Profile, camera: CameraModel) -> str:
     return f"markers of {' and '.join(sides_mm)} mm, calibration {number:08x}"
 
 
-def best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
+def _best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
     """The surest of a picture's poses, None without one.
 
     Args:
@@ -111,11 +100,6 @@ def best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
         position_cam_target_m=pose.tvec_m,
         covariance=cov if cov is not None and np.isfinite(cov).all() else None,
     )
-
-
-def is_seen_mirrored(output: PipelineOutput) -> bool:
-    """Whether the target was seen in the mirror only."""
-    return output.detections.mirrored and not output.poses
 
 
 def _uncertainty(pose: MarkerPose) -> float:
