@@ -76,6 +76,9 @@ DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
 MASK_S = 20.0
 """How long a live camera is watched to learn a mask."""
 
+DETAILS = "Details"
+"""Heading of the options that are not of every day."""
+
 SourceArgument = Annotated[
     list[str],
     typer.Argument(
@@ -96,18 +99,32 @@ BoardOption = Annotated[
 ]
 WidthOption = Annotated[
     str | None,
-    typer.Option("--measured-width", help="Width of the board's black area as printed, mm."),
+    typer.Option(
+        "--measured-width",
+        help="Width of the board's black area as printed, mm.",
+        rich_help_panel=DETAILS,
+    ),
 ]
 HeightOption = Annotated[
-    str | None, typer.Option("--measured-height", help="Its height as printed, mm.")
+    str | None,
+    typer.Option("--measured-height", help="Its height as printed, mm.", rich_help_panel=DETAILS),
 ]
 SizeOption = Annotated[
     str | None,
-    typer.Option("--size", help="Asked of camera:N, as in 720x576; else its driver's own."),
+    typer.Option(
+        "--size",
+        help="Asked of camera:N, as in 720x576; else its driver's own.",
+        rich_help_panel=DETAILS,
+    ),
 ]
 NameOption = Annotated[str, typer.Option("--name", help="The camera's name.")]
 SkipBrokenOption = Annotated[
-    bool, typer.Option("--skip-broken", help="Leave out pictures that cannot be read.")
+    bool,
+    typer.Option(
+        "--skip-broken",
+        help="Leave out pictures that cannot be read.",
+        rich_help_panel=DETAILS,
+    ),
 ]
 OutputOption = Annotated[
     Path | None,
@@ -145,10 +162,19 @@ def camera(
     size: SizeOption = None,
     model: Annotated[
         Literal["auto", "plumb_bob", "rational_polynomial", "fisheye"],
-        typer.Option("--model", help="Lens model; auto takes the recommended one."),
+        typer.Option(
+            "--model",
+            help="Lens model; auto takes the recommended one.",
+            rich_help_panel=DETAILS,
+        ),
     ] = "auto",
     reject: Annotated[
-        bool, typer.Option("--reject/--no-reject", help="Leave out outlier views and corners.")
+        bool,
+        typer.Option(
+            "--reject/--no-reject",
+            help="Leave out outlier views and corners.",
+            rich_help_panel=DETAILS,
+        ),
     ] = True,
     skip_broken: SkipBrokenOption = False,
     keep_pictures: Annotated[
@@ -156,6 +182,7 @@ def camera(
         typer.Option(
             "--keep-pictures",
             help="Folder for a live camera's pictures. Default: beside the output.",
+            rich_help_panel=DETAILS,
         ),
     ] = None,
 ) -> int:
@@ -271,7 +298,12 @@ def check(
     size: SizeOption = None,
     skip_broken: SkipBrokenOption = False,
     keep_pictures: Annotated[
-        Path | None, typer.Option("--keep-pictures", help="Folder for a live camera's pictures.")
+        Path | None,
+        typer.Option(
+            "--keep-pictures",
+            help="Folder for a live camera's pictures.",
+            rich_help_panel=DETAILS,
+        ),
     ] = None,
 ) -> int:
     """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
