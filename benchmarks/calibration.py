@@ -20,9 +20,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perchctl.calibration import BoardView, calibrate_camera
-from perchctl.calibration.detect import find_board
-from perchctl.calibration.lens import parameters_of
-from perchctl.calibration.predict import position_errors_mm, ray_difference_px
+from perchctl.calibration.board.adjust import parameters_of
+from perchctl.calibration.board.detect import find_board
+from perchctl.calibration.board.predict import position_errors_mm
 from tests.helpers.boards import (
     CHARUCO,
     CHESSBOARD,
@@ -30,6 +30,7 @@ from tests.helpers.boards import (
     corner_views,
     draw_camera,
     draw_poses,
+    ray_difference_px,
 )
 
 RANGES_M = (0.05, 0.1, 0.3, 1.0, 1.5)
@@ -63,10 +64,10 @@ def main() -> None:
         start_s = time.perf_counter()
         views, truth = views_of(seed, options.corners)
         result = calibrate_camera(views, "synthetic")
-        off = (result.solution.parameters - parameters_of(truth)) / result.solution.std
+        off = (result.fit.parameters - parameters_of(truth)) / result.std
         line = (
             f"seed {seed:2d}: {len(result.views)} of {len(views)} views, "
-            f"RMS {result.solution.rms_px:.3f} px, {result.camera.model}, largest parameter error "
+            f"RMS {result.fit.rms_px:.3f} px, {result.camera.model}, largest parameter error "
             f"{np.abs(off).max():.1f} sigma;"
         )
         below.setdefault("all parameters within 3 sigma", []).append(bool(np.abs(off).max() < 3))

@@ -18,17 +18,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from perchctl.calibration import (
     MountingRecording,
     profile_camera,
-    rotation_vectors,
     solve_carry,
     solve_pivot,
 )
-from perchctl.calibration.mounting.result import IN_95
+from perchctl.calibration.mounting.robust import IN_95
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
 from perchctl.sim import draw_hand, record_hand
@@ -51,12 +51,12 @@ def errors_of(seed: int, bare: bool) -> tuple[dict[str, float], list[float]]:
     carried = solve_carry(recording(hands["carry"], bare))
     pivoted = solve_pivot(recording(hands["pivot"], bare), PROFILE.target.size_sigma)
     truth = hands["carry"]
-    turn = rotation_vectors((carried.R_body_cam @ truth.T_body_cam[:3, :3].T)[None])
+    turn = Rotation.from_matrix(carried.R_body_cam @ truth.T_body_cam[:3, :3].T)
     angles = (np.array(carried.rpy_deg) - truth.rpy_deg + 180.0) % 360.0 - 180.0
     late_s = carried.latency_s - truth.latency_s
     tip_m = np.array(pivoted.gear_cam_m) - truth.gear_cam_m
     values = (
-        math.degrees(float(np.linalg.norm(turn))),
+        math.degrees(turn.magnitude()),
         1e3 * abs(late_s),
         1e3 * float(np.linalg.norm(tip_m)),
     )

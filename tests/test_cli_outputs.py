@@ -17,8 +17,8 @@ from tests.helpers.weights_data import write as write_session
 
 WRITING = [
     ["calibrate", "images:.", "-o", "OUT.yaml"],
-    ["calibrate", "--convert", str(ROOT / "calib/example_640x480.yaml"), "-o", "OUT.yaml"],
-    ["calibrate", "images:.", "--mask", "OUT.png"],
+    ["calibrate", "convert", str(ROOT / "calib/example_640x480.yaml"), "-o", "OUT.yaml"],
+    ["calibrate", "mask", "images:.", "-o", "OUT.png"],
     ["make-target", "-o", "OUT.pdf"],
     ["make-target", "--board", "chessboard:9x6:20mm", "-o", "OUT.pdf"],
     ["make-target", "--camera", "example_640x480.yaml", "--plot", "OUT.png"],
@@ -55,7 +55,7 @@ def test_one_rule_for_what_is_there_already(
 @pytest.mark.parametrize(
     "words",
     [
-        ["calibrate", "--convert", str(ROOT / "calib/example_640x480.yaml"), "-o", "OUT.yaml"],
+        ["calibrate", "convert", str(ROOT / "calib/example_640x480.yaml"), "-o", "OUT.yaml"],
         ["make-target", "--board", "chessboard:9x6:20mm", "-o", "OUT.pdf"],
         ["make-target", "--measured-large", "150", "-o", "OUT.yaml"],
         ["track", "images:pictures", "--stills", "--csv", "OUT.csv"],

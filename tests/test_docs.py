@@ -113,7 +113,7 @@ def cheap(line: str) -> list[str]:
                     words[words.index(option) + 1] = "1"
         case ["perchctl", "fit-weights"] if "--collect" in words:
             words += ["--positions", "3", "--frames", "10"]
-        case ["perchctl", "calibrate"] if "--mount" in words:  # without a vehicle in a hand
+        case ["perchctl", "calibrate"] if words[2] == "mount":  # without a vehicle in a hand
             words = [*words[:3], "-p", "my_vehicle.yaml", "--from", "hand.jsonl"]
         case ["perchctl", "log"]:
             words = ["short.jsonl" if word.endswith(".jsonl") else word for word in words]

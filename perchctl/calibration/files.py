@@ -1,16 +1,19 @@
-"""Reading camera calibrations: the ROS camera_info YAML that perchctl ships and writes,
-OpenCV's own FileStorage files (YAML, XML, JSON), and Kalibr's camchain YAML."""
+"""Calibration files: read from ROS (camera_info), OpenCV (FileStorage: YAML, XML, JSON) and Kalibr
+(camchain); written as one YAML that ROS, OpenCV's FileStorage and PyYAML all read."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from warnings import warn
 
 import cv2
 import numpy as np
 
-from perchctl.errors import InvalidValue, NotFound
+from perchctl.errors import InvalidValue, Note, NotFound
+from perchctl.geometry import Array
 from perchctl.profile import CameraConfig, find_calibration, parse_yaml
 from perchctl.vision import CameraModel
 
@@ -28,32 +31,18 @@ def profile_camera(config: CameraConfig) -> CameraModel:
     return load_calibration(config.calibration, cam=config.cam)
 
 
-def load_sized(file: Path | str, cam: str | None = None) -> CameraModel | None:
-    """As `load_calibration`; None where all but the pictures' size is there."""
-    try:
-        return load_calibration(file, cam=cam)
-    except SizeMissing:
-        return None
-
-
-def assumed_size_warning(file: Path | str, size_px: tuple[int, int]) -> str:
-    """The warning that goes with a size taken from the first picture."""
-    w, h = size_px
-    return (
-        f"{file}: the image size is missing; {w}x{h} px is taken from the first picture, which is "
-        f"right only if the camera was calibrated at that size: add image_width: {w} and "
-        f"image_height: {h} to the file"
-    )
-
-
 def load_calibration(
     file: Path | str, size_px: tuple[int, int] | None = None, cam: str | None = None
 ) -> CameraModel:
     """Read a camera model from a file, or by the name of one in `calib/`.
 
-    `size_px` is the pictures' size (width, height) where the file has none; `cam` names one
-    of the cameras of a Kalibr file.
-    Errors: NotFound (no file), SizeMissing, InvalidValue (wrong content)."""
+    Args:
+        size_px: the pictures' size (width, height) for a file that has none; a Note says so.
+        cam: one of the cameras of a Kalibr file.
+
+    Raises:
+        NotFound: no file. SizeMissing. InvalidValue: wrong content.
+    """
     path = find_calibration(file) if isinstance(file, str) else file
     try:
         text = path.read_text(encoding="utf-8")
@@ -64,22 +53,6 @@ def load_calibration(
     if "opencv-matrix" in text or "<opencv_storage>" in text:
         _check_no_cam(path, cam)
         return _checked(path, _opencv_values(path), size_px)
-    raw = _mapping(path, text)
-    cameras = [key for key in raw if re.fullmatch(r"cam\d+", str(key))]
-    try:
-        if cameras:
-            values = _kalibr_values(path, raw, _named(path, cameras, cam))
-        else:
-            _check_no_cam(path, cam)
-            values = _ros_values(raw)
-    except KeyError as error:
-        raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
-    except (TypeError, ValueError) as error:
-        raise InvalidValue(f"{path}: a value is not a number: {error}") from None
-    return _checked(path, values, size_px)
-
-
-def _mapping(path: Path, text: str) -> dict[Any, Any]:
     try:
         raw = parse_yaml(text)
     except ValueError as error:
@@ -89,16 +62,23 @@ def _mapping(path: Path, text: str) -> dict[Any, Any]:
             f"{path}: must hold camera_info keys (image_width, camera_matrix, ...) or a Kalibr "
             f"camchain (cam0: ...)"
         )
-    return raw
-
-
-def _ros_values(raw: dict[Any, Any]) -> dict[str, Any]:
-    return {
-        "size": _size(raw.get("image_width"), raw.get("image_height")),
-        "K": np.array(raw["camera_matrix"]["data"], dtype=float),
-        "dist": np.array(raw["distortion_coefficients"]["data"], dtype=float),
-        "model": str(raw.get("distortion_model", "plumb_bob")),
-    }
+    cameras = [key for key in raw if re.fullmatch(r"cam\d+", str(key))]
+    try:
+        if cameras:
+            values = _kalibr_values(path, raw, _named(path, cameras, cam))
+        else:
+            _check_no_cam(path, cam)
+            values = {
+                "size": _size(raw.get("image_width"), raw.get("image_height")),
+                "K": np.array(raw["camera_matrix"]["data"], dtype=float),
+                "dist": np.array(raw["distortion_coefficients"]["data"], dtype=float),
+                "model": str(raw.get("distortion_model", "plumb_bob")),
+            }
+    except KeyError as error:
+        raise InvalidValue(f"{path}: key {error.args[0]} is missing") from None
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(f"{path}: a value is not a number: {error}") from None
+    return _checked(path, values, size_px)
 
 
 def _check_no_cam(path: Path, cam: str | None) -> None:
@@ -215,4 +195,79 @@ def _checked(
             f"{path}: camera_matrix does not fit a {size[0]}x{size[1]} picture: focal lengths "
             f"must be positive and the centre inside the picture"
         )
+    if values["size"] is None:
+        warn(
+            Note(
+                f"{path}: the image size is missing; {size[0]}x{size[1]} px is taken from the "
+                f"first picture, which is right only if the camera was calibrated at that size: "
+                f"add image_width: {size[0]} and image_height: {size[1]} to the file"
+            ),
+            stacklevel=3,
+        )
     return CameraModel(size, K, dist, "fisheye" if model == "equidistant" else model)
+
+
+# --- Writing ---------------------------------------------------------------------------------
+# ROS wants camera_info keys; FileStorage wants ``dt: d`` in each matrix and a first line
+# ``%YAML 1.0``; PyYAML refuses ``%YAML:1.0`` and OpenCV's tags, and reads ``1e-05`` as a string.
+
+
+def camera_text(
+    camera: CameraModel, name: str, notes: Mapping[str, str | float | int | Array]
+) -> str:
+    """The file's text; `notes` are further keys (ROS readers pass over them), arrays (n, m)."""
+    entries: dict[str, str | float | int | Array] = {
+        "image_width": camera.size_px[0],
+        "image_height": camera.size_px[1],
+        "camera_name": name,
+        "camera_matrix": camera.K,
+        "distortion_model": "equidistant" if camera.model == "fisheye" else camera.model,
+        "distortion_coefficients": _coefficients(camera)[None],
+        "rectification_matrix": np.eye(3),
+        "projection_matrix": np.column_stack([camera.K, np.zeros(3)]),
+        **notes,
+    }
+    lines = ["%YAML 1.0", "---"]
+    for key, value in entries.items():
+        if isinstance(value, np.ndarray):
+            rows, cols = value.shape
+            data = ", ".join(_number(v) for v in value.ravel().tolist())
+            lines += [f"{key}:", f"  rows: {rows}", f"  cols: {cols}", "  dt: d"]
+            lines.append(f"  data: [{data}]")
+        else:
+            lines.append(f"{key}: {_quoted(value) if isinstance(value, str) else _number(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def camera_record(camera: CameraModel) -> dict[str, Any]:
+    """The camera model as JSON's own types: lengths in pixels, distances in metres."""
+    K = camera.K
+    return {
+        "fx": float(K[0, 0]),
+        "fy": float(K[1, 1]),
+        "cx": float(K[0, 2]),
+        "cy": float(K[1, 2]),
+        "distortion": [float(d) for d in camera.dist],
+        "model": camera.model,
+        "size_px": list(camera.size_px),
+    }
+
+
+def _coefficients(camera: CameraModel) -> Array:
+    """The distortion; ROS wants five coefficients of plumb_bob."""
+    short = camera.model == "plumb_bob" and camera.dist.size == 4
+    return np.append(camera.dist, 0.0) if short else camera.dist
+
+
+def _number(value: float | int) -> str:
+    """Read back to the very same number; with a point, or PyYAML reads a string."""
+    if isinstance(value, int):
+        return str(value)
+    text = repr(float(value))
+    mantissa, e, exponent = text.partition("e")
+    return text if not e or "." in mantissa else f"{mantissa}.0e{exponent}"
+
+
+def _quoted(text: str) -> str:
+    plain = "".join(c if c.isprintable() and c.isascii() else "_" for c in text)
+    return '"' + plain.replace("\\", "/").replace('"', "'") + '"'

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.types import Grey
+from perchctl.camera import Grey
 from perchctl.errors import InvalidValue
 
 LEAST_PICTURES = 20
@@ -33,7 +33,12 @@ class Gear:
 
     @property
     def share(self) -> float:
+        """Share of the picture that the vehicle covers."""
         return float(self.covered.mean())
+
+    def png(self) -> bytes:
+        """The mask as `camera.mask` has it: white is what the vehicle covers."""
+        return bytes(cv2.imencode(".png", np.where(self.covered, np.uint8(255), np.uint8(0)))[1])
 
 
 def learn_gear(pictures: Iterable[Grey]) -> Gear:
@@ -79,11 +84,6 @@ def learn_gear(pictures: Iterable[Grey]) -> Gear:
             f"of something with strong patterns all over the picture"
         )
     return Gear(covered, count)
-
-
-def mask_png(gear: Gear) -> bytes:
-    """As `camera.mask` has it: white is what the vehicle covers."""
-    return bytes(cv2.imencode(".png", np.where(gear.covered, np.uint8(255), np.uint8(0)))[1])
 
 
 def _connected(still: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -1,373 +1,268 @@
-"""The work behind `perchctl calibrate`: pictures in, calibration file and report out."""
+"""`perchctl calibrate`: pictures in, calibration file and report out; a mask, a check, a converted
+file. `calibrate mount` is in a file of its own."""
 
 from __future__ import annotations
 
 import contextlib
 import datetime
 import itertools
+import re
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+import typer
 
 from perchctl.calibration import (
-    AUTO_MODEL,
-    MODEL_NAMES,
     BoardView,
     Calibration,
-    Grey,
+    Moment,
     Rejection,
-    assumed_size_warning,
+    SizeMissing,
     calibrate_camera,
-    calibration_lines,
-    calibration_record,
-    calibration_text,
     camera_record,
     camera_text,
+    capture_views,
     check_calibration,
-    check_record,
     learn_gear,
     load_calibration,
-    load_sized,
-    mask_png,
+    polled,
     views_of_images,
     views_of_video,
 )
-from perchctl.camera import FrameSource, check_size, is_live
-from perchctl.commands.calibrate_live import captured_views
-from perchctl.commands.calibrate_mount_request import MountRequest
-from perchctl.commands.calibrate_source import Source, sized, source_of
+from perchctl.camera import (
+    IMAGE_SUFFIXES,
+    FrameSource,
+    Grey,
+    ImagesSource,
+    check_size,
+    image_files,
+    is_live,
+    open_source,
+    source_spec,
+    without_password,
+)
+from perchctl.commands.calibrate_mount import mount
+from perchctl.commands.command_line import (
+    CamOption,
+    Command,
+    ForceOption,
+    Group,
+    JsonOption,
+    ViewOption,
+    ViewPortOption,
+    complete_source,
+    examples,
+    new_app,
+    reporting,
+)
+from perchctl.commands.guide import guide
 from perchctl.commands.interrupt import Stopper, drawn
 from perchctl.commands.output import print_record, say
-from perchctl.commands.page import page_port
+from perchctl.commands.page import live_page, page_port
 from perchctl.commands.progress import search_bar
-from perchctl.errors import InvalidValue, PerchError, TimedOut, UsageError
+from perchctl.errors import InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, check_place, same_file, write_files
 from perchctl.target import NOTABLE_SCALE_ERROR, Board, mm_text, parse_board, parse_length
+from perchctl.vision import CameraModel
 
 FOLDER = Path("calib")
-_TYPED = {"reject": "no-reject"}
-_WITH_MOUNT = ("mount", "mounting", "output", "force", "as_json", "view", "view_port")
 SUFFIXES, CONTENT = (".yaml", ".yml"), "the format of a calibration"
+DEFAULT_BOARD = "charuco:10x7:25mm:18mm:DICT_5X5_100"
+MASK_S = 20.0
+"""How long a live camera is watched to learn a mask."""
+
+DETAILS = "Details"
+"""Heading of the options that are not of every day."""
+
+SourceArgument = Annotated[
+    list[str],
+    typer.Argument(
+        help="images:DIR (or a pattern), video:FILE, camera:N or its name, rtsp://..., "
+        "http://..., aideck://HOST, or a path; or many picture files.",
+        autocompletion=complete_source,
+    ),
+]
+BoardOption = Annotated[
+    str,
+    typer.Option(
+        "--board",
+        "-b",
+        help="chessboard:9x6:25mm (inner corners), charuco:10x7:25mm:18mm:DICT_5X5_100 "
+        "(squares; :legacy behind it for OpenCV's old layout), aprilgrid:6x6:22mm:0.3 (tags, "
+        "gap as a share of a tag), or Kalibr's .yaml of a board.",
+    ),
+]
+WidthOption = Annotated[
+    str | None,
+    typer.Option(
+        "--measured-width",
+        help="Width of the board's black area as printed, mm.",
+        rich_help_panel=DETAILS,
+    ),
+]
+HeightOption = Annotated[
+    str | None,
+    typer.Option("--measured-height", help="Its height as printed, mm.", rich_help_panel=DETAILS),
+]
+SizeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--size",
+        help="Asked of camera:N, as in 720x576; else its driver's own.",
+        rich_help_panel=DETAILS,
+    ),
+]
+NameOption = Annotated[str, typer.Option("--name", help="The camera's name.")]
+SkipBrokenOption = Annotated[
+    bool,
+    typer.Option(
+        "--skip-broken",
+        help="Leave out pictures that cannot be read.",
+        rich_help_panel=DETAILS,
+    ),
+]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        help="Calibration file; camera writes its report beside it as .png. "
+        "Default: calib/NAME_WIDTHxHEIGHT.yaml.",
+    ),
+]
+
+app = new_app(Group)
 
 
-@dataclass(frozen=True)
-class CalibrateRequest:
-    """The command line as it was given; None is not given."""
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl calibrate images:board",
+        "perchctl calibrate camera:0 --view",
+        "perchctl calibrate left*.jpg --board chessboard:9x6:25mm",
+    ),
+)
+@reporting
+def camera(
+    source: SourceArgument,
+    board: BoardOption = DEFAULT_BOARD,
+    output: OutputOption = None,
+    name: NameOption = "camera",
+    force: ForceOption = False,
+    view: ViewOption = False,
+    view_port: ViewPortOption = 0,
+    as_json: JsonOption = False,
+    measured_width: WidthOption = None,
+    measured_height: HeightOption = None,
+    size: SizeOption = None,
+    model: Annotated[
+        Literal["auto", "plumb_bob", "rational_polynomial", "fisheye"],
+        typer.Option(
+            "--model",
+            help="Lens model; auto takes the recommended one.",
+            rich_help_panel=DETAILS,
+        ),
+    ] = "auto",
+    reject: Annotated[
+        bool,
+        typer.Option(
+            "--reject/--no-reject",
+            help="Leave out outlier views and corners.",
+            rich_help_panel=DETAILS,
+        ),
+    ] = True,
+    skip_broken: SkipBrokenOption = False,
+    keep_pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--keep-pictures",
+            help="Folder for a live camera's pictures. Default: beside the output.",
+            rich_help_panel=DETAILS,
+        ),
+    ] = None,
+) -> int:
+    """Calibrate the camera, and report what its error means in mm at the target.
 
-    sources: tuple[str, ...] = ()
-    board: str = "charuco:10x7:25mm:18mm:DICT_5X5_100"
-    measured_width: str | None = None
-    measured_height: str | None = None
-    output: Path | None = None
-    size: str | None = None
-    name: str = "camera"
-    model: str = AUTO_MODEL
-    force: bool = False
-    check: Path | None = None
-    convert: Path | None = None
-    cam: str | None = None
-    mask: Path | None = None
-    reject: bool = True
-    plain_corners: bool = False
-    skip_broken: bool = False
-    keep_pictures: Path | None = None
-    as_json: bool = False
-    view: bool = False
-    view_port: int = 0
-    mount: bool = False
-    mounting: MountRequest = field(default_factory=MountRequest)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Views of the source, and pictures without the board."""
-
-    views: list[BoardView]
-    missing: list[Rejection]
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        return self.views[0].size_px
-
-
-def run(request: CalibrateRequest) -> int:
-    """Calibrate, check, convert, learn a mask or measure the mounting; returns the exit code.
-
-    Errors: NotFound, InvalidValue, UsageError, TimedOut (a silent camera); those of
-    `measure_mount`.
+    A view is rejected when its RMS is above 2.5 times the median view's, a corner when it is off
+    by more than 5 times its view's spread; both are named.
     """
-    if request.mount:
-        return _mount(request)
-    if (given := request.mounting.given()) is not None:
-        raise UsageError(f"{given} goes with --mount, which measures how the camera is mounted")
-    measured = request.measured_width is not None or request.measured_height is not None
-    if measured and not (request.convert is request.mask is None):
-        raise UsageError("--measured-* are a board's sides, and --convert and --mask look for none")
-    if request.convert is not None:
-        if request.sources or not (request.check is request.mask is None):
-            raise UsageError("--convert takes a file and no source, --check or --mask")
-        if request.size is not None:
-            raise UsageError("--size is asked of a camera, and --convert looks through none")
-        _refuse_beside("--convert takes over the file's lens model", request, "--model", "--view")
-        return _convert(request, request.convert)
-    if request.cam is not None and request.check is None:
-        raise UsageError("--cam names a camera of the file of --check or --convert: give one")
-    if not request.sources:
-        raise UsageError(
-            "a SOURCE is needed: images:DIR (or a pattern), video:FILE, camera:N, http://... or aideck://HOST"
-        )
-    source = sized(source_of(request.sources), request.size)
-    if not is_live(source.spec):
-        _refuse_beside(f"{source} is no live camera", request, "--view")
-    if request.check is not None:
-        _refuse_beside("--check judges a calibration as it is", request, "--model", "--output")
-    if request.mask is not None:
-        if request.check is not None or request.output is not None:
-            raise UsageError("--mask names its file itself, and takes no --output or --check")
-        return write_mask(source, request.mask, request.force, request.as_json)
-    board, notes = board_of(request.board, request.measured_width, request.measured_height)
-    _check_request(request)
-    for note in notes:
-        say(note)
-    if request.check is not None:
-        return _check(request, request.check, source, board)
-    return _calibrate(request, source, board)
+    pictures = _source(source, size, view)
+    _check_name(name)
+    if output is not None:
+        _check_output(output, force)
+    if keep_pictures is not None:
+        check_place(keep_pictures / "view_001.png", force=True)
+    layout = _measured_board(board, measured_width, measured_height)
 
+    def kept_in(size_px: tuple[int, int]) -> Path:
+        """The folder for a live camera's pictures; raises before a person has worked for them."""
+        file = _file(output, name, size_px)
+        _check_output(file, force)
+        return keep_pictures or _free_folder(file)
 
-def _refuse_beside(asked: str, request: CalibrateRequest, *options: str) -> None:
-    """Raises UsageError for an option that would be ignored."""
-    given = {
-        "--model": request.model != AUTO_MODEL,
-        "--output": request.output is not None,
-        "--view": request.view,
-    }
-    for option in options:
-        if given[option]:
-            raise UsageError(f"{asked}: {option} does not apply; leave it out")
-
-
-def _mount(request: CalibrateRequest) -> int:
-    from perchctl.commands.calibrate_mount import measure_mount
-
-    if request.sources:
-        raise UsageError(
-            f"with --mount the camera is the profile's or named by --source {request.sources[0]}"
-        )
-    for each in fields(request):
-        if each.name not in _WITH_MOUNT and getattr(request, each.name) != each.default:
-            name = _TYPED.get(each.name, each.name.replace("_", "-"))
-            raise UsageError(f"--{name} does not go with --mount: leave one of them out")
-    return measure_mount(
-        request.mounting,
-        request.output,
-        request.force,
-        request.as_json,
-        request.view,
-        request.view_port,
-    )
-
-
-def _check_request(request: CalibrateRequest) -> None:
-    if request.model not in (AUTO_MODEL, *MODEL_NAMES):
-        allowed = ", ".join((AUTO_MODEL, *MODEL_NAMES))
-        raise InvalidValue(f"lens model {request.model!r} is unknown; allowed are {allowed}")
-    if request.output is not None:
-        _check_output(request.output, request.force)
-    if request.keep_pictures is not None:
-        check_place(request.keep_pictures / "view_001.png", force=True)
-    if not request.name.strip() or "/" in request.name:
-        raise UsageError(f"--name {request.name!r} cannot name a file; use a word such as camera")
-
-
-def _calibrate(request: CalibrateRequest, source: Source, board: Board) -> int:
-    found = _find_views(request, source, board)
-    output = _output(request, found.size_px)
-    _check_output(output, request.force)
-    missing = f", {len(found.missing)} without" if found.missing else ""
-    say(f"{len(found.views)} views of the board{missing}")
-    result = calibrate_camera(
-        found.views, board.notation(), request.model, request.reject, found.missing
-    )
-    text = calibration_text(result, request.name, _now())
-    write_files({output: text.encode()})
-    for line in calibration_lines(result):
+    port = page_port(view, view_port)
+    views, missing = _find_views(pictures, layout, skip_broken, kept_in, port)
+    file = _file(output, name, views[0].size_px)
+    _check_output(file, force)
+    say(f"{len(views)} views of the board" + (f", {len(missing)} without" if missing else ""))
+    result = calibrate_camera(views, layout.notation(), model, reject, missing)
+    write_files({file: result.text(name, _now()).encode()})
+    for line in result.lines():
         say(line)
-    picture = drawn(lambda: _draw(result, _picture_of(output)))
-    say(f"wrote {output}" + ("" if picture is None else f" and {picture}"))
-    if request.as_json:
-        print_record(calibration_record(result, output, picture))
+    report = drawn(lambda: _draw(result, file.with_suffix(".png")))
+    say(f"wrote {file}" + ("" if report is None else f" and {report}"))
+    if as_json:
+        print_record(result.record(file, report))
     else:
-        print(output)
+        print(file)
     return 0
 
 
-def _draw(result: Calibration, picture: Path) -> Path:
-    from perchctl.calibration import draw_calibration
-
-    write_files({picture: draw_calibration(result)})
-    return picture
-
-
-def _check(request: CalibrateRequest, file: Path, source: Source, board: Board) -> int:
-    """Judge an existing calibration by new pictures."""
-    camera = load_sized(file, request.cam)
-    found = _find_views(request, source, board)
-    if camera is None:
-        camera = load_calibration(file, found.size_px, request.cam)
-        say(assumed_size_warning(file, found.size_px))
-    check_size(found.size_px, camera, str(source))
-    result = check_calibration(camera, found.views)
-    for item in found.missing:
-        say(f"{item.view}: {item.reason}")
-    for item in result.rejections:
-        say(f"left out {item.view}: {item.reason}")
-    say(f"{'PASS' if result.passed else 'FAIL'}: {file}: {result.reason}")
-    if request.as_json:
-        print_record(check_record(result, file))
-    else:
-        print("pass" if result.passed else "fail")
-    return 0 if result.passed else PerchError.exit_code
+app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl calibrate mount -p my_vehicle.yaml -u radio://0/80/2M/E7E7E7E7E7",
+        "perchctl calibrate mount -p my_vehicle.yaml --from calib/mounting_my_vehicle.jsonl "
+        "--write",
+        "perchctl calibrate mount --truth sim --seed 3",
+    ),
+)(mount)
 
 
-def _convert(request: CalibrateRequest, file: Path) -> int:
-    """Another program's calibration (OpenCV, Kalibr, ROS) as perchctl's file."""
-    camera = load_calibration(file, cam=request.cam)
-    output = _output(request, camera.size_px)
-    if same_file(output, file):
-        raise UsageError(f"{output} is the file to convert; name another with --output")
-    check_output(output, SUFFIXES, request.force, CONTENT)
-    notes = {"date": _now(), "converted_from": file.name}
-    text = camera_text(camera, request.name, notes)
-    write_files({output: text.encode()})
-    say(f"wrote {output} ({camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px)")
-    if request.as_json:
-        print_record(camera_record(camera) | {"file": str(output)})
-    else:
-        print(output)
-    return 0
-
-
-# -- files --------------------------------------------------------------------
-
-
-def _output(request: CalibrateRequest, size_px: tuple[int, int]) -> Path:
-    return request.output or FOLDER / f"{request.name}_{size_px[0]}x{size_px[1]}.yaml"
-
-
-def _picture_of(output: Path) -> Path:
-    return output.with_suffix(".png")
-
-
-def _pictures_folder(request: CalibrateRequest, size_px: tuple[int, int]) -> Path | None:
-    """Where a live camera's pictures go; raises what `_check_output` does, before a person
-    has worked for them."""
-    if request.check is not None:
-        return request.keep_pictures
-    output = _output(request, size_px)
-    _check_output(output, request.force)
-    if request.keep_pictures is not None:
-        return request.keep_pictures
-    names = (f"{output.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
-    return next(folder for name in names if not (folder := output.with_name(name)).exists())
-
-
-def _check_output(output: Path, force: bool) -> None:
-    check_output(output, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
-    check_place(_picture_of(output), force)
-
-
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-# -- views --------------------------------------------------------------------
-
-
-def _find_views(request: CalibrateRequest, source: Source, board: Board) -> _Found:
-    if source.scheme not in ("images", "video"):
-        return _Found(_live_views(request, source, board), [])
-    refine = not request.plain_corners
-    with search_bar("searching the board") as progress:
-        if source.scheme == "images":
-            pictures, skip = source.pictures(), request.skip_broken
-            views, missing = views_of_images(pictures, board, refine, progress, skip)
-        else:
-            views, missing = views_of_video(Path(source.place), board, refine, progress)
-    if not views:
-        count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
-        raise InvalidValue(
-            f"none of {count} of {source} shows the board {board.notation()}; is it wholly in "
-            f"view, sharp, and --board its true layout?"
-        )
-    return _Found(views, missing)
-
-
-def _live_views(request: CalibrateRequest, source: Source, board: Board) -> list[BoardView]:
-    frames = source.open()
-    try:
-        assert frames.size_px is not None  # the first frame is there
-        pictures = _pictures_folder(request, frames.size_px)
-        port = page_port(request.view, request.view_port)
-        return captured_views(frames, board, pictures, port)
-    finally:
-        frames.close()
-
-
-# --- The board that `perchctl calibrate` looks for: its notation, and what its print measures ---
-
-
-def board_of(notation: str, width: str | None, height: str | None) -> tuple[Board, list[str]]:
-    """The board, and what its measured sides (of the black area, mm) say of the print.
-
-    Raises NotFound, InvalidValue, UsageError.
-    """
-    board = parse_board(notation)
-    if width is None and height is None:
-        return board, []
-    if width is None or height is None:
-        raise UsageError(
-            "--measured-width and --measured-height go together: a lens is told from the "
-            "print's proportions, which one of them leaves open"
-        )
-    sides_m = (
-        parse_length(width, "--measured-width", bare_unit="mm"),
-        parse_length(height, "--measured-height", bare_unit="mm"),
-    )
-    board = board.measured(*sides_m)
-    notes = []
-    for name, meant_m, is_m, scale in zip(
-        ("width", "height"), board.size_m, sides_m, board.scale, strict=True
-    ):
-        off = f"{100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm"
-        notes.append(f"{name}: {mm_text(is_m)} mm, {off}")
-        if abs(scale - 1) > NOTABLE_SCALE_ERROR:
-            notes.append(f"{name}: more than 1 % off: was the page scaled when it was printed?")
-    return board, notes
-
-
-# --- `perchctl calibrate --mask`: what the vehicle's own gear covers, learned from any source ---
-
-
-LIVE_S = 20.0
-"""For which a live camera is looked at."""
-_PAUSE_S = 0.005
-
-
-def write_mask(source: Source, output: Path, force: bool, as_json: bool) -> int:
-    """Learn the mask and write it; returns the exit code.
-
-    Errors: NotFound, InvalidValue, TimedOut (a silent camera).
-    """
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl calibrate mask images:turned",
+        "perchctl calibrate mask camera:0 -o gear.png",
+        "perchctl calibrate mask video:turned.mp4 -o gear.png --force",
+    ),
+)
+@reporting
+def mask(
+    source: SourceArgument,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The mask, a PNG; camera.mask names it.")
+    ] = Path("gear.png"),
+    force: ForceOption = False,
+    size: SizeOption = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Learn what the vehicle itself covers of the picture, while it is turned about."""
+    pictures = _source(source, size)
     check_output(output, (".png",), force, "a mask's format")
     with contextlib.ExitStack() as stack:
-        frames = source.open()
+        frames = pictures.open()
         stack.callback(frames.close)
         stop = stack.enter_context(Stopper().installed())
         if frames.live:
-            say(f"turn the vehicle about for {LIVE_S:g} s (Ctrl-C ends and writes the mask)")
-        gear = learn_gear(_pictures(frames, stop.requested.is_set))
-    write_files({output: mask_png(gear)})
+            say(f"turn the vehicle about for {MASK_S:g} s (Ctrl-C ends and writes the mask)")
+        gear = learn_gear(_watched(frames, stop.requested.is_set))
+    write_files({output: gear.png()})
     say(
         f"wrote {output}: the vehicle covers {100 * gear.share:.1f} % of the picture, by "
         f"{gear.pictures} pictures; set camera.mask to it"
@@ -381,18 +276,330 @@ def write_mask(source: Source, output: Path, force: bool, as_json: bool) -> int:
     return 0
 
 
-def _pictures(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
-    """Those of a recording, or of a camera for some seconds."""
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl calibrate check camera.yaml images:board",
+        "perchctl calibrate check camera.yaml camera:0 --view",
+        "perchctl calibrate check camchain.yaml images:april --cam cam0 --board april_6x6.yaml",
+    ),
+)
+@reporting
+def check(
+    calibration: Annotated[Path, typer.Argument(help="The calibration file to judge.")],
+    source: SourceArgument,
+    board: BoardOption = DEFAULT_BOARD,
+    cam: CamOption = None,
+    view: ViewOption = False,
+    view_port: ViewPortOption = 0,
+    as_json: JsonOption = False,
+    measured_width: WidthOption = None,
+    measured_height: HeightOption = None,
+    size: SizeOption = None,
+    skip_broken: SkipBrokenOption = False,
+    keep_pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--keep-pictures",
+            help="Folder for a live camera's pictures.",
+            rich_help_panel=DETAILS,
+        ),
+    ] = None,
+) -> int:
+    """Judge a calibration by new pictures of a board; the exit code is 1 on a fail."""
+    pictures = _source(source, size, view)
+    if keep_pictures is not None:
+        check_place(keep_pictures / "view_001.png", force=True)
+    layout = _measured_board(board, measured_width, measured_height)
+    model: CameraModel | None = None
+    with contextlib.suppress(SizeMissing):  # then the pictures' own is taken
+        model = load_calibration(calibration, cam=cam)
+    port = page_port(view, view_port)
+    views, missing = _find_views(pictures, layout, skip_broken, lambda _: keep_pictures, port)
+    size_px = views[0].size_px
+    model = model or load_calibration(calibration, size_px, cam)
+    check_size(size_px, model, str(pictures))
+    result = check_calibration(model, views)
+    for item in missing:
+        say(f"{item.view}: {item.reason}")
+    for item in result.rejections:
+        say(f"left out {item.view}: {item.reason}")
+    say(f"{'PASS' if result.passed else 'FAIL'}: {calibration}: {result.reason}")
+    if as_json:
+        print_record(result.record(calibration))
+    else:
+        print("pass" if result.passed else "fail")
+    return 0 if result.passed else PerchError.exit_code
+
+
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl calibrate convert opencv.yaml",
+        "perchctl calibrate convert camchain.yaml --cam cam0 -o calib/from_kalibr.yaml",
+        "perchctl calibrate convert ost.yaml --name fpv",
+    ),
+)
+@reporting
+def convert(
+    calibration: Annotated[Path, typer.Argument(help="A file of OpenCV, Kalibr or ROS.")],
+    output: OutputOption = None,
+    name: NameOption = "camera",
+    cam: CamOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Write another program's calibration as perchctl's file."""
+    _check_name(name)
+    model = load_calibration(calibration, cam=cam)
+    file = _file(output, name, model.size_px)
+    if same_file(file, calibration):
+        raise UsageError(f"{file} is the file to convert; name another with --output")
+    check_output(file, SUFFIXES, force, CONTENT)
+    notes = {"date": _now(), "converted_from": calibration.name}
+    write_files({file: camera_text(model, name, notes).encode()})
+    say(f"wrote {file} ({model.model}, {model.size_px[0]}x{model.size_px[1]} px)")
+    if as_json:
+        print_record(camera_record(model) | {"file": str(file)})
+    else:
+        print(file)
+    return 0
+
+
+# -- files --------------------------------------------------------------------
+
+
+def _check_name(name: str) -> None:
+    if not name.strip() or "/" in name:
+        raise UsageError(f"--name {name!r} cannot name a file; use a word such as camera")
+
+
+def _file(output: Path | None, name: str, size_px: tuple[int, int]) -> Path:
+    return output or FOLDER / f"{name}_{size_px[0]}x{size_px[1]}.yaml"
+
+
+def _check_output(file: Path, force: bool) -> None:
+    check_output(file, SUFFIXES, force, f"{CONTENT}; the report goes beside it as .png")
+    check_place(file.with_suffix(".png"), force)
+
+
+def _free_folder(file: Path) -> Path:
+    """The first folder for pictures beside the file that does not exist yet."""
+    names = (f"{file.stem}_pictures{'' if n == 1 else f'_{n}'}" for n in itertools.count(1))
+    return next(folder for name in names if not (folder := file.with_name(name)).exists())
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def _draw(result: Calibration, picture: Path) -> Path:
+    from perchctl.calibration import draw_calibration
+
+    write_files({picture: draw_calibration(result)})
+    return picture
+
+
+# -- the source ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Source:
+    """A source as `open_source` takes it, or the picture files that were named one by one."""
+
+    spec: str
+    files: tuple[Path, ...] = ()
+    size_px: tuple[int, int] | None = None  # asked of a camera of this computer
+
+    def __str__(self) -> str:
+        """How messages name it."""
+        if self.files:
+            return f"{self.files[0]} and {len(self.files) - 1} more"
+        return without_password(self.spec)
+
+    @property
+    def scheme(self) -> str:
+        """``images``, ``video``, or a live source's."""
+        return self.spec.partition(":")[0]
+
+    @property
+    def place(self) -> str:
+        """What stands behind the scheme: a path, for ``images`` and ``video``."""
+        return str(Path(self.spec.partition(":")[2]).expanduser())
+
+    def open(self) -> FrameSource:
+        """Its frames, of a live source too. Errors: those of `open_source`."""
+        if self.files:
+            return ImagesSource(self.files)
+        return open_source(self.spec, 0.0, self.size_px, time.monotonic)
+
+
+def _source(words: Sequence[str], size: str | None, view: bool = False) -> Source:
+    """The source that the command line names; several words are picture files, which is what
+    a shell makes of ``left*.jpg``. Raises NotFound, InvalidValue, UsageError."""
+    if len(words) == 1:
+        source = Source(source_spec(words[0]))
+    else:
+        files = tuple(Path(word) for word in words)
+        for file in files:
+            _check_picture(file)
+        source = Source("images:", files)
+    if view and not is_live(source.spec):
+        raise UsageError(f"{source} is no live camera: --view does not apply; leave it out")
+    return sized(source, size)
+
+
+def _check_picture(file: Path) -> None:
+    if not file.exists():
+        raise NotFound(f"{file} does not exist; several sources are picture files, one by one")
+    if not file.is_file() or file.suffix.lower() not in IMAGE_SUFFIXES:
+        raise UsageError(
+            f"{file} is no picture file: several sources must all be pictures, as in "
+            f"left*.jpg; a folder, a video or a camera stands alone"
+        )
+
+
+def sized(source: Source, text: str | None) -> Source:
+    """The source with `--size`. Raises InvalidValue, UsageError."""
+    if text is None:
+        return source
+    found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text)
+    if found is None:
+        raise InvalidValue(f"--size: found {text!r}; needed is WIDTHxHEIGHT, as in 720x576")
+    if source.scheme != "camera":
+        raise UsageError(f"--size is asked of camera:N, and {source} has its own: leave it out")
+    return replace(source, size_px=(int(found[1]), int(found[2])))
+
+
+def _watched(source: FrameSource, stopped: Callable[[], bool]) -> Iterator[Grey]:
+    """The pictures of a recording, or of a live camera for `MASK_S`."""
     start_s = time.monotonic()
-    while not (stopped() or source.finished):
-        now_s = time.monotonic()
-        frame = source.poll(now_s)
+    for now_s, frame in polled(source, time.monotonic, time.sleep):
+        if stopped() or (source.live and now_s - start_s > MASK_S):
+            return
         if frame is not None:
             yield frame.image
-        elif source.live:
-            problem = source.problem(now_s)
-            if problem is not None:
-                raise TimedOut(problem)
-            time.sleep(_PAUSE_S)
-        if source.live and now_s - start_s > LIVE_S:
+
+
+# -- the board and its views ----------------------------------------------------
+
+
+def _measured_board(notation: str, width: str | None, height: str | None) -> Board:
+    """The board with its measured sides (of the black area, mm), which are compared with those
+    that it was meant to have. Raises NotFound, InvalidValue, UsageError."""
+    board = parse_board(notation)
+    if width is None and height is None:
+        return board
+    if width is None or height is None:
+        raise UsageError(
+            "--measured-width and --measured-height go together: a lens is told from the "
+            "print's proportions, which one of them leaves open"
+        )
+    sides_m = (
+        parse_length(width, "--measured-width", bare_unit="mm"),
+        parse_length(height, "--measured-height", bare_unit="mm"),
+    )
+    board = board.measured(*sides_m)
+    for name, meant_m, is_m, scale in zip(
+        ("width", "height"), board.size_m, sides_m, board.scale, strict=True
+    ):
+        say(f"{name}: {mm_text(is_m)} mm, {100 * (scale - 1):+.2f} % against {mm_text(meant_m)} mm")
+        if abs(scale - 1) > NOTABLE_SCALE_ERROR:
+            say(f"{name}: more than 1 % off: was the page scaled when it was printed?")
+    return board
+
+
+def _find_views(
+    source: Source,
+    board: Board,
+    skip_broken: bool,
+    kept_in: Callable[[tuple[int, int]], Path | None],
+    port: int | None,
+) -> tuple[list[BoardView], list[Rejection]]:
+    """The views, at least one, and the pictures without a board.
+
+    Args:
+        kept_in: the folder for a live camera's pictures (None: they are not kept), by their size;
+            called before the person begins.
+        port: of a live camera's page; None: no page.
+    """
+    if source.scheme not in ("images", "video"):
+        frames = source.open()
+        with contextlib.closing(frames):
+            assert frames.size_px is not None  # the first frame is there
+            return captured_views(frames, board, kept_in(frames.size_px), port), []
+    with search_bar("searching the board") as progress:
+        if source.scheme == "images":
+            files = image_files(source.files or source.place)
+            views, missing = views_of_images(files, board, progress, skip_broken)
+        else:
+            views, missing = views_of_video(Path(source.place), board, progress)
+    if not views:
+        count = f"{len(missing)} pictures" if source.scheme == "images" else missing[0].view
+        raise InvalidValue(
+            f"none of {count} of {source} shows the board {board.notation()}; is it wholly in "
+            f"view, sharp, and --board its true layout?"
+        )
+    return views, missing
+
+
+def captured_views(
+    source: FrameSource, board: Board, folder: Path | None, port: int | None
+) -> list[BoardView]:
+    """Views of a live camera, taken until all is covered or Ctrl-C ends it.
+
+    Args:
+        folder: gets their pictures, each as it is taken; None: they are not kept.
+        port: of the live page; None: no page.
+
+    Raises:
+        InvalidValue: no view was taken. Those of `capture_views`.
+    """
+    keeper = _Keeper(folder)
+    with contextlib.ExitStack() as stack:
+        stack.callback(keeper.report)
+        stop = stack.enter_context(Stopper().installed())
+        # The page draws the picture and its corners, but no axes: any camera serves.
+        any_camera = CameraModel(source.size_px or (640, 480), np.eye(3), np.zeros(5))
+        page = stack.enter_context(live_page(any_camera, "perchctl calibrate", port))
+        show = stack.enter_context(guide(page))
+        say("show the board near and far, tilted, in all corners (Ctrl-C ends and calibrates)")
+
+        def seen(moment: Moment) -> None:
+            if moment.taken:
+                keeper.keep(moment.image)
+            show(moment)
+
+        views = capture_views(source, board, seen, stopped=stop.requested.is_set)
+    if not views:
+        raise InvalidValue(
+            f"no view of the board {board.notation()} was taken from {source.describe()}"
+        )
+    return views
+
+
+class _Keeper:
+    """Writes each picture as it is taken, behind those that the folder has already."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._kept = 0
+        self._failed = False
+
+    def keep(self, picture: Grey) -> None:
+        """Never raises: pictures that cannot be kept are still calibrated from."""
+        if self._folder is None or self._failed:
             return
+        numbers = (path.stem.removeprefix("view_") for path in self._folder.glob("view_*.png"))
+        newest = max((int(number) for number in numbers if number.isdecimal()), default=0)
+        png = cv2.imencode(".png", picture)[1].tobytes()
+        try:
+            write_files({self._folder / f"view_{newest + 1:03d}.png": png})
+            self._kept += 1
+        except InvalidValue as error:
+            self._failed = True
+            say(f"pictures are no longer kept: {error}")
+
+    def report(self) -> None:
+        if self._kept:
+            say(f"kept {self._kept} pictures: images:{self._folder} takes them again")

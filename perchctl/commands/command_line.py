@@ -46,7 +46,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Print the target (or a board), true to size; design it; write measured sizes.",
     ),
     "calibrate": (
-        "cli.calibrate",
+        "calibrate",
         "Calibrate the camera, and report what its error means in mm at the target.",
     ),
     "new-profile": (

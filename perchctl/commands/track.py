@@ -14,7 +14,7 @@ from typing import Annotated, TextIO
 
 import typer
 
-from perchctl.calibration import assumed_size_warning, load_calibration, load_sized
+from perchctl.calibration import SizeMissing, load_calibration
 from perchctl.camera import (
     DEFAULT_RATE_HZ,
     FrameSource,
@@ -295,13 +295,14 @@ class _Run:
         stop: Stopper,
         stack: contextlib.ExitStack,
     ) -> None:
-        camera = load_sized(options.calibration, options.cam)
+        camera = None
+        with contextlib.suppress(SizeMissing):  # then the first picture's is taken
+            camera = load_calibration(options.calibration, cam=options.cam)
         self.input = _open(options, None if camera is None else camera.size_px, now)
         source = self.input.source
         stack.callback(source.close)
         if camera is None:
             camera = load_calibration(options.calibration, source.size_px, options.cam)
-            say(assumed_size_warning(options.calibration, camera.size_px))
         self.camera = camera
         check_size(source.size_px, camera, self.input.file_name(0))
         setup = camera_pipeline(options.profile, camera, options.stills)

@@ -74,7 +74,7 @@ def _about_turn(found: Findings) -> list[str]:
         return []
     return [
         f"the camera is turned by {', '.join(off)} from what the profile says: measure it with "
-        f"`perchctl calibrate --mount`"
+        f"`perchctl calibrate mount`"
     ]
 
 

@@ -170,6 +170,6 @@ def explained(turn_rad: Turn) -> str:
     shown = 180.0 if shown == -180.0 else shown
     return (
         f"camera seems turned by about {shown:.0f} deg from what the profile says: the target "
-        f"moves with the vehicle; measure it with `perchctl calibrate --mount`, or add "
+        f"moves with the vehicle; measure it with `perchctl calibrate mount`, or add "
         f"{shown:.0f} to the last of camera.mount.rpy_deg"
     )

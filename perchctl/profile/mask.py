@@ -21,7 +21,7 @@ def find_mask(name: str) -> Path:
     if not path.is_file():
         raise NotFound(
             f"camera.mask: {name} does not exist; "
-            f"perchctl calibrate SOURCE --mask {path.name} makes one, or remove the key"
+            f"perchctl calibrate mask SOURCE -o {path.name} makes one, or remove the key"
         )
     return path
 

@@ -12,17 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
     AttitudeSample,
+    Eye,
     MountingPart,
     MountingRecording,
-    best_pose,
-    camera_only_profile,
-    is_seen_mirrored,
     pose_basis,
-    rotation_matrices,
-    rotation_vectors,
 )
 from perchctl.camera import unmirror_frame
 from perchctl.geometry import Array, invert_T, make_T, rotation_from_rpy, rpy_from_rotation
@@ -31,7 +28,7 @@ from perchctl.sim.camera import DeliveredFrame, SimCamera
 from perchctl.sim.draw import draw_scenario
 from perchctl.sim.renderer import Renderer
 from perchctl.sim.scenario import Scenario
-from perchctl.vision import CameraModel, Frame, PipelineState, make_pipeline, step
+from perchctl.vision import CameraModel, Frame
 
 HAND_STREAM = 430
 SECONDS: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
@@ -210,7 +207,7 @@ def _together(*waves: Waves) -> Waves:
 
 
 def _rot_z(angles: Array) -> Array:
-    return rotation_matrices(np.stack([0.0 * angles, 0.0 * angles, angles], axis=1))
+    return np.asarray(Rotation.from_euler("z", angles[:, None]).as_matrix())
 
 
 # --- the true motion ---------------------------------------------------------------------
@@ -220,7 +217,8 @@ def R_target_cam(hand: Hand, t_s: Array) -> Array:
     """The camera's turn at times (n,), (n, 3, 3)."""
     turns = hand.turns(t_s)
     return np.asarray(
-        _rot_z(hand.heading_rad + turns[:, 2]) @ rotation_matrices(turns * (1.0, 1.0, 0.0))
+        _rot_z(hand.heading_rad + turns[:, 2])
+        @ Rotation.from_rotvec(turns * (1.0, 1.0, 0.0)).as_matrix()
     )
 
 
@@ -265,7 +263,7 @@ def attitudes(
     now = R_world_body(t_s)
     h = _RATE_STEP_S
     before, after = R_world_body(t_s - h), R_world_body(t_s + h)
-    rate = rotation_vectors(before.transpose(0, 2, 1) @ after) / (2.0 * h)
+    rate = Rotation.from_matrix(before.transpose(0, 2, 1) @ after).as_rotvec() / (2.0 * h)
     rpy = np.array([rpy_from_rotation(R) for R in now])
     place = cam_target_m(hand, t_s) @ hand.R_world_target.T - now @ hand.T_body_cam[:3, 3]
     sigma_m = max(hand.scenario.estimate_noise_m, 1e-4)
@@ -333,17 +331,13 @@ def record_hand(
 ) -> MountingRecording:
     """Record the whole part, through renderer and pipeline; `told` is called for each
     picture."""
-    pipeline = make_pipeline(camera_only_profile(profile), camera)
-    state = PipelineState()
-    poses, mirrored = [], 0
+    eye = Eye(profile, camera, live=False)
+    poses = []
     for frame in pictures(hand, profile, camera):
         picture = Frame(frame.index, frame.t_arrival_s, frame.image, frame.t_arrival_s, "whole")
         if profile.camera.mirrored:
             picture = unmirror_frame(picture)
-        state, output = step(state, picture, None, pipeline)
-        mirrored += is_seen_mirrored(output)
-        if (pose := best_pose(output, frame.t_arrival_s)) is not None:
-            poses.append(pose)
+        poses += eye.look(picture)
         told()
-    samples, by = attitudes(hand, positioned), pose_basis(profile, camera)
-    return MountingRecording(hand.part, samples, tuple(poses), mirrored, by)
+    felt, by = attitudes(hand, positioned), pose_basis(profile, camera)
+    return MountingRecording(hand.part, felt, tuple(poses), eye.mirrored, by)

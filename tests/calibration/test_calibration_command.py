@@ -12,12 +12,11 @@ import yaml
 from typer.testing import Result
 
 from perchctl.calibration import load_calibration
-from perchctl.calibration.lens import parameters_of
+from perchctl.calibration.board.adjust import parameters_of
 from perchctl.vision import CameraModel
-from tests.helpers.boards import (
-    CHARUCO,
-)
+from tests.helpers.boards import CHARUCO
 from tests.helpers.calibrating import calibrate, refused
+from tests.helpers.gear import SIZE_PX, write_turned_about
 
 pytestmark = pytest.mark.long
 
@@ -79,7 +78,7 @@ def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
 ) -> None:
     file = Path(json.loads(calibrated.stdout)["file"])
     source = f"images:{rendered[0]}"
-    passed = calibrate(source, "-b", BOARD, "--check", str(file), "--json")
+    passed = calibrate("check", str(file), source, "-b", BOARD, "--json")
     assert passed.exit_code == 0
     assert json.loads(passed.stdout)["pass"] is True
     raw = yaml.safe_load(file.read_text())
@@ -87,18 +86,18 @@ def test_the_same_pictures_pass_the_check_and_another_camera_s_fail(
     data[0], data[4] = 1.01 * data[0], 1.01 * data[4]
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text(yaml.safe_dump(raw))
-    failed = calibrate(source, "-b", BOARD, "--check", str(wrong), "--json")
+    failed = calibrate("check", str(wrong), source, "-b", BOARD, "--json")
     assert failed.exit_code == 1
     told = json.loads(failed.stdout)
     assert told["pass"] is False
     assert max(e["mm"] for e in told["error_mm"]) > 5
     other = tmp_path / "other.yaml"
     other.write_text(file.read_text().replace("image_width: 480", "image_width: 481"))
-    assert "calibrat" in refused(calibrate(source, "-b", BOARD, "--check", str(other)), 30)
+    assert "calibrat" in refused(calibrate("check", str(other), source, "-b", BOARD), 30)
     for key in ("image_width", "image_height"):
         del raw[key]
     other.write_text(yaml.safe_dump(raw))
-    unsized = calibrate(source, "-b", BOARD, "--check", str(other))
+    unsized = calibrate("check", str(other), source, "-b", BOARD)
     assert unsized.exit_code == 1
     assert "image size is missing; " in unsized.stderr
 
@@ -206,15 +205,41 @@ def test_many_sources_must_all_be_pictures(rendered: Rendered, tmp_path: Path) -
     assert "and 1 more shows" in said
 
 
-def test_usage() -> None:
-    refused(calibrate(), 2)
-    refused(calibrate("camera:0", "--convert", "x.yaml"), 2)
-    refused(calibrate("images:/nowhere"), 20)
-    sides = ("--measured-width", "249", "--measured-height", "174")
-    assert "look for none" in refused(calibrate("--convert", "x.yaml", *sides), 2)
-    assert "look for none" in refused(calibrate("images:.", "--mask", "x.png", *sides), 2)
-    refused(calibrate("images:.", "-b", "chess:9x6"), 30)
-    refused(calibrate("images:.", "--model", "cubic"), 30)
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ([], 2),
+        (["images:/nowhere"], 20),
+        (["images:.", "-b", "chess:9x6"], 30),
+        (["images:.", "--model", "cubic"], 2),
+        (["images:.", "--name", "a/b"], 2),
+        (["images:.", "--view"], 2),
+        (["images:.", "--size", "640x480"], 2),
+        (["images:.", "--check", "camera.yaml"], 2),
+        (["check", "camera.yaml"], 2),
+        (["check", "no.yaml", "images:."], 20),
+        (["convert", "no.yaml"], 20),
+        (["mask", "images:turned", "-o", "gear.jpg"], 30),
+        (["mask", "images:nothing"], 20),
+        (["mask"], 2),
+    ],
+)
+def test_wrong_usage_writes_nothing(
+    words: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = calibrate(*words)
+    assert result.exit_code == code, result.output
+    assert not result.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_old_form_s_camera_is_still_the_main_one() -> None:
+    named, plain = calibrate("camera", "--help"), calibrate("--help")
+    assert named.exit_code == plain.exit_code == 0
+    for subcommand in ("camera", "mount", "mask", "check", "convert"):
+        assert f"  {subcommand} " in plain.stdout
+    assert "--no-reject" in named.stdout
 
 
 def test_convert(tmp_path: Path) -> None:
@@ -225,10 +250,32 @@ def test_convert(tmp_path: Path) -> None:
         "  intrinsics: [300.5, 301.5, 320.25, 240.75]\n  resolution: [640, 480]\n"
     )
     output = tmp_path / "new" / "camera.yaml"
-    result = calibrate("--convert", str(kalibr), "-o", str(output), "--json")
+    result = calibrate("convert", str(kalibr), "-o", str(output), "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["fx"] == 300.5
     camera = load_calibration(output)
     assert camera.model == "fisheye"
     assert camera.dist.tolist() == [0.01, 0.02, -0.01, 0.002]
-    assert "--force" in refused(calibrate("--convert", str(kalibr), "-o", str(output)), 30)
+    assert "--force" in refused(calibrate("convert", str(kalibr), "-o", str(output)), 30)
+    same = calibrate("convert", str(output), "-o", str(output), "--force")
+    assert "is the file to convert" in refused(same, 2)
+
+
+def test_a_mask(tmp_path: Path) -> None:
+    write_turned_about(tmp_path / "turned")
+    file = tmp_path / "gear.png"
+    result = calibrate("mask", f"images:{tmp_path / 'turned'}", "-o", str(file), "--json")
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert set(np.unique(image)) == {0, 255}
+    assert image.shape == SIZE_PX[::-1]
+    assert told["file"] == str(file)
+    assert told["size_px"] == list(SIZE_PX)
+    assert told["covered"] == pytest.approx(float((image > 0).mean()), abs=1e-3)
+    again = calibrate("mask", f"images:{tmp_path / 'turned'}", "-o", str(file))
+    assert "--force" in refused(again, 30)
+    files = [str(path) for path in (tmp_path / "turned").iterdir()]
+    assert calibrate("mask", *files, "-o", str(file), "--force").exit_code == 0
+    assert (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == image).all()

@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from perchctl.calibration import BoardView, Grey, calibrate_camera, check_calibration
-from perchctl.calibration.detect import find_board
-from perchctl.calibration.pictures import _sharpness
+from perchctl.calibration import BoardView, calibrate_camera, check_calibration
+from perchctl.calibration.board.capture import sharpness
+from perchctl.calibration.board.detect import find_board
+from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.vision import CameraModel, is_combed, project
 from tests.helpers.boards import CHARUCO, BoardRenderer, draw_camera, draw_poses
@@ -57,7 +58,7 @@ def views(camera: CameraModel) -> list[BoardView]:
 
 def test_fields_calibrate_a_camera(views: list[BoardView], camera: CameraModel) -> None:
     result = calibrate_camera(views, "")
-    assert result.solution.rms_px < 0.06
+    assert result.fit.rms_px < 0.06
     assert result.camera.K[0, 0] == pytest.approx(camera.K[0, 0], rel=2e-3)
     assert result.camera.K[1, 1] == pytest.approx(camera.K[1, 1], rel=2e-3)
 
@@ -69,7 +70,7 @@ def test_fields_judge_a_calibration(views: list[BoardView], camera: CameraModel)
     assert not check_calibration(dataclasses.replace(camera, K=K), views).passed
 
 
-def test_a_comb_is_no_sharpness(camera: CameraModel) -> None:
+def test_a_comb_is_nosharpness(camera: CameraModel) -> None:
     """Of a video's frames the sharpest are searched: not those that moved most."""
     rng = np.random.default_rng(8)
     renderer = BoardRenderer(camera, CHARUCO)
@@ -78,4 +79,4 @@ def test_a_comb_is_no_sharpness(camera: CameraModel) -> None:
     combed = still.copy()
     combed[1::2] = np.roll(still, 3, axis=1)[1::2]
     assert is_combed(combed)
-    assert _sharpness(combed) < 1.2 * _sharpness(still)
+    assert sharpness(combed) < 1.2 * sharpness(still)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +13,17 @@ import cv2
 import numpy as np
 import pytest
 
-from perchctl.calibration import BoardView, CaptureMoment, capture_views
-from perchctl.calibration.novelty import Capture, Signature, consider, hint, progress, signature
-from perchctl.commands.calibrate_live import captured_views, coverage_bars, page_state
+from perchctl.calibration import BoardView, Moment, capture_views
+from perchctl.calibration.board.capture import (
+    Capture,
+    Signature,
+    consider,
+    hint,
+    progress,
+    signature,
+)
+from perchctl.commands.calibrate import captured_views
+from perchctl.commands.guide import guide, page_state
 from perchctl.display import LivePage, Sketch
 from perchctl.errors import TimedOut
 from perchctl.vision import Frame
@@ -94,14 +103,18 @@ def test_guided_capture_takes_still_new_sharp_views_and_ends() -> None:
     for pose in draw_poses(rng, camera, CHESSBOARD, 7):
         image = renderer.render(pose, rng, noise=1.0)
         images += [image, image, image]  # comes in, is still, stays
-    moments: list[CaptureMoment] = []
+    moments: list[Moment] = []
     views = capture_views(_Frames(images), CHESSBOARD, moments.append, _clock(), lambda s: None)
     assert 5 <= len(views) <= 7
-    assert sum(m.shot for m in moments) == len(views)
-    shots = [m.index for m in moments if m.shot]
+    assert sum(m.taken for m in moments) == len(views)
+    shots = [m.index for m in moments if m.taken]
     assert all(i % 3 == 1 for i in shots)  # at once when still, and once each
     assert moments[0].advice == "hold still"
-    assert 0 < moments[-1].covered["x"] <= 1
+    name, text, share = moments[-1].rows[0]
+    assert (name, text) == ("x", f"{100 * share:.0f} %")
+    assert 0 < share <= 1
+    assert moments[-1].rows[-1] == ("views", str(len(views)), None)
+    assert len({m.line for m in moments}) == len(views) + 1  # a pipe gets one line a view
     with pytest.raises(TimedOut, match="only 1 views"):
         capture_views(_Frames(images[:3]), CHESSBOARD, moments.append, _clock(), lambda s: None)
 
@@ -215,23 +228,19 @@ def test_guided_capture_refuses_blur_and_repetition_and_stops_when_covered() -> 
     assert "blurred" in consider(before, blurred, CHARUCO).advice
 
 
+ROWS = (("x", "50 %", 0.5), ("views", "3", None))
+
+
 def test_the_page_s_bars_are_shares_and_no_characters() -> None:
-    image = np.zeros((4, 4), np.uint8)
-    covered = {"x": 0.5, "y": 0.0, "size": 1.0, "tilt": 0.25}
-    moment = CaptureMoment(0, image, np.empty((0, 2)), covered, 3, "hold still", False)
+    moment = Moment(0, np.zeros((4, 4), np.uint8), (), ROWS, "hold still", "3 views")
     state = page_state(moment)
-    assert state["phase"] == "hold still"
-    *bars, views = state["rows"]
-    assert [(name, share) for name, _, share in bars] == list(covered.items())
-    assert [text for _, text, _ in bars] == ["50 %", "0 %", "100 %", "25 %"]
-    assert views == ["views", "3"]
+    assert state == {"rows": [["x", "50 %", 0.5], ["views", "3"]], "phase": "hold still"}
 
 
-def test_bars_in_a_pipe_are_one_line_a_view(capsys: pytest.CaptureFixture[str]) -> None:
-    with coverage_bars() as show:
-        for taken in (0, 0, 1):
-            show({"x": 0.5, "tilt": 0.0}, taken, "hold still")
-    assert capsys.readouterr().err.splitlines() == [
-        "perchctl: 0 views; x 50 %, tilt 0 %",
-        "perchctl: 1 views; x 50 %, tilt 0 %",
-    ]
+def test_a_pipe_gets_a_line_whenever_it_changes() -> None:
+    out = io.StringIO()
+    moment = Moment(0, np.zeros((4, 4), np.uint8), (), ROWS, "hold still", "")
+    with guide(None, out) as show:
+        for line in ("a", "a", "b"):
+            show(dataclasses.replace(moment, line=line))
+    assert out.getvalue().splitlines() == ["perchctl: a", "perchctl: b"]

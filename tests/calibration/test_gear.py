@@ -1,23 +1,14 @@
-"""`perchctl calibrate --mask`: the vehicle's own gear, learned from pictures that move."""
+"""`learn_gear`: the vehicle's own gear, learned from pictures that move."""
 
 from __future__ import annotations
-
-import json
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
 
 from perchctl.calibration import learn_gear
-from perchctl.commands import app
 from perchctl.errors import InvalidValue
-from tests.helpers.gear import SIZE_PX, legs, turned_about, write_turned_about
-
-
-def calibrate(*words: str) -> Result:
-    return CliRunner().invoke(app, ["calibrate", *words])
+from tests.helpers.gear import SIZE_PX, legs, turned_about
 
 
 def test_what_stays_the_same_is_the_gear() -> None:
@@ -50,46 +41,3 @@ def test_pictures_that_do_not_show_it_are_refused(
 ) -> None:
     with pytest.raises(InvalidValue, match=told):
         learn_gear(pictures)
-
-
-def test_the_command_writes_a_mask(tmp_path: Path) -> None:
-    write_turned_about(tmp_path / "turned")
-    file = tmp_path / "gear.png"
-    result = calibrate(f"images:{tmp_path / 'turned'}", "--mask", str(file), "--json")
-    assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    assert image is not None
-    assert set(np.unique(image)) == {0, 255}
-    assert image.shape == SIZE_PX[::-1]
-    assert told["file"] == str(file)
-    assert told["size_px"] == list(SIZE_PX)
-    assert told["covered"] == pytest.approx(float((image > 0).mean()), abs=1e-3)
-    again = calibrate(f"images:{tmp_path / 'turned'}", "--mask", str(file))
-    assert again.exit_code == InvalidValue.exit_code
-    assert "--force" in again.stderr
-    files = [str(path) for path in (tmp_path / "turned").iterdir()]
-    assert calibrate(*files, "--mask", str(file), "--force").exit_code == 0
-    assert (cv2.imread(str(file), cv2.IMREAD_UNCHANGED) == image).all()
-
-
-@pytest.mark.parametrize(
-    ("words", "code"),
-    [
-        (["images:turned", "--mask", "gear.jpg"], 30),
-        (["images:turned", "--mask", "gear.png", "--check", "camera.yaml"], 2),
-        (["images:turned", "--mask", "gear.png", "-o", "x.yaml"], 2),
-        (["--mask", "gear.png", "--convert", "x.yaml"], 2),
-        (["--mask", "gear.png"], 2),
-        (["images:nothing", "--mask", "gear.png"], 20),
-    ],
-)
-def test_wrong_ways_to_ask_for_a_mask_are_one_sentence(
-    words: list[str], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_turned_about(tmp_path / "turned")
-    result = calibrate(*words)
-    assert result.exit_code == code, result.output
-    assert len(result.stderr.splitlines()) == 1
-    assert not (tmp_path / "gear.png").exists()

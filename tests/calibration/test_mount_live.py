@@ -1,9 +1,8 @@
-"""`perchctl calibrate --mount` on a live camera and vehicle: read, guided, kept, never armed."""
+"""`perchctl calibrate mount` on a live camera and vehicle: read, guided, kept, never armed."""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import signal
 import socket
@@ -18,8 +17,8 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
+
 from perchctl.calibration import (
-    LEAST_S,
     AttitudeSample,
     Eye,
     Moment,
@@ -29,10 +28,9 @@ from perchctl.calibration import (
     load_calibration,
     read_recordings,
 )
-from perchctl.calibration.mounting.capture import MOST_S
+from perchctl.calibration.mounting.capture import LEAST_S, MOST_S
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.commands import app, calibrate_mount_live
-from perchctl.commands.calibrate_mount_live import guide, page_state
+from perchctl.commands import app, calibrate_mount
 from perchctl.errors import InvalidValue, TimedOut
 from perchctl.geometry import R_MARKER_TARGET
 from perchctl.link import MotionLink
@@ -58,15 +56,15 @@ def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimProcess]:
         yield process
 
 
-def press_after(poses: int) -> Callable[[], contextlib.AbstractContextManager[object]]:
+def press_after(poses: int) -> Callable[[object], contextlib.AbstractContextManager[object]]:
     """In the guide's place: Ctrl-C once so many poses are there."""
 
     @contextlib.contextmanager
-    def pressing() -> Iterator[Callable[[Moment], None]]:
+    def pressing(_page: object) -> Iterator[Callable[[Moment], None]]:
         pressed: list[bool] = []
 
         def tell(moment: Moment) -> None:
-            if moment.poses >= poses and not pressed:
+            if int(dict(row[:2] for row in moment.rows)["pictures"]) >= poses and not pressed:
                 pressed.append(True)
                 os.kill(os.getpid(), signal.SIGINT)
 
@@ -79,11 +77,11 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     sim: SimProcess, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(calibrate_mount_live, "guide", press_after(10))
+    monkeypatch.setattr(calibrate_mount, "guide", press_after(10))
     Path("mine.yaml").write_text("extends: crazyflie\n", encoding="utf-8")
     with relayed(sim.uri) as relay:
         words = ["-p", "mine.yaml", "-u", relay.uri, "--source", sim.stream_url, "--part", "carry"]
-        said = CliRunner().invoke(app, ["calibrate", "--mount", *words])
+        said = CliRunner().invoke(app, ["calibrate", "mount", *words])
         assert relay.up
         assert relay.commands() == []
         assert relay.writes() == []
@@ -91,7 +89,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     assert said.exit_code == 130, said.stderr
     log = Path("calib/mounting_mine.jsonl")
     assert f"kept the recording: {log}" in said.stderr
-    assert f"perchctl calibrate --mount -p mine.yaml --from {log}" in said.stderr
+    assert f"perchctl calibrate mount -p mine.yaml --from {log}" in said.stderr
     (recording,) = read_recordings(log)
     assert len(recording.poses) >= 10
     newest = recording.attitudes[-1]
@@ -102,7 +100,7 @@ def test_it_reads_and_commands_nothing_and_ctrl_c_keeps_the_recording(
     ages_s = np.diff([a.t_s for a in recording.attitudes])
     assert np.median(ages_s) == pytest.approx(0.01, abs=1e-4)
     assert abs(recording.poses[-1].t_s - newest.t_s) < 0.5  # one clock
-    again = CliRunner().invoke(app, ["calibrate", "--mount", "-p", "mine.yaml", "--from", str(log)])
+    again = CliRunner().invoke(app, ["calibrate", "mount", "-p", "mine.yaml", "--from", str(log)])
     assert again.exit_code == 30
     assert "lacks motion" in again.stderr
 
@@ -119,7 +117,7 @@ def test_a_vehicle_that_does_not_answer(
             "extends: crazyflie\nlink: {connect_timeout_s: 0.5}\n", encoding="utf-8"
         )
         words = ["-p", "mine.yaml", "-u", uri, "--source", sim.stream_url]
-        said = CliRunner().invoke(app, ["calibrate", "--mount", *words])
+        said = CliRunner().invoke(app, ["calibrate", "mount", *words])
     assert said.exit_code == 10
     assert f"no Crazyflie at {uri}: no answer" in said.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
@@ -132,7 +130,7 @@ def test_turning_motors_end_it(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(MotionLink, "motors_run", True)
     words = ["-p", "crazyflie", "-u", sim.uri, "--source", sim.stream_url]
-    said = CliRunner().invoke(app, ["calibrate", "--mount", *words])
+    said = CliRunner().invoke(app, ["calibrate", "mount", *words])
     assert said.exit_code == 52
     assert "motors" in said.stderr
     assert not list(tmp_path.iterdir())
@@ -200,43 +198,44 @@ def feed(attitudes: tuple[AttitudeSample, ...], film: _Film) -> Callable[[], lis
     return arrived
 
 
+def recorded(
+    tape: MountingTape,
+    film: _Film,
+    looks: _Looks,
+    sensors: VehicleSensors | None = None,
+    until_s: float = np.inf,
+) -> list[Moment]:
+    """Fill the tape from the film, by its own clock; the moments that were shown."""
+    moments: list[Moment] = []
+    sensors = sensors or VehicleSensors()
+    capture(
+        tape, film, looks, sensors, moments.append, film.clock, film.sleep,
+        lambda: film.now_s > until_s,
+    )  # fmt: skip
+    return moments
+
+
 def test_it_ends_when_no_turn_is_missing_and_says_which_is_until_then() -> None:
     whole = seen(hand("carry", seconds=LEAST_S["carry"] + 3.0))
-    film, tape, moments = _Film(), MountingTape("carry"), []
-    capture(
-        tape, film, _Looks(whole.poses), VehicleSensors(feed(whole.attitudes, film)),
-        moments.append, film.clock, film.sleep,
-    )  # fmt: skip
+    film, tape = _Film(), MountingTape("carry")
+    sensors = VehicleSensors(feed(whole.attitudes, film))
+    moments = recorded(tape, film, _Looks(whole.poses), sensors)
     assert film.now_s == pytest.approx(LEAST_S["carry"], abs=0.5)
-    assert moments[0].missing
-    assert moments[-1].missing == ()
     assert moments[-1].advice.startswith("enough")
-    turns = {word for moment in moments for m in moment.missing for word in m.split(":")[:1]}
-    assert {"yaw", "longer"} & turns
+    assert moments[-1].line == f"carry: {moments[-1].advice}"
+    assert ("missing", "nothing", None) in moments[-1].rows
+    texts = [text for moment in moments for _, text, _ in moment.rows]
+    assert any(text.startswith(("yaw:", "longer:")) for text in texts)
     assert tape.recording().poses[:100] == whole.poses[:100]
 
 
-def test_the_advice_names_what_is_in_the_way_first() -> None:
-    film, moments = _Film(), []
-    ended = lambda: film.now_s > 2.0  # noqa: E731
-    capture(
-        MountingTape("pivot"),
-        film,
-        _Looks(()),
-        VehicleSensors(),
-        moments.append,
-        film.clock,
-        film.sleep,
-        ended,
-    )
-    assert moments[-1].advice == "no target in view"
-    film = _Film()
-    capture(
-        MountingTape("pivot"), film, _Looks((), mirrored=True), VehicleSensors(), moments.append,
-        film.clock, film.sleep, ended,
-    )  # fmt: skip
-    assert "mirrored" in moments[-1].advice
-    assert "camera.mirrored" in moments[-1].advice
+@pytest.mark.parametrize(
+    ("mirrored", "words"), [(False, "no target in view"), (True, "camera.mirrored")]
+)
+def test_the_advice_names_what_is_in_the_way_first(mirrored: bool, words: str) -> None:
+    looks = _Looks((), mirrored)
+    moments = recorded(MountingTape("pivot"), _Film(), looks, until_s=2.0)
+    assert words in moments[-1].advice
 
 
 class _Receiver(_Film):
@@ -258,26 +257,19 @@ class _SeesEachNew(_Looks):
 
 
 def test_a_receivers_repetitions_are_no_pictures_without_the_target() -> None:
-    looks, moments = _SeesEachNew(seen(hand("pivot")).poses), []
-    film, tape = _Receiver(), MountingTape("pivot")
-    ended = lambda: film.now_s > 4.0  # noqa: E731
-    capture(tape, film, looks, VehicleSensors(), moments.append, film.clock, film.sleep, ended)
-    assert {moment.share for moment in moments} == {1.0}
+    looks, tape = _SeesEachNew(seen(hand("pivot")).poses), MountingTape("pivot")
+    moments = recorded(tape, _Receiver(), looks, until_s=4.0)
+    assert {share for m in moments for name, _, share in m.rows if name == "target"} == {1.0}
     assert len(moments) == len(tape.poses) == pytest.approx(20, abs=2)
     film = _Receiver(stuck_s=1.0)
-    capture(
-        MountingTape("pivot"), film, looks, VehicleSensors(), lambda _: None, film.clock, film.sleep
-    )
+    recorded(MountingTape("pivot"), film, looks)
     assert film.now_s == pytest.approx(MOST_S, abs=1.0), "and it ends though none is new"
 
 
 def test_a_mirrored_picture_ends_it_soon() -> None:
-    film, tape = _Film(), MountingTape("carry")
+    film = _Film()
     with pytest.raises(InvalidValue, match=r"mirrored.*camera\.mirrored"):
-        capture(
-            tape, film, _Looks((), mirrored=True), VehicleSensors(), lambda _: None, film.clock,
-            film.sleep,
-        )  # fmt: skip
+        recorded(MountingTape("carry"), film, _Looks((), mirrored=True))
     assert film.now_s < 5.0
 
 
@@ -301,49 +293,18 @@ def test_pictures_become_poses_or_are_counted_as_mirrored() -> None:
 
 def test_nobody_records_for_ever() -> None:
     film = _Film()
-    capture(
-        MountingTape("pivot"),
-        film,
-        _Looks(()),
-        VehicleSensors(),
-        lambda _: None,
-        film.clock,
-        film.sleep,
-    )
+    recorded(MountingTape("pivot"), film, _Looks(()))
     assert film.now_s == pytest.approx(MOST_S, abs=1.0)
 
 
 def test_a_camera_or_a_vehicle_that_goes_ends_it_and_the_tape_keeps_what_was() -> None:
     whole = seen(hand("pivot"))
-    film, tape = _Film(ends_s=3.0), MountingTape("pivot")
+    tape = MountingTape("pivot")
     with pytest.raises(TimedOut, match="camera:0 is unplugged"):
-        capture(
-            tape,
-            film,
-            _Looks(whole.poses),
-            VehicleSensors(),
-            lambda _: None,
-            film.clock,
-            film.sleep,
-        )
+        recorded(tape, _Film(ends_s=3.0), _Looks(whole.poses))
     assert len(tape.poses) > 20
-    film, tape = _Film(flooding=True), MountingTape("pivot")
+    tape = MountingTape("pivot")
     silent = VehicleSensors(problem=lambda now_s: "nothing heard for 2 s" if now_s > 1.0 else None)
     with pytest.raises(TimedOut, match="the vehicle is gone: nothing heard for 2 s"):
-        capture(tape, film, _Looks(whole.poses), silent, lambda _: None, film.clock, film.sleep)
+        recorded(tape, _Film(flooding=True), _Looks(whole.poses), silent)
     assert tape
-
-
-def test_a_pipe_gets_one_line_an_advice_and_the_page_its_bars() -> None:
-    moment = Moment(
-        0, np.zeros((4, 4), np.uint8), (), "carry", 3.0, 20, 0.5, ("yaw: turn it",), "a"
-    )
-    out = io.StringIO()
-    with guide(out) as tell:
-        for advice in ("a", "a", "b"):
-            tell(replace(moment, advice=advice))
-    assert out.getvalue().splitlines() == ["perchctl: carry, 3 s: a", "perchctl: carry, 3 s: b"]
-    state = page_state(moment)
-    assert state["phase"] == "a"
-    assert ["target", "50 %", 0.5] in state["rows"]
-    assert ["missing", "yaw: turn it"] in state["rows"]

@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
     AttitudeSample,
     MountingRecording,
-    rotation_matrices,
-    rotation_vectors,
     solve_carry,
     solve_pivot,
 )
+from perchctl.calibration.mounting.carry import Carried
+from perchctl.calibration.mounting.motion import missing
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.result import Carried, measured, student_factor
-from perchctl.calibration.mounting.solve import missing
-from perchctl.calibration.mounting.turns import turns_from_rpy
+from perchctl.calibration.mounting.robust import student_factor
 from perchctl.errors import InvalidValue
 from perchctl.geometry import Array, make_T, rotation_from_rpy
 from perchctl.sim.hand import Hand
@@ -31,36 +30,14 @@ ANGLE = st.floats(-np.pi, np.pi)
 
 
 def turn_error_deg(found: Carried, held: Hand) -> float:
-    off = rotation_vectors((found.R_body_cam @ held.T_body_cam[:3, :3].T)[None])
-    return float(np.degrees(np.linalg.norm(off)))
+    off = Rotation.from_matrix(found.R_body_cam @ held.T_body_cam[:3, :3].T)
+    return float(np.degrees(off.magnitude()))
 
 
 def mounted(held: Hand, R_body_cam: Array) -> Hand:
     T = make_T(R_body_cam, held.T_body_cam[:3, 3])
     scenario = replace(held.scenario, T_body_cam_true=tuple(map(tuple, T.tolist())))
     return replace(held, scenario=scenario)
-
-
-# --- rotations ---------------------------------------------------------------------------
-
-
-@given(st.lists(st.tuples(ANGLE, ANGLE, ANGLE), min_size=1, max_size=5))
-def test_turns_and_their_vectors(rpy: list[tuple[float, float, float]]) -> None:
-    R = turns_from_rpy(np.array(rpy))
-    for one, angles in zip(R, rpy, strict=True):
-        np.testing.assert_allclose(one, rotation_from_rpy(*angles), atol=1e-12)
-    np.testing.assert_allclose(rotation_matrices(rotation_vectors(R)), R, atol=2e-5)
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-4, 1.0, 3.05, 3.1415, np.pi])
-def test_the_vector_of_any_turn(size: float) -> None:
-    v = size * np.array([[0.6, 0.0, -0.8]])
-    assert (
-        np.abs(
-            rotation_matrices(rotation_vectors(rotation_matrices(v))) - rotation_matrices(v)
-        ).max()
-        < 1e-7
-    )
 
 
 def test_students_factor_is_the_tables() -> None:
@@ -184,14 +161,6 @@ def test_a_print_that_may_be_of_another_size_widens_the_interval() -> None:
     np.testing.assert_allclose(grown, np.square(0.02 * np.array(sure.gear_cam_m)), rtol=1e-6)
 
 
-def test_both_parts_in_a_profiles_terms() -> None:
-    pivoted = solve_pivot(seen(hand("pivot", 2, 14.0)))
-    only = measured(None, pivoted)
-    assert only.rpy_deg is None
-    assert only.latency_sigma_s is None
-    assert only.gear_cam_m == pivoted.gear_cam_m
-
-
 # --- what will not do --------------------------------------------------------------------
 
 
@@ -262,7 +231,8 @@ def test_a_mirrored_picture_is_recognised() -> None:
 def test_a_target_that_was_carried_about_is_refused() -> None:
     recording = seen(hand("carry", 3), errors=False)
     rng = np.random.default_rng(4)
-    way = rotation_matrices(np.cumsum(rng.normal(size=(len(recording.poses), 3)) * 0.1, axis=0))
+    steps = 0.1 * rng.normal(size=(len(recording.poses), 3))
+    way = Rotation.from_rotvec(steps.cumsum(axis=0)).as_matrix()
     moved = tuple(
         SeenPose(p.t_s, p.rotation_cam_target @ R, p.position_cam_target_m)
         for p, R in zip(recording.poses, way, strict=True)

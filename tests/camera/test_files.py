@@ -28,7 +28,7 @@ from perchctl.camera import (
     without_password,
 )
 from perchctl.camera.source import to_grey
-from perchctl.commands.calibrate_source import Source, sized
+from perchctl.commands.calibrate import Source, sized
 from perchctl.errors import InvalidValue, NotFound, UsageError
 from perchctl.log.write import make_header
 from perchctl.profile import Profile

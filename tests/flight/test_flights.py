@@ -303,7 +303,7 @@ def test_a_turned_mounting_is_named_within_three_decimetres(deg: int) -> None:
     assert any("turned by" in advice and "about z" in advice for advice in found.advice)
     off_deg = (found.turn_deg[2] - deg + 180.0) % 360.0 - 180.0
     assert abs(off_deg) < 3.0 * found.turn_sigma_deg[2]
-    assert "`perchctl calibrate --mount`" in flown.report.reason
+    assert "`perchctl calibrate mount`" in flown.report.reason
     assert flown.farthest_m < 0.25
 
 

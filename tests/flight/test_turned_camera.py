@@ -35,7 +35,7 @@ def wrong(profile: Profile, deg: float = -90.0) -> Profile:
 
 def measured(scenario: Scenario, seed: int, path: Path) -> Profile:
     """The wrong profile, once that very vehicle was carried and pivoted by a hand and the numbers
-    were written into it, by all that `calibrate --mount --write` does behind the pictures."""
+    were written into it, by all that `calibrate mount --write` does behind the pictures."""
     path.write_text("extends: sim\ncamera:\n  mount: {rpy_deg: [0, 0, -90]}  # a guess\n")
     parts = []
     for part in ("carry", "pivot"):

@@ -6,13 +6,13 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from perchctl.calibration import (
     MountingPart,
     MountingRecording,
     pose_basis,
     profile_camera,
-    rotation_matrices,
 )
 from perchctl.calibration.mounting.recording import SeenPose
 from perchctl.profile import Profile, load_profile
@@ -69,9 +69,9 @@ def seen(
         jitter = np.clip(rng.normal(size=len(p)), -2.5, 2.5) * scene.camera_jitter_s
         stamped_s = np.maximum.accumulate(stamped_s + jitter)
         noise = rng.normal(size=sigma.shape) * sigma
-        R, p = rotation_matrices(noise[:, :3]) @ R, p + noise[:, 3:]
+        R, p = Rotation.from_rotvec(noise[:, :3]).as_matrix() @ R, p + noise[:, 3:]
     for k in np.flatnonzero(rng.random(len(p)) < wrong):
-        R[k] = rotation_matrices(rng.normal(size=3) * 0.5) @ R[k]
+        R[k] = Rotation.from_rotvec(rng.normal(size=3) * 0.5).as_matrix() @ R[k]
         p[k] = p[k] + rng.normal(size=3) * 0.02
     poses = tuple(
         SeenPose(float(t), R[k], p[k], np.diag(claimed * sigma[k] ** 2))

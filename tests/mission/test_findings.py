@@ -54,7 +54,7 @@ def test_a_turn_is_named_by_its_axis() -> None:
     assert "-3.0 +- 0.8 deg about y" in advice
     assert "6.0 +- 0.8 deg about z" in advice
     assert "about x" not in advice
-    assert "`perchctl calibrate --mount`" in advice
+    assert "`perchctl calibrate mount`" in advice
     assert flight_findings(_seen(turn_deg=(0.0, 0.0, 4.0), sigma_deg=3.0), CAMERA).advice == ()
 
 

@@ -162,7 +162,7 @@ def test_the_turn_is_named(deg: float, words: str) -> None:
     watch = MountWatch(against=9, turn_rad=math.radians(deg))
     assert words in explained(watch.turn_rad)
     assert "camera.mount" in explained(watch.turn_rad)
-    assert "`perchctl calibrate --mount`" in explained(watch.turn_rad)
+    assert "`perchctl calibrate mount`" in explained(watch.turn_rad)
 
 
 def _mission(deg: float, hold: bool = False) -> tuple[planner.PlannerState, float]:

@@ -7,25 +7,24 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from perchctl.calibration.live import Moment, polled
 from perchctl.calibration.mounting.eye import Eye
+from perchctl.calibration.mounting.motion import MIRRORED, missing
 from perchctl.calibration.mounting.recording import (
     AttitudeSample,
     MountingPart,
     MountingRecording,
     SeenPose,
 )
-from perchctl.calibration.mounting.solve import MIRRORED, missing
-from perchctl.camera import FrameSource, Grey
+from perchctl.camera import FrameSource
 from perchctl.errors import InvalidValue, TimedOut
-from perchctl.geometry import Array
+from perchctl.vision import Frame
 
 LEAST_S: dict[MountingPart, float] = {"carry": 30.0, "pivot": 20.0}
 """For which a part is recorded, also where no turn is missing any more: more pictures, and as
 many times smaller intervals."""
 MOST_S = 180.0
 JUDGED_EVERY_S = 0.5
-POLL_S = 0.005
-GONE_AFTER_S = 3.0
 BEFORE_S = 1.5
 """Attitudes older than this when a part begins belong to no picture of it."""
 MIRRORED_PICTURES = 60
@@ -53,28 +52,6 @@ class MountingTape:
         return bool(self.attitudes or self.poses)
 
 
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """What to show of a frame.
-
-    Attributes:
-        seconds, poses: recorded so far.
-        share: of the last pictures, those with the target.
-        missing: what motion is, in a few words each.
-        advice: the one thing to do now.
-    """
-
-    index: int
-    image: Grey
-    outlines: tuple[tuple[str, Array], ...]
-    part: MountingPart
-    seconds: float
-    poses: int
-    share: float
-    missing: tuple[str, ...]
-    advice: str
-
-
 @dataclass(frozen=True)
 class VehicleSensors:
     """The vehicle's side: new attitudes, oldest first, and what is wrong, if anything is."""
@@ -99,94 +76,76 @@ def capture(
         TimedOut: camera or vehicle are gone; the tape keeps what came before.
         InvalidValue: the picture is mirrored.
     """
-    run = _Run(tape, eye, clock())
-    while not (stopped() or (source.live and run.over)):
-        now_s = clock()
+    oldest_s = clock() - BEFORE_S
+    progress = _Progress(tape.part)
+    for now_s, frame in polled(source, clock, sleep):
         if (problem := sensors.problem(now_s)) is not None:
             raise TimedOut(f"the vehicle is gone: {problem}")
-        tape.attitudes += sensors.attitudes()
-        run.drop_old()
-        frame = source.poll(now_s)
-        if frame is not None:
-            poses = eye.look(frame)
-            if frame.repeated and not eye.trouble:  # no picture without a target: no picture
-                run.alive(now_s)
-                continue
-            tape.poses += poses
-            tape.mirrored = eye.mirrored
-            if tape.mirrored >= MIRRORED_PICTURES and not tape.poses:
-                raise InvalidValue(MIRRORED)
-            run.judge(frame.t_s if not source.live else now_s, bool(poses))
-            show(run.moment(frame.index, frame.image))
-            continue
-        if source.finished:
+        tape.attitudes += [a for a in sensors.attitudes() if a.t_s >= oldest_s]
+        if stopped() or (source.live and progress.over):
             return
-        gone = source.problem(now_s)
-        if gone is not None and now_s - run.last_s > GONE_AFTER_S:
-            raise TimedOut(gone)
-        sleep(POLL_S)
+        if frame is None:
+            continue
+        poses = eye.look(frame)
+        progress.go_on(frame.t_s if not source.live else now_s)
+        if frame.repeated and not eye.trouble:  # no picture without a target: no picture
+            continue
+        tape.poses += poses
+        tape.mirrored = eye.mirrored
+        if tape.mirrored >= MIRRORED_PICTURES and not tape.poses:
+            raise InvalidValue(MIRRORED)
+        progress.judge(tape, bool(poses))
+        show(progress.moment(frame, tape, eye))
 
 
-class _Run:
+class _Progress:
     """How far a part is."""
 
-    def __init__(self, tape: MountingTape, eye: Eye, now_s: float) -> None:
-        self._tape, self._eye = tape, eye
+    def __init__(self, part: MountingPart) -> None:
+        self._least_s = LEAST_S[part]
         self._start_s: float | None = None
         self._judged_s = -JUDGED_EVERY_S
         self._with_target: deque[bool] = deque(maxlen=SHARE_OVER)
         self._missing: tuple[str, ...] = ("",)
-        self._oldest_s = now_s - BEFORE_S
-        self.last_s = now_s
         self._seconds = 0.0
 
     @property
     def over(self) -> bool:
-        enough = not self._missing and self._seconds >= LEAST_S[self._tape.part]
+        """No motion is missing, or too much time has gone."""
+        enough = not self._missing and self._seconds >= self._least_s
         return enough or self._seconds >= MOST_S
 
-    @property
-    def share(self) -> float:
-        return sum(self._with_target) / max(len(self._with_target), 1)
+    def go_on(self, now_s: float) -> None:
+        """Time goes on from the first frame."""
+        self._start_s = now_s if self._start_s is None else self._start_s
+        self._seconds = now_s - self._start_s
 
-    def drop_old(self) -> None:
-        attitudes = self._tape.attitudes
-        while attitudes and attitudes[0].t_s < self._oldest_s:
-            attitudes.pop(0)
-
-    def alive(self, now_s: float) -> None:
-        """The camera is; time goes on."""
-        if self._start_s is None:
-            self._start_s = now_s
-        self.last_s, self._seconds = now_s, now_s - self._start_s
-
-    def judge(self, now_s: float, seen: bool) -> None:
-        self.alive(now_s)
+    def judge(self, tape: MountingTape, seen: bool) -> None:
+        """Which motion is missing, now and then; `seen`: the newest picture shows the target."""
         self._with_target.append(seen)
         if self._seconds - self._judged_s >= JUDGED_EVERY_S:
             self._judged_s = self._seconds
-            self._missing = missing(self._tape.recording())
+            self._missing = missing(tape.recording())
 
-    def moment(self, index: int, image: Grey) -> Moment:
-        return Moment(
-            index,
-            image,
-            self._eye.outlines,
-            self._tape.part,
-            self._seconds,
-            len(self._tape.poses),
-            self.share,
-            self._missing,
-            self._advice(),
-        )
-
-    def _advice(self) -> str:
-        if self._eye.trouble:
-            return self._eye.trouble
-        if self._tape.mirrored > len(self._tape.poses):
-            return MIRRORED
-        if self.share < LEAST_SHARE:
-            return "no target in view"
-        if self._missing:
-            return self._missing[0]
-        return "enough; a little longer makes it surer"
+    def moment(self, frame: Frame, tape: MountingTape, eye: Eye) -> Moment:
+        """What to show of the newest frame."""
+        share = sum(self._with_target) / max(len(self._with_target), 1)
+        if eye.trouble:
+            advice = eye.trouble
+        elif tape.mirrored > len(tape.poses):
+            advice = MIRRORED
+        elif share < LEAST_SHARE:
+            advice = "no target in view"
+        else:
+            advice = (*self._missing, "enough; a little longer makes it surer")[0]
+        lacking = self._missing or ("nothing",)
+        rows = (
+            (tape.part, f"{self._seconds:.0f} s of {self._least_s:.0f}",
+             min(self._seconds / self._least_s, 1.0)),
+            ("target", f"{100 * share:.0f} %", share),
+            ("pictures", str(len(tape.poses)), None),
+            ("missing", lacking[0], None),
+            *(("", motion, None) for motion in lacking[1:]),
+        )  # fmt: skip
+        line = f"{tape.part}: {advice}"
+        return Moment(frame.index, frame.image, eye.outlines, rows, advice, line)

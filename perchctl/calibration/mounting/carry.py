@@ -1,35 +1,51 @@
-"""The carry: camera's turn and latency from the vehicle's turning and the target's in its pictures.
+"""The carry: the camera's turn and latency, from the rotations of vehicle and target.
 
 One rotation chain holds at each picture's exposure:
 ``R_cam_target = R_body_cam^T R_world_body(t - latency)^T R_world_target``. What is solved for
 together: the camera's turn, the latency, the target's turn in the world, the gyroscope's constant
-error and scale, a random walk of the summed-up turn, and the constant error of the vehicle's
-attitude. The attitude only says where the world's axes are: the camera's turn rests on large turns,
-felt and seen, so that an accelerometer that is off does not move it.
+error and scale, a random walk of the integrated rotation, and the constant error of the vehicle's
+attitude. The attitude only says where the world's axes are: the camera's turn rests on large
+rotations, measured by gyroscope and camera, so that an accelerometer that is off does not move it.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from perchctl.calibration.mounting.felt import Felt, Turned, sum_up, turned_at
-from perchctl.calibration.mounting.result import Left, covariance
-from perchctl.calibration.mounting.spread import (
+from perchctl.calibration.mounting.motion import AGAIN, check_recording
+from perchctl.calibration.mounting.recording import (
+    AttitudeSample,
+    MountingRecording,
+    PoseArrays,
+    pose_arrays,
+)
+from perchctl.calibration.mounting.robust import (
+    covariance,
     inverses,
     likeliest,
-    robust_shares,
+    normal_equations,
+    robust_least_squares,
     squared_distance,
-    weights,
+    student_weights,
 )
-from perchctl.calibration.mounting.turns import rotation_matrices, rotation_vectors
-from perchctl.geometry import Array
+from perchctl.errors import InvalidValue
+from perchctl.geometry import Array, rpy_from_rotation
+
+MOST_TURN_SIGMA_DEG = 0.5
+MOST_LATENCY_SIGMA_S = 0.01
+MOST_MISFIT_RAD = math.radians(3.0)
+MOST_LEFT_OUT = 0.4
+COUNTS_LITTLE = 0.2
 
 KNOT_S = 2.0
-BLOCKS = 15
-WALK_RAD = math.radians(0.03)  # of the summed-up turn in the first second; grows as its root
+WALK_RAD = math.radians(0.03)  # of the integrated rotation in the first second; grows as its root
 BIAS_SIGMA_RADPS = math.radians(3.0)  # of a BMI088 that nobody has calibrated
 SCALE_SIGMA = 0.005
 ATTITUDE_BIAS_SIGMA_RAD = np.radians([1.0, 1.0, 0.1])
@@ -38,7 +54,6 @@ ATTITUDE_SIGMA_RAD = np.radians([0.4, 0.4, 1.0])  # of the mean over `ATTITUDE_S
 ATTITUDE_S = 1.0
 _ESTIMATES_APART = 10  # samples; between them it is the same error
 FLOOR_RAD = math.radians(0.02)  # of a pose: lens, print and paper
-BARE_SIGMA_RAD = math.radians(0.3)  # of a pose that does not say
 _ROUNDS, _MOST_STEPS = 4, 10
 _LEAST_HELD = 1e-9  # of a turn that the motion leaves open: its sigma says so in the end
 
@@ -48,12 +63,252 @@ KNOTS = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """The poses as arrays: t_s (n,), R_cam_target (n, 3, 3), cov_rad2 (n, 3, 3)."""
+class Carried:
+    """The carry's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
+
+    Attributes:
+        R_body_cam: (3, 3); turn_cov_rad2 (3, 3) of a small turn of it in body axes.
+        latency_s: from exposure to the picture's timestamp; positive is a late picture.
+        jitter_s: spread of a single picture's latency.
+        attitude_bias_rad: of the vehicle's own estimate, (3,) in body axes; only roll and pitch
+            are known.
+        cam_body_m: place of the camera in body axes (3,), where a position was trusted.
+        t_s, residual_rad, counted: of each pose: its time, the misfit (n, 3) in camera
+            axes, and how much it counted, 0 to 1.
+        body_rpy_rad: the vehicle's attitude at each pose, (n, 3), heading unwrapped.
+    """
+
+    R_body_cam: Array
+    turn_cov_rad2: Array
+    latency_s: float
+    latency_sigma_s: float
+    jitter_s: float
+    attitude_bias_rad: Array
+    cam_body_m: Array | None
+    cam_body_sigma_m: Array | None
+    t_s: Array
+    residual_rad: Array
+    counted: Array
+    body_rpy_rad: Array
+
+    @property
+    def rpy_deg(self) -> tuple[float, float, float]:
+        """The camera's turn as `camera.mount.rpy_deg` has it."""
+        x, y, z = np.degrees(rpy_from_rotation(self.R_body_cam)).tolist()
+        return x, y, z
+
+    @property
+    def rpy_sigma_deg(self) -> tuple[float, float, float]:
+        """Of the angles, from the covariance of a small turn on the left of R_body_cam."""
+        step = 1e-6
+        small = Rotation.from_rotvec(step * np.eye(3)).as_matrix()
+        here = np.array(rpy_from_rotation(self.R_body_cam))
+        J = np.stack([np.array(rpy_from_rotation(R @ self.R_body_cam)) - here for R in small], 1)
+        J = ((J + np.pi) % (2.0 * np.pi) - np.pi) / step
+        x, y, z = np.degrees(np.sqrt(np.diagonal(J @ self.turn_cov_rad2 @ J.T))).tolist()
+        return x, y, z
+
+
+def solve_carry(recording: MountingRecording) -> Carried:
+    """The camera's turn in the body and its latency.
+
+    Raises InvalidValue: too little motion, a mirrored picture, or vehicle and camera do not
+    agree; with what to do.
+    """
+    check_recording(recording, "carry")
+    imu, poses = imu_arrays(recording.attitudes), pose_arrays(recording)
+    start = first_guess(integrate(imu, np.zeros(3), np.zeros(3)), poses)
+    if start is None:
+        raise InvalidValue(f"the target was not seen twice within half a second: {AGAIN['carry']}")
+    solved = _solve(imu, poses, *start)
+    _check(solved)
+    place_m, place_sigma_m = _camera_place(imu, poses, solved)
+    rpy = np.stack([rpy_from_rotation(R) for R in solved.body.R_world_body])
+    return Carried(
+        R_body_cam=solved.state.R_body_cam,
+        turn_cov_rad2=solved.cov[TURN, TURN],
+        latency_s=solved.state.latency_s,
+        latency_sigma_s=float(np.sqrt(solved.cov[LATENCY, LATENCY])),
+        jitter_s=solved.jitter_s,
+        attitude_bias_rad=solved.state.off_rad,
+        cam_body_m=place_m,
+        cam_body_sigma_m=place_sigma_m,
+        t_s=poses.t_s,
+        residual_rad=solved.misfit,
+        counted=solved.counted,
+        body_rpy_rad=np.unwrap(rpy, axis=0),
+    )
+
+
+# --- The vehicle's rotation, from its gyroscope ------------------------------------------------
+# Rates integrated over the whole recording drift by the sensor's constant error and by its noise's
+# random walk only, some hundredths of a degree in half a minute. The attitude that the vehicle
+# itself estimates rests on its accelerometers, whose constant error looks just like a camera that
+# is tilted in the body: it says where down is, not how the camera is turned.
+
+
+@dataclass(frozen=True, eq=False)
+class ImuArrays:
+    """Samples in the order of time, each time once: t_s (n,), estimate (n, 3, 3) R_world_body,
+    gyro_radps (n, 3), and position_m (n, 3) with sigma (n,), NaN where none was given."""
 
     t_s: Array
-    R_cam_target: Array
-    cov_rad2: Array
+    estimate: Array
+    gyro_radps: Array
+    position_m: Array
+    position_sigma_m: Array
+
+
+def imu_arrays(samples: Sequence[AttitudeSample]) -> ImuArrays:
+    """The samples as arrays."""
+    _, kept = np.unique([a.t_s for a in samples], return_index=True)
+    ordered = [samples[k] for k in kept.tolist()]
+    rpy = np.array([(a.roll_rad, a.pitch_rad, a.yaw_rad) for a in ordered])
+    nothing = (np.full(3, np.nan), np.nan)
+    places = [
+        nothing
+        if a.position_m is None or a.position_sigma_m is None
+        else (a.position_m, a.position_sigma_m)
+        for a in ordered
+    ]
+    return ImuArrays(
+        t_s=np.array([a.t_s for a in ordered]),
+        estimate=Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix(),
+        gyro_radps=np.array([a.gyro_radps for a in ordered]),
+        position_m=np.array([place for place, _ in places]),
+        position_sigma_m=np.array([sigma for _, sigma in places]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Integrated:
+    """The integrated rotation R_world_body (n, 3, 3) at t_s (n,), with its rates (n, 3).
+
+    `of_bias` and `of_scale` (n, 3, 3): by how much a change of the gyroscope's constant error
+    (rad/s) and of its scale (a share) turn the body, in world axes.
+    """
+
+    t_s: Array
+    R_world_body: Array
+    rate_radps: Array
+    of_bias: Array
+    of_scale: Array
+
+
+def integrate(imu: ImuArrays, bias_radps: Array, scale: Array) -> Integrated:
+    """With the gyroscope's errors taken off: rate = (gyro - bias) (1 + scale).
+
+    Between two samples the rate goes straight from one to the other, to fourth order (Magnus).
+    Where it begins in the world is chosen to agree with the estimate on the whole.
+    """
+    unbiased = imu.gyro_radps - bias_radps
+    rate = unbiased * (1.0 + scale)
+    dt = np.diff(imu.t_s)[:, None]
+    before, after = rate[:-1], rate[1:]
+    steps = _turns(0.5 * dt * (before + after) + dt**2 / 12.0 * np.cross(before, after))
+    R = np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
+    R = Rotation.from_matrix(imu.estimate @ R.transpose(0, 2, 1)).mean().as_matrix() @ R
+    return Integrated(
+        t_s=imu.t_s,
+        R_world_body=R,
+        rate_radps=rate,
+        of_bias=_integral(-R * (1.0 + scale), dt),
+        of_scale=_integral(R * unbiased[:, None, :], dt),
+    )
+
+
+def _integral(values: Array, dt: Array) -> Array:
+    """Integral (n, 3, 3) from the first on, by trapezia."""
+    steps = 0.5 * dt[:, :, None] * (values[1:] + values[:-1])
+    return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(steps, axis=0)])
+
+
+def interpolate(whole: Integrated, t_s: Array) -> Integrated:
+    """At other times (m,), which are held within the recording's."""
+    grid = whole.t_s
+    t_s = np.clip(t_s, grid[0], grid[-1])
+    k = np.clip(np.searchsorted(grid, t_s, side="right") - 1, 0, len(grid) - 2)
+    into = (t_s - grid[k])[:, None]
+    share = into / (grid[k + 1] - grid[k])[:, None]
+    change = whole.rate_radps[k + 1] - whole.rate_radps[k]
+    way = into * (whole.rate_radps[k] + 0.5 * share * change)
+
+    def between(values: Array) -> Array:
+        return np.asarray(values[k] + share[..., None] * (values[k + 1] - values[k]))
+
+    return Integrated(
+        t_s=t_s,
+        R_world_body=whole.R_world_body[k] @ _turns(way),
+        rate_radps=whole.rate_radps[k] + share * change,
+        of_bias=between(whole.of_bias),
+        of_scale=between(whole.of_scale),
+    )
+
+
+def _turns(vectors: Array) -> Array:
+    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3)."""
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
+
+
+def _vectors(R: Array) -> Array:
+    """Rotation vectors (n, 3) of rotation matrices (n, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(R).as_rotvec())
+
+
+# --- Turn of the camera and latency from nothing -------------------------------------------------
+# No start is needed, whatever the camera's turn.
+# Between two pictures the camera turns by the same rotation as the body, seen in its own axes:
+# ``v_body = R_body_cam v_cam`` for the rotation vectors. For each latency of a grid the R_body_cam
+# that fits best follows in closed form; the latency with the least misfit wins.
+
+
+LATENCIES_S = np.arange(-0.2, 1.0, 0.02)
+"""Also such as cannot be: a clock that is wrong is to be named, not hidden at the grid's end."""
+_SPAN_S = (0.2, 0.5)
+_MOST_PAIRS = 400
+_FIT_ROUNDS = 3
+_HALF_COUNTED_RAD = 0.02
+
+
+def first_guess(whole: Integrated, poses: PoseArrays) -> tuple[Array, float] | None:
+    """R_body_cam and the latency; None without pairs of pictures some tenths apart."""
+    first, second = _pairs(poses.t_s)
+    if len(first) < 3:
+        return None
+    R = poses.R_cam_target
+    seen = _vectors(R[first] @ R[second].transpose(0, 2, 1))
+    guesses = []
+    for latency_s in LATENCIES_S.tolist():
+        a = interpolate(whole, poses.t_s[first] - latency_s).R_world_body
+        b = interpolate(whole, poses.t_s[second] - latency_s).R_world_body
+        R_body_cam, misfit = _fit_turn(_vectors(a.transpose(0, 2, 1) @ b), seen)
+        guesses.append((misfit, latency_s, R_body_cam))
+    _, latency_s, R_body_cam = min(guesses, key=lambda guess: guess[0])
+    return R_body_cam, latency_s
+
+
+def _pairs(t_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Each picture and the first one that is `_SPAN_S` later."""
+    second = np.searchsorted(t_s, t_s + _SPAN_S[0])
+    first = np.flatnonzero(second < len(t_s))
+    second = second[first]
+    near = t_s[second] - t_s[first] <= _SPAN_S[1]
+    thinned = slice(None, None, 1 + int(near.sum()) // _MOST_PAIRS)
+    return first[near][thinned], second[near][thinned]
+
+
+def _fit_turn(body: Array, seen: Array) -> tuple[Array, float]:
+    """R with body = R seen, by least squares in which what fits badly counts less; the misfit."""
+    weight = np.ones(len(body))
+    R = np.eye(3)
+    for _ in range(_FIT_ROUNDS):
+        R = Rotation.align_vectors(body, seen, weight)[0].as_matrix()
+        miss = ((body - seen @ R.T) ** 2).sum(axis=1) / _HALF_COUNTED_RAD**2
+        weight = 1.0 / (1.0 + miss)
+    return R, float((miss * weight).mean())
+
+
+# --- All together: Gauss-Newton with weights by Student's t --------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,121 +324,119 @@ class State:
     knots_s: Array
     walk: Array
 
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """The minimum: `misfit` (n, 3) in camera axes, `counted` (n,), `rate_radps` (n, 3) of the
-    body, `cov` (16, 16) of all but the walk, in the order of the slices of this module."""
-
-    state: State
-    misfit: Array
-    counted: Array
-    body: Turned
-    cov: Array
-    factor: float
-    jitter_s: float
-
-
-def solve(felt: Felt, seen: Seen, R_body_cam: Array, latency_s: float) -> Solved:
-    """From a start within some ten degrees and some hundredths of a second."""
-    state = _begin(felt, seen, R_body_cam, latency_s)
-    factor, jitter_s = 3.0, 0.005
-    for k in range(_ROUNDS):
-        for _ in range(_MOST_STEPS):
-            rows = _rows(state, felt, seen, factor, jitter_s)
-            held = np.diag(_LEAST_HELD * np.diagonal(rows.information))
-            step = np.asarray(np.linalg.solve(rows.information + held, rows.gradient))
-            state = _moved(state, step)
-            if np.abs(step[TURN]).max() < 1e-6 and abs(step[LATENCY]) < 1e-6:
-                break
-        rows = _rows(state, felt, seen, factor, jitter_s)
-        if k < _ROUNDS - 1:
-            factor, jitter_s = likeliest(
-                rows.misfit[rows.within], seen.cov_rad2[rows.within], rows.along[rows.within]
-            )
-    blocks = rows.blocks()
-    known = rows.information - np.sum([b.information for b in blocks], axis=0)
-    d2 = squared_distance(rows.misfit, rows.inverse)[rows.within]
-    cov = covariance(known, blocks, np.arange(KNOTS), robust_shares(d2, 3))
-    return Solved(
-        state, rows.misfit, np.minimum(rows.counted, 1.0), rows.body, cov, factor, jitter_s
-    )
-
-
-def _begin(felt: Felt, seen: Seen, R_body_cam: Array, latency_s: float) -> State:
-    knots_s = np.linspace(
-        felt.t_s[0], felt.t_s[-1], 1 + max(1, round((felt.t_s[-1] - felt.t_s[0]) / KNOT_S))
-    )
-    body = turned_at(sum_up(felt, np.zeros(3), np.zeros(3)), seen.t_s - latency_s)
-    # Of many targets in the world that with the least distance to all.
-    each = body.R_world_body @ R_body_cam @ seen.R_cam_target
-    distance = np.abs(each[:, None] - each[None, :: 1 + len(each) // 60]).sum(axis=(2, 3))
-    middle = int(np.argmin(np.median(distance, axis=1)))
-    return State(
-        R_body_cam, each[middle], np.zeros(3), np.zeros(3), np.zeros(3), latency_s, knots_s,
-        np.zeros((len(knots_s), 3)),
-    )  # fmt: skip
+    def moved(self, step: Array) -> State:
+        """The state after a step, small turns on the left of the rotations."""
+        turn, target = _turns(np.stack([step[TURN], step[TARGET]]))
+        return replace(
+            self,
+            R_body_cam=turn @ self.R_body_cam,
+            R_world_target=target @ self.R_world_target,
+            bias_radps=self.bias_radps + step[BIAS],
+            scale=self.scale + step[SCALE],
+            off_rad=self.off_rad + step[OFF],
+            latency_s=float(np.clip(self.latency_s + step[LATENCY], -0.5, 1.5)),
+            walk=self.walk + step[KNOTS:].reshape(-1, 3),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """All rows at a state: the poses' design (n, 3, p), inverse covariances and weights, ..."""
+    """All rows at a state: the poses' design (n, 3, p), misfits (n, 3) in camera axes, inverse
+    covariances and weights, what a second of latency does (n, 3), the vehicle's rotation at each
+    pose, and the normal equations of all."""
 
     design: Array
     misfit: Array
     inverse: Array
     counted: Array
     along: Array
-    within: Array
-    body: Turned
+    body: Integrated
     information: Array
     gradient: Array
 
-    def blocks(self) -> list[Left]:
-        """Of the poses, by time."""
-        return [
-            Left(*_normal(self.design[k], self.misfit[k], self.inverse[k], self.counted[k]))
-            for k in np.array_split(np.arange(len(self.misfit)), BLOCKS)
-        ]
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """The minimum; `cov` (16, 16) of all but the walk, in the order of this module's slices."""
+
+    state: State
+    misfit: Array
+    counted: Array
+    body: Integrated
+    cov: Array
+    jitter_s: float
 
 
-def _normal(design: Array, misfit: Array, inverse: Array, counted: Array) -> tuple[Array, Array]:
-    weighted = np.einsum("nij,njp->nip", inverse * counted[:, None, None], design)
-    p = design.shape[2]
-    flat = weighted.reshape(-1, p)
-    return design.reshape(-1, p).T @ flat, -flat.T @ misfit.ravel()
+def _solve(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> _Solved:
+    """From a start within some ten degrees and some hundredths of a second."""
+    state = _begin(imu, poses, R_body_cam, latency_s)
+    cov_rad2 = poses.cov[:, :3, :3] + np.eye(3) * FLOOR_RAD**2
+    factor, jitter_s = 3.0, 0.005
+    for k in range(_ROUNDS):
+        for _ in range(_MOST_STEPS):
+            rows = _rows(state, imu, poses, cov_rad2, factor, jitter_s)
+            held = np.diag(_LEAST_HELD * np.diagonal(rows.information))
+            step = np.asarray(np.linalg.solve(rows.information + held, rows.gradient))
+            state = state.moved(step)
+            if np.abs(step[TURN]).max() < 1e-6 and abs(step[LATENCY]) < 1e-6:
+                break
+        rows = _rows(state, imu, poses, cov_rad2, factor, jitter_s)
+        within = rows.counted > 0.0
+        if k < _ROUNDS - 1:
+            factor, jitter_s = likeliest(rows.misfit[within], cov_rad2[within], rows.along[within])
+    of_poses, _ = normal_equations(rows.design, rows.misfit, rows.inverse, rows.counted)
+    known = rows.information - of_poses
+    cov = covariance(rows.design, rows.misfit, rows.inverse, rows.counted, known, KNOTS)
+    return _Solved(state, rows.misfit, np.minimum(rows.counted, 1.0), rows.body, cov, jitter_s)
 
 
-def _rows(state: State, felt: Felt, seen: Seen, factor: float, jitter_s: float) -> _Rows:
-    """Gauss-Newton's normal equations; a step is information^-1 gradient."""
-    whole = sum_up(felt, state.bias_radps, state.scale)
-    exposed_s = seen.t_s - state.latency_s
-    within = (exposed_s >= felt.t_s[0]) & (exposed_s <= felt.t_s[-1])
-    body = turned_at(whole, exposed_s)
+def _begin(imu: ImuArrays, poses: PoseArrays, R_body_cam: Array, latency_s: float) -> State:
+    seconds = imu.t_s[-1] - imu.t_s[0]
+    knots_s = np.linspace(imu.t_s[0], imu.t_s[-1], 1 + max(1, round(seconds / KNOT_S)))
+    body = interpolate(integrate(imu, np.zeros(3), np.zeros(3)), poses.t_s - latency_s)
+    # Of many targets in the world that with the least distance to all.
+    each = body.R_world_body @ R_body_cam @ poses.R_cam_target
+    distance = np.abs(each[:, None] - each[None, :: 1 + len(each) // 60]).sum(axis=(2, 3))
+    middle = int(np.argmin(np.median(distance, axis=1)))
+    none = np.zeros(3)
+    walk = np.zeros((len(knots_s), 3))
+    return State(R_body_cam, each[middle], none, none, none, latency_s, knots_s, walk)
+
+
+def _rows(
+    state: State,
+    imu: ImuArrays,
+    poses: PoseArrays,
+    cov_rad2: Array,
+    factor: float,
+    jitter_s: float,
+) -> _Rows:
+    """The normal equations; a Gauss-Newton step is information^-1 gradient."""
+    whole = integrate(imu, state.bias_radps, state.scale)
+    exposed_s = poses.t_s - state.latency_s
+    within = (exposed_s >= imu.t_s[0]) & (exposed_s <= imu.t_s[-1])
+    body = interpolate(whole, exposed_s)
     hats = _hats(state.knots_s, body.t_s)
-    R_world_body = rotation_matrices(hats @ state.walk) @ body.R_world_body
+    R_world_body = _turns(hats @ state.walk) @ body.R_world_body
     R_cam_world = state.R_body_cam.T @ R_world_body.transpose(0, 2, 1)
     predicted = R_cam_world @ state.R_world_target
-    misfit = rotation_vectors(seen.R_cam_target @ predicted.transpose(0, 2, 1))
+    misfit = _vectors(poses.R_cam_target @ predicted.transpose(0, 2, 1))
     along = -body.rate_radps @ state.R_body_cam
-    design = np.zeros((len(misfit), 3, KNOTS + 3 * len(state.knots_s)))
+    n = len(misfit)
+    design = np.zeros((n, 3, KNOTS + state.walk.size))
     design[:, :, TURN] = state.R_body_cam.T
     design[:, :, TARGET] = -R_cam_world
     design[:, :, BIAS] = R_cam_world @ body.of_bias
     design[:, :, SCALE] = R_cam_world @ body.of_scale
     design[:, :, LATENCY] = along
-    design[:, :, KNOTS:] = (
-        hats[:, None, :, None] * R_cam_world[:, :, None, :]
-    ).reshape(len(misfit), 3, -1)  # fmt: skip
-    inverse = inverses(seen.cov_rad2, factor, along, jitter_s)
-    counted = weights(squared_distance(misfit, inverse), 3) * within
-    information, gradient = _normal(design, misfit, inverse, counted)
-    for more in (_known(state), _estimated(state, felt, whole)):
+    design[:, :, KNOTS:] = (hats[:, None, :, None] * R_cam_world[:, :, None, :]).reshape(n, 3, -1)
+    inverse = inverses(cov_rad2, factor, along, jitter_s)
+    counted = student_weights(squared_distance(misfit, inverse)) * within
+    information, gradient = normal_equations(design, misfit, inverse, counted)
+    for more in (_known(state), _estimated(state, imu, whole)):
         information, gradient = information + more[0], gradient + more[1]
     body = replace(body, R_world_body=R_world_body)
-    return _Rows(
-        design, misfit, inverse, counted, along, within, body, information, gradient
-    )  # fmt: skip
+    return _Rows(design, misfit, inverse, counted, along, body, information, gradient)
 
 
 def _known(state: State) -> tuple[Array, Array]:
@@ -206,45 +459,105 @@ def _known(state: State) -> tuple[Array, Array]:
     return information, gradient
 
 
-def _estimated(state: State, felt: Felt, whole: Turned) -> tuple[Array, Array]:
+def _estimated(state: State, imu: ImuArrays, whole: Integrated) -> tuple[Array, Array]:
     """The vehicle's own attitude, by its mean over each second; it errs slowly."""
     some = slice(None, None, _ESTIMATES_APART)
-    hats = _hats(state.knots_s, felt.t_s[some])
-    R_world_body = rotation_matrices(hats @ state.walk) @ whole.R_world_body[some]
-    off = rotation_vectors(felt.estimate[some] @ R_world_body.transpose(0, 2, 1))
+    hats = _hats(state.knots_s, imu.t_s[some])
+    R_world_body = _turns(hats @ state.walk) @ whole.R_world_body[some]
+    off = _vectors(imu.estimate[some] @ R_world_body.transpose(0, 2, 1))
     misfit = off - R_world_body @ state.off_rad
     n = len(misfit)
     design = np.zeros((n, 3, KNOTS + state.walk.size))
     design[:, :, OFF] = -R_world_body
     design[:, :, BIAS], design[:, :, SCALE] = -whole.of_bias[some], -whole.of_scale[some]
     design[:, :, KNOTS:] = -(hats[:, None, :, None] * np.eye(3)[:, None, :]).reshape(n, 3, -1)
-    count = max(1, round((felt.t_s[-1] - felt.t_s[0]) / ATTITUDE_S))
+    count = max(1, round((imu.t_s[-1] - imu.t_s[0]) / ATTITUDE_S))
     parts = [k for k in np.array_split(np.arange(n), count) if len(k)]
     mean_design = np.array([design[k].mean(axis=0) for k in parts])
     mean_misfit = np.array([misfit[k].mean(axis=0) for k in parts])
     known = np.broadcast_to(np.diag(1.0 / ATTITUDE_SIGMA_RAD**2), (len(parts), 3, 3))
-    d2 = squared_distance(mean_misfit, known)
-    return _normal(mean_design, mean_misfit, known, np.minimum(weights(d2, 3), 1.0))
-
-
-def _moved(state: State, step: Array) -> State:
-    return replace(
-        state,
-        R_body_cam=rotation_matrices(step[TURN]) @ state.R_body_cam,
-        R_world_target=rotation_matrices(step[TARGET]) @ state.R_world_target,
-        bias_radps=state.bias_radps + step[BIAS],
-        scale=state.scale + step[SCALE],
-        off_rad=state.off_rad + step[OFF],
-        latency_s=float(np.clip(state.latency_s + step[LATENCY], -0.5, 1.5)),
-        walk=state.walk + step[KNOTS:].reshape(-1, 3),
-    )
+    counted = np.minimum(student_weights(squared_distance(mean_misfit, known)), 1.0)
+    return normal_equations(mean_design, mean_misfit, known, counted)
 
 
 def _hats(knots_s: Array, t_s: Array) -> Array:
     """Weights (n, j) of the knots in linear interpolation."""
-    k = np.clip(np.searchsorted(knots_s, t_s, side="right") - 1, 0, len(knots_s) - 2)
-    share = np.clip((t_s - knots_s[k]) / (knots_s[k + 1] - knots_s[k]), 0.0, 1.0)
-    out = np.zeros((len(t_s), len(knots_s)))
-    rows = np.arange(len(t_s))
-    out[rows, k], out[rows, k + 1] = 1.0 - share, share
-    return out
+    return np.stack([np.interp(t_s, knots_s, one) for one in np.eye(len(knots_s))], axis=1)
+
+
+def _check(solved: _Solved) -> None:
+    """Raises InvalidValue unless vehicle and camera agree, and well enough."""
+    used = solved.counted > 0.0
+    size = np.linalg.norm(solved.misfit[used], axis=1)
+    left_out = float((solved.counted[used] < COUNTS_LITTLE).mean())
+    if np.median(size) > MOST_MISFIT_RAD or left_out > MOST_LEFT_OUT:
+        raise InvalidValue(
+            f"the turns that the vehicle felt and those that the camera saw differ by "
+            f"{math.degrees(np.median(size)):.1f} deg ({100 * left_out:.0f} % of the pictures do "
+            f"not fit at all): target and camera must not move in the room or on the vehicle; "
+            f"then {AGAIN['carry']}"
+        )
+    sigma = np.sqrt(np.diagonal(solved.cov))
+    turn_deg, latency_s = math.degrees(sigma[TURN].max()), float(sigma[LATENCY])
+    if not turn_deg <= MOST_TURN_SIGMA_DEG:
+        raise InvalidValue(
+            f"the camera's turn is known to {turn_deg:.1f} deg only (at most "
+            f"{MOST_TURN_SIGMA_DEG:g} is accepted): {AGAIN['carry']}, and farther to each side"
+        )
+    if not latency_s <= MOST_LATENCY_SIGMA_S:
+        raise InvalidValue(
+            f"the latency is known to {1e3 * latency_s:.0f} ms only (at most "
+            f"{1e3 * MOST_LATENCY_SIGMA_S:g} is accepted): turn faster to and fro"
+        )
+    if solved.state.latency_s < -2.0 * latency_s:
+        raise InvalidValue(
+            f"the pictures are stamped {-1e3 * solved.state.latency_s:.0f} ms before they can have "
+            f"been taken: camera and telemetry must be on one clock"
+        )
+
+
+# --- Where the camera sits in the body, from a vehicle that knows its position -------------------
+# ``p_world_body + R_world_body (t_body_cam + R_body_cam p_cam_target) = p_world_target`` at each
+# picture's exposure, with a world that drifts evenly. The rotations are those solved for above.
+
+
+LEAST_PLACED = 100
+_DRIFT_SIGMA_MPS = 0.02
+_PLACE_ROUNDS = 8
+
+
+def _camera_place(
+    imu: ImuArrays, poses: PoseArrays, solved: _Solved
+) -> tuple[Array, Array] | tuple[None, None]:
+    """t_body_cam (3,) m and its sigma; None where too few pictures have a trusted position."""
+    trusted = np.isfinite(imu.position_sigma_m)
+    t_s = solved.body.t_s
+    if trusted.sum() < LEAST_PLACED:
+        return None, None
+    known_s = imu.t_s[trusted]
+    near = np.abs(known_s[np.clip(np.searchsorted(known_s, t_s), 0, len(known_s) - 1)] - t_s) < 0.1
+    if near.sum() < LEAST_PLACED:
+        return None, None
+    body_m = np.stack([np.interp(t_s, known_s, axis) for axis in imu.position_m[trusted].T], 1)
+    sigma_m = np.interp(t_s, known_s, imu.position_sigma_m[trusted])[near]
+    R, p_cam_target_m = solved.body.R_world_body[near], poses.p_cam_target_m[near]
+    design = np.zeros((len(R), 3, 9))  # the camera's place, the target's, and the drift
+    design[:, :, :3] = R
+    design[:, :, 3:6] = -np.eye(3)
+    design[:, :, 6:] = (t_s[near] - t_s[near].mean())[:, None, None] * np.eye(3)
+    known = np.diag([0.0] * 6 + [_DRIFT_SIGMA_MPS**-2] * 3)
+    inverse = np.eye(3) / sigma_m[:, None, None] ** 2
+
+    def place(R_body_cam: Array) -> tuple[Array, Array, Array]:
+        way_m = p_cam_target_m @ R_body_cam.T
+        right = -(np.einsum("nij,nj->ni", R, way_m) + body_m[near])
+        return robust_least_squares(design, right, inverse, _PLACE_ROUNDS, known)
+
+    found, misfit, counted = place(solved.state.R_body_cam)
+    cov = covariance(design, misfit, inverse, counted, known, 3)
+    # The camera's turn is not known exactly either.
+    values, axes = np.linalg.eigh(solved.cov[TURN, TURN])
+    for turn in _turns((axes * np.sqrt(np.maximum(values, 0.0))).T):
+        moved_m = (place(turn @ solved.state.R_body_cam)[0] - found)[:3]
+        cov += np.outer(moved_m, moved_m)
+    return found[:3], np.sqrt(np.diagonal(cov))

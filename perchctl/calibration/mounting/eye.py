@@ -5,9 +5,9 @@ from __future__ import annotations
 import zlib
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from perchctl.calibration.mounting.recording import SeenPose
-from perchctl.calibration.mounting.turns import cross_matrix, rotation_matrices
 from perchctl.camera import HealthState, assess_frame
 from perchctl.geometry import R_MARKER_TARGET, Array
 from perchctl.profile import Profile
@@ -35,7 +35,9 @@ class Eye:
     """
 
     def __init__(self, profile: Profile, camera: CameraModel, live: bool) -> None:
-        self._pipeline = make_pipeline(camera_only_profile(profile), camera)
+        # A pipeline that knows nothing of how the camera is mounted.
+        bare = camera_profile(profile).model_copy(update={"pose": profile.pose})
+        self._pipeline = make_pipeline(bare, camera)
         self._live = live
         self._state = PipelineState()
         self._fields = FieldState()
@@ -58,26 +60,13 @@ class Eye:
         seen = []
         for picture in found:
             self._state, output = step(self._state, picture, None, self._pipeline)
-            self._remember(output)
-            pose = best_pose(output, picture.t_s)
+            self.mirrored += output.detections.mirrored and not output.poses
+            named = ((name, output.detections.get(name)) for name in MARKERS)
+            self.outlines = tuple((name, d.corners_px) for name, d in named if d is not None)
+            pose = _best_pose(output, picture.t_s)
             if pose is not None:
                 seen.append(pose)
         return seen
-
-    def _remember(self, output: PipelineOutput) -> None:
-        self.mirrored += is_seen_mirrored(output)
-        found = ((name, output.detections.get(name)) for name in MARKERS)
-        self.outlines = tuple((name, d.corners_px) for name, d in found if d is not None)
-
-
-# --- From what the pipeline saw in a picture to a recording's pose -----------------------------
-
-
-def camera_only_profile(profile: Profile) -> Profile:
-    """The profile with the camera in the place of vehicle and gear: for a pipeline that knows
-    nothing of how the camera is mounted."""
-    bare = camera_profile(profile)
-    return bare.model_copy(update={"pose": profile.pose})
 
 
 def pose_basis(profile: Profile, camera: CameraModel) -> str:
@@ -89,7 +78,7 @@ def pose_basis(profile: Profile, camera: CameraModel) -> str:
     return f"markers of {' and '.join(sides_mm)} mm, calibration {number:08x}"
 
 
-def best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
+def _best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
     """The surest of a picture's poses, None without one.
 
     Args:
@@ -107,15 +96,10 @@ def best_pose(output: PipelineOutput, t_s: float) -> SeenPose | None:
         cov = J @ cov @ J.T
     return SeenPose(
         t_s=t_s,
-        rotation_cam_target=rotation_matrices(pose.rvec_rad) @ R_MARKER_TARGET,
+        rotation_cam_target=Rotation.from_rotvec(pose.rvec_rad).as_matrix() @ R_MARKER_TARGET,
         position_cam_target_m=pose.tvec_m,
         covariance=cov if cov is not None and np.isfinite(cov).all() else None,
     )
-
-
-def is_seen_mirrored(output: PipelineOutput) -> bool:
-    """Whether the target was seen in the mirror only."""
-    return output.detections.mirrored and not output.poses
 
 
 def _uncertainty(pose: MarkerPose) -> float:
@@ -123,9 +107,9 @@ def _uncertainty(pose: MarkerPose) -> float:
 
 
 def _left_jacobian(v: Array) -> Array:
-    """Change (3, 3) of a small turn on the left of the rotation with its vector v (3,)."""
+    """Change (3, 3) of a small rotation on the left of the one with the vector v (3,)."""
     angle = float(np.linalg.norm(v))
-    K = cross_matrix(v)
+    K = np.cross(np.eye(3), v)
     if angle < 1e-6:
         return np.asarray(np.eye(3) + 0.5 * K)
     a = (1.0 - np.cos(angle)) / angle**2

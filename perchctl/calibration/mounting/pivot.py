@@ -11,144 +11,133 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from perchctl.calibration.mounting.result import Left, covariance
-from perchctl.calibration.mounting.spread import likeliest, robust_shares, squared_distance, weights
-from perchctl.calibration.mounting.turns import cross_matrix
+from perchctl.calibration.mounting.carry import COUNTS_LITTLE, MOST_LEFT_OUT
+from perchctl.calibration.mounting.motion import AGAIN, check_recording, tilts_rad
+from perchctl.calibration.mounting.recording import (
+    MountingRecording,
+    PoseArrays,
+    in_order,
+    pose_arrays,
+)
+from perchctl.calibration.mounting.robust import (
+    covariance,
+    likeliest,
+    robust_least_squares,
+    squared_distance,
+)
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 
-BLOCKS = 15
+MOST_TIP_SIGMA_M = 1e-3
+SLIPPED_M, SLIP_EXPLAINS = 4e-4, 0.1
+"""Of the misfit; of a tip that stays where it is a jump explains 4 % at most."""
 FLOOR_M = 5e-5  # of the tip on its point
-BARE_SHARE = 0.005  # of its distance: the place of a pose that does not say
 _START_SIGMA_M = 1e-3
-_ROUNDS = 12
-_SPLITS, _SLIP_ROUNDS = 19, 4
-TIP, POINT = slice(0, 3), slice(3, 6)
+_ROUNDS, _SPLITS, _SLIP_ROUNDS = 4, 19, 4
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """The poses as arrays: t_s (n,), R_cam_target (n, 3, 3), p_cam_target_m (n, 3) and their
-    covariances cov (n, 6, 6), turn first."""
+class Pivoted:
+    """The pivot's solution. A sigma is such that the value +- 1.96 sigma is a 95 % interval.
 
+    Attributes:
+        gear_cam_m: tip of the gear in the camera's frame; its covariance (3, 3).
+        point_target_m: where the tip stood, in the target's frame, (3,).
+        t_s, residual_m, counted: of each pose: its time, the tip's way from where it should
+            be (n, 3) in the target's axes, and how much it counted, 0 to 1.
+        tilt_rad: (n, 2): of the camera's view to the target's x and y.
+    """
+
+    gear_cam_m: Array
+    covariance_m2: Array
+    point_target_m: Array
     t_s: Array
-    R_cam_target: Array
-    p_cam_target_m: Array
-    cov: Array
-
-    def part(self, which: Array) -> Seen:
-        return Seen(
-            self.t_s[which], self.R_cam_target[which], self.p_cam_target_m[which], self.cov[which]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """tip_m and point_m (3,), the tip's covariance (3, 3), misfit (n, 3) in camera axes, counted
-    (n,), and the inverse covariances (n, 3, 3) of the misfits."""
-
-    tip_m: Array
-    point_m: Array
-    cov_m2: Array
-    misfit: Array
+    residual_m: Array
     counted: Array
-    inverse: Array
+    tilt_rad: Array
+
+    @property
+    def gear_cam_sigma_m(self) -> Array:
+        """Of the tip along the camera's axes, (3,)."""
+        return np.sqrt(np.diagonal(self.covariance_m2))
 
 
-def solve(seen: Seen) -> Solved:
-    """At least some pictures that are tilted differently; without tilts it is singular."""
-    n = len(seen.t_s)
-    design = _design(seen)
-    inverse = np.broadcast_to(np.eye(3) / _START_SIGMA_M**2, (n, 3, 3))
-    counted = np.ones(n)
-    factor = 1.0
-    for k in range(_ROUNDS):
-        found, misfit = _least_squares(design, seen.p_cam_target_m, inverse, counted)
-        cov = _of_misfit(seen, found[POINT])
-        if k % 3 == 0:
+def solve_pivot(recording: MountingRecording, size_sigma: float = 0.005) -> Pivoted:
+    """The gear's tip in the camera's frame.
+
+    Args:
+        size_sigma: by which share the printed sizes may be off (`target.size_sigma`): all
+            distances are, with them.
+
+    Raises InvalidValue: too few or too equal tilts, a tip that slipped, a mirrored picture.
+    """
+    check_recording(recording, "pivot")
+    poses = pose_arrays(recording)
+    n, R, p_m = len(poses.t_s), poses.R_cam_target, poses.p_cam_target_m
+    design = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), -R], axis=2)
+    inverse: Array = np.broadcast_to(np.eye(3) / _START_SIGMA_M**2, (n, 3, 3))
+    for k in range(_ROUNDS + 1):
+        found, misfit, counted = robust_least_squares(design, p_m, inverse, 3)
+        if k < _ROUNDS:
+            cov = _misfit_covariance(poses, found[3:])
             factor, _ = likeliest(misfit, cov)
-        inverse = np.asarray(np.linalg.inv(cov)) / factor**2
-        counted = weights(squared_distance(misfit, inverse), 3)
-    blocks = [
-        Left(*_normal(design[b], -misfit[b], inverse[b], counted[b]))
-        for b in np.array_split(np.arange(n), BLOCKS)
-    ]
-    robust = robust_shares(squared_distance(misfit, inverse), 3)
-    return Solved(
-        tip_m=found[TIP],
-        point_m=found[POINT],
-        cov_m2=covariance(np.zeros((6, 6)), blocks, np.arange(3), robust),
-        misfit=misfit,
+            inverse = np.asarray(np.linalg.inv(cov)) / factor**2
+    tip_m = found[:3]
+    cov_m2 = covariance(design, misfit, inverse, counted, np.zeros((6, 6)), 3)
+    _check_slip(poses, design, misfit, inverse)
+    _check_known(cov_m2, counted)
+    return Pivoted(
+        gear_cam_m=tip_m,
+        covariance_m2=cov_m2 + size_sigma**2 * np.outer(tip_m, tip_m),
+        point_target_m=found[3:],
+        t_s=poses.t_s,
+        residual_m=np.einsum("nji,nj->ni", R, misfit),
         counted=np.minimum(counted, 1.0),
-        inverse=inverse,
+        tilt_rad=tilts_rad(in_order(recording)),
     )
 
 
-def _design(seen: Seen) -> Array:
-    design = np.zeros((len(seen.t_s), 3, 6))
-    design[:, :, TIP] = np.eye(3)
-    design[:, :, POINT] = -seen.R_cam_target
-    return design
-
-
-def _least_squares(
-    design: Array, right: Array, inverse: Array, counted: Array
-) -> tuple[Array, Array]:
-    """What is found, (p,), and the misfits (n, 3)."""
-    information, gradient = _normal(design, right, inverse, counted)
-    found = np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
-    return found, design @ found - right
-
-
-def _of_misfit(seen: Seen, point_m: Array) -> Array:
+def _misfit_covariance(poses: PoseArrays, point_m: Array) -> Array:
     """Covariance (n, 3, 3) of what each pose's error does to the tip."""
-    J = np.zeros((len(seen.t_s), 3, 6))
-    J[:, :, :3] = cross_matrix(seen.R_cam_target @ point_m)
-    J[:, :, 3:] = -np.eye(3)
-    return np.asarray(J @ seen.cov @ J.transpose(0, 2, 1) + np.eye(3) * FLOOR_M**2)
+    way_m = poses.R_cam_target @ point_m
+    across = np.cross(np.eye(3), way_m[:, None, :])  # [way]x
+    J = np.concatenate([across, -np.broadcast_to(np.eye(3), across.shape)], axis=2)
+    return np.asarray(J @ poses.cov @ J.transpose(0, 2, 1) + np.eye(3) * FLOOR_M**2)
 
 
-def _normal(design: Array, right: Array, inverse: Array, counted: Array) -> tuple[Array, Array]:
-    weighted = (inverse * counted[:, None, None]) @ design
-    flat = weighted.reshape(-1, design.shape[2])
-    return design.reshape(-1, design.shape[2]).T @ flat, flat.T @ right.ravel()
+def _check_known(cov_m2: Array, counted: Array) -> None:
+    left_out = float((counted < COUNTS_LITTLE).mean())
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(cov_m2)[-1]))
+    if left_out > MOST_LEFT_OUT or not sigma_m <= MOST_TIP_SIGMA_M:
+        raise InvalidValue(
+            f"the tip is known to {1e3 * sigma_m:.1f} mm only, at most "
+            f"{1e3 * MOST_TIP_SIGMA_M:g} is accepted, and {100 * left_out:.0f} % of the pictures "
+            f"do not fit: {AGAIN['pivot']}"
+        )
 
 
-def in_target(seen: Seen, solved: Solved) -> Array:
-    """The misfits in the target's axes, (n, 3): where the tip was, from its point."""
-    return np.asarray(np.einsum("nji,nj->ni", seen.R_cam_target, solved.misfit))
-
-
-@dataclass(frozen=True)
-class Slip:
-    """When the point changed, by how far, and which share of the misfit that explains."""
-
-    t_s: float
-    moved_m: float
-    explains: float
-
-
-def slip(seen: Seen, solved: Solved) -> Slip:
-    """The likeliest moment at which the tip jumped from one point to another.
+def _check_slip(poses: PoseArrays, design: Array, misfit: Array, inverse: Array) -> None:
+    """Raises InvalidValue if the tip jumped from one point to another at some moment.
 
     For moments all over the recording, each with a point before and one after: that with the
     least misfit, counted robustly.
     """
-    n, p = len(seen.t_s), seen.p_cam_target_m
-    one = _design(seen)
-    alone = _size(solved.misfit, solved.inverse)
-    best = Slip(float(seen.t_s[0]), 0.0, 0.0)
+    n = len(misfit)
+    alone = _size(misfit, inverse)
+    explains, moved_m, at_s = 0.0, 0.0, 0.0
     for k in np.unique(np.linspace(0, n, _SPLITS + 2).astype(np.intp))[1:-1]:
-        two = np.zeros((n, 3, 9))
-        two[:, :, :6] = one
-        two[k:, :, 6:] = one[k:, :, POINT]
-        counted = np.ones(n)
-        for _ in range(_SLIP_ROUNDS):
-            found, misfit = _least_squares(two, p, solved.inverse, counted)
-            counted = weights(squared_distance(misfit, solved.inverse), 3)
-        explains = 1.0 - _size(misfit, solved.inverse) / alone
-        if explains > best.explains:
-            best = Slip(float(seen.t_s[k]), float(np.linalg.norm(found[6:])), explains)
-    return best
+        after = (np.arange(n) >= k)[:, None, None] * design[:, :, 3:]
+        two = np.concatenate([design, after], axis=2)
+        found, with_two, _ = robust_least_squares(two, poses.p_cam_target_m, inverse, _SLIP_ROUNDS)
+        share = 1.0 - _size(with_two, inverse) / alone
+        if share > explains:
+            explains, moved_m = share, float(np.linalg.norm(found[6:]))
+            at_s = float(poses.t_s[k] - poses.t_s[0])
+    if moved_m > SLIPPED_M and explains > SLIP_EXPLAINS:
+        raise InvalidValue(
+            f"the tip slipped by {1e3 * moved_m:.1f} mm {at_s:.0f} s after "
+            f"the beginning: {AGAIN['pivot']}; a dent or a ring of tape holds it"
+        )
 
 
 def _size(misfit: Array, inverse: Array) -> float:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import io
-import math
 
 import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
-from perchctl.calibration.mounting.report import MountingReport, mounting_lines
-from perchctl.calibration.mounting.result import IN_95, Carried, Pivoted
+from perchctl.calibration.mounting.carry import COUNTS_LITTLE, Carried
+from perchctl.calibration.mounting.pivot import Pivoted
+from perchctl.calibration.mounting.report import MountingReport
+from perchctl.calibration.mounting.robust import IN_95
 from perchctl.geometry import Array
 from perchctl.plot import BLUE, GREEN, GREY, GRID, ORANGE, VERMILLION, new_figure, save_png
 
 WIDTH_IN, ROW_IN, TOP_IN = 12.0, 3.5, 3.4
-COUNTS_LITTLE = 0.2
 _AXES = (BLUE, ORANGE, GREEN)
 _WIDEST = 99.0  # percentile that still fits on an axis: the outliers lie beyond
 
@@ -26,19 +27,16 @@ def draw_mounting(c: MountingReport) -> bytes:
     figure = new_figure(WIDTH_IN, sum(heights_in))
     halves = figure.subfigures(len(heights_in), 1, squeeze=False, height_ratios=heights_in)[:, 0]
     top = halves[0].add_gridspec(1, 2, width_ratios=(1.6, 1.0))
-    _numbers(halves[0].add_subplot(top[0, 0]), mounting_lines(c))
+    _numbers(halves[0].add_subplot(top[0, 0]), c.lines())
     _from_above(halves[0].add_subplot(top[0, 1]), c)
     for half, part in zip(halves[1:], rows, strict=True):
-        title = _carry_title(part) if isinstance(part, Carried) else _pivot_title(part)
-        half.suptitle(title, fontsize=11, weight="bold")
-        left, middle, right = half.subplots(1, 3)
+        half.suptitle(_title(part), fontsize=11, weight="bold")
+        left, right = half.subplots(1, 2)
         if isinstance(part, Carried):
-            _turns(left, part)
-            _residuals(middle, part)
-            _by_axis(right, part)
+            _rotations(left, part)
+            _residuals(right, part)
         else:
-            _tilts(left, part)
-            _tip(middle, part)
+            _tip(left, part)
             _tip_in_time(right, part)
     content = io.BytesIO()
     save_png(figure, content)
@@ -113,16 +111,14 @@ def _above(p_m: Array) -> tuple[float, float]:
     return -1e3 * float(p_m[1]), 1e3 * float(p_m[0])
 
 
-def _carry_title(c: Carried) -> str:
-    jitter_ms = 1e3 * IN_95 * c.jitter_s
-    return f"Carry: {c.poses} pictures, single ones {jitter_ms:.0f} ms later or earlier"
+def _title(part: Carried | Pivoted) -> str:
+    if isinstance(part, Pivoted):
+        return f"Pivot: {len(part.t_s)} pictures"
+    jitter_ms = 1e3 * IN_95 * part.jitter_s
+    return f"Carry: {len(part.t_s)} pictures, single ones {jitter_ms:.0f} ms later or earlier"
 
 
-def _pivot_title(p: Pivoted) -> str:
-    return f"Pivot: {len(p.t_s)} pictures"
-
-
-def _turns(axes: Axes, c: Carried) -> None:
+def _rotations(axes: Axes, c: Carried) -> None:
     roll, pitch, yaw = np.degrees(c.body_rpy_rad).T
     shown = axes.scatter(roll, pitch, c=yaw - yaw.min(), s=7, cmap="viridis")
     axes.figure.colorbar(shown, ax=axes, label="heading from its least (deg)")
@@ -131,52 +127,17 @@ def _turns(axes: Axes, c: Carried) -> None:
 
 def _residuals(axes: Axes, c: Carried) -> None:
     size = np.degrees(np.linalg.norm(c.residual_rad, axis=1))
-    _points(axes, c.t_s - c.t_s[0], size, c.counted)
-    axes.set_ylim(0.0, 1.2 * _widest(size[c.counted > COUNTS_LITTLE]))
+    good = _points(axes, c.t_s - c.t_s[0], size, c.counted)
+    axes.set_ylim(0.0, 1.2 * _widest(size[good]))
     _labelled(axes, "Misfit", "time (s)", "felt against seen (deg)")
-
-
-def _by_axis(axes: Axes, c: Carried) -> None:
-    """Of those that count: what a wrong model would skew."""
-    kept = np.degrees(c.residual_rad[c.counted > COUNTS_LITTLE])
-    wide = _widest(kept)
-    for k, (name, colour) in enumerate(zip("xyz", _AXES, strict=True)):
-        spread = float(np.std(kept[:, k]))
-        axes.hist(
-            kept[:, k], bins=np.linspace(-wide, wide, 41).tolist(), histtype="step", color=colour,
-            label=f"{name}: mean {kept[:, k].mean():+.3f}, spread {spread:.2f} deg",
-        )  # fmt: skip
-    axes.set_ylim(0.0, 1.35 * axes.get_ylim()[1])
-    axes.legend(fontsize=8, loc="upper left")
-    _labelled(axes, "About the camera's axes", "misfit (deg)", "pictures")
-
-
-def _tilts(axes: Axes, p: Pivoted) -> None:
-    tilt_deg = np.degrees(p.tilt_rad[p.counted > COUNTS_LITTLE])
-    axes.scatter(tilt_deg[:, 0], tilt_deg[:, 1], s=7, color=BLUE)
-    reach = max(35.0, 1.05 * float(np.abs(tilt_deg).max(initial=0.0)))
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
-    axes.set_aspect("equal")
-    for radius in (10.0, 20.0, 30.0):
-        axes.plot(*_circle(radius), color=GREY, linewidth=0.6)
-    _labelled(axes, "Tilts about the tip", "to the target's x (deg)", "to its y (deg)")
 
 
 def _tip(axes: Axes, p: Pivoted) -> None:
     """Seen along the target's normal."""
     way_mm = 1e3 * p.residual_m
-    good = p.counted > COUNTS_LITTLE
-    x, y = way_mm[:, 0], way_mm[:, 1]
-    axes.scatter(x[good], y[good], s=7, color=BLUE, label="counts")
-    if not good.all():
-        left = f"left out: {(~good).sum()}"
-        axes.scatter(x[~good], y[~good], s=12, color=VERMILLION, marker="x", label=left)
+    good = _points(axes, way_mm[:, 0], way_mm[:, 1], p.counted)
     reach = 1.3 * _widest(way_mm[good])
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
-    axes.set_aspect("equal")
-    axes.legend(fontsize=8, loc="upper right")
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     _labelled(axes, "The tip, from where it stands", "target x (mm)", "target y (mm)")
 
 
@@ -192,23 +153,20 @@ def _tip_in_time(axes: Axes, p: Pivoted) -> None:
     _labelled(axes, "The tip over time", "time (s)", "from its point (mm)")
 
 
-def _points(axes: Axes, x: Array, y: Array, counted: Array) -> None:
+def _points(axes: Axes, x: Array, y: Array, counted: Array) -> NDArray[np.bool_]:
+    """Draws what counts, and what is left out; True where a pose counts, (n,)."""
     good = counted > COUNTS_LITTLE
     axes.plot(x[good], y[good], ".", markersize=3, color=BLUE, label="counts")
     if not good.all():
         left = f"left out: {(~good).sum()}"
         axes.plot(x[~good], y[~good], "x", markersize=4, color=VERMILLION, label=left)
     axes.legend(fontsize=8, loc="upper right")
+    return good
 
 
 def _widest(values: Array) -> float:
     """But for outliers, and never nothing: an axis needs some width."""
     return float(np.percentile(np.abs(values), _WIDEST)) + 1e-6 if values.size else 1.0
-
-
-def _circle(radius: float) -> tuple[Array, Array]:
-    angle = np.linspace(0.0, 2.0 * math.pi, 73)
-    return radius * np.cos(angle), radius * np.sin(angle)
 
 
 def _labelled(axes: Axes, title: str, x: str, y: str) -> None:

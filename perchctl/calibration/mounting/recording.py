@@ -1,4 +1,4 @@
-"""What was seen and felt while the vehicle was moved by hand, and its file of JSON lines.
+"""Poses and attitudes of a vehicle that is moved by hand, and their file of JSON lines.
 
 Each part begins with a line ``{"part": "carry", ...}``; one line a sample follows, first all
 attitudes, then all poses. A file holds one part or both.
@@ -7,22 +7,24 @@ attitudes, then all poses. A file holds one part or both.
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.files import write_files
 from perchctl.geometry import Array
 
 MountingPart = Literal["carry", "pivot"]
-FORMAT = 1
+BARE_SIGMA_RAD, BARE_SHARE = np.radians(0.3), 0.005
+"""Of a pose that does not say: of its rotation, and of its distance."""
+_FORMAT = 1
 _DECIMALS = 9
-_MOST_NOT_A_TURN = 1e-3  # of R R^T - 1
+_MOST_NOT_A_ROTATION = 1e-3  # of R R^T - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +72,48 @@ class MountingRecording:
     seen_by: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class PoseArrays:
+    """Poses by time: t_s (n,), R_cam_target (n, 3, 3), p_cam_target_m (n, 3), and their
+    covariances cov (n, 6, 6), rotation first: their own, or what their distance usually has."""
+
+    t_s: Array
+    R_cam_target: Array
+    p_cam_target_m: Array
+    cov: Array
+
+
+def pose_arrays(recording: MountingRecording) -> PoseArrays:
+    """The poses of a recording as arrays."""
+    poses = in_order(recording)
+    covs = []
+    for pose in poses:
+        far_m = float(np.linalg.norm(pose.position_cam_target_m))
+        usual = np.diag(np.square([BARE_SIGMA_RAD] * 3 + [BARE_SHARE * far_m] * 3))
+        covs.append(usual if pose.covariance is None else pose.covariance)
+    return PoseArrays(
+        t_s=np.array([p.t_s for p in poses]),
+        R_cam_target=np.array([p.rotation_cam_target for p in poses]),
+        p_cam_target_m=np.array([p.position_cam_target_m for p in poses]),
+        cov=np.array(covs),
+    )
+
+
+def in_order(recording: MountingRecording) -> tuple[SeenPose, ...]:
+    """The poses by time."""
+    return tuple(sorted(recording.poses, key=lambda pose: pose.t_s))
+
+
+# --- The file --------------------------------------------------------------------------------
+
+
 def write_recordings(path: Path, recordings: Sequence[MountingRecording]) -> None:
     """Write the whole file, or nothing.
 
     Raises:
         InvalidValue: it cannot be written, or `read_recordings` would refuse a number.
     """
-    records = [record for recording in recordings for record in _lines(recording)]
+    records = [record for recording in recordings for record in _records(recording)]
     try:
         lines = [json.dumps(r, separators=(",", ":"), allow_nan=False) for r in records]
     except ValueError:
@@ -84,41 +121,10 @@ def write_recordings(path: Path, recordings: Sequence[MountingRecording]) -> Non
     write_files({path: ("\n".join(lines) + "\n").encode()})
 
 
-def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
-    """The parts of a file, in its order.
-
-    Raises:
-        NotFound: no such file.
-        InvalidValue: it is none of `write_recordings`, with the line that is not.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise NotFound(f"{path} is not there: name a recording of calibrate --mount") from None
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise InvalidValue(f"{path} cannot be read: {why}") from None
-    parts: list[_Growing] = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        try:
-            _add(parts, json.loads(line, parse_constant=_refuse_constant))
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
-            what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-            raise InvalidValue(
-                f"{path}, line {number} is no line of a recording of calibrate --mount: {what}"
-            ) from None
-    if not parts:
-        raise InvalidValue(f"{path} is empty: name a recording of calibrate --mount")
-    return tuple(
-        MountingRecording(p.part, tuple(p.attitudes), tuple(p.poses), p.mirrored, p.seen_by)
-        for p in parts
-    )
-
-
-def _lines(recording: MountingRecording) -> Iterator[dict[str, Any]]:
+def _records(recording: MountingRecording) -> Iterator[dict[str, Any]]:
     yield {
         "part": recording.part,
-        "format": FORMAT,
+        "format": _FORMAT,
         "mirrored_pictures": recording.mirrored_pictures,
         "seen_by": recording.seen_by,
     }
@@ -146,76 +152,87 @@ def _plain(value: Any) -> Any:
     return np.round(np.asarray(value, dtype=np.float64), _DECIMALS).tolist()
 
 
-class _Growing:
-    def __init__(self, part: MountingPart, mirrored: int, seen_by: str) -> None:
-        self.part: MountingPart = part
-        self.mirrored = mirrored
-        self.seen_by = seen_by
-        self.attitudes: list[AttitudeSample] = []
-        self.poses: list[SeenPose] = []
+_Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+_Row = Annotated[list[FiniteFloat], Field(min_length=6, max_length=6)]
 
 
-def _add(parts: list[_Growing], record: Any) -> None:
-    """One line into what is read so far. KeyError, TypeError and ValueError where it is none."""
-    if not isinstance(record, dict):
-        raise ValueError("not a JSON object")
-    if "part" in record:
-        if record["part"] not in get_args(MountingPart):
-            raise ValueError(
-                f"part {record['part']!r} is none of {', '.join(get_args(MountingPart))}"
-            )
-        if record["format"] != FORMAT:
-            raise ValueError(f"format {record['format']!r}, this version reads {FORMAT}")
-        mirrored, seen_by = int(record["mirrored_pictures"]), str(record.get("seen_by", ""))
-        parts.append(_Growing(record["part"], mirrored, seen_by))
-    elif not parts:
-        raise ValueError("the file does not begin with a part")
-    elif "rotation_cam_target" in record:
-        parts[-1].poses.append(_pose(record))
-    else:
-        parts[-1].attitudes.append(_attitude(record))
+class _Part(BaseModel):
+    part: MountingPart
+    format: Literal[1]
+    mirrored_pictures: int
+    seen_by: str = ""
 
 
-def _attitude(record: Mapping[str, Any]) -> AttitudeSample:
-    roll, pitch, yaw = _array(record["rpy_rad"], (3,)).tolist()
-    sigma = record.get("position_sigma_m")
-    return AttitudeSample(
-        t_s=_number(record["t_s"]),
-        roll_rad=roll,
-        pitch_rad=pitch,
-        yaw_rad=yaw,
-        gyro_radps=_array(record["gyro_radps"], (3,)),
-        position_m=_array(record["position_m"], (3,)) if "position_m" in record else None,
-        position_sigma_m=None if sigma is None else _number(sigma),
+class _Attitude(BaseModel):
+    t_s: FiniteFloat
+    rpy_rad: _Vector
+    gyro_radps: _Vector
+    position_m: _Vector | None = None
+    position_sigma_m: FiniteFloat | None = None
+
+    def sample(self) -> AttitudeSample:
+        place = None if self.position_m is None else np.array(self.position_m)
+        gyro = np.array(self.gyro_radps)
+        return AttitudeSample(self.t_s, *self.rpy_rad, gyro, place, self.position_sigma_m)
+
+
+class _Pose(BaseModel):
+    t_s: FiniteFloat
+    rotation_cam_target: tuple[_Vector, _Vector, _Vector]
+    position_cam_target_m: _Vector
+    covariance: Annotated[list[_Row], Field(min_length=6, max_length=6)] | None = None
+
+    def pose(self) -> SeenPose:
+        R = np.array(self.rotation_cam_target)
+        if np.abs(R @ R.T - np.eye(3)).max() > _MOST_NOT_A_ROTATION or np.linalg.det(R) < 0.0:
+            raise ValueError("rotation_cam_target is no rotation")
+        cov = None if self.covariance is None else np.array(self.covariance)
+        return SeenPose(self.t_s, R, np.array(self.position_cam_target_m), cov)
+
+
+def read_recordings(path: Path) -> tuple[MountingRecording, ...]:
+    """The parts of a file, in its order.
+
+    Raises:
+        NotFound: no such file.
+        InvalidValue: it is none of `write_recordings`, with the line that is not.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise NotFound(f"{path} is not there: name a recording of calibrate mount") from None
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise InvalidValue(f"{path} cannot be read: {why}") from None
+    parts: list[tuple[_Part, list[AttitudeSample], list[SeenPose]]] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        try:
+            record = json.loads(line)
+            if "part" in record:
+                parts.append((_Part.model_validate(record), [], []))
+            elif not parts:
+                raise ValueError("the file does not begin with a part")
+            elif "rotation_cam_target" in record:
+                parts[-1][2].append(_Pose.model_validate(record).pose())
+            else:
+                parts[-1][1].append(_Attitude.model_validate(record).sample())
+        except (TypeError, ValueError, RecursionError) as error:
+            raise InvalidValue(
+                f"{path}, line {number} is no line of a recording of calibrate mount: "
+                f"{_reason(error)}"
+            ) from None
+    if not parts:
+        raise InvalidValue(f"{path} is empty: name a recording of calibrate mount")
+    return tuple(
+        MountingRecording(
+            head.part, tuple(attitudes), tuple(poses), head.mirrored_pictures, head.seen_by
+        )
+        for head, attitudes, poses in parts
     )
 
 
-def _pose(record: Mapping[str, Any]) -> SeenPose:
-    R = _array(record["rotation_cam_target"], (3, 3))
-    if np.abs(R @ R.T - np.eye(3)).max() > _MOST_NOT_A_TURN or np.linalg.det(R) < 0.0:
-        raise ValueError("rotation_cam_target is no rotation")
-    cov = record.get("covariance")
-    return SeenPose(
-        t_s=_number(record["t_s"]),
-        rotation_cam_target=R,
-        position_cam_target_m=_array(record["position_cam_target_m"], (3,)),
-        covariance=None if cov is None else _array(cov, (6, 6)),
-    )
-
-
-def _array(value: Any, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"found {value!r}, expected finite numbers of shape {shape}"[:120])
-    return array
-
-
-def _number(value: Any) -> float:
-    number = float(value)
-    if not math.isfinite(number):
-        raise ValueError(f"found {value!r}, expected a finite number")
-    return number
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")
+def _reason(error: Exception) -> str:
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"

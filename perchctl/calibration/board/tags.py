@@ -11,7 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from perchctl.calibration.types import Grey
+from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.profile import aruco_dictionary
 from perchctl.target import TAG_BORDER_CELLS, TAG_DICTIONARY, Board, tag_cells

@@ -11,11 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from perchctl.calibration.check import Level, level, limit_mm, sentence
-from perchctl.calibration.lens import PARAMETERS
-from perchctl.calibration.predict import distortion_curve, ray_errors_px
-from perchctl.calibration.types import Calibration
-from perchctl.geometry import Array
+from perchctl.calibration.board.adjust import PARAMETERS
+from perchctl.calibration.board.predict import limit_mm, ray_errors_px
+from perchctl.calibration.board.result import Calibration, Level
 from perchctl.plot import (
     BLACK,
     BLUE,
@@ -23,7 +21,6 @@ from perchctl.plot import (
     GREY,
     GRID,
     ORANGE,
-    SKY,
     VERMILLION,
     new_figure,
     save_png,
@@ -39,9 +36,8 @@ _LINE_IN = 1.45 / 72.0  # height of a line of one point
 _MARGIN_IN = 0.11
 _ARROW_SHARE = 0.06  # of the width: the largest residual's arrow
 _MOST_NAMES = 45
-_MOST_LINES = 24  # of numbers
+_MOST_LINES = 22  # of what was left out
 LIMIT_LOW = 0.5  # mm: the axis reaches down to it
-_LOOP_SHARE, _LINE_SHARE = 0.3, 0.04  # of the width
 
 
 def draw_calibration(calibration: Calibration) -> bytes:
@@ -52,22 +48,22 @@ def draw_calibration(calibration: Calibration) -> bytes:
 
 
 def report_figure(calibration: Calibration) -> Figure:
-    """The verdict in a banner, and six panels."""
-    headline = wrap(sentence(calibration), _HEADLINE_CHARS)
+    """The verdict in a banner, four panels, and the numbers."""
+    headline = wrap(calibration.sentence, _HEADLINE_CHARS)
     notes = [line for note in _notes(calibration) for line in wrap(note, _NOTES_CHARS)]
     banner_in = 2 * _MARGIN_IN + _LINE_IN * (_HEADLINE_PT * len(headline) + _NOTES_PT * len(notes))
     figure = new_figure(WIDTH_IN, banner_in + PANELS_IN, dpi=DPI)
     halves = figure.add_gridspec(2, 1, height_ratios=(banner_in, PANELS_IN))
     banner, panels = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
-    banner.set_facecolor(BANNER[level(calibration)])
+    banner.set_facecolor(BANNER[calibration.level])
     _write(banner, banner_in, headline, notes)
     grid = panels.add_gridspec(3, 2, height_ratios=(1.25, 1.0, 1.0))
     _coverage(panels.add_subplot(grid[0, 0]), calibration)
     _residuals(panels.add_subplot(grid[0, 1]), calibration)
     _views(panels.add_subplot(grid[1, 0]), calibration)
     _target(panels.add_subplot(grid[1, 1]), calibration)
-    _distortion(panels.add_subplot(grid[2, 0]), calibration)
-    _numbers(panels.add_subplot(grid[2, 1]), calibration)
+    _numbers(panels.add_subplot(grid[2, 0]), _number_lines(calibration))
+    _numbers(panels.add_subplot(grid[2, 1]), _left_out_lines(calibration))
     return figure
 
 
@@ -89,7 +85,7 @@ def _notes(calibration: Calibration) -> list[str]:
     """What it rests on, and whole sentences on what would mend it."""
     out = [r for r in calibration.rejections if not r.corners]
     found = (
-        f"{len(calibration.views)} views, RMS {calibration.solution.rms_px:.3f} px, "
+        f"{len(calibration.views)} views, RMS {calibration.fit.rms_px:.3f} px, "
         f"{f'{len(out)} views rejected' if out else 'no view rejected'}"
     )
     return [found, *map(str, calibration.lacks)]
@@ -107,20 +103,13 @@ def _coverage(ax: Axes, calibration: Calibration) -> None:
     for view in calibration.seen:
         if view.name not in used:
             ax.plot(*view.corners_px.T, "x", markersize=4, color=VERMILLION)
-    *_, each = ray_errors_px(calibration.camera, calibration.solution.covariance)
+    *_, each = ray_errors_px(calibration.camera, calibration.covariance)
     error = np.ma.masked_invalid(each.reshape(13, 17))
     x, y = np.linspace(0, w - 1, 17), np.linspace(0, h - 1, 13)
-    dots = np.concatenate([view.corners_px for view in calibration.seen])
     with catch_warnings():
         simplefilter("ignore", UserWarning)  # there may be no line at all
-        contours = ax.contour(x, y, error, levels=(0.1, 0.3, 1, 3, 10))
-    contours.remove()  # drawn by hand, without those that tell nothing
-    for value, found in zip(contours.levels, contours.allsegs, strict=True):
-        lines = [line for line in found if len(line) and _tells(line, w)]
-        for line in lines:
-            ax.plot(*line.T, color=BLACK, linewidth=0.8, alpha=0.7)
-        if lines:
-            _label(ax, f"{value:g} px", max(lines, key=len), dots, (w, h))
+        lines = ax.contour(x, y, error, levels=(0.1, 0.3, 1, 3, 10), colors=BLACK, alpha=0.7)
+    ax.clabel(lines, fmt="%g px", fontsize=8)
     covered = 100 * calibration.covered.mean()
     ax.set_title(
         f"Coverage {covered:.0f} %: orange is uncovered; lines: 95 % error of a ray", fontsize=10
@@ -128,30 +117,10 @@ def _coverage(ax: Axes, calibration: Calibration) -> None:
     _frame(ax, w, h)
 
 
-def _tells(line: Array, width_px: int) -> bool:
-    """A small closed line (n, 2) is the noise of a level that the error has everywhere, and a
-    very short one is hardly seen."""
-    closed = bool((line[0] == line[-1]).all())
-    least = _LOOP_SHARE if closed else _LINE_SHARE
-    return float(np.ptp(line, axis=0).max()) > least * width_px
-
-
-def _label(ax: Axes, text: str, line: Array, dots: Array, size_px: tuple[int, int]) -> None:
-    """On the line (n, 2), where the fewest dots are, within the frame."""
-    margin = 0.06 * size_px[0]
-    inside = np.clip(line, margin, np.array(size_px) - margin)
-    if (inside == line).all(axis=1).any():
-        inside = line[(inside == line).all(axis=1)]
-    apart = np.linalg.norm(inside[:, None] - dots[None], axis=2).min(axis=1)
-    x, y = inside[int(np.argmax(apart))]
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.9, "pad": 1.0}
-    ax.text(x, y, text, fontsize=8, ha="center", va="center", bbox=box, zorder=5, clip_on=True)
-
-
 def _residuals(ax: Axes, calibration: Calibration) -> None:
     w, h = calibration.camera.size_px
     points = np.concatenate([v.corners_px for v in calibration.views])
-    residuals = np.concatenate(calibration.solution.residuals_px)
+    residuals = np.concatenate(calibration.fit.residuals)
     length = np.linalg.norm(residuals, axis=1)
     largest = max(float(np.quantile(length, 0.99)), 1e-6)
     scale = _ARROW_SHARE * w / largest
@@ -175,9 +144,7 @@ def _residuals(ax: Axes, calibration: Calibration) -> None:
 
 
 def _views(ax: Axes, calibration: Calibration) -> None:
-    rms = dict(
-        zip([v.name for v in calibration.views], calibration.solution.view_rms_px(), strict=True)
-    )
+    rms = dict(zip([v.name for v in calibration.views], calibration.fit.view_rms_px(), strict=True))
     out = {r.view: r.reason for r in calibration.rejections if not r.corners}
     trimmed = {r.view for r in calibration.rejections if r.corners}
     names = [v.name for v in calibration.seen]
@@ -188,7 +155,7 @@ def _views(ax: Axes, calibration: Calibration) -> None:
             ax.text(i, 0.97 * top, "rejected", rotation=90, ha="center", va="top", fontsize=8)
         else:
             ax.bar(i, rms[name], color=ORANGE if name in trimmed else BLUE)
-    ax.axhline(calibration.solution.rms_px, color=BLACK, linewidth=0.9, linestyle="--")
+    ax.axhline(calibration.fit.rms_px, color=BLACK, linewidth=0.9, linestyle="--")
     ax.set_ylim(0, top)
     ax.set_xlim(-0.7, len(names) - 0.3)
     if len(names) <= _MOST_NAMES:
@@ -236,69 +203,45 @@ def _target(ax: Axes, calibration: Calibration) -> None:
     ax.legend(fontsize=8, loc="upper left")
 
 
-def _distortion(ax: Axes, calibration: Calibration) -> None:
-    camera = calibration.camera
-    w, h = camera.size_px
-    centre = camera.K[:2, 2]
-    corners = np.array([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]], dtype=np.float64)
-    away = corners - centre
-    far = away[np.argmax(np.linalg.norm(away, axis=1))]
-    far_px = float(np.linalg.norm(far))
-    r_px, shift, spread = distortion_curve(camera, calibration.solution.covariance, far)
-    ax.fill_between(
-        r_px, shift - spread, shift + spread, color=SKY, alpha=0.4, linewidth=0, label="95 % band"
-    )
-    ax.plot(r_px, shift, color=BLUE, linewidth=1.8, label="moved by the lens")
-    ax.axhline(0, color=GREY, linewidth=0.8)
-    used = max(
-        float(np.linalg.norm(v.corners_px - centre, axis=1).max()) for v in calibration.views
-    )
-    ax.axvline(used, color=VERMILLION, linewidth=1.2, linestyle=":", label="outermost corner seen")
-    if r_px[-1] < 0.99 * far_px:
-        folds = f"the model folds back at {r_px[-1]:.0f} px"
-        ax.axvline(r_px[-1], color=BLACK, linewidth=1.2, linestyle="--", label=folds)
-    low, high = float(shift.min()), float(shift.max())
-    margin = 0.25 * (high - low) + 0.5
-    ax.set_ylim(low - margin, high + margin)
-    ax.set_xlim(0, far_px)
-    ax.set_xlabel("distance from the image centre [px]")
-    ax.set_ylabel("moved by the lens [px]")
-    ax.set_title(f"Distortion ({camera.model}) with its 95 % band", fontsize=10)
-    ax.grid(True, color=GRID, linewidth=0.6)
-    # The curve begins at 0 on the left and ends on the right, far below or above.
-    ax.legend(fontsize=8, loc="lower left" if shift[-1] < 0 else "upper left")
-
-
-def _numbers(ax: Axes, calibration: Calibration) -> None:
+def _numbers(ax: Axes, lines: Sequence[str]) -> None:
     ax.set_axis_off()
-    solution = calibration.solution
-    names = PARAMETERS[calibration.camera.model]
+    ax.text(
+        0.0, 1.0, _plain("\n".join(lines)), family="monospace", fontsize=7.8, linespacing=1.15,
+        va="top", ha="left", transform=ax.transAxes, in_layout=False,
+    )  # fmt: skip
+
+
+def _number_lines(calibration: Calibration) -> list[str]:
+    """The lens parameters, and how each model did."""
+    fit = calibration.fit
     lines = [f"{'':4}{'value':>12}{'+- 1 sigma':>12}"]
-    for name, value, std in zip(names, solution.parameters, solution.std, strict=True):
+    for name, value, std in zip(
+        PARAMETERS[fit.model], fit.parameters, calibration.std, strict=True
+    ):
         digits = 2 if name[0] in "fc" else 5
         lines.append(f"{name:4}{value:12.{digits}f}{std:12.{digits}f}")
     lines += ["", f"{'lens model':22}{'RMS':>8}{'held out':>10}"]
     notes = list(dict.fromkeys(s.note for s in calibration.scores if s.note))
     for s in calibration.scores:
-        mark = ">" if s.model == calibration.camera.model else " "
-        rms = "-" if s.rms_px is None else f"{s.rms_px:.4f}"
-        held = "-" if s.held_out_px is None else f"{s.held_out_px:.4f}"
+        mark = ">" if s.model == fit.model else " "
+        rms, held = (
+            "-" if value is None else f"{value:.4f}" for value in (s.rms_px, s.held_out_px)
+        )
         best = " recommended" if s.model == calibration.recommended else ""
         note = f" ({notes.index(s.note) + 1})" if s.note else ""
         lines.append(f"{mark} {s.model:20}{rms:>8}{held:>10}{best}{note}")
-    lines += [f"({i}) {_shorter(note, 74)}" for i, note in enumerate(notes, start=1)]
-    out = [f"{r.view}: {r.reason}" for r in calibration.rejections]
-    out += [f"{r.view}: {r.reason}" for r in calibration.missing]
-    if out:
-        room = _MOST_LINES - len(lines) - 3
-        named = out if len(out) <= room + 1 else out[:room]
-        lines += ["", "left out:"] + [f"  {_shorter(text, 74)}" for text in named]
-        if len(out) > len(named):
-            lines.append(f"  and {len(out) - len(named)} more (--json names them)")
-    ax.text(
-        0.0, 1.0, _plain("\n".join(lines)), family="monospace", fontsize=7.8, linespacing=1.15,
-        va="top", ha="left", transform=ax.transAxes, in_layout=False,
-    )  # fmt: skip
+    return lines + [f"({i}) {_shorter(note, 74)}" for i, note in enumerate(notes, start=1)]
+
+
+def _left_out_lines(calibration: Calibration) -> list[str]:
+    out = [f"{r.view}: {r.reason}" for r in (*calibration.rejections, *calibration.missing)]
+    if not out:
+        return []
+    named = out if len(out) <= _MOST_LINES else out[: _MOST_LINES - 1]
+    lines = ["left out:"] + [f"  {_shorter(text, 74)}" for text in named]
+    if len(out) > len(named):
+        lines.append(f"  and {len(out) - len(named)} more (--json names them)")
+    return lines
 
 
 def _frame(ax: Axes, w: int, h: int) -> None:

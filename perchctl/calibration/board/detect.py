@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.calibration.tags import find_tags
-from perchctl.calibration.types import BoardView, Grey
+from perchctl.calibration.board.tags import find_tags
+from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import TAG_BORDER_CELLS, Board, BoardKind, tag_cells
 from perchctl.vision import field_picture, is_combed
@@ -25,27 +25,61 @@ TAG_REACH = 0.6
 """Of the small squares of an aprilgrid; they are a third as large as a chessboard's."""
 _RIM_PX = 2.0
 """A tag's corner nearer to the picture's rim is not seen from all sides."""
-_WINDOW_PX = {"chessboard": 11, "aprilgrid": 2}
 _CHESS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SECTORS = cv2.CALIB_CB_NORMALIZE_IMAGE  # exhaustive would take a second where there is none
 
 
-def find_board(image: Grey, board: Board, name: str = "", refine: bool = True) -> BoardView | str:
-    """The view of a board, or why there is none.
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """One picture of the board.
 
-    Args:
-        image: grey, uint8 (h, w).
-        refine: fit the corners (`perchctl.calibration.detect`); otherwise they are
-            OpenCV's, with `cv2.cornerSubPix` in the window of OpenCV's own program for
-            chessboards, and in Kalibr's for aprilgrids.
+    Attributes:
+        name: of the file, or the frame's number.
+        size_px: the picture's width and height.
+        ids: number of each corner on the board, (n,).
+        object_m: the corners on the board, z = 0, (n, 3).
+        corners_px: in the picture, pixel (0, 0) is the centre of the top-left one, (n, 2).
+        blur_px: median spread of the edges at the corners (tanh width).
+    """
+
+    name: str
+    size_px: tuple[int, int]
+    ids: NDArray[np.intp]
+    object_m: Array
+    corners_px: Array
+    blur_px: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def keep(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> BoardView:
+        """The same view with some of its corners."""
+        return replace(
+            self,
+            ids=self.ids[which],
+            object_m=self.object_m[which],
+            corners_px=self.corners_px[which],
+        )
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A view, or corners of a view, left out, and why."""
+
+    view: str
+    reason: str
+    corners: tuple[int, ...] = ()  # empty: the whole view
+
+
+def find_board(image: Grey, board: Board, name: str = "") -> BoardView | str:
+    """The view of a board in a grey picture (h, w), or why there is none.
 
     Of an interlaced picture, whose fields show a moving board in two places, the view is the
     mean of both fields' corners: where the board was half way between them.
     """
     if is_combed(image):
-        fields = [_whole(field_picture(image, row), board, name, refine) for row in (0, 1)]
-        return _half_way(*fields)
-    return _whole(image, board, name, refine)
+        return _half_way(*(_whole(field_picture(image, row), board, name) for row in (0, 1)))
+    return _whole(image, board, name)
 
 
 def _half_way(a: BoardView | str, b: BoardView | str) -> BoardView | str:
@@ -58,10 +92,10 @@ def _half_way(a: BoardView | str, b: BoardView | str) -> BoardView | str:
     if len(in_a) < MIN_CORNERS:
         return a if len(a.ids) >= len(b.ids) else b
     middle = (a.corners_px[in_a] + b.corners_px[in_b]) / 2.0
-    return replace(a, ids=a.ids[in_a], object_m=a.object_m[in_a], corners_px=middle)
+    return replace(a.keep(in_a), corners_px=middle)
 
 
-def _whole(image: Grey, board: Board, name: str, refine: bool) -> BoardView | str:
+def _whole(image: Grey, board: Board, name: str) -> BoardView | str:
     h, w = image.shape
     scale = min(1.0, SEARCH_PX / max(h, w))
     small = image
@@ -75,19 +109,13 @@ def _whole(image: Grey, board: Board, name: str, refine: bool) -> BoardView | st
     ids, corners = found
     # cv2.resize keeps the outer rims of the outer pixels, half a pixel before (0, 0).
     corners = (corners + 0.5) / scale - 0.5
-    object_m = board.corners_m()[ids]
-    if not refine:
-        if board.kind != "charuco":
-            corners = _fixed_window(image, corners, _WINDOW_PX[board.kind])
-        return BoardView(name, (w, h), ids, object_m, corners)
     along, down = _local_axes(_cells(board, ids), corners)
     fit = fit_saddles(image, corners, along, down, _room(board))
     if fit.ok.sum() < MIN_CORNERS:
         return f"only {int(fit.ok.sum())} corners are sharp enough to be measured"
-    good = BoardView(
-        name, (w, h), ids, object_m, fit.corners_px, float(np.median(fit.width_px[fit.ok]))
-    )
-    return good.keep(fit.ok)
+    blur_px = float(np.median(fit.width_px[fit.ok]))
+    object_m = board.corners_m()[ids]
+    return BoardView(name, (w, h), ids, object_m, fit.corners_px, blur_px).keep(fit.ok)
 
 
 def _room(board: Board) -> Room:
@@ -161,13 +189,6 @@ def _cells(board: Board, ids: NDArray[np.intp]) -> Array:
     return np.asarray(board.corners_m()[ids, :2] / board.square_m)
 
 
-def _fixed_window(image: Grey, corners: Array, half_px: int) -> Array:
-    points = np.ascontiguousarray(corners, dtype=np.float32).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
-    moved = cv2.cornerSubPix(image, points, (half_px, half_px), (-1, -1), criteria)
-    return np.asarray(moved, dtype=np.float64).reshape(-1, 2)
-
-
 def _local_axes(cells: Array, corners: Array) -> tuple[Array, Array]:
     """A square's two sides at each corner, as seen: the derivative of the homography from
     board to picture, which smooths over single bad corners; (n, 2) each."""
@@ -207,12 +228,10 @@ _MIN_WIDTH_PX, _MAX_WIDTH_SHARE = 0.25, 1.2
 
 @dataclass(frozen=True, eq=False)
 class Saddles:
-    """corners_px (n, 2); ok (n,): the fit holds; sigma_px (n,): its own spread from the
-    grey residuals; width_px (n,): the wider edge's spread."""
+    """corners_px (n, 2); ok (n,): the fit holds; width_px (n,): the wider edge's spread."""
 
     corners_px: Array
     ok: NDArray[np.bool_]
-    sigma_px: Array
     width_px: Array
 
 
@@ -247,10 +266,7 @@ def fit_saddles(
             the picture shows them, (n, 2) each.
         room: how far the picture is of use around a corner.
     """
-    n = len(corners_px)
-    start = np.asarray(corners_px, dtype=np.float64).reshape(-1, 2)
-    if n == 0:
-        return Saddles(start, np.zeros(0, dtype=np.bool_), np.zeros(0), np.zeros(0))
+    start = np.asarray(corners_px, dtype=np.float64)
     axes = np.stack([along_px, down_px], axis=2)  # (n, 2, 2): board units -> px
     size_px = _thickness_px(axes)
     reach = np.clip(
@@ -286,12 +302,7 @@ def _sample(
 ) -> tuple[Array, NDArray[np.bool_]]:
     places = centre[:, None] + offsets
     h, w = image.shape
-    inside = (
-        (places[..., 0] >= 0)
-        & (places[..., 0] <= w - 1)
-        & (places[..., 1] >= 0)
-        & (places[..., 1] <= h - 1)
-    )
+    inside = ((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2)
     xy = places.astype(np.float32)
     grey = cv2.remap(image.astype(np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR)
     return np.asarray(grey, dtype=np.float64), inside
@@ -433,4 +444,4 @@ def _judged(
         & (sigma < 0.5)
     )
     corners = np.where(ok[:, None], start + state[:, :2], start)
-    return Saddles(corners, ok, sigma, np.exp(state[:, 4:]).max(axis=1))
+    return Saddles(corners, ok, np.exp(state[:, 4:]).max(axis=1))

@@ -1,0 +1,1 @@
+"""Calibration of the lens from pictures of a printed board."""

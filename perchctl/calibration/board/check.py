@@ -1,0 +1,160 @@
+"""Does an existing calibration fit new pictures?
+
+The new views give two solutions: the file's camera with only the boards' poses fitted,
+and a camera of the same model fitted to these views alone. The first's reprojection
+error shows a wrong lens; but poses take up a wrong focal length, so the two cameras
+are compared at the target as well, in mm. The check fails
+
+- when the file's RMS is more than twice that of the free camera and above 0.3 px, or
+- when the two put the target further apart, straight ahead, than half of the limit
+  (1 mm, or 1 % of the distance) and than the 95 % line of the new pictures themselves.
+
+Pictures whose own 95 % line is above twice the limit cannot judge, and the check is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from perchctl.calibration.board.adjust import (
+    Fit,
+    NoSolution,
+    fit_from,
+    lens_covariance,
+    poses_only,
+    reject,
+    weighted_fit,
+)
+from perchctl.calibration.board.detect import BoardView, Rejection
+from perchctl.calibration.board.predict import limit_mm, position_errors_mm, predict_errors
+from perchctl.calibration.board.result import rejected_views
+from perchctl.calibration.board.solve import tilts_deg
+from perchctl.errors import InvalidValue
+from perchctl.vision import CameraModel
+
+MIN_CHECK_VIEWS = 3
+RMS_FACTOR = 2.0
+RMS_FLOOR_PX = 0.3
+UNSURE_FACTOR = 2.0
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """mm: between the target's places by the two cameras, straight ahead; mm95: how well
+    the new pictures fix it."""
+
+    z_m: float
+    mm: float
+    mm95: float
+
+    @property
+    def share(self) -> float:
+        """Of the limit; zero where the pictures themselves do not fix it so well."""
+        return self.mm / limit_mm(self.z_m) if self.mm > self.mm95 else 0.0
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """The verdict on a calibration by new pictures, and why.
+
+    rms_px is with the file's camera (infinite: it cannot see the boards), as are the `views`,
+    by name; free_rms_px that of the camera which fits the pictures best.
+    """
+
+    passed: bool
+    reason: str
+    rms_px: float
+    free_rms_px: float
+    views: tuple[tuple[str, float], ...]
+    rejections: tuple[Rejection, ...]
+    deviations: tuple[Deviation, ...]
+
+    def record(self, file: Path) -> dict[str, Any]:
+        """The object of `calibrate check --json`."""
+        return {
+            "pass": self.passed,
+            "reason": self.reason,
+            "file": str(file),
+            "rms_px": self.rms_px if np.isfinite(self.rms_px) else None,
+            "best_rms_px": self.free_rms_px,
+            "views": [{"name": name, "rms_px": rms} for name, rms in self.views],
+            "views_rejected": rejected_views(self.rejections),
+            "error_mm": [vars(d) for d in self.deviations if np.isfinite(d.mm)],
+        }
+
+
+def check_calibration(camera: CameraModel, views: Sequence[BoardView]) -> CheckResult:
+    """Judge a calibration by new views of a board.
+
+    Raises InvalidValue for too few views, or views that do not fix it.
+    """
+    if len(views) < MIN_CHECK_VIEWS:
+        raise InvalidValue(
+            f"{len(views)} pictures show the board, a check needs at least {MIN_CHECK_VIEWS}: add "
+            f"some with the board tilted by 20 to 45 deg and near the picture's rims"
+        )
+    try:
+        robust = reject(views, weighted_fit(views, camera.model)[0])
+    except NoSolution:
+        raise InvalidValue(
+            "no camera fits these pictures: is --board the true layout of the board?"
+        ) from None
+    free = _nearer(robust.views, robust.fit, camera)
+    fixed = poses_only(robust.views, camera)
+    if fixed is None:
+        reason = "the calibration cannot see the boards where they are: it is another camera's"
+        return CheckResult(False, reason, np.inf, free.rms_px, (), robust.rejections, ())
+    covariance = lens_covariance(free)
+    known = predict_errors(free.camera, covariance) if np.isfinite(covariance).all() else ()
+    deviations = tuple(
+        Deviation(e.z_m, float(position_errors_mm(camera, free.camera, e.z_m)[0]), e.axis_mm95)
+        for e in known
+    )
+    passed, reason = _judged(fixed, free, deviations)
+    if passed:
+        _check_evidence(free, deviations)
+    names = [view.name for view in robust.views]
+    by_view = tuple(zip(names, fixed.view_rms_px().tolist(), strict=True))
+    return CheckResult(
+        passed, reason, fixed.rms_px, free.rms_px, by_view, robust.rejections, deviations
+    )
+
+
+def _nearer(views: Sequence[BoardView], fit: Fit, camera: CameraModel) -> Fit:
+    """The better of the free solutions from nothing and from the file's camera."""
+    try:
+        return min(fit, fit_from(views, camera), key=lambda end: end.cost)
+    except NoSolution:
+        return fit
+
+
+def _judged(fixed: Fit, free: Fit, deviations: Sequence[Deviation]) -> tuple[bool, str]:
+    if fixed.rms_px > max(RMS_FACTOR * free.rms_px, RMS_FLOOR_PX):
+        return False, (
+            f"reprojection RMS {fixed.rms_px:.2f} px, where these pictures allow "
+            f"{free.rms_px:.2f} px"
+        )
+    worst = max(deviations, key=lambda d: d.share, default=None)
+    if worst is not None and worst.share > 0.5:
+        return False, (
+            f"at {worst.z_m * 100:.0f} cm the target would be {worst.mm:.1f} mm from where "
+            f"these pictures put it (+-{worst.mm95:.1f} mm), and "
+            f"{0.5 * limit_mm(worst.z_m):.1f} mm is allowed"
+        )
+    return True, f"reprojection RMS {fixed.rms_px:.2f} px ({free.rms_px:.2f} px at best)"
+
+
+def _check_evidence(free: Fit, deviations: Sequence[Deviation]) -> None:
+    """Raises InvalidValue where the pictures could not show a wrong focal length."""
+    if deviations and all(d.mm95 <= UNSURE_FACTOR * limit_mm(d.z_m) for d in deviations):
+        return
+    raise InvalidValue(
+        f"{len(free.poses)} pictures (board tilted by at most {tilts_deg(free.poses).max():.0f} "
+        f"deg) are too little to judge a focal length: add some with the board tilted by 20 to "
+        f"45 deg, filling the picture"
+    )

@@ -1,0 +1,58 @@
+"""A live camera that a person is guided in front of: its frames, and what is shown with each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from perchctl.camera import FrameSource, Grey
+from perchctl.errors import TimedOut
+from perchctl.geometry import Array
+from perchctl.vision import Frame
+
+POLL_S = 0.005
+GONE_AFTER_S = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What a guided recording shows of a frame.
+
+    Attributes:
+        index, image: the frame's number and picture (h, w).
+        outlines: kind and corners (n, 2) px of what was found in it.
+        rows: name, text, and a share 0..1 for a bar (None: no bar) of each value to show.
+        advice: the one thing to do now.
+        line: the state in one line, for a pipe.
+        taken: the recording keeps this frame.
+    """
+
+    index: int
+    image: Grey
+    outlines: tuple[tuple[str, Array], ...]
+    rows: tuple[tuple[str, str, float | None], ...]
+    advice: str
+    line: str
+    taken: bool = False
+
+
+def polled(
+    source: FrameSource, clock: Callable[[], float], sleep: Callable[[float], None]
+) -> Iterator[tuple[float, Frame | None]]:
+    """The time and the new frame, or None, at each look at a source, until it has ended.
+
+    Raises TimedOut: the source reports a problem, and gave no frame for `GONE_AFTER_S`.
+    """
+    last_s = clock()
+    while True:
+        now_s = clock()
+        frame = source.poll(now_s)
+        if frame is not None:
+            last_s = now_s
+        elif source.finished:
+            return
+        elif (problem := source.problem(now_s)) and now_s - last_s > GONE_AFTER_S:
+            raise TimedOut(problem)
+        yield now_s, frame
+        if frame is None:
+            sleep(POLL_S)
