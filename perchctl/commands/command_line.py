@@ -58,7 +58,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Show a profile as it is flown: every key with its value, unit, bounds and meaning.",
     ),
     "fit-weights": (
-        "cli.fit_weights",
+        "fit_weights",
         "Fit the merge weights to poses whose truth is known, and verify that they help.",
     ),
     "track": (

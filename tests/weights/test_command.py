@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
-from perchctl.weights.report import figure
+from perchctl.weights.result import figure
 from tests.helpers.fit_weights import run
 from tests.helpers.weights_data import BEST, independent, known, write
 
