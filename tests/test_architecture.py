@@ -97,7 +97,7 @@ MOST_NAMES = {
     "replay": 15,
     "report": 15,
     "sim": 31,
-    "target": 47,
+    "target": 30,
     "track": 15,
     "vision": 50,
     "weights": 15,

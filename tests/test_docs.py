@@ -194,8 +194,8 @@ LONG = (
     "perchctl calibrate aideck:",
     "perchctl calibrate images:board --measured",
     "perchctl fit-weights collect",
-    "perchctl make-target --camera",
-    "perchctl make-target -p target_only --camera",
+    "perchctl make-target design",
+    "perchctl make-target suggest",
     "python docs/pictures/make.py",
 )
 

@@ -42,8 +42,8 @@ _BAD_PLACE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "make-target": (
-        "cli.make_target",
-        "Print the target (or a board), true to size; design it; write measured sizes.",
+        "make_target",
+        "Print the target true to size, or a board; design it; write measured sizes.",
     ),
     "calibrate": (
         "cli.calibrate",

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from perchctl.target import TargetDrawing, ink_coverage, sheet_coverage
+from perchctl.target import TargetDrawing
 
 Picture = NDArray[np.uint8]
 
@@ -88,10 +88,10 @@ class Sheet:
         size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
         # In place: at the finest level each array of these has 20 MB, and a campaign's peak of
         # memory is here.
-        sheet = sheet_coverage(self.drawing, px_per_m, size, window_px)
+        sheet = self.drawing.sheet_coverage(px_per_m, size, window_px)
         alpha = np.multiply(sheet, 255.0)
         alpha = np.rint(alpha, out=alpha).astype(np.uint8)
-        value = ink_coverage(self.drawing, px_per_m, size, window_px)
+        value = self.drawing.ink_coverage(px_per_m, size, window_px)
         value *= INK_GREY - PAPER_GREY
         sheet *= PAPER_GREY
         value += sheet

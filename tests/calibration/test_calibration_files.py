@@ -148,7 +148,7 @@ def test_one_of_several_cameras_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("words", [
     ("calibrate", "--convert", "{chain}", "-o", "{out}.yaml"),
     ("calibrate", "{pictures}", "--check", "{chain}"),
-    ("make-target", "--camera", "{chain}", "--plot", "{out}.png"),
+    ("make-target", "design", "{chain}", "--plot", "{out}.png"),
     ("track", "{pictures}", "--stills", "--json", "--calibration", "{chain}"),
     ("track", "{pictures}", "--stills", "--json", "-p", "{profile}"),
 ])  # fmt: skip
@@ -179,7 +179,7 @@ def test_every_command_that_reads_kalibr_s_file_takes_the_camera(
     assert "its cameras are cam0, cam1" in wrong.stderr
 
 
-@pytest.mark.parametrize("words", [("calibrate", "images:."), ("make-target",)])
+@pytest.mark.parametrize("words", [("calibrate", "images:."), ("make-target", "design")])
 def test_a_camera_of_no_file_is_refused(words: tuple[str, ...]) -> None:
     result = CliRunner().invoke(app, [*words, "--cam", "cam0"])
     assert result.exit_code == 2

@@ -10,7 +10,7 @@ import numpy as np
 from perchctl.calibration import BoardView, Grey
 from perchctl.geometry import Array
 from perchctl.target import Board, parse_board
-from perchctl.target.sheets import black_squares
+from perchctl.target.boards import black_squares
 from perchctl.vision import CameraModel, project, undistort
 
 CHARUCO = parse_board("charuco:10x7:25mm:18mm:DICT_5X5_100")

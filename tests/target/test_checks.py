@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target import Board, check_target, parse_board, parse_length, parse_page, tag_cells
-from perchctl.target.checks import white_centre_ids
-from perchctl.target.sheets import black_squares, board_rectangles
+from perchctl.target import Board, check_target, parse_board, parse_length, tag_cells
+from perchctl.target.boards import black_squares, board_rectangles
+from perchctl.target.page import parse_page
+from perchctl.target.reading import white_centre_ids
 
 
 def target_of(
@@ -76,7 +77,7 @@ def test_what_cannot_work_is_refused(name: str) -> None:
 def test_a_dictionary_that_reads_more_than_its_id_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("perchctl.target.checks._ids_read", lambda image, dictionary: {997, 5, 3})
+    monkeypatch.setattr("perchctl.target.reading._ids_read", lambda image, dictionary: {997, 5, 3})
     with pytest.raises(InvalidValue, match="would be confused"):
         check_target(target_of(), 0.05)
 

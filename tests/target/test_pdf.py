@@ -13,19 +13,21 @@ from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target import (
-    Board,
+from perchctl.target import Board, parse_board
+from perchctl.target.page import (
+    Circle,
+    Filled,
+    Item,
+    Line,
     Page,
-    board_page,
-    parse_board,
+    Polygon,
+    Text,
     parse_page,
     pdf_bytes,
-    target_pages,
 )
-from perchctl.target.limits import PlainReader
-from perchctl.target.page import Circle, Filled, Item, Line, Polygon, Text
 from perchctl.target.page import text_width as width_of
-from perchctl.target.sheets import fitting_page
+from perchctl.target.reading import PlainReader
+from perchctl.target.sheets import board_page, fitting_page, target_pages
 from tests.helpers.raster import PX_PER_MM, black_runs_mm, page_picture
 
 TARGET = TargetConfig()

@@ -6,13 +6,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from perchctl.profile import load_profile
-from perchctl.target import Optics, Page, make_design, tile_page
+from perchctl.target import Optics, make_design
 from perchctl.target.design import Ranges
-from perchctl.target.overhead import SURE_PX
-from perchctl.target.page import PAGES_MM, Circle, Line, Text
-from perchctl.target.sheets import UNPRINTABLE
+from perchctl.target.page import (
+    OVERLAP,
+    PAGES_MM,
+    UNPRINTABLE,
+    Circle,
+    Line,
+    Page,
+    Text,
+    tile_page,
+)
+from perchctl.target.sight import SURE_PX
 from perchctl.target.suggest import Suggestion
-from perchctl.target.tiles import OVERLAP
 from perchctl.vision import CameraModel
 from tests.helpers.flights import short_profile
 from tests.target.test_design import PAPER_CAMERA

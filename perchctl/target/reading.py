@@ -1,9 +1,16 @@
-"""What is checked before ink is spent: that the target, as drawn, can be read and used."""
+"""What a plain detector reads of a target: of its drawing, before ink is spent, and of small
+pictures through blur and noise.
+
+The smallest side that is read is found by trial: a formula would hold for one id and one
+detector; a few hundred small pictures through the detector itself take a second and hold for the
+target at hand.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import cv2
@@ -14,13 +21,150 @@ from perchctl.errors import InvalidValue
 from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary, dictionary_size
 from perchctl.target.drawing import (
     RING_MIN_PER_LARGE_SIDE,
-    draw_bitmap,
+    TargetDrawing,
     draw_target,
     marker_cells,
+    mm_text,
 )
-from perchctl.target.lengths import mm_text
-from perchctl.target.limits import PlainReader
-from perchctl.vision import MARKERS
+from perchctl.vision import MARKERS, MarkerName
+
+
+class PlainReader:
+    """cv2.aruco with its default parameters, and for each marker a dictionary of just
+    its id (the other ids of a nested dictionary are not searched)."""
+
+    def __init__(self, target: TargetConfig) -> None:
+        dictionaries = [_own(target.large), _own(target.small)]
+        self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
+
+    def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:
+        """Corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
+        corners, ids, _, which = self._detector.detectMarkersMultiDict(image)
+        if ids is None or len(corners) == 0:
+            return {}
+        return {
+            MARKERS[int(dictionary)]: np.asarray(quad, np.float32).reshape(4, 2)
+            for quad, dictionary in zip(corners, np.asarray(which).ravel(), strict=True)
+        }
+
+
+def _own(marker: MarkerConfig) -> Any:
+    source = aruco_dictionary(marker.dictionary)
+    return cv2.aruco.Dictionary(
+        np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1]), source.markerSize, 0
+    )
+
+
+# --- The smallest side that is read through blur and noise ---------------------------------------
+
+
+FOUND_RATE = 0.9
+TRIALS = 24
+STEP = 1.04
+"""Ratio of neighbouring sides that are tried."""
+SIDE_RANGE_PX = (6.0, 400.0)
+_STREAM = 801
+_PAPER, _INK, _CEILING = 225.0, 30.0, 140.0
+_MIN_PICTURE_PX = 64
+_PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What the picture suffers: `blur_px` is the sigma of lens, focus and link together,
+    `noise` the sigma of the grey levels (0..255)."""
+
+    blur_px: float = 1.0
+    noise: float = 5.0
+
+
+@cache
+def smallest_side_px(
+    target: TargetConfig,
+    marker: MarkerName,
+    optics: Optics,
+    picture_px: int,
+    trials: int = TRIALS,
+) -> float | None:
+    """Side in px from which on the marker, seen straight on at any turn, is found in
+    `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.
+
+    `picture_px` is the larger side of the camera's picture; `trials` are the pictures of a side.
+    """
+    drawing, reader = draw_target(target), PlainReader(target)
+    count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
+
+    @cache
+    def rate(i: int) -> float:
+        return _rate(
+            drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px, trials
+        )
+
+    def found(i: int) -> bool:
+        # Three neighbours together: between 0.8 and 1 the rate rises slowly.
+        return (rate(i - 1) + rate(i) + rate(i + 1)) / 3.0 >= FOUND_RATE
+
+    # Trying the largest sides first would be slow: large pictures. Upwards by doubling,
+    # then bisection.
+    low, high, stride = -1, 0, 4
+    while not found(high):
+        low, high, stride = high, high + stride, min(2 * stride, 16)
+        if high > count:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if found(middle) else (middle, high)
+    return float(SIDE_RANGE_PX[0] * STEP**high)
+
+
+def _rate(
+    drawing: TargetDrawing,
+    reader: PlainReader,
+    marker: MarkerName,
+    side_px: float,
+    optics: Optics,
+    picture_px: int,
+    trials: int,
+) -> float:
+    side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
+    pictures = sample_pictures(drawing, side_px / side_m, side_px, optics, trials)
+    least_px = _PERIMETER_RATE * picture_px
+    hits = 0
+    for picture in pictures:
+        quad = reader.read(picture).get(marker)
+        if quad is not None and cv2.arcLength(quad, True) >= least_px:
+            hits += 1
+    return hits / trials
+
+
+def sample_pictures(
+    drawing: TargetDrawing, px_per_m: float, side_px: float, optics: Optics, count: int
+) -> list[NDArray[np.uint8]]:
+    """`count` pictures around the target's centre, 3 times `side_px` wide, at any turn and
+    any place between the pixels."""
+    fine = 2 if optics.blur_px >= 1.0 else 4
+    size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
+    n = size * fine
+    ink = drawing.ink_coverage(px_per_m * fine, n)
+    sheet = drawing.sheet_coverage(px_per_m * fine, n)
+    flat = (_CEILING * (1.0 - sheet) + _PAPER * (sheet - ink) + _INK * ink).astype(np.float32)
+    rng = np.random.default_rng([_STREAM, round(1e3 * side_px)])
+    pictures = []
+    for _ in range(count):
+        shift = rng.uniform(-0.5, 0.5, 2)
+        turn = cv2.getRotationMatrix2D(((n - 1) / 2.0, (n - 1) / 2.0), rng.uniform(0.0, 360.0), 1.0)
+        turn = np.asarray(turn, np.float64) + np.outer(shift * fine, (0.0, 0.0, 1.0))
+        turned = cv2.warpAffine(flat, turn, (n, n), borderMode=cv2.BORDER_REPLICATE)
+        if optics.blur_px > 0.05:
+            turned = cv2.GaussianBlur(turned, (0, 0), optics.blur_px * fine)
+        picture = cv2.resize(turned, (size, size), interpolation=cv2.INTER_AREA)
+        noisy = np.asarray(picture, np.float64) + rng.normal(0.0, optics.noise, picture.shape)
+        pictures.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    return pictures
+
+
+# --- What is checked before ink is spent ---------------------------------------------------------
+
 
 RING_RANGE_PER_LARGE_SIDE = (RING_MIN_PER_LARGE_SIDE, 9.0 / 150.0)
 """White ring around the small marker, per side of the large one, where the large one's
@@ -157,7 +301,7 @@ def _check_reading(target: TargetConfig, white_ids: tuple[int, ...], search: boo
 
 
 def _picture(target: TargetConfig) -> NDArray[np.uint8]:
-    return draw_bitmap(draw_target(target), _READ_SIDE_PX / target.large.side_m).image
+    return draw_target(target).bitmap(_READ_SIDE_PX / target.large.side_m)
 
 
 def largest_small_m(target: TargetConfig) -> float | None:
