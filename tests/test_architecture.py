@@ -97,7 +97,7 @@ MOST_NAMES = {
     "replay": 15,
     "report": 15,
     "sim": 31,
-    "target": 30,
+    "target": 29,
     "track": 15,
     "vision": 50,
     "weights": 15,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from perchctl.calibration.tags import find_tags
 from perchctl.calibration.types import BoardView, Grey
 from perchctl.geometry import Array
-from perchctl.target import TAG_BORDER_CELLS, Board, BoardKind, tag_cells
+from perchctl.target import TAG_BORDER_CELLS, Board, tag_cells
 from perchctl.vision import field_picture, is_combed
 
 MIN_CORNERS = 6
@@ -149,7 +149,7 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
     return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
 
 
-_FINDERS: dict[BoardKind, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
+_FINDERS: dict[str, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
     "chessboard": _chessboard,
     "charuco": _charuco,
     "aprilgrid": _aprilgrid,

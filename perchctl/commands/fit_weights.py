@@ -7,7 +7,7 @@ import time
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -57,6 +57,10 @@ from perchctl.weights import (
 app = new_app(Group)
 
 
+def _grouped(panel: str, *names: str, **settings: Any) -> Any:
+    return typer.Option(*names, rich_help_panel=panel, **settings)
+
+
 @app.command(
     cls=Command,
     epilog=examples(
@@ -89,23 +93,15 @@ def fit(
     as_json: JsonOption = False,
     step: Annotated[
         float | None,
-        typer.Option(
-            "--step",
-            help="Constant step, in 1 / mean(d^2); else it falls.",
-            rich_help_panel="LMS",
-        ),
+        _grouped("LMS", "--step", help="Constant step, in 1 / mean(d^2); else it falls."),
     ] = None,
     passes: Annotated[
-        int | None,
-        typer.Option("--passes", help="Times through the data.", rich_help_panel="LMS"),
+        int | None, _grouped("LMS", "--passes", help="Times through the data.")
     ] = None,
     order: Annotated[
-        Literal["shuffled", "recorded"],
-        typer.Option("--order", help="Of the rows.", rich_help_panel="LMS"),
+        Literal["shuffled", "recorded"], _grouped("LMS", "--order", help="Of the rows.")
     ] = "shuffled",
-    start: Annotated[
-        float, typer.Option("--start", help="First weight.", rich_help_panel="LMS")
-    ] = 0.5,
+    start: Annotated[float, _grouped("LMS", "--start", help="First weight.")] = 0.5,
 ) -> int:
     """Fit the merge weights to poses whose truth is known, and verify that they help.
 
@@ -237,47 +233,32 @@ def collect(
         ),
     ] = None,
     uri: Annotated[
-        str | None,
-        typer.Option("--uri", "-u", help="Vehicle, for --truth estimate.", rich_help_panel="Truth"),
+        str | None, _grouped("Truth", "--uri", "-u", help="Vehicle, for --truth estimate.")
     ] = None,
     mocap: Annotated[
         str | None,
-        typer.Option(
-            "--mocap",
-            help="TYPE:HOST, as in vicon:192.168.1.2; else the profile's.",
-            rich_help_panel="Truth",
+        _grouped(
+            "Truth", "--mocap", help="TYPE:HOST, as in vicon:192.168.1.2; else the profile's."
         ),
     ] = None,
     bodies: Annotated[
         str | None,
-        typer.Option(
+        _grouped(
+            "Truth",
             "--bodies",
             help="Rigid bodies of vehicle and target; else the profile's, and target.",
-            rich_help_panel="Truth",
         ),
     ] = None,
     target: Annotated[
         str | None,
-        typer.Option(
-            "--target",
-            help="Target in the world, 'x y z yaw' in m and deg.",
-            rich_help_panel="Truth",
-        ),
+        _grouped("Truth", "--target", help="Target in the world, 'x y z yaw' in m and deg."),
     ] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Of the places.", rich_help_panel="Simulation")
-    ] = 0,
+    seed: Annotated[int, _grouped("Simulation", "--seed", min=0, help="Of the places.")] = 0,
     noise: Annotated[
-        float,
-        typer.Option(
-            "--noise", min=0.0, max=50.0, help="Grey levels.", rich_help_panel="Simulation"
-        ),
+        float, _grouped("Simulation", "--noise", min=0.0, max=50.0, help="Grey levels.")
     ] = 4.0,
     blur: Annotated[
-        float,
-        typer.Option(
-            "--blur", min=0.0, max=50.0, help="Sigma in px.", rich_help_panel="Simulation"
-        ),
+        float, _grouped("Simulation", "--blur", min=0.0, max=50.0, help="Sigma in px.")
     ] = 1.0,
 ) -> int:
     """Collect the data of a fit: poses of both markers at places whose actual pose is known.

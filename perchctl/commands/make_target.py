@@ -42,7 +42,6 @@ from perchctl.target import (
     measured_target,
     mm_text,
     mounted_camera,
-    new_profile_text,
     parse_board,
     parse_length,
     suggest_target,
@@ -73,45 +72,25 @@ TileOption = Annotated[
 MagnetOption = Annotated[
     str, typer.Option("--magnet", help="Diameter of the magnet behind the sheet.")
 ]
+
+
+def _of_target(name: str, text: str, **limits: Any) -> Any:
+    return typer.Option(name, help=text, rich_help_panel=ANOTHER, **limits)
+
+
 LargeOption = Annotated[
-    str | None,
-    typer.Option(
-        "--large",
-        help="Side of the large marker: 150mm, 15cm, 0.15m.",
-        rich_help_panel=ANOTHER,
-    ),
+    str | None, _of_target("--large", "Side of the large marker: 150mm, 15cm, 0.15m.")
 ]
-LargeIdOption = Annotated[
-    int | None,
-    typer.Option("--large-id", min=0, help="Its id.", rich_help_panel=ANOTHER),
-]
+LargeIdOption = Annotated[int | None, _of_target("--large-id", "Its id.", min=0)]
 LargeDictOption = Annotated[
-    str | None,
-    typer.Option(
-        "--large-dict",
-        help="Its dictionary, such as DICT_4X4_1000.",
-        rich_help_panel=ANOTHER,
-    ),
+    str | None, _of_target("--large-dict", "Its dictionary, such as DICT_4X4_1000.")
 ]
 SmallOption = Annotated[
-    str | None,
-    typer.Option(
-        "--small",
-        help="Side of the small marker, with its unit.",
-        rich_help_panel=ANOTHER,
-    ),
+    str | None, _of_target("--small", "Side of the small marker, with its unit.")
 ]
-SmallIdOption = Annotated[
-    int | None,
-    typer.Option("--small-id", min=0, help="Its id.", rich_help_panel=ANOTHER),
-]
+SmallIdOption = Annotated[int | None, _of_target("--small-id", "Its id.", min=0)]
 SmallDictOption = Annotated[
-    str | None,
-    typer.Option(
-        "--small-dict",
-        help="Its dictionary: DICT_ARUCO_ORIGINAL, ...",
-        rich_help_panel=ANOTHER,
-    ),
+    str | None, _of_target("--small-dict", "Its dictionary: DICT_ARUCO_ORIGINAL, ...")
 ]
 
 
@@ -276,9 +255,11 @@ def design(
     check_output(plot, (".png",), force)
     target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
     found = make_design(target, model, Optics(blur, noise), config, ceiling)
+    from perchctl.target import draw_design  # matplotlib takes a second to load
+
     lines = [found.text(name), f"wrote {plot}"]
     record = found.record() | {"target": target.model_dump(mode="json")}
-    return _write({plot: found.picture()}, lines, record, force, as_json)
+    return _write({plot: draw_design(found)}, lines, record, force, as_json)
 
 
 @app.command(
@@ -311,6 +292,8 @@ def suggest(
     magnet_m = parse_length(magnet, "--magnet")
     found, proposed = suggest_target(model, optics, config, magnet_m, ceiling, page)
     present = make_design(config.target, model, optics, config, ceiling)
+    from perchctl.target import draw_design  # matplotlib takes a second to load
+
     lines = [f"note: {note}" for note in found.notes] + [found.command(), ""]
     lines += [f"why: {reason}" for reason in found.reasons]
     lines += [*proposed.compared_with(present, f"profile {config.name}"), ""]
@@ -322,7 +305,7 @@ def suggest(
         **proposed.record(),
         "target": found.target.model_dump(mode="json"),
     }
-    return _write({plot: proposed.picture()}, lines, record, force, as_json)
+    return _write({plot: draw_design(proposed)}, lines, record, force, as_json)
 
 
 @app.command(
@@ -379,7 +362,7 @@ def measured(
     found = measured_target(nominal, sides_m)
     files: dict[Path, bytes] = {}
     if not changed:
-        files[path] = new_profile_text(_named_from(base, path), found.target).encode()
+        files[path] = found.profile_text(_named_from(base, path)).encode()
     else:
         write_profile_values(path, _changed_values(found.target, config.target))
     lines = [*found.notes, f"{'changed' if changed else 'wrote'} {path}: fly -p {path}"]

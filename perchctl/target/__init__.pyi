@@ -1,7 +1,6 @@
 from .boards import TAG_BORDER_CELLS as TAG_BORDER_CELLS
 from .boards import TAG_DICTIONARY as TAG_DICTIONARY
 from .boards import Board as Board
-from .boards import BoardKind as BoardKind
 from .boards import parse_board as parse_board
 from .boards import tag_cells as tag_cells
 from .design import TargetDesign as TargetDesign
@@ -12,7 +11,7 @@ from .drawing import mm_text as mm_text
 from .drawing import parse_length as parse_length
 from .measured import NOTABLE_SCALE_ERROR as NOTABLE_SCALE_ERROR
 from .measured import measured_target as measured_target
-from .measured import new_profile_text as new_profile_text
+from .plot import draw_design as draw_design
 from .print_check import PrintCheck as PrintCheck
 from .print_check import PrintVerdict as PrintVerdict
 from .reading import Optics as Optics

@@ -21,11 +21,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
@@ -261,65 +262,65 @@ def _wrong(text: str, why: str) -> InvalidValue:
 # --- Kalibr's own description of a board (``target_type: aprilgrid``) in perchctl's notation ---
 
 
-KEYS = {
-    "aprilgrid": ("tagCols", "tagRows", "tagSize", "tagSpacing"),
-    "checkerboard": ("targetCols", "targetRows", "colSpacingMeters", "rowSpacingMeters"),
-}
+class _Aprilgrid(BaseModel, strict=True):
+    target_type: Literal["aprilgrid"]
+    tagCols: int
+    tagRows: int
+    tagSize: float
+    tagSpacing: float
+
+    def notation(self) -> str:
+        counts = f"{self.tagCols}x{self.tagRows}"
+        return f"aprilgrid:{counts}:{1e3 * self.tagSize:.9g}mm:{self.tagSpacing:g}"
+
+
+class _Checkerboard(BaseModel, strict=True):
+    """It counts inner corners, as perchctl does."""
+
+    target_type: Literal["checkerboard"]
+    targetCols: int
+    targetRows: int
+    colSpacingMeters: float
+    rowSpacingMeters: float
+
+    @model_validator(mode="after")
+    def _square(self) -> Self:
+        if self.colSpacingMeters != self.rowSpacingMeters:
+            raise ValueError(
+                "colSpacingMeters and rowSpacingMeters differ: squares of a chessboard are "
+                "square; a print that is not is given by its measured sides"
+            )
+        return self
+
+    def notation(self) -> str:
+        counts = f"{self.targetCols}x{self.targetRows}"
+        return f"chessboard:{counts}:{1e3 * self.colSpacingMeters:.9g}mm"
+
+
+_KALIBR: TypeAdapter[_Aprilgrid | _Checkerboard] = TypeAdapter(
+    Annotated[_Aprilgrid | _Checkerboard, Field(discriminator="target_type")]
+)
+_MOST_CHARACTERS = 200  # of the file's faults in a sentence
 
 
 def kalibr_notation(path: Path) -> str:
-    """``aprilgrid:6x6:88mm:0.3`` from the file that is given to Kalibr as --target; a
-    checkerboard counts inner corners in both.
+    """``aprilgrid:6x6:88mm:0.3`` from the file that is given to Kalibr as --target.
 
     Raises NotFound, InvalidValue.
     """
     try:
-        raw: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        return _KALIBR.validate_python(parse_yaml(path.read_text(encoding="utf-8"))).notation()
     except FileNotFoundError:
         raise NotFound(f"board file {path} does not exist") from None
     except UnicodeDecodeError:
-        raise InvalidValue(f"{path}: cannot be read as a board: not a text file") from None
+        why = "not a text file"
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = "".join(f"{key}: " for key in first["loc"][1:])
+        why = f"{place}{first['msg']}"
     except (OSError, ValueError) as error:
-        raise InvalidValue(f"{path}: cannot be read as a board: {error}") from None
-    kind = raw.get("target_type") if isinstance(raw, dict) else None
-    if not isinstance(kind, str) or kind not in KEYS:
-        raise InvalidValue(
-            f"{path}: is no board of Kalibr's that is known here: target_type must be "
-            f"{' or '.join(KEYS)}, found {_shown(kind)}"
-        )
-    columns, rows, across, more = (_number(path, raw, key) for key in KEYS[kind])
-    counts = f"{_whole(path, kind, columns)}x{_whole(path, kind, rows)}"
-    if kind == "aprilgrid":
-        return f"{kind}:{counts}:{1e3 * across:.9g}mm:{more:g}"
-    if across != more:
-        raise InvalidValue(
-            f"{path}: colSpacingMeters {across:g} and rowSpacingMeters {more:g} differ: squares "
-            f"of a chessboard are square; a print that is not is given by its measured sides"
-        )
-    return f"chessboard:{counts}:{1e3 * across:.9g}mm"
-
-
-def _number(path: Path, raw: dict[str, Any], key: str) -> float:
-    value = raw.get(key)
-    if value is None:
-        raise InvalidValue(f"{path}: key {key} is missing")
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InvalidValue(f"{path}: {key}: {_shown(value)} is not a number")
-    return float(value)
-
-
-def _whole(path: Path, kind: str, value: float) -> int:
-    if not value.is_integer():
-        raise InvalidValue(f"{path}: {value:g} columns or rows of a {kind} are not whole")
-    return int(value)
-
-
-def _shown(value: Any) -> str:
-    """A value of the file, kept to a sentence's length."""
-    if value is None:
-        return "nothing"
-    text = repr(value) if isinstance(value, (str, int, float)) else type(value).__name__
-    return text if len(text) <= 40 else f"{text[:40]}..."
+        why = str(error)
+    raise InvalidValue(f"{path}: cannot be read as Kalibr's board: {why[:_MOST_CHARACTERS]}")
 
 
 # --- What of a board is black ------------------------------------------------------------------

@@ -110,12 +110,6 @@ class TargetDesign:
         """The least pose error that the corners allow, from contact to z1."""
         return _error_curve(self.target, self.ranges)
 
-    def picture(self) -> bytes:
-        """A PNG: bars from the nearest to the farthest range, and the error bound below them."""
-        from perchctl.target.plot import draw_design  # matplotlib takes a second to load
-
-        return draw_design(self)
-
     def record(self) -> dict[str, object]:
         """Ranges, gaps and blind range for machines; metres."""
         r = self.ranges

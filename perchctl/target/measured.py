@@ -26,6 +26,19 @@ class Measured:
     target: TargetConfig
     notes: tuple[str, ...]
 
+    def profile_text(self, base: str) -> str:
+        """A small profile that extends `base` and holds the target."""
+        name = yaml.safe_dump(base, width=1000).splitlines()[0]
+        lines = [f"extends: {name}", "", "target:", "  # sides of the black squares, measured"]
+        lines += [
+            f"  {which}: {{dictionary: {marker.dictionary}, id: {marker.id}, "
+            f"side_m: {marker.side_m:g}}}"
+            for which, marker in (("large", self.target.large), ("small", self.target.small))
+        ]
+        if self.target.size_sigma != TargetConfig().size_sigma:
+            lines.append(f"  size_sigma: {self.target.size_sigma:g}")
+        return "\n".join(lines) + "\n"
+
 
 def measured_target(nominal: TargetConfig, sides_m: Mapping[str, float]) -> Measured:
     """The target with the sides of ``large`` and ``small``, as far as they were measured. Both
@@ -62,17 +75,3 @@ def measured_target(nominal: TargetConfig, sides_m: Mapping[str, float]) -> Meas
     if target.size_sigma > MEASURED_SIGMA:
         notes.append("measure both markers: distances claim less until both sizes are known")
     return Measured(target, tuple(notes))
-
-
-def new_profile_text(base: str, target: TargetConfig) -> str:
-    """A small profile that extends `base` and holds the target."""
-    name = yaml.safe_dump(base, width=1000).splitlines()[0]
-    lines = [f"extends: {name}", "", "target:", "  # sides of the black squares, measured"]
-    lines += [
-        f"  {which}: {{dictionary: {marker.dictionary}, id: {marker.id}, "
-        f"side_m: {marker.side_m:g}}}"
-        for which, marker in (("large", target.large), ("small", target.small))
-    ]
-    if target.size_sigma != TargetConfig().size_sigma:
-        lines.append(f"  size_sigma: {target.size_sigma:g}")
-    return "\n".join(lines) + "\n"

@@ -173,7 +173,7 @@ own centre is not white (measured: at 0 mm of 150 the small marker is never foun
 MIN_DISTANCE = 3
 """Cells in which two patterns of one size must differ: one more than the wrong bits that
 are corrected in both."""
-LISTED_IDS, MOST_TRIED = 6, 20
+LISTED_IDS = 6
 _READ_SIDE_PX = 480.0
 
 
@@ -194,11 +194,8 @@ class TargetCheck:
         return f"{white}; both markers are read from the drawing"
 
 
-def check_target(target: TargetConfig, magnet_m: float, *, search: bool = True) -> TargetCheck:
-    """Raises InvalidValue, in one sentence, for the first thing that is wrong.
-
-    `search` for sizes and ids that would do, to name them: takes seconds.
-    """
+def check_target(target: TargetConfig, magnet_m: float) -> TargetCheck:
+    """Raises InvalidValue, in one sentence, for the first thing that is wrong."""
     _check_magnet(target, magnet_m)
     large, small = target.large, target.small
     for name, marker in (("large", large), ("small", small)):
@@ -215,9 +212,9 @@ def check_target(target: TargetConfig, magnet_m: float, *, search: bool = True) 
             raise InvalidValue(
                 f"the white ring around the small marker would be {check.ring_m * 1e3:.1f} mm, "
                 f"and {low * 1e3:.1f} to {high * 1e3:.1f} mm are needed: "
-                f"{_white_hint(target, white_ids, search)}"
+                f"{_white_hint(target, white_ids)}"
             )
-    _check_reading(target, white_ids, search)
+    _check_reading(target, white_ids)
     return check
 
 
@@ -268,7 +265,7 @@ def _turns_onto_itself(marker: MarkerConfig) -> bool:
     return any(np.array_equal(cells, np.rot90(cells, turn)) for turn in (1, 2, 3))
 
 
-def _check_reading(target: TargetConfig, white_ids: tuple[int, ...], search: bool) -> None:
+def _check_reading(target: TargetConfig, white_ids: tuple[int, ...]) -> None:
     """Reads the drawing: both markers must be found, and each whole dictionary must find
     nothing else in it."""
     large, small = target.large, target.small
@@ -278,13 +275,13 @@ def _check_reading(target: TargetConfig, white_ids: tuple[int, ...], search: boo
             f"nearly the same pattern, so one marker would be taken for the other: take another "
             f"id for one of them"
         )
-    image = _picture(target)
+    image = draw_target(target).bitmap(_READ_SIDE_PX / large.side_m)
     seen = PlainReader(target).read(image)
     for name in MARKERS:
         if name not in seen:
             raise InvalidValue(
                 f"the {name} marker cannot be read from this drawing: "
-                f"{_white_hint(target, white_ids, search)}"
+                f"{_white_hint(target, white_ids)}"
             )
     same_size = (
         aruco_dictionary(large.dictionary).markerSize
@@ -298,21 +295,6 @@ def _check_reading(target: TargetConfig, white_ids: tuple[int, ...], search: boo
                 f"{marker.dictionary} also reads id {min(extra)} from this drawing, so the two "
                 f"dictionaries would be confused: take another id or dictionary"
             )
-
-
-def _picture(target: TargetConfig) -> NDArray[np.uint8]:
-    return draw_target(target).bitmap(_READ_SIDE_PX / target.large.side_m)
-
-
-def largest_small_m(target: TargetConfig) -> float | None:
-    """The largest small marker, in whole mm, with which both are read; None without one."""
-    for millimetre in range(math.floor(target.small.side_m * 1e3), 3, -1):
-        smaller = target.model_copy(
-            update={"small": target.small.model_copy(update={"side_m": millimetre / 1e3})}
-        )
-        if len(PlainReader(smaller).read(_picture(smaller))) == 2:
-            return millimetre / 1e3
-    return None
 
 
 def _ids_read(image: NDArray[np.uint8], dictionary: Any) -> set[int]:
@@ -331,22 +313,10 @@ def _distance(a: MarkerConfig, b: MarkerConfig) -> int:
     return min(int((np.rot90(first, turn) != second).sum()) for turn in range(4))
 
 
-def _white_hint(target: TargetConfig, white_ids: tuple[int, ...], search: bool) -> str:
-    if not search:
-        return "take a smaller small marker, or another id"
-    fits = largest_small_m(target)
-    small = "take a smaller --small" + ("" if fits is None else f" (up to {mm_text(fits)}mm)")
-    if target.large.id in white_ids:
+def _white_hint(target: TargetConfig, white_ids: tuple[int, ...]) -> str:
+    small = "take a smaller --small"
+    if not white_ids or target.large.id in white_ids:
         return small
-    readable = [i for i in white_ids[:MOST_TRIED] if _reads_with(target, i)]
-    if not readable:
-        return small
-    return (
-        f"{small}, or a --large-id that is white in the middle "
-        f"({target.large.dictionary}: {', '.join(str(i) for i in readable[:LISTED_IDS])})"
-    )
-
-
-def _reads_with(target: TargetConfig, large_id: int) -> bool:
-    other = target.model_copy(update={"large": target.large.model_copy(update={"id": large_id})})
-    return len(PlainReader(other).read(_picture(other))) == 2
+    listed = ", ".join(str(i) for i in white_ids[:LISTED_IDS])
+    dictionary = target.large.dictionary
+    return f"{small}, or a --large-id that is white in the middle ({dictionary}: {listed})"

@@ -61,8 +61,7 @@ class Measurements:
         t_s: (n,).
         large, small: (n, 4), NaN where the marker was not seen.
         actual: (n, 4), the truth.
-        joint: (n, 4), both markers solved together; NaN where it is missing. None where
-            the data do not hold it.
+        joint: (n, 4), both markers solved together; NaN where it is missing.
         line: the row's line in its file, (n,).
         notes: sentences about the data that are no faults.
     """
@@ -74,7 +73,7 @@ class Measurements:
     large: Array
     small: Array
     actual: Array
-    joint: Array | None
+    joint: Array
     line: NDArray[np.int64]
     notes: tuple[str, ...] = ()
 
@@ -123,24 +122,16 @@ def _joined(parts: list[Measurements]) -> Measurements:
     for part in parts:
         positions.append(part.position - int(part.position.min()) + offset)
         offset = int(positions[-1].max()) + 1
-
-    def all_of(key: str) -> Any:
-        return np.concatenate([getattr(part, key) for part in parts])
-
-    joints = [
-        np.full_like(part.large, np.nan) if part.joint is None else part.joint for part in parts
-    ]
+    arrays: dict[str, Any] = {
+        key: np.concatenate([getattr(part, key) for part in parts])
+        for key in ("t_s", "large", "small", "actual", "joint", "line")
+    }
     return Measurements(
         name=", ".join(part.name for part in parts),
         sha256=",".join(part.sha256 for part in parts),
         position=np.concatenate(positions),
-        t_s=all_of("t_s"),
-        large=all_of("large"),
-        small=all_of("small"),
-        actual=all_of("actual"),
-        joint=None if all(part.joint is None for part in parts) else np.concatenate(joints),
-        line=all_of("line"),
         notes=tuple(note for part in parts for note in part.notes),
+        **arrays,
     )
 
 
@@ -251,7 +242,7 @@ def _parsed(path: Path, sha256: str, reader: Any, ended: bool) -> Measurements:
         large=pose("large"),
         small=pose("small"),
         actual=pose("actual"),
-        joint=pose("joint") if JOINT[0] in names else None,
+        joint=pose("joint") if JOINT[0] in names else np.full((len(at), 4), np.nan),
         line=at,
         notes=() if ended else (note,),
     )

@@ -60,7 +60,7 @@ class Errors:
 
     Attributes:
         positions: the positions' numbers, (g,); starts: the first row of each, (g,).
-        large, small: a and b, (n, 4). joint: (n, 4) with NaN, or None.
+        large, small: a and b, (n, 4). joint: (n, 4) with NaN.
         use: False where the row is an outlier on the axis, (n, 4).
         actual: the truth at each position's first row, (g, 4).
         single_rows: rows left out because only one marker, or none, was seen.
@@ -73,7 +73,7 @@ class Errors:
     starts: NDArray[np.int64]
     large: Array
     small: Array
-    joint: Array | None
+    joint: Array
     use: NDArray[np.bool_]
     actual: Array
     single_rows: int
@@ -96,10 +96,9 @@ def errors_of(data: Measurements) -> Errors:
     large, small = data.large[rows] - actual, data.small[rows] - actual
     yaw = np.concatenate([large[:, YAW], small[:, YAW]])
     reference = float(np.arctan2(np.sin(yaw).sum(), np.cos(yaw).sum()))
-    joint = None if data.joint is None else data.joint[rows] - actual
+    joint = data.joint[rows] - actual
     for each in (large, small, joint):
-        if each is not None:
-            each[:, YAW] = reference + wrap(each[:, YAW] - reference)
+        each[:, YAW] = reference + wrap(each[:, YAW] - reference)
     return Errors(
         name=data.name,
         line=int(data.line[rows[0]]),
@@ -509,8 +508,6 @@ def evidence(errors: Errors, sums: Array, weights: Mapping[str, Array]) -> Evide
 
 def _joint_squares(errors: Errors) -> Array | None:
     """(g, 4), NaN where a position has no joint pose; None without any."""
-    if errors.joint is None:
-        return None
     there = errors.use & ~np.isnan(errors.joint)
     if not there.any():
         return None

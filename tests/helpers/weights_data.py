@@ -65,7 +65,7 @@ def measured(
         large=turned(actual + a),
         small=turned(actual + b),
         actual=turned(actual),
-        joint=None,
+        joint=np.full((n, 4), np.nan),
         line=np.arange(n) + 2,
     )
 

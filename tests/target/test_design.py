@@ -15,7 +15,14 @@ import numpy as np
 import pytest
 
 from perchctl.profile import Profile, TargetConfig, load_profile
-from perchctl.target import Optics, TargetDesign, check_target, make_design, suggest_target
+from perchctl.target import (
+    Optics,
+    TargetDesign,
+    check_target,
+    draw_design,
+    make_design,
+    suggest_target,
+)
 from perchctl.target.design import Ranges, pose_bound
 from perchctl.target.drawing import marker_corners_m
 from perchctl.target.sight import FieldOfView, square_outline, turned_outline
@@ -199,7 +206,7 @@ def test_what_no_target_can_cover_is_said(profile: Profile) -> None:
 
 
 def test_the_plot_and_the_record(paper_design: TargetDesign) -> None:
-    png = paper_design.picture()
+    png = draw_design(paper_design)
     picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     assert picture is not None
     assert min(picture.shape[:2]) > 500

@@ -38,7 +38,6 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
     data = read_csv(simulated)
     assert np.unique(data.position).tolist() == [1, 2, 3, 4]
     assert len(data) == 48
-    assert data.joint is not None
     for pose in (data.large, data.small, data.joint):
         assert np.abs((pose - data.actual)[:, :3]).max() < 2e-3
     torn = simulated.with_name("torn.csv")
