@@ -319,7 +319,15 @@ def suggest(
 )
 @reporting
 def measured(
-    profile: ProfileOption = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile",
+            "-p",
+            help="Profile that gets the sizes, or with -o the one that the new one extends.",
+            autocompletion=complete_profile,
+        ),
+    ] = None,
     measured_large: Annotated[
         str | None,
         typer.Option("--measured-large", help="Side of the large black square as printed, mm."),
