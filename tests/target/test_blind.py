@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
 from perchctl.profile.vision import VehicleConfig
 from perchctl.target import mounted_camera
 from perchctl.target.sight import Mounted
-from perchctl.vision import CameraModel
+from tests.target.rig import camera_of
 
-CAMERA = CameraModel(
-    (640, 480),
-    np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]]),
-    np.zeros(5),
-)
+CAMERA = camera_of()
 SMALL_M = 0.0125  # its half side
 WIDE, HIGH = 317 / 380, 237 / 380  # of the picture, from the axis, less the margin
 

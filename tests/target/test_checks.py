@@ -11,22 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.errors import InvalidValue, NotFound
-from perchctl.profile import MarkerConfig, TargetConfig
 from perchctl.target import Board, check_target, parse_board, parse_length, tag_cells
 from perchctl.target.boards import black_squares, board_rectangles
 from perchctl.target.page import parse_page
 from perchctl.target.reading import white_centre_ids
-
-
-def target_of(
-    large: tuple[str, int, float] = ("DICT_4X4_1000", 997, 150.0),
-    small: tuple[str, int, float] = ("DICT_ARUCO_ORIGINAL", 5, 25.0),
-) -> TargetConfig:
-    first, second = (
-        MarkerConfig(dictionary=name, id=marker_id, side_m=side_mm / 1e3)
-        for name, marker_id, side_mm in (large, small)
-    )
-    return TargetConfig(large=first, small=second)
+from tests.target.rig import target_of
 
 
 def test_the_paper_s_target_passes_and_is_white_in_the_middle() -> None:

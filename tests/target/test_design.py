@@ -25,16 +25,13 @@ from perchctl.target import (
 )
 from perchctl.target.design import Ranges, pose_bound
 from perchctl.target.drawing import marker_corners_m
-from perchctl.target.sight import FieldOfView, square_outline, turned_outline
-from perchctl.vision import CameraModel
+from perchctl.target.sight import SURE_PX, FieldOfView, square_outline, turned_outline
+from perchctl.target.suggest import Suggestion
+from tests.helpers.flights import short_profile
+from tests.target.rig import camera_of
 
 TARGET = TargetConfig()
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def camera_of(focal_px: float, dist: tuple[float, ...] = (0.0,) * 5) -> CameraModel:
-    K = np.array([[focal_px, 0.0, 319.5], [0.0, focal_px, 239.5], [0.0, 0.0, 1.0]])
-    return CameraModel((640, 480), K, np.array(dist))
 
 
 PAPER_CAMERA = camera_of(380.0)
@@ -213,3 +210,25 @@ def test_the_plot_and_the_record(paper_design: TargetDesign) -> None:
     record = paper_design.record()
     assert record["z1_m"] == paper_design.ranges.z1_m
     assert record["warnings"] == []
+
+
+def test_a_target_beyond_the_named_pages_is_proposed_in_sheets() -> None:
+    target = load_profile("sim").target
+    assert Suggestion(target, "a3", (), ()).command().endswith("--page a3")
+    command = Suggestion(target, "460x500mm", (), ()).command()
+    assert command.endswith("--page 460x500mm --tile a3")
+
+
+def test_a_gap_on_the_ground_is_named_where_the_target_is_the_position() -> None:
+    """From the search height it would be near enough."""
+    ranges = Ranges(3.4, 0.5, 0.16, 0.12, 0.03, 16.6, 17.0, 380.0)
+    ground = short_profile({"positioning": "target"}, base="sim")
+    sure_m = 380.0 * ground.target.large.side_m / SURE_PX
+
+    def warned(profile: Profile, ceiling_m: float) -> bool:
+        design = make_design(ground.target, PAPER_CAMERA, Optics(), profile, ceiling_m, ranges)
+        return any("gap on the ground" in text for text in design.warnings)
+
+    assert not warned(ground, 2.9)
+    assert warned(ground, 3.4) is (0.9 * sure_m < 3.4 - 0.005)
+    assert not warned(load_profile("sim"), 3.4)

@@ -18,15 +18,13 @@ from perchctl.target import (
     sight_from,
 )
 from perchctl.target.sight import SURE_PX, least_side_px
-from perchctl.vision import CameraModel, project, square_corners
+from perchctl.vision import project, square_corners
+from tests.target.rig import camera_of
 
 TARGET = TargetConfig()
 SIDE_M = TARGET.large.side_m
 F = 380.0
-CAMERA = CameraModel(
-    (640, 480), np.array([[F, 0.0, 319.5], [0.0, F, 239.5], [0.0, 0.0, 1.0]]),
-    np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
-)  # fmt: skip
+CAMERA = camera_of(F, (-0.05, 0.01, 0.0, 0.0, 0.0))
 angles = st.floats(-math.pi, math.pi)
 leans = st.floats(-25.0, 25.0)
 mounts = st.builds(
