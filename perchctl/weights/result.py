@@ -353,12 +353,12 @@ def _positions_text(result: Result) -> str:
     ]
     for k in range(min(count, MOST_POSITIONS)):
         *xyz, yaw = places[k]
-        cells = [*(f"{v:.2f}" for v in xyz), f"{yaw:.1f}", *map(figure, error[k] * _SCALES)]
+        cells = [*(f"{v:.2f}" for v in xyz), f"{yaw:.1f}", *map(_figure, error[k] * _SCALES)]
         lines.append(line(str(int(result.errors.positions[k])), cells))
     return "\n".join(lines)
 
 
-def figure(value: float, sign: str = "", spread: float = 0.0) -> str:
+def _figure(value: float, sign: str = "", spread: float = 0.0) -> str:
     """To three digits of the larger one, but no finer than hundredths; beyond 100 000 in
     thousands (k). No exponent, and no zero with a minus."""
     size = max(abs(value), abs(spread))
@@ -370,7 +370,7 @@ def figure(value: float, sign: str = "", spread: float = 0.0) -> str:
 
 def _scaled(values: Array, halves: Array, sign: str = "") -> list[str]:
     pairs = zip((values * _SCALES).tolist(), (halves * _SCALES).tolist(), strict=True)
-    return [f"{figure(v, sign, h)} +-{figure(h, '', v)}" for v, h in pairs]
+    return [f"{_figure(v, sign, h)} +-{_figure(h, '', v)}" for v, h in pairs]
 
 
 def _line(label: str, cells: Sequence[str]) -> str:
