@@ -19,8 +19,9 @@ import numpy as np
 from perchctl.geometry import make_T, rotation_from_rpy
 from perchctl.profile import TargetConfig
 from perchctl.sim import Renderer, Scenario
-from perchctl.target import Optics, design_ranges
-from perchctl.target.limits import FOUND_RATE, TRIALS, PlainReader
+from perchctl.target import Optics
+from perchctl.target.design import design_ranges
+from perchctl.target.reading import FOUND_RATE, TRIALS, PlainReader
 from perchctl.vision import CameraModel, MarkerName
 
 FOCAL_PX = (250.0, 380.0, 600.0)

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from perchctl.weights.table import NEEDED
+from perchctl.weights.data import NEEDED
 
 MOST_S, MOST_BYTES = 10.0, 1e9
 
@@ -39,8 +39,9 @@ def command(*words: str) -> str:
 def experiment(profile: str, positions: int, folder: Path) -> None:
     fitted, other = folder / "fitted.csv", folder / "other.csv"
     words = ("-p", profile, "--truth", "sim", "--positions", str(positions))
-    command("--collect", str(other), *words, "--seed", "1")
-    print(command("--collect", str(fitted), *words, "--seed", "0", "--test", str(other)))
+    command("collect", str(other), *words, "--seed", "1")
+    command("collect", str(fitted), *words, "--seed", "0")
+    print(command(str(fitted), "-p", profile, "--test", str(other)))
 
 
 def write_rows(path: Path, rows: int) -> None:

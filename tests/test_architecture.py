@@ -100,7 +100,7 @@ MOST_NAMES = {
     "replay": 15,
     "report": 15,
     "sim": 29,
-    "target": 47,
+    "target": 29,
     "track": 15,
     "vision": 50,
     "weights": 15,

@@ -111,7 +111,7 @@ def cheap(line: str) -> list[str]:
             for option in ("-n", "--only"):
                 if option in words:
                     words[words.index(option) + 1] = "1"
-        case ["perchctl", "fit-weights"] if "--collect" in words:
+        case ["perchctl", "fit-weights"] if "collect" in words:
             words += ["--positions", "3", "--frames", "10"]
         case ["perchctl", "calibrate"] if words[2] == "mount":  # without a vehicle in a hand
             words = [*words[:3], "-p", "my_vehicle.yaml", "--from", "hand.jsonl"]
@@ -193,9 +193,9 @@ LONG = (
     "perchctl calibrate images:april",
     "perchctl calibrate aideck:",
     "perchctl calibrate images:board --measured",
-    "perchctl fit-weights --collect",
-    "perchctl make-target --camera",
-    "perchctl make-target -p target_only --camera",
+    "perchctl fit-weights collect",
+    "perchctl make-target design",
+    "perchctl make-target suggest",
     "python docs/pictures/make.py",
 )
 
@@ -219,7 +219,7 @@ def test_every_command_line_runs(
     if "mocap" in words:
         pytest.importorskip("motioncapture", reason="motion capture needs the extra [mocap]")
     shutil.copytree(place, tmp_path, dirs_exist_ok=True)
-    if "--collect" in words:
+    if "collect" in words:
         (tmp_path / "session.csv").unlink()
     if "--parquet" in words:
         pytest.importorskip("pyarrow", reason="Parquet needs the extra [parquet]")

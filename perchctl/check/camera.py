@@ -17,7 +17,7 @@ from perchctl.errors import PerchError
 from perchctl.flight import too_near_problem
 from perchctl.perception import MIRRORED_FRAMES
 from perchctl.profile import Profile
-from perchctl.target import Optics, TargetDesign, blind_lines, cm_text, design_ranges, make_design
+from perchctl.target import Optics, TargetDesign, make_design
 from perchctl.vision import BLENDED, Pipeline
 
 RATE_WARN_HZ, RATE_FAIL_HZ = 20.0, 7.0
@@ -276,24 +276,23 @@ def design_of(
         gear_m = profile.vehicle.gear_body_m[2]
         ceiling_m = rehearsal.height_m + gear_m + float(rehearsal.target.e_m[2])
     target, model = profile.target, pipeline.camera
-    ranges = design_ranges(target, model, optics, FEW_TRIALS)
-    return make_design(target, model, optics, profile, ceiling_m, ranges)
+    return make_design(target, model, optics, profile, ceiling_m, trials=FEW_TRIALS)
 
 
 def _ranges(design: TargetDesign, measured: bool) -> Row:
     r = design.ranges
     each = (("z1", r.z1_m), ("z2", r.z2_m), ("z3", r.z3_m))
-    found = ", ".join(f"{n} {'never' if z is None else f'{cm_text(z)} cm'}" for n, z in each)
+    found = ", ".join(f"{n} {'never' if z is None else f'{100.0 * z:.3g} cm'}" for n, z in each)
     optics = f"blur {design.optics.blur_px:g} px, noise {design.optics.noise:g}"
     if not measured:
         return skipped("ranges", f"{found} with a guessed {optics}", "see focus")
     if design.warnings:
         return warned("ranges", f"{found} ({optics}): {design.warnings[0]}",
-                      "see perchctl make-target --camera --suggest")  # fmt: skip
+                      "see perchctl make-target suggest")  # fmt: skip
     return passed("ranges", f"{found} ({optics})")
 
 
 def _blind(design: TargetDesign) -> Row:
     """From where on nothing is measured any more, and whether a turn of the camera helps."""
-    found, *advice = blind_lines(design.mount)
+    found, *advice = design.mount.lines()
     return warned("blind", found, advice[0]) if advice else passed("blind", found)

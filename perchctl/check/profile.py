@@ -159,7 +159,7 @@ def _markers(profile: Profile) -> Row:
     )
     try:
         # The magnet is no part of a profile: one that just covers the small marker.
-        check_target(profile.target, 1.01 * math.sqrt(2.0) * small.side_m, search=False)
+        check_target(profile.target, 1.01 * math.sqrt(2.0) * small.side_m)
     except PerchError as error:
         return Row("markers", Verdict.WARN, f"{found}: {error}", "print a target that can be read")
     return Row("markers", Verdict.PASS, found)

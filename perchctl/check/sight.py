@@ -17,7 +17,7 @@ SEEN_WARN = 0.5
 """Of the pictures, as in the row `target`."""
 ROOM_WARN = 0.03
 """Of the picture's larger side: by so much a lean of 2 to 3 deg moves the target."""
-LARGER = "print a larger target: perchctl make-target --camera --ceiling --suggest proposes one"
+LARGER = "print a larger target: perchctl make-target suggest --ceiling M proposes one"
 
 
 def is_asked(profile: Profile) -> bool:

@@ -42,8 +42,8 @@ _BAD_PLACE = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "make-target": (
-        "cli.make_target",
-        "Print the target (or a board), true to size; design it; write measured sizes.",
+        "make_target",
+        "Print the target true to size, or a board; design it; write measured sizes.",
     ),
     "calibrate": (
         "calibrate",
@@ -58,7 +58,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Show a profile as it is flown: every key with its value, unit, bounds and meaning.",
     ),
     "fit-weights": (
-        "cli.fit_weights",
+        "fit_weights",
         "Fit the merge weights to poses whose truth is known, and verify that they help.",
     ),
     "track": (

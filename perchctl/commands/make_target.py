@@ -1,247 +1,404 @@
-"""The work behind `perchctl make-target`: print, check, design, and write what was measured."""
+"""`perchctl make-target`: print the target or a board, design a target, write measured sizes."""
 
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from perchctl.calibration import load_calibration, profile_camera
-from perchctl.commands.make_target_request import (
-    TargetOutcome,
-    TargetRequest,
-    check_request,
-    check_within,
-    requested_target,
+from perchctl.commands.command_line import (
+    CamOption,
+    Command,
+    ForceOption,
+    Group,
+    JsonOption,
+    complete_profile,
+    examples,
+    new_app,
+    reporting,
 )
 from perchctl.commands.output import print_record
 from perchctl.errors import InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, check_place, write_files
-from perchctl.profile import Profile, TargetConfig, find_calibration, load_profile
+from perchctl.profile import (
+    MarkerConfig,
+    Profile,
+    TargetConfig,
+    check_marker_id,
+    find_calibration,
+    load_profile,
+    write_profile_values,
+)
 from perchctl.target import (
     Optics,
-    Page,
-    blind_lines,
-    board_page,
+    board_pdf,
     check_target,
-    compare_designs,
-    describe_design,
-    design_record,
-    error_curve,
     make_design,
     measured_target,
     mm_text,
     mounted_camera,
-    new_profile_text,
     parse_board,
     parse_length,
-    parse_page,
     suggest_target,
-    target_pages,
-    tile_page,
-    updated_profile_text,
-    write_profile,
+    target_pdf,
 )
+from perchctl.vision import CameraModel
 
-__all__ = ["TargetRequest", "run"]
-
-DESIGN_PLOT, SUGGESTION_PLOT = Path("design.png"), Path("suggestion.png")
 DEFAULT_PROFILE = "sim"
-BLUR_LIMIT_PX, NOISE_LIMIT = 20.0, 60.0
+BASE_FOR_NEW = "crazyflie"
+"""What a new profile extends where -p names a file that does not exist yet."""
+SIDE_LIMITS_M = (0.004, 2.0)
+ANOTHER = "Another target than the profile's"
+
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        "-p",
+        help="Profile with the target; sim if none is named.",
+        autocompletion=complete_profile,
+    ),
+]
+PageOption = Annotated[str, typer.Option("--page", help="a4, letter, a3, or 220x240mm.")]
+TileOption = Annotated[
+    str | None,
+    typer.Option("--tile", help="Print it on several sheets of this size, to be glued: a4, a3."),
+]
+MagnetOption = Annotated[
+    str, typer.Option("--magnet", help="Diameter of the magnet behind the sheet.")
+]
 
 
-def run(request: TargetRequest) -> int:
-    """Do the one task that was requested, print what came of it; returns the exit code.
+def _of_target(name: str, text: str, **limits: Any) -> Any:
+    return typer.Option(name, help=text, rich_help_panel=ANOTHER, **limits)
 
-    Raises NotFound, InvalidValue, UsageError; then nothing has been written.
+
+LargeOption = Annotated[
+    str | None, _of_target("--large", "Side of the large marker: 150mm, 15cm, 0.15m.")
+]
+LargeIdOption = Annotated[int | None, _of_target("--large-id", "Its id.", min=0)]
+LargeDictOption = Annotated[
+    str | None, _of_target("--large-dict", "Its dictionary, such as DICT_4X4_1000.")
+]
+SmallOption = Annotated[
+    str | None, _of_target("--small", "Side of the small marker, with its unit.")
+]
+SmallIdOption = Annotated[int | None, _of_target("--small-id", "Its id.", min=0)]
+SmallDictOption = Annotated[
+    str | None, _of_target("--small-dict", "Its dictionary: DICT_ARUCO_ORIGINAL, ...")
+]
+
+
+def _finite(value: float | None) -> float | None:
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter("must be a number")
+    return value
+
+
+CameraArgument = Annotated[
+    str | None, typer.Argument(help="Calibration file; by default the profile's.")
+]
+CeilingOption = Annotated[
+    float | None,
+    typer.Option(
+        "--ceiling",
+        min=0.3,
+        max=50.0,
+        callback=_finite,
+        help="Height of the ceiling over the floor, m.",
+    ),
+]
+BlurOption = Annotated[
+    float,
+    typer.Option(
+        "--blur", min=0.0, max=20.0, callback=_finite, help="Sigma of the picture's blur, px."
+    ),
+]
+NoiseOption = Annotated[
+    float,
+    typer.Option(
+        "--noise",
+        min=0.0,
+        max=60.0,
+        callback=_finite,
+        help="Sigma of the picture's noise, grey levels of 255.",
+    ),
+]
+PlotOption = Annotated[Path, typer.Option("--plot", help="The design's picture.")]
+
+app = new_app(Group)
+
+
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl make-target -p crazyflie -o target.pdf",
+        "perchctl make-target --large 120mm --small 20mm --page letter",
+        "perchctl make-target --large 355mm --small 35mm --page 442x470mm --tile a3",
+    ),
+)
+@reporting
+def sheet(
+    profile: ProfileOption = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(
+        "target.pdf"
+    ),
+    page: PageOption = "a4",
+    tile: TileOption = None,
+    magnet: MagnetOption = "50mm",
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    large: LargeOption = None,
+    large_id: LargeIdOption = None,
+    large_dict: LargeDictOption = None,
+    small: SmallOption = None,
+    small_id: SmallIdOption = None,
+    small_dict: SmallDictOption = None,
+) -> int:
+    """Print the target true to size, or a board; design it; write measured sizes.
+
+    sheet writes a PDF of the profile's target, front and back, checked before it is written.
     """
-    check_request(request)
-    if request.board is not None:
-        outcome = _board(request, request.board)
-    elif request.measured_large is not None or request.measured_small is not None:
-        outcome = write_measured(request)
-    elif request.camera is not None:
-        outcome = _design(request, request.camera)
-    else:
-        profile = load_profile(request.profile or DEFAULT_PROFILE)
-        target = requested_target(request, profile)
-        outcome = _target(request, profile, target)
-        outcome.lines.extend(_mounting(profile, target))
-    for path in outcome.files:
-        check_place(path, request.force)
-    write_files(outcome.files)
-    if request.as_json:
-        print_record(outcome.record)
-    else:
-        print("\n".join(outcome.lines))
-    return 0
-
-
-def _target(request: TargetRequest, profile: Profile, target: TargetConfig) -> TargetOutcome:
-    """The target's sheet, front and back, checked before it is written."""
-    page = parse_page(request.page)
-    check = check_target(target, request.magnet_m)
-    # Options on top of a profile make it another target, with no date.
-    own = target == profile.target
-    date = profile.date if own else None
-    origin = f"profile {profile.name}" if own else "sizes from the command line"
-    pages = target_pages(target, page, request.magnet_m, origin, date)
-    title = f"perchctl target, {mm_text(target.large.side_m)} mm"
-    files = _sheet_files(request, "target.pdf", pages, title, date)
+    config = load_profile(profile or DEFAULT_PROFILE)
+    target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
+    magnet_m = parse_length(magnet, "--magnet")
+    check = check_target(target, magnet_m)
+    _check_pdf(output)
+    pdf = target_pdf(target, page, magnet_m, *_origin(config, target), tile)
     lines = [
-        *(f"wrote {path}" for path in files),
+        f"wrote {output}",
         check.text(target),
         "print at 100 % and measure both rulers: 100 mm each",
+        *_mounting(config, target),
     ]
     record = {
-        "files": [str(path) for path in files],
         "target": target.model_dump(mode="json"),
         "white_centre": check.white_centre,
         "white_centre_ids": list(check.white_ids),
     }
-    return TargetOutcome(files, lines, record)
+    return _write({output: pdf}, lines, record, force, as_json)
 
 
-def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
-    """What the profile's camera sees of that target to the end; nothing without a
-    calibration, as a sheet needs none."""
-    try:
-        camera = profile_camera(profile.camera)
-    except PerchError:
-        return []
-    name = profile.camera.calibration
-    return [f"{name}: {text}" for text in blind_lines(mounted_camera(target, camera, profile))]
-
-
-def _board(request: TargetRequest, notation: str) -> TargetOutcome:
-    """The sheet of a calibration board."""
-    board = parse_board(notation)
-    if board.scale != (1.0, 1.0):
-        raise UsageError(f"--board {notation}: a board is printed as meant; leave out :measured=")
-    page = board_page(board, parse_page(request.page))
-    files = _sheet_files(request, "board.pdf", [page], f"perchctl {board.notation()}")
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl make-target board charuco:10x7:25mm:18mm:DICT_5X5_100",
+        "perchctl make-target board chessboard:9x6:25mm --page letter -o chess.pdf",
+        "perchctl make-target board aprilgrid:6x6:22mm:0.3 -o april.pdf",
+    ),
+)
+@reporting
+def board(
+    notation: Annotated[
+        str,
+        typer.Argument(
+            help="charuco:10x7:25mm:18mm:DICT_5X5_100 (squares), chessboard:9x6:25mm (inner "
+            "corners), aprilgrid:6x6:22mm:0.3 (tags, gap as a share of a tag), or Kalibr's .yaml "
+            "of a board."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="PDF to write.")] = Path(
+        "board.pdf"
+    ),
+    page: PageOption = "a4",
+    tile: TileOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Print a calibration board, in the notation that calibrate reads."""
+    printed = parse_board(notation)
+    if printed.scale != (1.0, 1.0):
+        raise UsageError(f"{notation}: a board is printed as meant; leave out :measured=")
+    _check_pdf(output)
     lines = [
-        *(f"wrote {path}" for path in files),
+        f"wrote {output}",
         "print at 100 %, glue it on something flat, and measure both rulers: 100 mm each",
     ]
-    record = {"files": [str(path) for path in files], "board": board.notation()}
-    return TargetOutcome(files, lines, record)
+    record = {"board": printed.notation()}
+    return _write({output: board_pdf(printed, page, tile)}, lines, record, force, as_json)
 
 
-def _sheet_files(
-    request: TargetRequest,
-    default: str,
-    pages: Sequence[Page],
-    title: str,
-    date: datetime.date | None = None,
-) -> dict[Path, bytes]:
-    """The PDF, by its place."""
-    from perchctl.target import pdf_bytes
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl make-target design",
+        "perchctl make-target design example_640x480.yaml --ceiling 2.4 --blur 2.0",
+        "perchctl make-target design -p my_vehicle.yaml --large 120mm --small 20mm",
+    ),
+)
+@reporting
+def design(
+    camera: CameraArgument = None,
+    profile: ProfileOption = None,
+    ceiling: CeilingOption = None,
+    blur: BlurOption = 1.0,
+    noise: NoiseOption = 5.0,
+    plot: PlotOption = Path("design.png"),
+    cam: CamOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    large: LargeOption = None,
+    large_id: LargeIdOption = None,
+    large_dict: LargeDictOption = None,
+    small: SmallOption = None,
+    small_id: SmallIdOption = None,
+    small_dict: SmallDictOption = None,
+) -> int:
+    """Compute from where to where a camera sees each marker, how exactly, and where a gap is."""
+    config = load_profile(profile or DEFAULT_PROFILE)
+    name, model = _camera(config, camera, cam)
+    check_output(plot, (".png",), force)
+    target = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
+    found = make_design(target, model, Optics(blur, noise), config, ceiling)
+    from perchctl.target import draw_design  # matplotlib takes a second to load
 
-    pdf = request.output or Path(default)
-    if pdf.suffix.lower() != ".pdf":
-        raise UsageError(f"-o {pdf}: the file must end in .pdf")
-    printed = list(pages)
-    if request.tile is not None:
-        sheet = parse_page(request.tile)
-        printed = [tile for page in pages for tile in tile_page(page, sheet)]
-    return {pdf: pdf_bytes(printed, title, date)}
-
-
-def _design(request: TargetRequest, camera_name: str) -> TargetOutcome:
-    """The ranges of a target for a camera, with its picture, and its sheet with `-o`."""
-    from perchctl.target import draw_design
-
-    if request.suggest and request.output is not None:
-        raise UsageError("--suggest prints a command to run; give -o to that command")
-    check_within("--blur", request.blur_px, 0.0, BLUR_LIMIT_PX, "px")
-    check_within("--noise", request.noise, 0.0, NOISE_LIMIT, "grey levels")
-    if request.ceiling_m is not None:
-        check_within("--ceiling", request.ceiling_m, 0.3, 50.0, "m")
-    profile = load_profile(request.profile or DEFAULT_PROFILE)
-    path = find_calibration(camera_name)
-    camera = load_calibration(path, cam=request.cam)
-    plot = request.plot or (SUGGESTION_PLOT if request.suggest else DESIGN_PLOT)
-    check_output(plot, (".png",), request.force)
-    optics = Optics(request.blur_px, request.noise)
-    lines: list[str] = []
-    record: dict[str, Any] = {}
-    if request.suggest:
-        found, design = suggest_target(
-            camera, optics, profile, request.magnet_m, request.ceiling_m, request.page
-        )
-        present = make_design(profile.target, camera, optics, profile, request.ceiling_m)
-        lines += [f"note: {note}" for note in found.notes] + [found.command(), ""]
-        lines += [f"why: {reason}" for reason in found.reasons]
-        lines += [*compare_designs(design, present, f"profile {profile.name}"), ""]
-        record = {
-            "command": found.command(),
-            "reasons": list(found.reasons),
-            "notes": list(found.notes),
-        }
-    else:
-        target = requested_target(request, profile)
-        design = make_design(target, camera, optics, profile, request.ceiling_m)
-    curve = error_curve(design)
-    lines.append(describe_design(design, curve, str(path)))
-    record |= design_record(design) | {"target": design.target.model_dump(mode="json")}
-    files: dict[Path, bytes] = {}
-    if request.output is not None:
-        sheet = _target(request, profile, design.target)
-        lines += sheet.lines
-        files |= sheet.files
-    if plot in files:
-        raise UsageError(f"{plot} is the sheet's picture already; name another with --plot")
-    files[plot] = draw_design(design, curve)
-    lines.append(f"wrote {plot}")
-    return TargetOutcome(files, lines, record | {"files": [str(path) for path in files]})
+    lines = [found.text(name), f"wrote {plot}"]
+    record = found.record() | {"target": target.model_dump(mode="json")}
+    return _write({plot: draw_design(found)}, lines, record, force, as_json)
 
 
-# --- `perchctl make-target --measured-large, --measured-small`: sizes of the print into a profile
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl make-target suggest --ceiling 2.4",
+        "perchctl make-target suggest example_640x480.yaml --ceiling 2.4 --blur 2.0",
+        "perchctl make-target suggest -p target_only --ceiling 3.6 --page a3",
+    ),
+)
+@reporting
+def suggest(
+    camera: CameraArgument = None,
+    profile: ProfileOption = None,
+    ceiling: CeilingOption = None,
+    page: PageOption = "a4",
+    magnet: MagnetOption = "50mm",
+    blur: BlurOption = 1.0,
+    noise: NoiseOption = 5.0,
+    plot: PlotOption = Path("suggestion.png"),
+    cam: CamOption = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Propose sizes and ids for a camera, and compare them with the profile's target."""
+    config = load_profile(profile or DEFAULT_PROFILE)
+    name, model = _camera(config, camera, cam)
+    check_output(plot, (".png",), force)
+    optics = Optics(blur, noise)
+    magnet_m = parse_length(magnet, "--magnet")
+    found, proposed = suggest_target(model, optics, config, magnet_m, ceiling, page)
+    present = make_design(config.target, model, optics, config, ceiling)
+    from perchctl.target import draw_design  # matplotlib takes a second to load
+
+    lines = [f"note: {note}" for note in found.notes] + [found.command(), ""]
+    lines += [f"why: {reason}" for reason in found.reasons]
+    lines += [*proposed.compared_with(present, f"profile {config.name}"), ""]
+    lines += [proposed.text(name), f"wrote {plot}"]
+    record = {
+        "command": found.command(),
+        "reasons": list(found.reasons),
+        "notes": list(found.notes),
+        **proposed.record(),
+        "target": found.target.model_dump(mode="json"),
+    }
+    return _write({plot: draw_design(proposed)}, lines, record, force, as_json)
 
 
-BASE_FOR_NEW = "crazyflie"
-"""What a new profile extends where -p names a file that does not exist yet."""
-
-
-def write_measured(request: TargetRequest) -> TargetOutcome:
-    """Write a profile with the measured sizes.
-
-    Raises NotFound, InvalidValue, UsageError; then nothing has been written.
-    """
-    base, path = _profile_to_write(request)
-    changed = path.exists() and request.output is None
-    if changed and not request.force:
+@app.command(
+    cls=Command,
+    epilog=examples(
+        "perchctl make-target measured -p my_vehicle.yaml --measured-large 149.6 "
+        "--measured-small 24.9 --force",
+        "perchctl make-target measured -p crazyflie -o my_vehicle.yaml --measured-large 149.6",
+        "perchctl make-target measured -p new.yaml --large 120mm --measured-large 119.8",
+    ),
+)
+@reporting
+def measured(
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            "--profile",
+            "-p",
+            help="Profile that gets the sizes, or with -o the one that the new one extends.",
+            autocompletion=complete_profile,
+        ),
+    ] = None,
+    measured_large: Annotated[
+        str | None,
+        typer.Option("--measured-large", help="Side of the large black square as printed, mm."),
+    ] = None,
+    measured_small: Annotated[
+        str | None,
+        typer.Option("--measured-small", help="Side of the small black square as printed, mm."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="A small new profile that extends the one of -p."),
+    ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    large: LargeOption = None,
+    large_id: LargeIdOption = None,
+    large_dict: LargeDictOption = None,
+    small: SmallOption = None,
+    small_id: SmallIdOption = None,
+    small_dict: SmallDictOption = None,
+) -> int:
+    """Write the sizes that were measured on the print into the profile that flies."""
+    if measured_large is None and measured_small is None:
+        raise UsageError("give --measured-large and --measured-small, in mm: nothing was measured")
+    base, path = _profile_to_write(profile, output)
+    changed = path.exists() and output is None
+    if changed and not force:
         raise InvalidValue(
             f"{path} exists already; add --force to write the sizes into it, "
             f"or -o NEW.yaml for a small profile that extends it"
         )
-    check_place(path, request.force)
-    profile = load_profile(base)
-    found = measured_target(
-        requested_target(request, profile),
-        _measured(request.measured_large, "large"),
-        _measured(request.measured_small, "small"),
-    )
-    if changed:
-        text = updated_profile_text(path, path.read_text(encoding="utf-8"), found.target)
+    check_place(path, force)
+    config = load_profile(base)
+    nominal = _chosen(config, (large, large_id, large_dict), (small, small_id, small_dict))
+    sides_m = {
+        name: parse_length(text, f"--measured-{name}", bare_unit="mm")
+        for name, text in (("large", measured_large), ("small", measured_small))
+        if text is not None
+    }
+    found = measured_target(nominal, sides_m)
+    files: dict[Path, bytes] = {}
+    if not changed:
+        files[path] = found.profile_text(_named_from(base, path)).encode()
     else:
-        text = new_profile_text(_named_from(base, path), found.target)
-    write_profile(path, text, profile.model_copy(update={"target": found.target}))
+        write_profile_values(path, _changed_values(found.target, config.target))
     lines = [*found.notes, f"{'changed' if changed else 'wrote'} {path}: fly -p {path}"]
-    record = {"files": [str(path)], "target": found.target.model_dump(mode="json")}
-    return TargetOutcome({}, lines, record | {"notes": list(found.notes)})
+    record = {"target": found.target.model_dump(mode="json"), "notes": list(found.notes)}
+    return _write(files, lines, {"files": [str(path)]} | record, force, as_json)
 
 
-def _profile_to_write(request: TargetRequest) -> tuple[str, Path]:
+def _changed_values(new: TargetConfig, old: TargetConfig) -> dict[str, float | int | str]:
+    """By the keys of a profile. A marker is written whole: no base may have it."""
+    values: dict[str, float | int | str] = {}
+    for name in ("large", "small"):
+        marker: MarkerConfig = getattr(new, name)
+        if marker != getattr(old, name):
+            values[f"target.{name}.dictionary"] = marker.dictionary
+            values[f"target.{name}.id"] = marker.id
+            values[f"target.{name}.side_m"] = marker.side_m
+    if new.size_sigma != old.size_sigma:
+        values["target.size_sigma"] = new.size_sigma
+    return values
+
+
+def _profile_to_write(name: str | None, output: Path | None) -> tuple[str, Path]:
     """The profile that the sizes start from, and the file that gets them."""
-    name = request.profile
-    if request.output is not None:
-        if request.output.suffix.lower() not in (".yaml", ".yml"):
-            raise UsageError(f"-o {request.output}: measured sizes go into a profile, a .yaml file")
-        return name or BASE_FOR_NEW, request.output
-    if name is None or not ("/" in name or name.endswith((".yaml", ".yml"))):
+    if output is not None:
+        if output.suffix.lower() not in (".yaml", ".yml"):
+            raise UsageError(f"-o {output}: measured sizes go into a profile, a .yaml file")
+        return name or BASE_FOR_NEW, output
+    if name is None or not _is_file(name):
         shown = name or BASE_FOR_NEW
         raise UsageError(
             f"name the profile that gets the sizes: -p my_vehicle.yaml, or -p {shown} "
@@ -253,12 +410,94 @@ def _profile_to_write(request: TargetRequest) -> tuple[str, Path]:
 
 def _named_from(base: str, path: Path) -> str:
     """How the new profile at `path` names its base: a file by its path from there."""
-    file = Path(base).expanduser()
-    if not ("/" in base or base.endswith((".yaml", ".yml"))):
+    if not _is_file(base):
         return base
-    same = file.resolve().parent == path.resolve().parent
-    return file.name if same else str(file.resolve())
+    file = Path(base).expanduser().resolve()
+    return file.name if file.parent == path.resolve().parent else str(file)
 
 
-def _measured(text: str | None, name: str) -> float | None:
-    return None if text is None else parse_length(text, f"--measured-{name}", bare_unit="mm")
+def _is_file(profile: str) -> bool:
+    return "/" in profile or profile.endswith((".yaml", ".yml"))
+
+
+# --- What several of them do -------------------------------------------------------------------
+
+
+Marker = tuple[str | None, int | None, str | None]
+"""Side, id and dictionary of a marker as they were given."""
+
+
+def _chosen(profile: Profile, large: Marker, small: Marker) -> TargetConfig:
+    """The profile's target with the options on top."""
+    markers = {}
+    for name, (side, marker_id, dictionary) in (("large", large), ("small", small)):
+        old: MarkerConfig = getattr(profile.target, name)
+        if dictionary is not None and marker_id is None:
+            raise UsageError(f"--{name}-dict needs --{name}-id: ids belong to their dictionary")
+        chosen = dictionary or old.dictionary
+        number = old.id if marker_id is None else marker_id
+        try:
+            check_marker_id(chosen, number)
+        except ValueError as error:
+            raise InvalidValue(f"--{name}-id, --{name}-dict: {error}") from None
+        side_m = old.side_m if side is None else parse_length(side, f"--{name}")
+        low_m, high_m = SIDE_LIMITS_M
+        if not low_m <= side_m <= high_m:
+            raise InvalidValue(
+                f"--{name}: {mm_text(side_m)} mm is outside of {mm_text(low_m)} mm to {high_m:g} m"
+            )
+        markers[name] = MarkerConfig(dictionary=chosen, id=number, side_m=side_m)
+    if markers["small"].side_m >= markers["large"].side_m / 2:
+        raise InvalidValue(
+            f"the small marker ({mm_text(markers['small'].side_m)} mm) must be less than half "
+            f"of the large one ({mm_text(markers['large'].side_m)} mm)"
+        )
+    return profile.target.model_copy(update=markers)
+
+
+def _camera(profile: Profile, name: str | None, cam: str | None) -> tuple[str, CameraModel]:
+    """The calibration's file, and the camera."""
+    path = find_calibration(name or profile.camera.calibration)
+    return str(path), load_calibration(path, cam=cam)
+
+
+def _origin(profile: Profile, target: TargetConfig) -> tuple[str, datetime.date | None]:
+    """Where the sizes come from, and their date. Options on top of a profile make it another
+    target, with no date."""
+    if target == profile.target:
+        return f"profile {profile.name}", profile.date
+    return "sizes from the command line", None
+
+
+def _mounting(profile: Profile, target: TargetConfig) -> list[str]:
+    """What the profile's camera sees of that target to the end; nothing without a
+    calibration, as a sheet needs none."""
+    try:
+        camera = profile_camera(profile.camera)
+    except PerchError:
+        return []
+    name = profile.camera.calibration
+    return [f"{name}: {text}" for text in mounted_camera(target, camera, profile).lines()]
+
+
+def _check_pdf(path: Path) -> None:
+    if path.suffix.lower() != ".pdf":
+        raise UsageError(f"-o {path}: the file must end in .pdf")
+
+
+def _write(
+    files: Mapping[Path, bytes],
+    lines: list[str],
+    record: dict[str, Any],
+    force: bool,
+    as_json: bool,
+) -> int:
+    """Write all files, then print what was done."""
+    for path in files:
+        check_place(path, force)
+    write_files(files)
+    if as_json:
+        print_record({"files": [str(path) for path in files]} | record)
+    else:
+        print("\n".join(lines))
+    return 0

@@ -25,7 +25,6 @@ from perchctl.link import Link
 from perchctl.positioning import FeedStatus
 from perchctl.profile import Profile
 from perchctl.target import (
-    FieldOfView,
     TargetFromBody,
     offset_text,
     overhead_view,
@@ -233,7 +232,7 @@ def _too_far(sight: TargetFromBody, profile: Profile, camera: CameraModel) -> st
     aside_m, most = math.hypot(*sight.aside_m), ""
     aside = f"{aside_m:.2f}"
     side_m, mount = profile.target.large.side_m, profile.camera.mount
-    reach = reach_at(side_m, FieldOfView(camera), mount, sight.height_m)
+    reach = reach_at(side_m, camera, mount, sight.height_m)
     if reach is not None:
         room_m = math.floor(100.0 * max(0.0, reach.radius_m - _leant_m(sight))) / 100.0
         aside, room = distinct_figures(aside_m, room_m, 2)

@@ -19,7 +19,7 @@ from perchctl.profile.old_keys import RENAMED, with_present_keys
 from perchctl.profile.places import data_folder
 from perchctl.profile.plain_yaml import parse_yaml
 
-Value = float | tuple[float, ...]
+Value = float | int | str | tuple[float, ...]
 
 _DECIMALS = 6
 _STEP = "  "
@@ -172,7 +172,7 @@ def _inserted(
 def _flow(value: Value) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(map(_number, value))}]"
-    return _number(value)
+    return _number(value) if isinstance(value, float) else str(value)
 
 
 def _number(value: float) -> str:

@@ -21,7 +21,7 @@ from perchctl.geometry import Array, invert_T, make_T, rot_z
 from perchctl.profile import TargetConfig
 from perchctl.sim.optics import COARSE_PX, Picture, RayGrid, local_px_per_m, plane_map, trace
 from perchctl.sim.scenario import Neighbour
-from perchctl.target import TargetDrawing, draw_target, ink_coverage, sheet_coverage
+from perchctl.target import TargetDrawing, draw_target
 
 PAPER_GREY, INK_GREY, CEILING_GREY = 225.0, 30.0, 140.0
 
@@ -94,10 +94,10 @@ class Sheet:
         size = math.ceil(self.drawing.sheet_side_m * px_per_m) + 4
         # In place: at the finest level each array of these has 20 MB, and a campaign's peak of
         # memory is here.
-        sheet = sheet_coverage(self.drawing, px_per_m, size, window_px)
+        sheet = self.drawing.sheet_coverage(px_per_m, size, window_px)
         alpha = np.multiply(sheet, 255.0)
         alpha = np.rint(alpha, out=alpha).astype(np.uint8)
-        value = ink_coverage(self.drawing, px_per_m, size, window_px)
+        value = self.drawing.ink_coverage(px_per_m, size, window_px)
         value *= INK_GREY - PAPER_GREY
         sheet *= PAPER_GREY
         value += sheet

@@ -21,21 +21,29 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
-from perchctl.profile import dictionary_size, parse_yaml
-from perchctl.target.lengths import mm_text, parse_length
+from perchctl.profile import MarkerConfig, aruco_dictionary, dictionary_size, parse_yaml
+from perchctl.target.drawing import (
+    Rectangle,
+    marker_cells,
+    merged_rectangles,
+    mm_text,
+    parse_length,
+)
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid"]
 EXAMPLES = "chessboard:9x6:25mm, charuco:10x7:25mm:18mm:DICT_5X5_100 or aprilgrid:6x6:22mm:0.3"
 MAX_COUNT = 100
 APRILGRID_DEFAULTS = ("6x6", "22mm", "0.3")
-TAG_DICTIONARY = "DICT_APRILTAG_36H11"
+TAG_DICTIONARY, TAG_BORDER_CELLS = "DICT_APRILTAG_36H11", 2
 SPACING_LIMITS = (0.1, 1.0)
 MAX_SCALE_ERROR = 0.1
 """A print off by more than this was not measured in the unit that was meant."""
@@ -254,62 +262,125 @@ def _wrong(text: str, why: str) -> InvalidValue:
 # --- Kalibr's own description of a board (``target_type: aprilgrid``) in perchctl's notation ---
 
 
-KEYS = {
-    "aprilgrid": ("tagCols", "tagRows", "tagSize", "tagSpacing"),
-    "checkerboard": ("targetCols", "targetRows", "colSpacingMeters", "rowSpacingMeters"),
-}
+class _Aprilgrid(BaseModel, strict=True):
+    target_type: Literal["aprilgrid"]
+    tagCols: int
+    tagRows: int
+    tagSize: float
+    tagSpacing: float
+
+    def notation(self) -> str:
+        counts = f"{self.tagCols}x{self.tagRows}"
+        return f"aprilgrid:{counts}:{1e3 * self.tagSize:.9g}mm:{self.tagSpacing:g}"
+
+
+class _Checkerboard(BaseModel, strict=True):
+    """It counts inner corners, as perchctl does."""
+
+    target_type: Literal["checkerboard"]
+    targetCols: int
+    targetRows: int
+    colSpacingMeters: float
+    rowSpacingMeters: float
+
+    @model_validator(mode="after")
+    def _square(self) -> Self:
+        if self.colSpacingMeters != self.rowSpacingMeters:
+            raise ValueError(
+                "colSpacingMeters and rowSpacingMeters differ: squares of a chessboard are "
+                "square; a print that is not is given by its measured sides"
+            )
+        return self
+
+    def notation(self) -> str:
+        counts = f"{self.targetCols}x{self.targetRows}"
+        return f"chessboard:{counts}:{1e3 * self.colSpacingMeters:.9g}mm"
+
+
+_KALIBR: TypeAdapter[_Aprilgrid | _Checkerboard] = TypeAdapter(
+    Annotated[_Aprilgrid | _Checkerboard, Field(discriminator="target_type")]
+)
+_MOST_CHARACTERS = 200  # of the file's faults in a sentence
 
 
 def kalibr_notation(path: Path) -> str:
-    """``aprilgrid:6x6:88mm:0.3`` from the file that is given to Kalibr as --target; a
-    checkerboard counts inner corners in both.
+    """``aprilgrid:6x6:88mm:0.3`` from the file that is given to Kalibr as --target.
 
     Raises NotFound, InvalidValue.
     """
     try:
-        raw: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        return _KALIBR.validate_python(parse_yaml(path.read_text(encoding="utf-8"))).notation()
     except FileNotFoundError:
         raise NotFound(f"board file {path} does not exist") from None
     except UnicodeDecodeError:
-        raise InvalidValue(f"{path}: cannot be read as a board: not a text file") from None
+        why = "not a text file"
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = "".join(f"{key}: " for key in first["loc"][1:])
+        why = f"{place}{first['msg']}"
     except (OSError, ValueError) as error:
-        raise InvalidValue(f"{path}: cannot be read as a board: {error}") from None
-    kind = raw.get("target_type") if isinstance(raw, dict) else None
-    if not isinstance(kind, str) or kind not in KEYS:
-        raise InvalidValue(
-            f"{path}: is no board of Kalibr's that is known here: target_type must be "
-            f"{' or '.join(KEYS)}, found {_shown(kind)}"
+        why = str(error)
+    raise InvalidValue(f"{path}: cannot be read as Kalibr's board: {why[:_MOST_CHARACTERS]}")
+
+
+# --- What of a board is black ------------------------------------------------------------------
+
+
+def board_rectangles(board: Board) -> list[Rectangle]:
+    """The black area in metres, origin in the board's centre, x right and y up."""
+    if board.kind == "aprilgrid":
+        return _aprilgrid_rectangles(board)
+    columns, rows = board.squares
+    width, height = board.size_m
+    found: list[Rectangle] = []
+    black = black_squares(board)
+    for row in range(rows):
+        for column in range(columns):
+            if black[row, column]:
+                x, y = column * board.square_m - width / 2, height / 2 - row * board.square_m
+                found.append(Rectangle(x, y - board.square_m, x + board.square_m, y))
+    if board.marker_m is None or board.dictionary is None:
+        return found
+    for marker_id, (row, column) in enumerate(np.argwhere(~black)):
+        cells = marker_cells(
+            MarkerConfig(dictionary=board.dictionary, id=marker_id, side_m=board.marker_m)
         )
-    columns, rows, across, more = (_number(path, raw, key) for key in KEYS[kind])
-    counts = f"{_whole(path, kind, columns)}x{_whole(path, kind, rows)}"
-    if kind == "aprilgrid":
-        return f"{kind}:{counts}:{1e3 * across:.9g}mm:{more:g}"
-    if across != more:
-        raise InvalidValue(
-            f"{path}: colSpacingMeters {across:g} and rowSpacingMeters {more:g} differ: squares "
-            f"of a chessboard are square; a print that is not is given by its measured sides"
-        )
-    return f"chessboard:{counts}:{1e3 * across:.9g}mm"
+        at = np.linspace(-board.marker_m / 2, board.marker_m / 2, len(cells) + 1)
+        x = (column + 0.5) * board.square_m - width / 2
+        y = height / 2 - (row + 0.5) * board.square_m
+        found += merged_rectangles(cells, x + at, y - at)
+    return found
 
 
-def _number(path: Path, raw: dict[str, Any], key: str) -> float:
-    value = raw.get(key)
-    if value is None:
-        raise InvalidValue(f"{path}: key {key} is missing")
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InvalidValue(f"{path}: {key}: {_shown(value)} is not a number")
-    return float(value)
+def _aprilgrid_rectangles(board: Board) -> list[Rectangle]:
+    assert board.marker_m is not None
+    (columns, rows), (width, height) = board.squares, board.size_m
+    pitch, side = board.square_m + board.marker_m, board.square_m
+    found = []
+    for x in np.arange(columns) * pitch - width / 2:
+        for y in height / 2 - np.arange(rows) * pitch:
+            found.append(Rectangle(float(x), float(y - side), float(x + side), float(y)))
+    corners = board.corners_m()
+    for tag in range(board.columns * board.rows):
+        cells = tag_cells(tag)
+        at = np.linspace(0.0, board.marker_m, len(cells) + 1)
+        x, y, _ = corners[board.tag_corners(tag)[2]]  # the top left one
+        found += merged_rectangles(cells, x - width / 2 + at, height / 2 - y - at)
+    return found
 
 
-def _whole(path: Path, kind: str, value: float) -> int:
-    if not value.is_integer():
-        raise InvalidValue(f"{path}: {value:g} columns or rows of a {kind} are not whole")
-    return int(value)
+def tag_cells(tag: int) -> NDArray[np.bool_]:
+    """Black cells of an aprilgrid's tag as Kalibr prints it, (10, 10), row 0 at the top."""
+    dictionary = aruco_dictionary(TAG_DICTIONARY)
+    n = int(dictionary.markerSize) + 2 * TAG_BORDER_CELLS
+    picture = dictionary.generateImageMarker(tag, n, borderBits=TAG_BORDER_CELLS)
+    return np.asarray(picture)[::-1, ::-1] < 128  # half a turn: see `Board.tag_corners`
 
 
-def _shown(value: Any) -> str:
-    """A value of the file, kept to a sentence's length."""
-    if value is None:
-        return "nothing"
-    text = repr(value) if isinstance(value, (str, int, float)) else type(value).__name__
-    return text if len(text) <= 40 else f"{text[:40]}..."
+def black_squares(board: Board) -> NDArray[np.bool_]:
+    """Which squares are black, (rows, columns), row 0 at the top; a charuco board's
+    markers fill the others, row by row."""
+    columns, rows = board.squares
+    # OpenCV's old pattern begins with white where the rows are even in number.
+    first = 1 if board.legacy and rows % 2 == 0 else 0
+    return np.asarray((np.add.outer(np.arange(rows), np.arange(columns)) + first) % 2 == 0)

@@ -10,23 +10,30 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from perchctl.geometry import Array
 from perchctl.profile import Profile, TargetConfig
-from perchctl.target.blind import Mounted, mounted_camera
-from perchctl.target.drawing import marker_corners_m
-from perchctl.target.limits import TRIALS, Optics, smallest_side_px
-from perchctl.target.overhead import least_side_px
-from perchctl.target.visible import FieldOfView, square_outline, turned_outline
+from perchctl.target.drawing import marker_corners_m, mm_text
+from perchctl.target.reading import TRIALS, Optics, smallest_side_px
+from perchctl.target.sight import (
+    FieldOfView,
+    Mounted,
+    gear_from_camera,
+    least_side_px,
+    mounted_camera,
+    square_outline,
+    turned_outline,
+)
 from perchctl.vision import CameraModel
 
 CORNER_SIGMA_PX = 0.2
 """Spread of a corner that the error bound is drawn for: a plainly refined one."""
 CURVE_POINTS = 160
-PAPER_CM = {"z1": 115.0, "z2": 25.0, "z3": 12.0}
-PAPER_FOCAL_PX, PAPER_SIZE_PX = 380.0, (640, 480)
+_TABLE_CM = (3, 5, 7, 10, 15, 20, 25, 30, 50, 75, 100, 150, 200, 300, 500)
+_COMPARED_M = (1.0, 0.5, 0.2, 0.1)
 
 
 @dataclass(frozen=True)
@@ -61,20 +68,6 @@ class GearRanges:
     small_nearest_m: float | None
 
 
-@dataclass(frozen=True)
-class TargetDesign:
-    target: TargetConfig
-    camera: CameraModel
-    optics: Optics
-    ranges: Ranges
-    gear: GearRanges
-    mount: Mounted
-    standoff_m: float
-    search_range_m: float | None  # camera to target at the highest search position
-    search_height_m: float
-    warnings: tuple[str, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class ErrorCurve:
     """The bound over the range: `z_m` (n,), and x, z (m) and yaw (rad) for each of
@@ -83,8 +76,86 @@ class ErrorCurve:
     z_m: Array
     bounds: dict[str, Array]  # (n, 3)
 
+    def best_at(self, z_m: float) -> tuple[int, str | None]:
+        """The point nearest to that range, and what gives the least error there; None where
+        nothing is whole and readable."""
+        i = int(np.abs(self.z_m - z_m).argmin())
+        names = (n for n in ("both", "large", "small") if math.isfinite(self.bounds[n][i, 0]))
+        return i, next(names, None)
+
+
+@dataclass(frozen=True)
+class TargetDesign:
+    """A target, a camera and a profile, and what follows from them.
+
+    Attributes:
+        search_range_m: from the camera to the target at the highest search position, where the
+            ceiling's height is known.
+        warnings: a sentence for each gap.
+    """
+
+    target: TargetConfig
+    camera: CameraModel
+    optics: Optics
+    ranges: Ranges
+    gear: GearRanges
+    mount: Mounted
+    standoff_m: float
+    search_range_m: float | None
+    search_height_m: float
+    warnings: tuple[str, ...]
+
+    @cached_property
+    def curve(self) -> ErrorCurve:
+        """The least pose error that the corners allow, from contact to z1."""
+        return _error_curve(self.target, self.ranges)
+
+    def record(self) -> dict[str, object]:
+        """Ranges, gaps and blind range for machines; metres."""
+        r = self.ranges
+        return {
+            "z1_m": r.z1_m,
+            "z2_m": r.z2_m,
+            "z3_m": r.z3_m,
+            "z3_upright_m": r.z3_upright_m,
+            "z4_m": r.z4_m,
+            "large_px": r.large_px,
+            "small_px": r.small_px,
+            "gear_large_nearest_m": self.gear.large_nearest_m,
+            "gear_small_nearest_m": self.gear.small_nearest_m,
+            "blind": self.mount.record(),
+            "search_range_m": self.search_range_m,
+            "warnings": list(self.warnings),
+        }
+
+    def text(self, camera_name: str) -> str:
+        """Ranges, overlap, error over the range, warnings; several lines."""
+        return _text(self, camera_name)
+
+    def compared_with(self, present: TargetDesign, name: str) -> list[str]:
+        """A table of sizes, ranges and errors beside those of the present target, whose name is
+        `name`."""
+        pair = (self, present)
+        rows: list[tuple[str, ...]] = [("", "proposed", name)]
+        rows.append(("large marker, mm", *(mm_text(d.target.large.side_m) for d in pair)))
+        rows.append(("small marker, mm", *(mm_text(d.target.small.side_m) for d in pair)))
+        for key, what in (
+            ("z1_m", "large one read up to, cm"),
+            ("z2_m", "small one read up to, cm"),
+            ("z3_m", "large one whole down to, cm"),
+            ("z4_m", "small one whole down to, cm"),
+        ):
+            cells = (_cm(getattr(d.ranges, key)).removesuffix(" cm") for d in pair)
+            rows.append((what, *cells))
+        for z_m in _COMPARED_M:
+            cells = (_height_error(d.curve, z_m) for d in pair)
+            rows.append((f"least error in z at {100 * z_m:.0f} cm, mm", *cells))
+        first, new, old = (max(len(row[i]) for row in rows) for i in range(3))
+        return [f"   {row[0]:<{first}}  {row[1]:>{new}}  {row[2]:>{old}}" for row in rows]
+
 
 def focal_px(camera: CameraModel) -> float:
+    """The mean focal length."""
     return math.sqrt(float(camera.K[0, 0] * camera.K[1, 1]))
 
 
@@ -92,22 +163,11 @@ def design_ranges(
     target: TargetConfig, camera: CameraModel, optics: Optics, trials: int = TRIALS
 ) -> Ranges:
     """By trial through the detector (far) and by geometry (near)."""
-    f = focal_px(camera)
+    f, view, ahead = focal_px(camera), FieldOfView(camera), (np.eye(3), np.zeros(3))
     picture_px = max(camera.size_px)
     large_px = smallest_side_px(target, "large", optics, picture_px, trials)
     small_px = smallest_side_px(target, "small", optics, picture_px, trials)
-    return _ranges(target, FieldOfView(camera), f, large_px, small_px)
-
-
-def _ranges(
-    target: TargetConfig,
-    view: FieldOfView,
-    f: float,
-    large_px: float | None,
-    small_px: float | None,
-) -> Ranges:
     large, small = target.large.side_m, target.small.side_m
-    ahead = (np.eye(3), np.zeros(3))
     return Ranges(
         z1_m=None if large_px is None else f * large / large_px,
         z2_m=None if small_px is None else f * small / small_px,
@@ -117,18 +177,6 @@ def _ranges(
         large_px=large_px,
         small_px=small_px,
         focal_px=f,
-    )
-
-
-def gear_ranges(target: TargetConfig, camera: CameraModel, profile: Profile) -> GearRanges:
-    """With the camera mounted as in the profile, the vehicle level."""
-    T_body_cam = profile.camera.mount.T_body_cam
-    R_cam_body = T_body_cam[:3, :3].T
-    gear_cam = R_cam_body @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
-    view = FieldOfView(camera)
-    return GearRanges(
-        view.nearest_m(turned_outline(target.large.side_m), R_cam_body, gear_cam),
-        view.nearest_m(turned_outline(target.small.side_m), R_cam_body, gear_cam),
     )
 
 
@@ -144,16 +192,19 @@ def make_design(
     profile: Profile,
     ceiling_m: float | None = None,
     ranges: Ranges | None = None,
+    trials: int = TRIALS,
 ) -> TargetDesign:
     """Ranges and what is wrong with them for a flight by that profile under a ceiling of
-    that height over the floor (None: unknown)."""
-    ranges = ranges or design_ranges(target, camera, optics)
-    gear = gear_ranges(target, camera, profile)
-    standoff = profile.planner.ascend.standoff_m
+    that height over the floor (None: unknown). `trials` are the pictures of a side, where the
+    ranges are not given."""
+    ranges = ranges or design_ranges(target, camera, optics, trials)
+    view, sides = FieldOfView(camera), (target.large.side_m, target.small.side_m)
+    nearest = (view.nearest_m(turned_outline(s), *gear_from_camera(profile)) for s in sides)
     height = 0.0 if is_seen_from_ground(profile) else profile.planner.search.max_height_m
     search = None
     if ceiling_m is not None:
         search = ceiling_m - height - profile.camera.mount.position_m[2]
+    gear, standoff = GearRanges(*nearest), profile.planner.ascend.standoff_m
     warnings = _warnings(target, ranges, gear, standoff, height, ceiling_m, search)
     return TargetDesign(
         target=target,
@@ -200,31 +251,100 @@ def _warnings(
         )
     if ranges.z2_m <= ranges.z3_m:
         found.append(
-            f"gap between the markers: the small one is read up to {cm_text(ranges.z2_m)} cm, and "
-            f"the large one is whole at any turn only from {cm_text(ranges.z3_m)} cm on"
+            f"gap between the markers: the small one is read up to {_cm(ranges.z2_m)}, and "
+            f"the large one is whole at any turn only from {_cm(ranges.z3_m)} on"
         )
     elif ranges.z2_m < 1.15 * ranges.z3_m:
         found.append("the overlap is short: less than 15 % of the range")
-    if gear.small_nearest_m is None or gear.small_nearest_m > standoff_m:
-        at = (
-            ""
-            if gear.small_nearest_m is None
-            else f" (only from {cm_text(gear.small_nearest_m)} cm on)"
-        )
+    nearest_m = gear.small_nearest_m
+    if nearest_m is None or nearest_m > standoff_m:
+        at = "" if nearest_m is None else f" (only from {_cm(nearest_m)} on)"
         found.append(
-            f"gap before contact: with the gear {cm_text(standoff_m)} cm under the target the "
+            f"gap before contact: with the gear {_cm(standoff_m)} under the target the "
             f"small marker is not wholly in the picture{at}; mount the camera nearer to the gear"
         )
     return found
 
 
-def error_curve(design: TargetDesign, sigma_px: float = CORNER_SIGMA_PX) -> ErrorCurve:
-    """The Cramer-Rao bound over the range from contact to z1."""
-    r = design.ranges
+def _text(design: TargetDesign, camera_name: str) -> str:
+    r, optics, target = design.ranges, design.optics, design.target
+    width, height = design.camera.size_px
+    large, small = target.large, target.small
+    both = "none: the two markers are never seen together at every turn"
+    if r.z2_m is not None and r.z3_m is not None and r.z2_m > r.z3_m:
+        both = f"{_cm(r.z3_m)} to {_cm(r.z2_m)}, both markers at any turn"
+    blind, *advice = design.mount.lines()
+    lines = [
+        f"camera    {camera_name}, {width}x{height}, f {r.focal_px:.0f} px",
+        f"optics    blur sigma {optics.blur_px:g} px, noise sigma {optics.noise:g}",
+        f"target    {mm_text(large.side_m)} mm {large.dictionary}/{large.id} around "
+        f"{mm_text(small.side_m)} mm {small.dictionary}/{small.id}",
+        f"z1        {_cm(r.z1_m):<9} large marker from here on inwards (side {_px(r.large_px)})",
+        f"z2        {_cm(r.z2_m):<9} small marker from here on inwards (side {_px(r.small_px)})",
+        f"z3        {_cm(r.z3_m):<9} whole large marker down to here at any turn; "
+        f"{_cm(r.z3_upright_m)} where it is upright",
+        f"z4        {_cm(r.z4_m):<9} whole small marker down to here at any turn",
+        f"overlap   {both}",
+        f"at gear   whole large marker down to {_cm(design.gear.large_nearest_m)}, small down to "
+        f"{_cm(design.gear.small_nearest_m)} between gear and target, the gear under its centre",
+        f"mounting  {blind}",
+        *(f"advice    {text}" for text in advice),
+    ]
+    if design.search_range_m is not None:
+        where = f"at the highest search position ({design.search_height_m:g} m)"
+        if design.search_height_m == 0.0:
+            where = "on the ground, from where it has to be seen"
+        lines.append(f"search    target {_cm(design.search_range_m)} away {where}")
+    lines += ["", *_table(design.curve), ""]
+    lines += [f"warning: {text}" for text in design.warnings] or ["no gap from search to stand-off"]
+    return "\n".join(lines)
+
+
+def _table(curve: ErrorCurve) -> list[str]:
+    """Least possible errors at a few ranges, by the best that is seen there."""
+    lines = [
+        f"least error that the corners allow (sigma {CORNER_SIGMA_PX:g} px):",
+        "   range cm   x, y mm     z mm   turn deg   seen",
+    ]
+    for z_cm in _TABLE_CM:
+        if not curve.z_m[0] <= z_cm / 100.0 <= curve.z_m[-1]:
+            continue
+        i, name = curve.best_at(z_cm / 100.0)
+        line = f"   {100 * curve.z_m[i]:8.1f}   nothing whole and readable"
+        if name is not None:
+            x, z, yaw = curve.bounds[name][i]
+            line = (
+                f"   {100 * curve.z_m[i]:8.1f}  {1e3 * x:8.3f}  {1e3 * z:7.3f}  "
+                f"{math.degrees(yaw):9.3f}   {name}"
+            )
+        lines.append(line)
+    return lines
+
+
+def _height_error(curve: ErrorCurve, z_m: float) -> str:
+    """By the best that is seen at the range nearest to it, in mm."""
+    i, name = curve.best_at(z_m)
+    if name is None or not curve.z_m[0] <= z_m <= curve.z_m[-1]:
+        return "-"
+    return f"{1e3 * curve.bounds[name][i, 1]:.3f}"
+
+
+def _cm(length_m: float | None) -> str:
+    return "never" if length_m is None else f"{100.0 * length_m:.3g} cm"
+
+
+def _px(side_px: float | None) -> str:
+    return "never" if side_px is None else f"{side_px:.0f} px"
+
+
+# --- The least pose error that corners of a given spread allow (Cramer-Rao bound) --------------
+
+
+def _error_curve(target: TargetConfig, r: Ranges) -> ErrorCurve:
     spans = {"large": (r.z3_m, r.z1_m), "small": (r.z4_m, r.z2_m)}
     ends = [v for span in spans.values() for v in span if v is not None]
     z = np.geomspace(min(ends, default=0.02), max(ends, default=2.0), CURVE_POINTS)
-    sides = {"large": design.target.large.side_m, "small": design.target.small.side_m}
+    sides = {"large": target.large.side_m, "small": target.small.side_m}
     bounds = {name: np.full((len(z), 3), np.nan) for name in ("large", "small", "both")}
     for i, z_m in enumerate(z):
         seen = [
@@ -232,41 +352,21 @@ def error_curve(design: TargetDesign, sigma_px: float = CORNER_SIGMA_PX) -> Erro
             for name, (near, far) in spans.items()
             if near is not None and far is not None and near * 0.9999 <= z_m <= far * 1.0001
         ]
-        for name, used in (
-            *((n, [n]) for n in seen),
-            *([("both", seen)] if len(seen) == 2 else []),
-        ):
-            bounds[name][i] = _row(
-                pose_bound([sides[n] for n in used], float(z_m), r.focal_px, sigma_px)
-            )
+        used = {name: [sides[name]] for name in seen}
+        if len(seen) == 2:
+            used["both"] = list(sides.values())
+        for name, sides_m in used.items():
+            x, _, z_sigma, yaw = pose_bound(sides_m, float(z_m), r.focal_px, CORNER_SIGMA_PX)
+            bounds[name][i] = x, z_sigma, yaw
     return ErrorCurve(z, bounds)
 
 
-def _row(bound: PoseBound) -> tuple[float, float, float]:
-    return bound.x_m, bound.z_m, bound.yaw_rad
-
-
-def cm_text(length_m: float) -> str:
-    """A length in centimetres, without its unit, for a sentence."""
-    return f"{100.0 * length_m:.3g}"
-
-
-# --- The least pose error that corners of a given spread allow (Cramer-Rao bound) --------------
-
-
-@dataclass(frozen=True)
-class PoseBound:
-    """Standard deviations of the target's position in the camera frame and of its turn."""
-
-    x_m: float
-    y_m: float
-    z_m: float
-    yaw_rad: float
-
-
-def pose_bound(sides_m: list[float], z_m: float, focal_px: float, sigma_px: float) -> PoseBound:
-    """The bound for centred, concentric markers of these sides, seen straight on from
-    `z_m`, all corners solved together; every corner has `sigma_px` in x and in y.
+def pose_bound(
+    sides_m: list[float], z_m: float, focal_px: float, sigma_px: float
+) -> tuple[float, float, float, float]:
+    """The least standard deviations of x, y, z (m, in the camera frame) and of the turn (rad), for
+    centred, concentric markers of these sides, seen straight on from `z_m`, all corners solved
+    together; every corner has `sigma_px` in x and in y.
 
     The pose has all six degrees of freedom. Perturbed by a turn w and a shift t, a corner
     X moves by w x X + t.
@@ -281,10 +381,5 @@ def pose_bound(sides_m: list[float], z_m: float, focal_px: float, sigma_px: floa
     du = focal_px * (dx / z_m - x[:, None] * dz / z_m**2)
     dv = focal_px * (dy / z_m - y[:, None] * dz / z_m**2)
     J: Array = np.concatenate([du, dv])
-    covariance = np.linalg.inv(J.T @ J) * sigma_px**2
-    sigma = np.sqrt(np.diag(covariance))
-    return PoseBound(float(sigma[3]), float(sigma[4]), float(sigma[5]), float(sigma[2]))
-
-
-def degrees(bound: PoseBound) -> float:
-    return math.degrees(bound.yaw_rad)
+    sigma = sigma_px * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    return float(sigma[3]), float(sigma[4]), float(sigma[5]), float(sigma[2])

@@ -11,12 +11,15 @@ cells of both markers and of the white ring around the small one.
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from perchctl.errors import InvalidValue
 from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
 
@@ -62,18 +65,28 @@ class TargetDrawing:
     sheet_side_m: float
     ring_m: float
 
+    def ink_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
+        """Exact share of black in the windows of size_px x size_px pixels around the centre,
+        0..1."""
+        w = overlap(self.edges_m, px_per_m, size_px, window_px)
+        # The grid is symmetric about 0, so the same weights serve rows from the top.
+        return np.asarray(w @ self.black.astype(np.float64) @ w.T)
 
-@dataclass(frozen=True, eq=False)
-class Bitmap:
-    """A picture of the sheet: `image` uint8 (n, n), row 0 at the top of the print.
+    def sheet_coverage(self, px_per_m: float, size_px: int, window_px: float = 1.0) -> Array:
+        """Exact share of the sheet in each pixel's window, 0..1, shape (size_px, size_px)."""
+        half = self.sheet_side_m / 2.0
+        w = overlap(np.array([-half, half]), px_per_m, size_px, window_px)
+        return np.asarray(w @ w.T)
 
-    The drawing's origin is at column and row `center_px`; a point (x, y) is at
-    column ``center_px + x * px_per_m``, row ``center_px - y * px_per_m``.
-    """
+    def bitmap(self, px_per_m: float) -> NDArray[np.uint8]:
+        """The whole sheet, black 0 on white 255, (n, n), each pixel the exact mean of its area;
+        row 0 is at the top of the print, the centre in the middle of the picture."""
+        size = max(1, int(np.ceil(self.sheet_side_m * px_per_m - 1e-9)))
+        return np.rint(255.0 * (1.0 - self.ink_coverage(px_per_m, size))).astype(np.uint8)
 
-    image: NDArray[np.uint8]
-    px_per_m: float
-    center_px: float
+    def rectangles(self) -> list[Rectangle]:
+        """The black area as few, large, non-overlapping rectangles (for a PDF)."""
+        return merged_rectangles(self.black, self.edges_m, -self.edges_m)
 
 
 def marker_cells(marker: MarkerConfig) -> NDArray[np.bool_]:
@@ -166,37 +179,6 @@ def overlap(edges_m: Array, px_per_m: float, size_px: int, window_px: float = 1.
     return np.diff(below, axis=1) / window_px
 
 
-def ink_coverage(
-    drawing: TargetDrawing, px_per_m: float, size_px: int, window_px: float = 1.0
-) -> Array:
-    """Exact share of black in the windows of size_px x size_px pixels around the centre, 0..1."""
-    w = overlap(drawing.edges_m, px_per_m, size_px, window_px)
-    # The grid is symmetric about 0, so the same weights serve rows from the top.
-    return w @ drawing.black.astype(np.float64) @ w.T
-
-
-def sheet_coverage(
-    drawing: TargetDrawing, px_per_m: float, size_px: int, window_px: float = 1.0
-) -> Array:
-    """Exact share of the sheet in each pixel's window, 0..1, shape (size_px, size_px)."""
-    half = drawing.sheet_side_m / 2.0
-    w = overlap(np.array([-half, half]), px_per_m, size_px, window_px)
-    return w @ w.T
-
-
-def draw_bitmap(drawing: TargetDrawing, px_per_m: float) -> Bitmap:
-    """The whole sheet, black 0 on white 255, each pixel the exact mean of its area."""
-    size = max(1, int(np.ceil(drawing.sheet_side_m * px_per_m - 1e-9)))
-    ink = ink_coverage(drawing, px_per_m, size)
-    image = np.rint(255.0 * (1.0 - ink)).astype(np.uint8)
-    return Bitmap(image, px_per_m, (size - 1) / 2.0)
-
-
-def black_rectangles(drawing: TargetDrawing) -> list[Rectangle]:
-    """The black area as few, large, non-overlapping rectangles (for a PDF)."""
-    return merged_rectangles(drawing.black, drawing.edges_m, -drawing.edges_m)
-
-
 def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> list[Rectangle]:
     """Black cells of a grid as few, large, non-overlapping rectangles.
 
@@ -226,3 +208,38 @@ def merged_rectangles(black: NDArray[np.bool_], xs_m: Array, ys_m: Array) -> lis
                 )
             )
     return found
+
+
+# --- Lengths as people write them: with their unit ---------------------------------------------
+
+
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_LENGTH = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)\s*([a-zA-Z]*)\s*")
+
+
+def parse_length(text: str, what: str, *, bare_unit: str | None = None) -> float:
+    """``150mm``, ``15cm`` or ``0.15m`` in metres.
+
+    `what` names the value in the error; a number without a unit is taken in `bare_unit`,
+    and refused where that is None. Raises InvalidValue.
+    """
+    match = _LENGTH.fullmatch(text)
+    if match is None:
+        raise InvalidValue(f"{what}: {text!r} is not a length; write 150mm, 15cm or 0.15m")
+    number, unit = match.groups()
+    if not unit:
+        if bare_unit is None:
+            raise InvalidValue(f"{what}: {text!r} has no unit; write {number}mm, or cm or m")
+        unit = bare_unit
+    if unit not in UNITS_M:
+        raise InvalidValue(f"{what}: unit {unit!r} in {text!r} is unknown; allowed are mm, cm, m")
+    value = float(number) * UNITS_M[unit]
+    if not (math.isfinite(value) and value > 0.0):
+        raise InvalidValue(f"{what}: {text!r} must be more than zero")
+    # What a person writes has no more than 12 digits: 0.1 cm is 0.001 m, not 0.0010000000000000002.
+    return float(f"{value:.12g}")
+
+
+def mm_text(length_m: float) -> str:
+    """``150`` or ``149.6``: a length in millimetres, without a unit, to 1 um."""
+    return f"{round(length_m * 1e3, 3):g}"

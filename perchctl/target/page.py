@@ -1,19 +1,25 @@
-"""A printed page as shapes in millimetres, whatever file it becomes.
+"""A printed page as shapes in millimetres, cut into sheets of paper, and written as a PDF.
 
 Page axes: origin at the top left corner of the paper, x right, y down, mm.
 """
 
 from __future__ import annotations
 
+import datetime
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
+from fpdf import FPDF
+from fpdf.enums import PathPaintRule
+from fpdf.fonts import CORE_FONTS_CHARWIDTHS
+from fpdf.prefs import ViewerPreferences
+
 from perchctl.errors import InvalidValue
-from perchctl.target.drawing import Rectangle
-from perchctl.target.lengths import parse_length
+from perchctl.target.drawing import Rectangle, parse_length
 
 PAGES_MM: dict[str, tuple[float, float]] = {
     "a4": (210.0, 297.0),
@@ -23,6 +29,14 @@ PAGES_MM: dict[str, tuple[float, float]] = {
 """Named pages, portrait, in the order in which one that fits is proposed."""
 
 MAX_PAGE_MM = 5000.0
+UNPRINTABLE = 5.0
+"""mm at the paper's edges that many printers leave white."""
+OVERLAP = 10.0
+"""mm that two neighbouring sheets of one page share: what is cut off, and glued on."""
+_CUT_MARK = 4.0
+_PT_PER_MM = 72.0 / 25.4
+_EPOCH = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
+"""The date in the file where the profile names none: never the clock's."""
 Anchor = Literal["start", "middle", "end"]
 
 
@@ -36,16 +50,20 @@ class Filled:
 
 @dataclass(frozen=True)
 class Line:
+    """`dash` is the length of dashes and gaps; 0 is solid."""
+
     x0: float
     y0: float
     x1: float
     y1: float
     width: float = 0.2
-    dash: float = 0.0  # length of dashes and gaps, 0 is solid
+    dash: float = 0.0
 
 
 @dataclass(frozen=True)
 class Circle:
+    """A circle that is not filled."""
+
     x: float
     y: float
     radius: float
@@ -76,6 +94,8 @@ Item = Filled | Line | Circle | Polygon | Text
 
 @dataclass(frozen=True)
 class Page:
+    """Width and height of the paper, mm, and what is printed on it."""
+
     width: float
     height: float
     items: tuple[Item, ...]
@@ -127,37 +147,35 @@ def filled(rectangles: Sequence[Rectangle], x: float, y: float) -> Filled:
     )
 
 
-def mirrored(items: Sequence[Item], width: float) -> tuple[Item, ...]:
-    """The items as they lie on the back of the sheet; texts stay readable."""
-    return tuple(_mirrored(item, width) for item in items)
-
-
-def _mirrored(item: Item, width: float) -> Item:
+def placed(item: Item, x: float, y: float, mirror: bool = False) -> Item:
+    """The item moved by x and y; with `mirror` its own x runs to the left, and texts stay
+    readable."""
+    sign = -1.0 if mirror else 1.0
     match item:
         case Filled(boxes):
-            return Filled(tuple((width - x - w, y, w, h) for x, y, w, h in boxes))
-        case Line(x0=x0, x1=x1):
-            return replace(item, x0=width - x0, x1=width - x1)
+            return Filled(
+                tuple((x + sign * left - w * mirror, y + top, w, h) for left, top, w, h in boxes)
+            )
+        case Line(x0, y0, x1, y1):
+            return replace(item, x0=x + sign * x0, y0=y + y0, x1=x + sign * x1, y1=y + y1)
         case Polygon(points):
-            return Polygon(tuple((width - x, y) for x, y in points))
-        case Circle(x=x):
-            return replace(item, x=width - x)
-        case Text(x=x, anchor=anchor):
+            return Polygon(tuple((x + sign * px, y + py) for px, py in points))
+        case Circle():
+            return replace(item, x=x + sign * item.x, y=y + item.y)
+        case Text(anchor=anchor):
             other: dict[Anchor, Anchor] = {"start": "end", "end": "start", "middle": "middle"}
-            return replace(item, x=width - x, anchor=other[anchor])
+            there = other[anchor] if mirror else anchor
+            return replace(item, x=x + sign * item.x, y=y + item.y, anchor=there)
 
 
 @cache
 def _widths() -> dict[str, int]:
-    from fpdf.fonts import CORE_FONTS_CHARWIDTHS
-
     return dict(CORE_FONTS_CHARWIDTHS["helvetica"])
 
 
 def text_width(text: str, size: float) -> float:
     """Width of a line of Helvetica, mm."""
-    widths = _widths()
-    return sum(widths.get(character, 600) for character in text) * size / 1000.0
+    return sum(_widths().get(character, 600) for character in text) * size / 1000.0
 
 
 def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
@@ -174,3 +192,114 @@ def wrapped(texts: Sequence[str], size: float, width: float) -> list[str]:
                 line = longer
         lines.append(line)
     return lines
+
+
+# --- A page that is larger than the printer's paper, on sheets that overlap ---------------------
+
+
+def tile_page(page: Page, paper: tuple[float, float]) -> list[Page]:
+    """The page on sheets (width, height, mm), upright or across, whichever are fewer; row by row
+    from the top left one. A page that fits is one sheet of its own size.
+
+    Each sheet shows `OVERLAP` of its neighbour's; lines at the page's edges, in the middle of
+    the overlap, say where to cut.
+    """
+    if any(page.width <= w and page.height <= h for w, h in (paper, paper[::-1])):
+        return [page]
+    width, height = min((paper, paper[::-1]), key=lambda size: math.prod(_counts(page, size)))
+    columns, rows = _counts(page, (width, height))
+    dx, dy = (side - 2.0 * UNPRINTABLE - OVERLAP for side in (width, height))
+    cuts_x = [i * dx + OVERLAP / 2 for i in range(1, columns)]
+    cuts_y = [j * dy + OVERLAP / 2 for j in range(1, rows)]
+    marks = [
+        *(Line(x, a, x, a + _CUT_MARK) for x in cuts_x for a in (0.0, page.height - _CUT_MARK)),
+        *(Line(a, y, a + _CUT_MARK, y) for y in cuts_y for a in (0.0, page.width - _CUT_MARK)),
+    ]
+    return [
+        Page(
+            width,
+            height,
+            tuple(
+                placed(item, UNPRINTABLE - i * dx, UNPRINTABLE - j * dy)
+                for item in (*page.items, *marks)
+            ),
+        )
+        for j in range(rows)
+        for i in range(columns)
+    ]
+
+
+def _counts(page: Page, paper: tuple[float, float]) -> tuple[int, int]:
+    """Columns and rows of sheets."""
+    columns, rows = (
+        max(1, math.ceil((whole - OVERLAP) / (side - 2.0 * UNPRINTABLE - OVERLAP) - 1e-9))
+        for whole, side in zip((page.width, page.height), paper, strict=True)
+    )
+    return columns, rows
+
+
+# --- The PDF ------------------------------------------------------------------------------------
+
+
+def pdf_bytes(
+    pages: Sequence[Page], title: str, date: datetime.date | None = None, tile: str | None = None
+) -> bytes:
+    """A PDF of all pages, true to size, the same bytes for the same pages; print scaling is
+    switched off in the viewer's preferences. `tile` names the paper that the pages are cut to.
+
+    Raises InvalidValue for a `tile` that is no page.
+    """
+    if tile is not None:
+        paper = parse_page(tile)
+        pages = [sheet for page in pages for sheet in tile_page(page, paper)]
+    first = pages[0]
+    pdf = FPDF(unit="mm", format=(first.width, first.height))
+    pdf.set_auto_page_break(False)
+    pdf.set_margin(0.0)
+    pdf.set_title(title)
+    pdf.set_producer("perchctl")
+    pdf.set_creation_date(
+        datetime.datetime.combine(date, datetime.time(), datetime.UTC) if date else _EPOCH
+    )
+    # Portrait pages turn about their long edge, which is the upright one.
+    duplex = "DuplexFlipLongEdge" if first.height >= first.width else "DuplexFlipShortEdge"
+    pdf.viewer_preferences = ViewerPreferences(
+        print_scaling="None", duplex=duplex if len(pages) == 2 else None
+    )
+    for page in pages:
+        pdf.add_page(orientation="portrait", format=(page.width, page.height))
+        for item in page.items:
+            _draw(pdf, item)
+    return bytes(pdf.output())
+
+
+def _draw(pdf: FPDF, item: Item) -> None:
+    match item:
+        case Filled() | Polygon():
+            with pdf.new_path(paint_rule=PathPaintRule.FILL_NONZERO) as path:
+                path.style.fill_color = "#000000"
+                path.style.stroke_color = None
+                if isinstance(item, Filled):
+                    for x, y, w, h in item.boxes:
+                        path.rectangle(x, y, w, h)
+                else:
+                    path.move_to(*item.points[0])
+                    for point in item.points[1:]:
+                        path.line_to(*point)
+                    path.close()
+        case Line(x0, y0, x1, y1, width, dash):
+            pdf.set_line_width(width)
+            pdf.set_dash_pattern(dash=dash, gap=dash)
+            pdf.line(x0, y0, x1, y1)
+        case Circle(x, y, radius, width):
+            pdf.set_line_width(width)
+            pdf.set_dash_pattern()
+            pdf.circle(x, y, radius)
+        case Text(x, y, text, size, anchor, upwards):
+            pdf.set_font("helvetica", size=size * _PT_PER_MM)
+            back = {"start": 0.0, "middle": 0.5, "end": 1.0}[anchor] * text_width(text, size)
+            if upwards:
+                with pdf.rotation(90.0, x, y):
+                    pdf.text(x - back, y, text)
+            else:
+                pdf.text(x - back, y, text)

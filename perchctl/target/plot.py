@@ -14,15 +14,16 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from perchctl.plot import BLACK, BLUE, GREY, GRID, ORANGE, new_figure, save_png
 
 if TYPE_CHECKING:
-    from perchctl.target.design import ErrorCurve, TargetDesign
+    from perchctl.target.design import TargetDesign
 
 SIZE_IN = (9.0, 7.5)
 STYLES = {"large": (BLUE, "-", 1.4), "small": (ORANGE, "-", 1.4), "both": (BLACK, "--", 2.0)}
 PANELS = (("x, y [mm]", 1e3), ("z [mm]", 1e3), ("turn [deg]", 180.0 / math.pi))
 
 
-def draw_design(design: TargetDesign, curve: ErrorCurve) -> bytes:
+def draw_design(design: TargetDesign) -> bytes:
     """A PNG: bars from the nearest to the farthest range, and the error bound below them."""
+    curve = design.curve
     figure = new_figure(*SIZE_IN)
     axes = figure.subplots(4, 1, sharex=True, height_ratios=(0.8, 1, 1, 1))
     _plot_spans(axes[0], design)

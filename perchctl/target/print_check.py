@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 
 from perchctl.geometry import Array
 from perchctl.profile import TargetConfig
@@ -27,8 +28,6 @@ a printer's dot."""
 SIGMAS = 3.0
 MIN_FRAMES = 5
 _FOLD = 500  # frames whose size ratios are kept one by one
-_STEPS = 12
-_SETTLED = 1e-10
 
 
 @dataclass(frozen=True)
@@ -68,35 +67,39 @@ def size_ratio(
     seen = undistort_px(np.concatenate([large_px, small_px]), camera)
     if not np.isfinite(seen).all() or not all(math.isfinite(s) and s > 0.0 for s in sigma_px):
         return None
+    weight = np.repeat(1.0 / np.array(sigma_px), 8)
+
+    def errors(p: Array) -> Array:
+        """In sigmas, (16,), by rvec, tvec and the ratio."""
+        X = np.concatenate([X_large, p[6] * X_small])
+        image, _ = cv2.projectPoints(X, p[:3], p[3:6], camera.K, None)
+        return np.asarray(weight * (image.reshape(-1, 2) - seen).ravel())
+
     try:
         ok, rvec, tvec = cv2.solvePnP(
             X_large, np.ascontiguousarray(seen[:4]), camera.K, None, flags=cv2.SOLVEPNP_SQPNP
         )
-    except cv2.error:
-        return None
-    if not ok or not (np.isfinite(rvec).all() and np.isfinite(tvec).all()) or tvec[2, 0] <= 0.0:
-        return None
-    p = np.concatenate([np.ravel(rvec), np.ravel(tvec), [1.0]])
-    weight = np.repeat([1.0 / sigma_px[0] ** 2, 1.0 / sigma_px[1] ** 2], 8)
-    information = np.eye(7)
-    for _ in range(_STEPS):
-        error, J = _linearised(p, X_large, X_small, seen, camera.K)
-        information = J.T @ (J * weight[:, None])
-        try:
-            step = -np.linalg.solve(information, J.T @ (weight * error))
-        except np.linalg.LinAlgError:
+        start = np.concatenate([np.ravel(rvec), np.ravel(tvec), [1.0]])
+        if not ok or start[5] <= 0.0:
             return None
-        p = p + step
-        if not np.isfinite(p).all() or p[6] <= 0.0 or p[5] <= 0.0:
-            return None
-        if abs(step[6]) < _SETTLED:
-            break
-    error, _ = _linearised(p, X_large, X_small, seen, camera.K)
-    chi2 = float((weight * error**2).sum()) / (len(error) - 7)
-    sigma = math.sqrt(float(np.linalg.inv(information)[6, 6]) * max(1.0, chi2))
-    sides = [_side_px(quad) for quad in (seen[:4], seen[4:])]
-    bias = math.hypot(*(2.0 * CORNER_BIAS_PX / side for side in sides))
-    return SizeRatio(float(p[6]), sigma, bias, 1, sides[1])
+        found = least_squares(errors, start, method="lm", x_scale="jac")
+        covariance = np.linalg.inv(found.jac.T @ found.jac)
+    except (cv2.error, ValueError, np.linalg.LinAlgError):
+        return None
+    if found.x[5] <= 0.0 or found.x[6] <= 0.0:
+        return None
+    chi2 = 2.0 * float(found.cost) / (len(weight) - len(start))
+    sides = [
+        float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean())
+        for quad in (seen[:4], seen[4:])
+    ]
+    return SizeRatio(
+        float(found.x[6]),
+        math.sqrt(float(covariance[6, 6]) * max(1.0, chi2)),
+        math.hypot(*(2.0 * CORNER_BIAS_PX / side for side in sides)),
+        1,
+        sides[1],
+    )
 
 
 def combined(ratios: Sequence[SizeRatio]) -> SizeRatio | None:
@@ -140,7 +143,7 @@ def verdict(ratio: SizeRatio | None, target: TargetConfig) -> PrintVerdict:
     return PrintVerdict(
         True,
         f"print error: {ratio_text}; measure both black squares and give them to "
-        f"perchctl make-target --measured-large MM --measured-small MM",
+        f"perchctl make-target measured --measured-large MM --measured-small MM",
     )
 
 
@@ -178,24 +181,3 @@ class PrintCheck:
 
     def verdict(self) -> PrintVerdict:
         return verdict(combined(self._ratios), self.target)
-
-
-def _linearised(
-    p: Array, X_large: Array, X_small: Array, seen: Array, K: Array
-) -> tuple[Array, Array]:
-    """Errors (16,) px and their Jacobian (16, 7) by rvec, tvec and the ratio."""
-    scaled = X_small * p[6]
-    image, jacobian = cv2.projectPoints(np.concatenate([X_large, scaled]), p[:3], p[3:6], K, None)
-    R = cv2.Rodrigues(p[:3])[0]
-    cam = scaled @ R.T + p[3:6]
-    d = X_small @ R.T
-    x, y, z = cam.T
-    by_ratio = np.zeros((8, 2))
-    by_ratio[4:, 0] = K[0, 0] * (d[:, 0] / z - x * d[:, 2] / z**2)
-    by_ratio[4:, 1] = K[1, 1] * (d[:, 1] / z - y * d[:, 2] / z**2)
-    J = np.column_stack([np.asarray(jacobian[:, :6], np.float64), by_ratio.ravel()])
-    return (image.reshape(-1, 2) - seen).ravel(), J
-
-
-def _side_px(quad: Array) -> float:
-    return float(np.linalg.norm(quad - np.roll(quad, 1, axis=0), axis=1).mean())

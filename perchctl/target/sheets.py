@@ -10,22 +10,13 @@ import datetime
 import math
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from perchctl.errors import InvalidValue
-from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary
-from perchctl.target.boards import TAG_DICTIONARY, Board
-from perchctl.target.drawing import (
-    Rectangle,
-    black_rectangles,
-    draw_target,
-    marker_cells,
-    merged_rectangles,
-)
-from perchctl.target.lengths import mm_text
+from perchctl.profile import MarkerConfig, TargetConfig
+from perchctl.target.boards import Board, board_rectangles
+from perchctl.target.drawing import draw_target, marker_cells, mm_text
 from perchctl.target.page import (
     PAGES_MM,
+    UNPRINTABLE,
     Circle,
     Item,
     Line,
@@ -33,14 +24,14 @@ from perchctl.target.page import (
     Polygon,
     Text,
     filled,
-    mirrored,
     page_name,
+    parse_page,
+    pdf_bytes,
+    placed,
     text_width,
     wrapped,
 )
 
-UNPRINTABLE = 5.0
-"""mm at the paper's edges that many printers leave white."""
 MIN_QUIET_CELLS = 0.5
 """White around the large marker, in its cells. One cell is printed where the page has
 room; down to half a cell the range stays the same even on a black ceiling (measured: side
@@ -70,6 +61,34 @@ class Place:
     caption: tuple[str, ...]
 
 
+def target_pdf(
+    target: TargetConfig,
+    page: str,
+    magnet_m: float,
+    origin: str = "",
+    date: datetime.date | None = None,
+    tile: str | None = None,
+) -> bytes:
+    """The target's sheet, front and back, as a PDF.
+
+    Args:
+        page: ``a4``, ``letter``, ``a3`` or a size such as ``220x240mm``.
+        origin: where the sizes come from, for the caption.
+        tile: the paper that the page is cut to, as `page`.
+
+    Raises InvalidValue where the page is too small, with the page that fits.
+    """
+    pages = target_pages(target, parse_page(page), magnet_m, origin, date)
+    return pdf_bytes(pages, f"perchctl target, {mm_text(target.large.side_m)} mm", date, tile)
+
+
+def board_pdf(board: Board, page: str, tile: str | None = None) -> bytes:
+    """The board as a PDF; `page` and `tile` as in `target_pdf`. Raises InvalidValue where it does
+    not fit."""
+    sheet = board_page(board, parse_page(page))
+    return pdf_bytes([sheet], f"perchctl {board.notation()}", tile=tile)
+
+
 def target_pages(
     target: TargetConfig,
     page: tuple[float, float],
@@ -77,12 +96,15 @@ def target_pages(
     origin: str = "",
     date: datetime.date | None = None,
 ) -> tuple[Page, Page]:
-    """Front and back. `origin` names where the sizes come from, for the caption.
-
-    Raises InvalidValue where the page is too small, with the page that fits.
-    """
+    """Front and back, with the largest quiet zone, up to one cell, that leaves room for rulers
+    and caption. Raises InvalidValue where the page is too small."""
     texts = _caption(target, origin, date)
-    place = _place(target, page, texts)
+    place = _fitted(target, page, texts)
+    if place is None:
+        raise InvalidValue(
+            f"a target of {1e3 * target.large.side_m:g} mm with its white and its rulers does not "
+            f"fit on {page_name(*page)}; --page {_fitting_page(target, texts)} holds it"
+        )
     return _front(target, place), _back(target, place, magnet_m)
 
 
@@ -114,17 +136,6 @@ def board_page(board: Board, page: tuple[float, float]) -> Page:
     items += [Text(left, base + 3.2 * i, line, _LABEL) for i, line in enumerate(lines)]
     items += _rulers(cx, cy, max(width / 2, _RULER_REACH), max(height / 2, _RULER_REACH))
     return Page(w, h, tuple(items))
-
-
-def _place(target: TargetConfig, page: tuple[float, float], texts: tuple[str, ...]) -> Place:
-    """The largest quiet zone, up to one cell, that leaves room for rulers and caption."""
-    place = _fitted(target, page, texts)
-    if place is None:
-        raise InvalidValue(
-            f"a target of {1e3 * target.large.side_m:g} mm with its white and its rulers does not "
-            f"fit on {page_name(*page)}; --page {_fitting_page(target, texts)} holds it"
-        )
-    return place
 
 
 def fits(target: TargetConfig, page: tuple[float, float]) -> bool:
@@ -198,14 +209,14 @@ def _caption(target: TargetConfig, origin: str, date: datetime.date | None) -> t
         + (f"  ({origin}{dated})" if origin else ""),
         "Print at 100 %, not scaled: both rulers must measure 100 mm. Cut along the corner marks, "
         "glue the magnet to the back.",
-        "Then measure the black squares and give their sides to perchctl make-target "
+        "Then measure the black squares and give their sides to perchctl make-target measured "
         "--measured-large and --measured-small.",
     )
 
 
 def _front(target: TargetConfig, place: Place) -> Page:
     cx, cy, half = place.width / 2, place.height / 2, place.sheet / 2
-    items: list[Item] = [filled(black_rectangles(draw_target(target)), cx, cy)]
+    items: list[Item] = [filled(draw_target(target).rectangles(), cx, cy)]
     items += _cut_marks(cx, cy, half)
     items += _corner_ticks(cx, cy, half, 500.0 * target.large.side_m)
     ruler_half = _ruler_half(half)
@@ -240,7 +251,8 @@ def _back(target: TargetConfig, place: Place, magnet_m: float) -> Page:
     base = cy + half + _MARK_GAP + _MARK + 2.0 + _TEXT
     for i, line in enumerate(wrapped(texts, _TEXT, place.width - 2 * UNPRINTABLE)):
         items.append(Text(cx, base + _LINE * i, line, _TEXT, "middle"))
-    return Page(place.width, place.height, mirrored(items, place.width))
+    back = tuple(placed(item, place.width, 0.0, mirror=True) for item in items)
+    return Page(place.width, place.height, back)
 
 
 def _rulers(cx: float, cy: float, half_x: float, half_y: float) -> list[Item]:
@@ -294,69 +306,3 @@ def _up_arrow(x: float, tail_y: float) -> list[Item]:
     points = [(0.0, 0.0), (2.5, 4.5), (0.6, 4.5), (0.6, _ARROW), (-0.6, _ARROW), (-0.6, 4.5)]
     shape = tuple((x + dx, tip + dy) for dx, dy in [*points, (-2.5, 4.5)])
     return [Polygon(shape), Text(x + 4.0, tail_y - 2.0, "up", 4.0)]
-
-
-# --- What of a calibration board is black ------------------------------------------------------
-
-
-TAG_BORDER_CELLS = 2
-
-
-def board_rectangles(board: Board) -> list[Rectangle]:
-    """The black area in metres, origin in the board's centre, x right and y up."""
-    if board.kind == "aprilgrid":
-        return _aprilgrid_rectangles(board)
-    columns, rows = board.squares
-    width, height = board.size_m
-    found: list[Rectangle] = []
-    black = black_squares(board)
-    for row in range(rows):
-        for column in range(columns):
-            if black[row, column]:
-                x, y = column * board.square_m - width / 2, height / 2 - row * board.square_m
-                found.append(Rectangle(x, y - board.square_m, x + board.square_m, y))
-    if board.marker_m is None or board.dictionary is None:
-        return found
-    for marker_id, (row, column) in enumerate(np.argwhere(~black)):
-        cells = marker_cells(
-            MarkerConfig(dictionary=board.dictionary, id=marker_id, side_m=board.marker_m)
-        )
-        at = np.linspace(-board.marker_m / 2, board.marker_m / 2, len(cells) + 1)
-        x = (column + 0.5) * board.square_m - width / 2
-        y = height / 2 - (row + 0.5) * board.square_m
-        found += merged_rectangles(cells, x + at, y - at)
-    return found
-
-
-def _aprilgrid_rectangles(board: Board) -> list[Rectangle]:
-    assert board.marker_m is not None
-    (columns, rows), (width, height) = board.squares, board.size_m
-    pitch, side = board.square_m + board.marker_m, board.square_m
-    found = []
-    for x in np.arange(columns) * pitch - width / 2:
-        for y in height / 2 - np.arange(rows) * pitch:
-            found.append(Rectangle(float(x), float(y - side), float(x + side), float(y)))
-    corners = board.corners_m()
-    for tag in range(board.columns * board.rows):
-        cells = tag_cells(tag)
-        at = np.linspace(0.0, board.marker_m, len(cells) + 1)
-        x, y, _ = corners[board.tag_corners(tag)[2]]  # the top left one
-        found += merged_rectangles(cells, x - width / 2 + at, height / 2 - y - at)
-    return found
-
-
-def tag_cells(tag: int) -> NDArray[np.bool_]:
-    """Black cells of an aprilgrid's tag as Kalibr prints it, (10, 10), row 0 at the top."""
-    dictionary = aruco_dictionary(TAG_DICTIONARY)
-    n = int(dictionary.markerSize) + 2 * TAG_BORDER_CELLS
-    picture = dictionary.generateImageMarker(tag, n, borderBits=TAG_BORDER_CELLS)
-    return np.asarray(picture)[::-1, ::-1] < 128  # half a turn: see `Board.tag_corners`
-
-
-def black_squares(board: Board) -> NDArray[np.bool_]:
-    """Which squares are black, (rows, columns), row 0 at the top; a charuco board's
-    markers fill the others, row by row."""
-    columns, rows = board.squares
-    # OpenCV's old pattern begins with white where the rows are even in number.
-    first = 1 if board.legacy and rows % 2 == 0 else 0
-    return np.asarray((np.add.outer(np.arange(rows), np.arange(columns)) + first) % 2 == 0)

@@ -10,16 +10,19 @@ from functools import partial
 import numpy as np
 
 from perchctl.errors import InvalidValue
-from perchctl.geometry import Array
 from perchctl.profile import MarkerConfig, Profile, TargetConfig
-from perchctl.target.checks import check_target
 from perchctl.target.design import TargetDesign, focal_px, is_seen_from_ground, make_design
-from perchctl.target.lengths import mm_text
-from perchctl.target.limits import Optics, smallest_side_px
-from perchctl.target.overhead import least_side_px
+from perchctl.target.drawing import mm_text
 from perchctl.target.page import PAGES_MM, parse_page
+from perchctl.target.reading import Optics, check_target, smallest_side_px
 from perchctl.target.sheets import fits, fitting_page
-from perchctl.target.visible import FieldOfView, turned_outline
+from perchctl.target.sight import (
+    FieldOfView,
+    gear_from_camera,
+    least_side_px,
+    raised,
+    turned_outline,
+)
 from perchctl.vision import CameraModel
 
 DEFAULT_SEARCH_M = 1.15
@@ -183,13 +186,10 @@ def _target(large_m: float, small_m: float) -> TargetConfig:
 
 def _largest_at_standoff_m(view: FieldOfView, profile: Profile) -> float:
     """The largest side whose circle is in the picture with the gear at the stand-off."""
-    T_body_cam = profile.camera.mount.T_body_cam
-    R: Array = T_body_cam[:3, :3].T
-    gear = R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
+    R, gear = gear_from_camera(profile)
     low, high = 0.0, 1.0
     while high - low > 1e-4:
         middle = (low + high) / 2.0
-        circle = turned_outline(middle)
-        points = np.column_stack([circle, np.full(len(circle), profile.planner.ascend.standoff_m)])
+        points = raised(turned_outline(middle), profile.planner.ascend.standoff_m)
         low, high = (middle, high) if view.holds(points @ R.T + gear) else (low, middle)
     return low

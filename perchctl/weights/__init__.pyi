@@ -1,11 +1,10 @@
+from .collect import Experiment as Experiment
 from .collect import SessionFile as SessionFile
-from .dialogue import Experiment as Experiment
-from .evidence import FITTED as FITTED
-from .lms import LmsOptions as LmsOptions
+from .fit import FITTED as FITTED
+from .fit import LmsOptions as LmsOptions
 from .plot import draw_weights as draw_weights
-from .report import report_text as report_text
-from .result import Result as Result
 from .result import fit_weights as fit_weights
+from .result import report_text as report_text
 from .result import weights_record as weights_record
 from .result import write_weights as write_weights
 from .simulated import SimulatedStand as SimulatedStand
@@ -13,3 +12,4 @@ from .truth import EstimateTruth as EstimateTruth
 from .truth import MocapTruth as MocapTruth
 from .truth import TypedTruth as TypedTruth
 from .truth import four_numbers as four_numbers
+from .truth import open_named as open_named

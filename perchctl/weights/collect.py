@@ -1,22 +1,26 @@
-"""Collecting the data: frames of one place in, checked rows of the session's file out.
+"""Collecting the data: a person places the camera, checked rows of the session's file come out.
 
-A session is a CSV (`perchctl.weights.table`) to which whole positions are appended, each
-in one write: it can be stopped at any time and continued, and a line that a crash cut in
-two is taken off when it is continued.
+A session is a CSV (`perchctl.weights.data`) to which whole positions are appended, each in one
+write: it can be stopped at any time and continued, and a line that a crash cut in two is taken
+off when it is continued. Shaken and half-seen positions are refused and taken again.
 """
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from perchctl.errors import InvalidValue
+from perchctl.camera import FrameSource, check_size
+from perchctl.errors import Interrupted, InvalidValue, NotFound, TimedOut
 from perchctl.files import cannot_be_written
-from perchctl.geometry import Array
+from perchctl.geometry import Array, wrap_rad
 from perchctl.profile import Profile
 from perchctl.vision import (
     MARKERS,
@@ -24,20 +28,25 @@ from perchctl.vision import (
     CameraModel,
     Frame,
     MarkerPose,
-    Pipeline,
     PipelineState,
     estimate_pose,
     make_pipeline,
     step,
 )
-from perchctl.weights.table import HEADER, row_text
+from perchctl.weights.data import HEADER, row_text
+from perchctl.weights.truth import Actual, Ask, Truth, moved
 
 SEEN_SHARE = 0.9
 """Of a position's frames both markers must be in so many."""
 STILL_PX = 1.0
 """The target's picture must not wander farther than this within a position (between its
 thirds), nor shake with a greater standard deviation."""
+SILENT_S = 5.0
+FAR_M, FAR_RAD = 0.03, math.radians(10.0)
+"""A typed pose that differs from the camera's by more is asked about."""
 _LEAST_FRAMES = 3
+
+Bar = Callable[[str, int], AbstractContextManager[Callable[[], None]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +62,20 @@ class MarkerReading:
     center_px: Array | None
 
 
-def collecting_pipeline(profile: Profile, camera: CameraModel) -> Pipeline:
-    """The profile's pipeline, as it is when it merges by weights."""
-    merge = profile.merge.model_copy(update={"method": "weights"})
-    return make_pipeline(profile.model_copy(update={"merge": merge}), camera)
-
-
 class MarkerReader:
-    """Takes the frames of one place through the pipeline; a new place needs a new reader."""
+    """Takes the frames of one place through the profile's pipeline, as it is when it merges by
+    weights; a new place needs a new reader."""
 
-    def __init__(self, setup: Pipeline, attitude: Attitude | None = None) -> None:
-        self._setup, self._attitude = setup, attitude
+    def __init__(
+        self, profile: Profile, camera: CameraModel, attitude: Attitude | None = None
+    ) -> None:
+        merge = profile.merge.model_copy(update={"method": "weights"})
+        self._setup = make_pipeline(profile.model_copy(update={"merge": merge}), camera)
+        self._attitude = attitude
         self._state = PipelineState()
 
     def read(self, frame: Frame) -> MarkerReading:
+        """The poses of one frame, relative to the gear in the level frame."""
         self._state, output = step(self._state, frame, self._attitude, self._setup)
         detections = output.detections
         seen = [d for name in MARKERS if (d := detections.get(name)) is not None]
@@ -100,44 +109,38 @@ def fault_of(readings: list[MarkerReading]) -> str | None:
     centers = np.array([r.center_px for r in readings if r.center_px is not None])
     if len(centers) < _LEAST_FRAMES:
         return f"half seen: both markers at once were found in {len(centers)} of {count} frames"
-    spread_px = float(np.linalg.norm(centers.std(axis=0)))
     thirds = np.array([part.mean(axis=0) for part in np.array_split(centers, 3)])
     drift_px = float(np.linalg.norm(np.ptp(thirds, axis=0)))
-    if max(spread_px, drift_px) > STILL_PX:
+    wander_px = max(float(np.linalg.norm(centers.std(axis=0))), drift_px)
+    if wander_px > STILL_PX:
         return (
-            f"shaken: the target wandered {max(spread_px, drift_px):.1f} px in the picture "
-            f"(allowed is {STILL_PX:g}); fix the camera and hold still"
+            f"shaken: the target wandered {wander_px:.1f} px in the picture (allowed is "
+            f"{STILL_PX:g}); fix the camera and hold still"
         )
     return None
 
 
-def typical(readings: list[MarkerReading]) -> Array:
-    """Median of the large marker's pose, (4,); yaw about the first one's."""
-    poses = np.array([r.large for r in readings if r.large is not None])
-    poses[:, 3] = np.unwrap(poses[:, 3])
-    return np.asarray(np.median(poses, axis=0))
-
-
 def rows_of(position: int, readings: Iterable[MarkerReading], actual: Array) -> str:
+    """The lines of a position in the session's file."""
     return "".join(row_text(position, r.t_s, [r.large, r.small, actual, r.joint]) for r in readings)
 
 
 class SessionFile:
-    """The file of a session. Errors: InvalidValue for a file that is something else."""
+    """The file of a session. Errors: InvalidValue for a file that is something else.
+
+    Attributes:
+        note: a sentence, if an unfinished end was taken off.
+        done: numbers of the positions that are complete.
+    """
 
     def __init__(self, path: Path, frames: int) -> None:
-        self._path = path
+        self.path = path
         self.note = ""
         self.done: list[int] = []
-        """Numbers of the positions that are complete."""
         if path.exists() and path.stat().st_size:
             self._continue(frames)
         else:
-            self._write(HEADER + "\n", "x" if not path.exists() else "w")
-
-    @property
-    def path(self) -> Path:
-        return self._path
+            self._write(HEADER + "\n", "w")
 
     @property
     def next_position(self) -> int:
@@ -150,40 +153,156 @@ class SessionFile:
 
     def _write(self, text: str, mode: str) -> None:
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with self._path.open(mode, encoding="utf-8", newline="") as stream:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open(mode, encoding="utf-8", newline="") as stream:
                 stream.write(text)
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            raise cannot_be_written(self._path, error) from None
+            raise cannot_be_written(self.path, error) from None
 
     def _continue(self, frames: int) -> None:
         try:
-            text = self._path.read_bytes()
+            text = self.path.read_bytes()
         except OSError as error:
-            raise InvalidValue(f"{self._path}: cannot be read: {error.strerror}") from None
-        head, _, _ = text.partition(b"\n")
-        if head.strip() != HEADER.encode():
+            raise InvalidValue(f"{self.path}: cannot be read: {error.strerror}") from None
+        *lines, torn = text.split(b"\n")
+        if not lines or lines[0].strip() != HEADER.encode():
             raise InvalidValue(
-                f"{self._path}: line 1: not a session of perchctl (its header differs), so "
-                f"nothing is appended; name a new file for --collect"
+                f"{self.path}: line 1: not a session of perchctl (its header differs), so "
+                f"nothing is appended; name a new file"
             )
-        whole = text.rfind(b"\n") + 1
-        lines = text[:whole].splitlines(keepends=True)
-        counts: dict[int, int] = {}
+        positions = []
         for number, line in enumerate(lines[1:], start=2):
             cell = line.partition(b",")[0]
             if not cell.isdigit():
-                raise InvalidValue(f"{self._path}: line {number}: position: not a whole number")
-            counts[int(cell)] = counts.get(int(cell), 0) + 1
-        keep = whole
-        last = int(lines[-1].partition(b",")[0]) if len(lines) > 1 else None
-        if last is not None and (counts[last] < frames and whole < len(text)):
+                raise InvalidValue(f"{self.path}: line {number}: position: not a whole number")
+            positions.append(int(cell))
+        counts = Counter(positions)
+        if torn and positions and counts[positions[-1]] < frames:
             # The position that was being written: its tail is lost, so all of it is taken again.
-            keep = sum(len(line) for line in lines[: len(lines) - counts[last]])
-            del counts[last]
-        if keep < len(text):
-            os.truncate(self._path, keep)
-            self.note = f"{self._path}: an unfinished end was taken off"
+            del lines[-counts.pop(positions[-1]) :]
+        if torn:
+            os.truncate(self.path, sum(len(line) + 1 for line in lines))
+            self.note = f"{self.path}: an unfinished end was taken off"
         self.done = list(counts)
+
+
+class Experiment:
+    """Takes positions with a person until the session is full.
+
+    `ask` prints a question and returns the answer, `say` prints a sentence; `bar` shows
+    progress; `now` and `wait` are the clock.
+    """
+
+    def __init__(
+        self,
+        session: SessionFile,
+        source: FrameSource,
+        profile: Profile,
+        camera: CameraModel,
+        truth: Truth,
+        ask: Ask,
+        say: Callable[[str], None],
+        bar: Bar,
+        now: Callable[[], float],
+        wait: Callable[[float], None],
+    ) -> None:
+        self._session, self._source, self._truth = session, source, truth
+        self._profile, self._camera = profile, camera
+        self._ask, self._say, self._bar, self._now, self._wait = ask, say, bar, now, wait
+
+    def run(self, positions: int, frames: int) -> None:
+        """Errors: Interrupted when the person stops (the session keeps what is complete),
+        and those of the source and the truth."""
+        while len(self._session.done) < positions:
+            number = self._session.next_position
+            self._say(
+                f"position {len(self._session.done) + 1} of {positions}: place the camera so "
+                f"that both markers are whole in the picture, at another height, place and heading"
+            )
+            fault = self._take(number, frames)
+            if fault is None:
+                self._say(f"position {number} is kept in {self._session.path}")
+            else:
+                self._say(f"position {number} is refused, take it again: {fault}")
+
+    def _take(self, number: int, frames: int) -> str | None:
+        """One position into the file; a sentence if it must be taken again."""
+        try:
+            before = self._truth.actual(self._answer)
+        except InvalidValue as error:
+            return str(error)
+        self._answer("hold still and press Enter (q stops): ")
+        reader = MarkerReader(self._profile, self._camera, before.attitude)
+        readings = []
+        with self._bar("frames", frames) as advance:
+            for frame in self._frames(frames):
+                readings.append(reader.read(frame))
+                advance()
+        fault = fault_of(readings)
+        if fault is None and self._truth.repeatable:
+            fault = moved(before, self._truth.actual(self._answer))
+        if fault is None:
+            fault = self._mismatch(before, readings)
+        if fault is None:
+            self._session.append(number, rows_of(number, readings, before.pose))
+        return fault
+
+    def _answer(self, question: str) -> str:
+        try:
+            text = self._ask(question)
+        except EOFError:
+            text = "q"
+        if text.strip().lower() in ("q", "quit"):
+            raise Interrupted(
+                f"stopped with {len(self._session.done)} positions in {self._session.path}; the "
+                f"same command goes on from there"
+            )
+        return text
+
+    def _mismatch(self, actual: Actual, readings: list[MarkerReading]) -> str | None:
+        """A sentence if the camera measures another pose, and the person does not keep it."""
+        poses = np.array([r.large for r in readings if r.large is not None])
+        poses[:, 3] = np.unwrap(poses[:, 3])
+        seen = np.median(poses, axis=0)
+        off_m = float(np.linalg.norm(seen[:3] - actual.pose[:3]))
+        off_rad = abs(wrap_rad(float(seen[3] - actual.pose[3])))
+        if off_m <= FAR_M and off_rad <= FAR_RAD:
+            return None
+        expected = _pose_text(actual.pose)
+        self._say(f"the camera measures {_pose_text(seen)}, but the actual pose is {expected}")
+        if self._answer("keep it all the same? [y/N] ").strip().lower() in ("y", "yes"):
+            return None
+        return "the actual pose does not fit what the camera sees"
+
+    def _frames(self, count: int) -> Iterator[Frame]:
+        if self._source.live:
+            self._source.poll(self._now())  # taken before Enter was pressed
+        since_s = self._now()
+        got = 0
+        while got < count:
+            now_s = self._now()
+            frame = self._source.poll(now_s)
+            if frame is not None and not frame.repeated:
+                if got == 0:
+                    height, width = frame.image.shape[:2]
+                    check_size((width, height), self._camera, self._source.describe())
+                got, since_s = got + 1, now_s
+                yield frame
+                continue
+            if self._source.finished:
+                raise NotFound(
+                    f"{self._source.describe()} ended after {got} of {count} frames of the position"
+                )
+            if now_s - since_s > SILENT_S:
+                raise TimedOut(
+                    self._source.problem(now_s)
+                    or f"{self._source.describe()} gave no frame for {SILENT_S:g} s"
+                )
+            self._wait(0.002)
+
+
+def _pose_text(pose: Array) -> str:
+    x, y, z = (float(v) * 100.0 for v in pose[:3])
+    return f"({x:.1f}, {y:.1f}, {z:.1f}) cm at {math.degrees(wrap_rad(float(pose[3]))):.0f} deg"

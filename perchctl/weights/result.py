@@ -1,66 +1,55 @@
-"""The fit from data files: all that it found out, as one value, one JSON record, and the weights
-file that a profile names (`merge.weights_file`)."""
+"""The fit from data files: all that it found out, as one value, as a report for a terminal, as one
+JSON record, and as the weights file that a profile names (`merge.weights_file`)."""
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+import textwrap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from perchctl.errors import InvalidValue
 from perchctl.files import write_files
-from perchctl.geometry import Array, rotation_from_rpy
-from perchctl.log import FlightLog, read_log
-from perchctl.profile import Profile
-from perchctl.sim import Scenario, draw_scenario
-from perchctl.weights.check import check
-from perchctl.weights.evidence import (
+from perchctl.geometry import Array
+from perchctl.weights.data import AXES, UNITS, YAW, read_data, wrap
+from perchctl.weights.fit import (
     FITTED,
+    LABELS,
+    PAPER_WEIGHTS,
     SINGLE,
+    Errors,
     Evidence,
     Fitted,
-    evidence,
-    fit_all,
-    on_other_data,
-)
-from perchctl.weights.fit import (
-    Bias,
-    Errors,
-    Sums,
+    LmsOptions,
+    LmsRun,
     biases,
     check_determined,
     errors_of,
+    evidence,
+    fit_all,
     odd_positions,
+    position_means,
     sums_of,
 )
-from perchctl.weights.lms import LmsOptions, LmsRun
-from perchctl.weights.table import chunks_of, read_csv
-from perchctl.weights.types import AXES, PAPER_WEIGHTS, SOURCES, UNITS, Measurements, joined, wrap
 
 FORMAT = "perchctl-merge-weights"
 _HEAD = """\
 # Merge weights of the large marker (the small one's are 1 - w), fitted by perchctl
 # fit-weights. Named by a profile: merge: {method: weights, weights_file: THIS_FILE}
 """
-Bar = Callable[[str, int | None], AbstractContextManager[Callable[[], None]]]
 
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """All that a fit found out. `chosen` names the method whose weights are offered."""
+    """All that a fit found out. `chosen` names the method whose weights are offered; `other` is
+    the evidence from other data, named `other_name`."""
 
     errors: Errors
-    sums: Sums
-    bias: dict[str, Bias]
+    sums: Array
     fits: dict[str, Fitted]
     runs: dict[str, LmsRun]
     evidence: Evidence
@@ -72,7 +61,13 @@ class Result:
 
     @property
     def proven(self) -> list[bool]:
+        """Whether the chosen weight beats the better single marker, by axis."""
         return [bool(p) for p in self.evidence.proven[self.chosen]]
+
+    @property
+    def better(self) -> list[str]:
+        """The better single marker, by axis."""
+        return [SINGLE[int(k)] for k in self.evidence.better]
 
     @property
     def recommended(self) -> Array:
@@ -83,47 +78,39 @@ class Result:
 
 
 def fit_weights(
-    paths: Sequence[Path], lms: LmsOptions, chosen: str, test: Path | None, bar: Bar
+    paths: Sequence[Path], lms: LmsOptions, chosen: str, test: Path | None = None
 ) -> Result:
     """Read all data and fit the weights to it by each method; `chosen` is the one that is
-    offered, `test` other data to judge it by. `bar` shows progress. Errors: NotFound,
-    InvalidValue."""
-    with bar("reading [MB]", sum(chunks_of(path) for path in paths)) as advance:
-        parts = [_read(path, advance) for path in paths]
-    tested = None if test is None else _read(test, lambda: None)
-    data = joined(parts)
-    refuse_repeated(parts, tested)
+    offered, `test` other data to judge it by. Errors: NotFound, InvalidValue, UsageError."""
+    data, tested = read_data(paths, test)
     errors = errors_of(data)
     sums = sums_of(errors)
     check_determined(errors, sums)
-    with bar("fitting", None) as advance:
-        fits, runs = fit_all(errors, sums, lms, advance)
-    proof = evidence(errors, sums, fits)
-    other = None if tested is None else on_other_data(errors_of(tested), fits)
+    fits, runs = fit_all(errors, sums, lms)
+    other = None
+    if tested is not None:
+        judged = errors_of(tested)
+        other = evidence(judged, sums_of(judged), {n: fit.weights for n, fit in fits.items()})
     return Result(
         errors=errors,
         sums=sums,
-        bias=biases(sums),
         fits=fits,
         runs=runs,
-        evidence=proof,
+        evidence=evidence(errors, sums, {name: fit.folds for name, fit in fits.items()}),
         other=other,
-        other_name=str(test) if test is not None else "",
+        other_name="" if test is None else str(test),
         chosen=chosen,
         notes=(*data.notes, *_notes(errors, sums, fits)),
         sha256=data.sha256,
     )
 
 
-def _notes(errors: Errors, sums: Sums, fits: Mapping[str, Fitted]) -> list[str]:
+def _notes(errors: Errors, sums: Array, fits: Mapping[str, Fitted]) -> list[str]:
     """Sentences on clipped weights, odd positions, and too few of them."""
     notes = []
     for name, found in fits.items():
-        outside = [
-            f"{axis} {w:.3f}"
-            for axis, w in zip(AXES, found.raw, strict=True)
-            if not 0.0 <= w <= 1.0
-        ]
+        weights = zip(AXES, found.raw, strict=True)
+        outside = [f"{axis} {w:.3f}" for axis, w in weights if not 0.0 <= w <= 1.0]
         if outside:
             notes.append(f"{name}: clipped to 0 .. 1: {', '.join(outside)}")
     for number, axis, off in odd_positions(errors, sums):
@@ -132,21 +119,16 @@ def _notes(errors: Errors, sums: Sums, fits: Mapping[str, Fitted]) -> list[str]:
             f"position {number}: both markers are off by {size} in {axis} more than elsewhere; "
             f"was its actual pose taken down wrongly?"
         )
-    if len(errors.positions) < 5:
-        notes.append(
-            f"{len(errors.positions)} positions are few: intervals are wide (10 are usual)"
-        )
+    count = len(errors.positions)
+    if count < 5:
+        notes.append(f"{count} positions are few: intervals are wide (10 are usual)")
     return notes
 
 
-def _read(path: Path, advance: Callable[[], None]) -> Measurements:
-    logged = path.suffix.lower() == ".jsonl"
-    data = read_flight_log(path) if logged else read_csv(path, advance)
-    check(data)
-    return data
+# --- The JSON record and the weights file ------------------------------------------------------
 
 
-def by_axis(values: Array) -> dict[str, float | None]:
+def _by_axis(values: Array) -> dict[str, float | None]:
     return {
         axis: float(value) if math.isfinite(value) else None
         for axis, value in zip(AXES, values, strict=True)
@@ -155,55 +137,59 @@ def by_axis(values: Array) -> dict[str, float | None]:
 
 def weights_record(result: Result) -> dict[str, Any]:
     """The one object of `--json`. Lengths in m, angles in rad."""
-    found: dict[str, Any] = {name: by_axis(result.fits[name].weights) for name in FITTED}
-    found["paper"] = dict(zip(AXES, PAPER_WEIGHTS, strict=True))
-    found["method"] = result.chosen
-    found["recommended"] = by_axis(result.recommended) if any(result.proven) else None
-    found["proven"] = dict(zip(AXES, result.proven, strict=True))
-    found["better_single"] = {
-        axis: SINGLE[int(i)] for axis, i in zip(AXES, result.evidence.better, strict=True)
+    bias = biases(result.sums)
+    lms = result.runs["lms"]
+    record: dict[str, Any] = {name: _by_axis(result.fits[name].weights) for name in FITTED}
+    record |= {
+        "paper": dict(zip(AXES, PAPER_WEIGHTS, strict=True)),
+        "method": result.chosen,
+        "recommended": _by_axis(result.recommended) if any(result.proven) else None,
+        "proven": dict(zip(AXES, result.proven, strict=True)),
+        "better_single": dict(zip(AXES, result.better, strict=True)),
+        "intervals": {
+            name: {
+                axis: list(pair)
+                for axis, *pair in zip(
+                    AXES, _by_axis(fit.low).values(), _by_axis(fit.high).values(), strict=True
+                )
+            }
+            for name, fit in result.fits.items()
+        },
+        "errors": _errors_record(result.evidence),
     }
-    found["intervals"] = {
-        name: {axis: [lo, hi] for (axis, lo), hi in zip(
-            by_axis(result.fits[name].low).items(), by_axis(result.fits[name].high).values(),
-            strict=True,
-        )}
-        for name in FITTED
-    }  # fmt: skip
-    found["errors"] = _errors_record(result.evidence)
     if result.other is not None:
-        found["test"] = {"file": result.other_name, "errors": _errors_record(result.other)}
-    found["bias"] = {name: by_axis(bias.mean) for name, bias in result.bias.items()}
-    found["bias_half_width"] = {
-        name: by_axis(bias.half_width) for name, bias in result.bias.items()
+        record["test"] = {"file": result.other_name, "errors": _errors_record(result.other)}
+    return record | {
+        "bias": {name: _by_axis(mean) for name, (mean, _) in bias.items()},
+        "bias_half_width": {name: _by_axis(half) for name, (_, half) in bias.items()},
+        "outliers": dict(zip(AXES, result.errors.outliers.tolist(), strict=True)),
+        "lms_run": {
+            "passes": lms.passes,
+            "rows": int(lms.rows[-1]),
+            "moved_in_second_half": _by_axis(lms.moved),
+        },
+        "data": _data_record(result),
+        "notes": list(result.notes),
     }
-    found["outliers"] = {axis: int(k) for axis, k in zip(AXES, result.errors.outliers, strict=True)}
-    found["lms_run"] = {
-        "passes": result.runs["lms"].passes,
-        "rows": int(result.runs["lms"].rows[-1]),
-        "moved_in_second_half": by_axis(result.runs["lms"].moved),
-    }
-    found["data"] = {
+
+
+def _data_record(result: Result) -> dict[str, Any]:
+    return {
         "file": result.errors.name,
         "sha256": result.sha256,
         "rows": len(result.errors),
         "positions": len(result.errors.positions),
     }
-    found["notes"] = list(result.notes)
-    return found
 
 
 def _errors_record(evidence: Evidence) -> dict[str, Any]:
     """By method its RMS, (x, y, z, yaw), the interval, and the gain over the better
     single marker with its interval."""
     return {
-        name: {
-            **by_axis(method.rms),
-            "low": by_axis(method.low),
-            "high": by_axis(method.high),
-            "gain": by_axis(method.gain),
-            "gain_low": by_axis(method.gain_low),
-            "gain_high": by_axis(method.gain_high),
+        name: _by_axis(method.rms)
+        | {
+            key: _by_axis(getattr(method, key))
+            for key in ("low", "high", "gain", "gain_low", "gain_high")
         }
         for name, method in evidence.methods.items()
     }
@@ -211,37 +197,25 @@ def _errors_record(evidence: Evidence) -> dict[str, Any]:
 
 def write_weights(path: Path, result: Result, date: str, *, anyway: bool) -> None:
     """Write the weights file: those that are recommended, or, `anyway`, all that were fitted.
-    Errors: InvalidValue when it cannot be written; the old one then stays."""
-    content = _file_content(result, date)
-    if anyway:
-        content["weights"] = dict(content["fitted"])
-        content["axes"] = dict.fromkeys(AXES, "merged")
-    text = _HEAD + yaml.safe_dump({"format": FORMAT, **content}, sort_keys=False)
-    write_files({path: text.encode("utf-8")})
+    Errors in it are in m and rad, on positions not fitted to. Errors: InvalidValue when it cannot
+    be written; the old one then stays."""
 
+    def rounded(weights: Array) -> dict[str, float]:
+        return {axis: round(float(w), 6) for axis, w in zip(AXES, weights, strict=True)}
 
-def _file_content(result: Result, date: str) -> dict[str, Any]:
-    """What a weights file holds. Errors in m and rad, on positions not fitted to."""
-    rounded = {axis: round(float(w), 6) for axis, w in by_axis(result.recommended).items() if w
-               is not None}  # fmt: skip
-    fitted = result.fits[result.chosen]
-    return {
+    fitted = rounded(result.fits[result.chosen].weights)
+    merged = [anyway or proven for proven in result.proven]
+    content = {
+        "format": FORMAT,
         "date": date,
         "method": result.chosen,
-        "weights": rounded,
+        "weights": dict(fitted) if anyway else rounded(result.recommended),
         "axes": {
-            axis: "merged" if proven else f"{SINGLE[int(better)]} alone"
-            for axis, proven, better in zip(
-                AXES, result.proven, result.evidence.better, strict=True
-            )
+            axis: "merged" if m else f"{name} alone"
+            for axis, m, name in zip(AXES, merged, result.better, strict=True)
         },
-        "fitted": {axis: round(float(w), 6) for axis, w in zip(AXES, fitted.weights, strict=True)},
-        "data": {
-            "file": result.errors.name,
-            "sha256": result.sha256,
-            "rows": len(result.errors),
-            "positions": len(result.errors.positions),
-        },
+        "fitted": fitted,
+        "data": _data_record(result),
         "errors": {
             name: {
                 f"{axis}_{unit}": float(f"{value:.6g}")
@@ -250,188 +224,158 @@ def _file_content(result: Result, date: str) -> dict[str, Any]:
             for name, method in result.evidence.methods.items()
         },
     }
+    text = _HEAD + yaml.safe_dump(content, sort_keys=False)
+    write_files({path: text.encode("utf-8")})
 
 
-# --- Rows that are there twice: they would narrow the intervals, and are no more evidence ------
+# --- The report, for a terminal of 80 columns: the verdict first, notes last -------------------
+# Lengths are in micrometres and angles in thousandths of a degree, as that is the size of the
+# errors of good corners.
 
 
-_MIX = 0x9E3779B97F4A7C15  # odd: its powers mix all bits
+WIDTH = 80
+MOST_POSITIONS = 20
+_SCALES = np.array([1e6, 1e6, 1e6, 180e3 / math.pi])
+_HEADS = tuple(
+    f"{axis} [{unit}]" for axis, unit in zip(AXES, ("um", "um", "um", "mdeg"), strict=True)
+)
 
 
-def refuse_repeated(parts: Sequence[Measurements], test: Measurements | None = None) -> None:
-    """Raises InvalidValue where a file, or a row, is named twice; `test` is the data that the
-    fit is judged by, and must hold none of the others' rows."""
-    files = [*parts, test] if test is not None else list(parts)
-    why = "the same rows twice are no more evidence"
-    for number, part in enumerate(files):
-        if part is test:
-            why = "--test judges by other data than was fitted to"
-        for before in files[:number]:
-            if part.sha256 == before.sha256:
-                both = f"{before.name} and {part.name} hold the same data"
-                same = f"{part.name} is named twice" if part.name == before.name else both
-                raise InvalidValue(f"{same}: {why}; name it once")
-    found = _first_again(files)
-    if found is not None:
-        (file, row), (old_file, old_row), count = found
-        part, before = files[file], files[old_file]
-        others = f" and {count - 1} more likewise" if count > 1 else ""
-        raise InvalidValue(
-            f"{part.name}: line {int(part.line[row])}: this row stands in line "
-            f"{int(before.line[old_row])} of {before.name} too{others}: "
-            f"{why}; take out what is there twice"
+def report_text(result: Result) -> str:
+    """Verdict, errors, gains, weights, offsets, positions, notes."""
+    errors = result.errors
+    data = f"{errors.name}: {len(errors)} rows of {len(errors.positions)} positions"
+    if errors.single_rows:
+        data += f" ({errors.single_rows} more rows without both markers do not count)"
+    title = "RMS error on positions left out of the fit, 95 % interval"
+    parts = [_wrapped(data), _verdict(result)]
+    parts += _evidence_text(result.evidence, result.chosen, title, "")
+    if result.other is not None:
+        where = f" on {result.other_name}"
+        parts += _evidence_text(result.other, result.chosen, f"RMS error{where}", where)
+    parts += [_weights_text(result), _bias_text(result), _positions_text(result)]
+    if result.notes:
+        parts.append("\n".join(_wrapped(f"note: {note}") for note in result.notes))
+    return "\n\n".join(parts)
+
+
+def _verdict(result: Result) -> str:
+    """What to fly with, and why, in a line for each axis."""
+    if not any(result.proven):
+        return _wrapped(
+            "not recommended: on no axis do these weights beat the better single marker beyond "
+            "the 95 % interval; take more positions, or fly merge.method: joint"
         )
+    lines = [f"recommended weights of the large marker ({LABELS[result.chosen]})"]
+    for axis, name, proven, weight in zip(
+        AXES, result.better, result.proven, result.recommended, strict=True
+    ):
+        why = (
+            f"beats the {name} marker alone beyond the 95 % interval"
+            if proven
+            else f"the {name} marker alone: no weight is proven to beat it"
+        )
+        lines.append(f"  {axis:<4} {weight:.3f}  {why}")
+    return "\n".join(lines)
 
 
-def _first_again(
-    files: Sequence[Measurements],
-) -> tuple[tuple[int, int], tuple[int, int], int] | None:
-    """(file, row) of the first row that was there before, where it was, and how many such
-    rows there are."""
-    values = np.concatenate([_values(part) for part in files])
-    rows = np.arange(len(values))
-    _, first, group = np.unique(_hashes(values), return_index=True, return_inverse=True)
-    before = first[group]
-    again = (before != rows) & (values == values[before]).all(axis=1)
-    lengths = [len(part) for part in files]
-    file = np.repeat(np.arange(len(files)), lengths)
-    # Without times, rows of one position may well come out equal: rounded, of a camera at rest.
-    timeless = np.array([float(np.ptp(part.t_s)) == 0.0 for part in files])
-    position = np.concatenate([part.position for part in files])
-    alike = (file == file[before]) & (position == position[before]) & timeless[file]
-    again &= ~alike
-    if not again.any():
-        return None
-    starts = np.concatenate([[0], np.cumsum(lengths)])
-    row = int(np.argmax(again))
-    there, old = int(file[row]), int(file[before[row]])
-    return (
-        (there, row - int(starts[there])),
-        (old, int(before[row] - starts[old])),
-        int(again.sum()),
+def _evidence_text(found: Evidence, chosen: str, title: str, where: str) -> list[str]:
+    """Each method's error, and by how much the chosen weights' error is below that of others."""
+    errors = [_wrapped(title), _line("", _HEADS)]
+    for name, method in found.methods.items():
+        errors.append(_line(LABELS[name], _scaled(method.rms, method.high - method.rms)))
+    gains = [
+        _wrapped(f"gain of {LABELS[chosen]} in RMS error{where} over (* beyond its interval)"),
+        _line("", _HEADS),
+    ]
+    for other in ("large", "small", "paper", "joint"):
+        if other in found.methods:
+            m = found.methods[chosen].against(found.methods[other])
+            beyond = (m.gain_low > 0.0) | (m.gain_high < 0.0)
+            cells = _scaled(m.gain, m.gain_high - m.gain, "+")
+            marked = [c + ("*" if b else " ") for c, b in zip(cells, beyond, strict=True)]
+            gains.append(_line(LABELS[other], marked).rstrip())
+    return ["\n".join(errors), "\n".join(gains)]
+
+
+def _weights_text(result: Result) -> str:
+    """The large marker's, by all methods, and how LMS got there."""
+    lines = [_line("fitted weights", AXES)]
+    for name, fit in result.fits.items():
+        halves = (fit.high - fit.low) / 2.0
+        cells = [f"{w:.3f} +-{half:.3f}" for w, half in zip(fit.weights, halves, strict=True)]
+        lines.append(_line(LABELS[name], cells))
+    lines.append(_line(LABELS["paper"], [f"{w:.3f}{'':8}" for w in PAPER_WEIGHTS]).rstrip())
+    run = result.runs["lms"]
+    away = np.abs(run.weights - result.fits["closed_form"].raw).max()
+    lines.append(
+        _wrapped(
+            f"LMS took {run.passes} passes ({int(run.rows[-1])} rows); in their second half its "
+            f"weights moved by at most {run.moved.max():.4f}, and it ends {away:.4f} from the "
+            f"closed form"
+        )
     )
+    return "\n".join(lines)
 
 
-def _values(part: Measurements) -> Array:
-    """Time and poses of each row, (n, 13); what was not seen is 0."""
-    poses = [np.nan_to_num(getattr(part, source)) for source in SOURCES]
-    return np.ascontiguousarray(np.column_stack([part.t_s, *poses]) + 0.0)
+def _bias_text(result: Result) -> str:
+    lines = [
+        _wrapped("constant offsets (no weight can mend them: calibration, mounting or print can)"),
+        _line("", _HEADS),
+    ]
+    for name, (mean, half) in biases(result.sums).items():
+        lines.append(_line(f"{name} marker", _scaled(mean, half, "+")))
+    cells = [f"{count}{'':6}" for count in result.errors.outliers]
+    lines.append(_line("outliers left out", cells).rstrip())
+    return "\n".join(lines)
 
 
-def _hashes(values: Array) -> NDArray[np.uint64]:
-    factors = np.array(
-        [pow(_MIX, k, 1 << 64) for k in range(1, values.shape[1] + 1)], dtype=np.uint64
-    )
-    bits = values.view(np.uint64)
-    mixed: NDArray[np.uint64] = (bits ^ (bits >> np.uint64(29))) * factors
-    sums: NDArray[np.uint64] = mixed.sum(axis=1, dtype=np.uint64)
-    return sums
+def _positions_text(result: Result) -> str:
+    """The paper's tables I and II in one: a line for each position, with the mean merged pose's
+    error by weights fitted without it."""
+    a, b = position_means(result.sums)
+    folds = result.fits[result.chosen].folds
+    error = folds * a + (1.0 - folds) * b
+    error[:, YAW] = wrap(error[:, YAW])
+    actual = result.errors.actual
+    places = np.column_stack([actual[:, :3] * 100.0, np.degrees(wrap(actual[:, YAW]))])
+    count = len(actual)
+    more = f" (the first {MOST_POSITIONS} of {count})" if count > MOST_POSITIONS else ""
+
+    def line(name: str, cells: Sequence[str]) -> str:
+        widths = (8, 8, 8, 11, 9, 8, 8, 12)
+        return f"{name:<8}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True))
+
+    lines = [
+        f"positions{more}: as they are, and the merged pose's error there (weights fitted",
+        "to the others; Tables I and II of the paper)",
+        line("", ("x [cm]", "y [cm]", "z [cm]", "yaw [deg]", *_HEADS)),
+    ]
+    for k in range(min(count, MOST_POSITIONS)):
+        *xyz, yaw = places[k]
+        cells = [*(f"{v:.2f}" for v in xyz), f"{yaw:.1f}", *map(_figure, error[k] * _SCALES)]
+        lines.append(line(str(int(result.errors.positions[k])), cells))
+    return "\n".join(lines)
 
 
-# --- Flight logs with truth as data: the simulator's, flown in lockstep ------------------------
-# Such a log holds the true position of the body; the target's true place follows from the
-# profile and seed in its header. Each stretch of `STRETCH_S` with both markers in sight
-# counts as one position. The heading's truth is the vehicle's own estimate, which does not
-# drift in the simulator; roll and pitch are the estimate's too.
+def _figure(value: float, sign: str = "", spread: float = 0.0) -> str:
+    """To three digits of the larger one, but no finer than hundredths; beyond 100 000 in
+    thousands (k). No exponent, and no zero with a minus."""
+    size = max(abs(value), abs(spread))
+    if size >= 99_950:
+        return f"{value / 1e3:{sign}.0f}k"
+    digits = 2 if size < 9.995 else 1 if size < 99.95 else 0
+    return f"{round(value, digits) + 0.0:{sign}.{digits}f}"
 
 
-STRETCH_S = 1.0
-LEAST_ROWS = 5
-"""A stretch with fewer frames of both markers is too little evidence."""
+def _scaled(values: Array, halves: Array, sign: str = "") -> list[str]:
+    pairs = zip((values * _SCALES).tolist(), (halves * _SCALES).tolist(), strict=True)
+    return [f"{_figure(v, sign, h)} +-{_figure(h, '', v)}" for v, h in pairs]
 
 
-def read_flight_log(path: Path) -> Measurements:
-    """The frames with both markers. Errors: NotFound, InvalidValue (no log, no truth)."""
-    log = read_log(path)
-    scenario, later_s = _truth_of(log)
-    # With `camera.latency_s: measured` the flight has taken some of it off already.
-    ahead_s = later_s + np.nan_to_num(log.column("delay_used_s"))
-    t_s = log.column("t_s")
-    frame_s = log.column("frame_t_s")
-    poses = {name: _poses(log, name[0]) for name in ("large", "small", "joint")}
-    both = np.isfinite(poses["large"]).all(axis=1) & np.isfinite(poses["small"]).all(axis=1)
-    actual = _actual(log, scenario, t_s, frame_s + ahead_s)
-    rows = np.flatnonzero(both & np.isfinite(actual).all(axis=1))
-    if not len(rows) and np.isfinite(poses["joint"]).any():
-        raise InvalidValue(
-            f"{path}: line 1: both markers were only solved jointly in this flight; fly it with "
-            f"pose.each_marker: true (or merge.method: weights) in the profile"
-        )
-    if not len(rows):
-        raise InvalidValue(
-            f"{path}: lines 2 to {len(log.records) + 1}: no tick with the truth holds both markers"
-        )
-    position = np.floor((frame_s[rows] - frame_s[rows][0]) / STRETCH_S).astype(np.int64)
-    numbers, counts = np.unique(position, return_counts=True)
-    kept = np.isin(position, numbers[counts >= LEAST_ROWS])
-    rows, position = rows[kept], position[kept]
-    if not len(rows):
-        raise InvalidValue(
-            f"{path}: line 2: no stretch of {STRETCH_S:g} s holds {LEAST_ROWS} frames with both "
-            f"markers"
-        )
-    joint = poses["joint"][rows]
-    return Measurements(
-        name=str(path),
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
-        position=position,
-        t_s=frame_s[rows],
-        large=poses["large"][rows],
-        small=poses["small"][rows],
-        actual=actual[rows],
-        joint=None if np.isnan(joint).all() else joint,
-        line=rows.astype(np.int64) + 2,
-        notes=(f"{path}: heading and tilt of the truth are the vehicle's own estimate",),
-    )
+def _line(label: str, cells: Sequence[str]) -> str:
+    return f"{label:<20}" + "".join(f" {cell:>14}" for cell in cells)
 
 
-def _truth_of(log: FlightLog) -> tuple[Scenario, float]:
-    """The scenario that was flown, and how much later than logged the frames were taken."""
-    if not np.isfinite(log.column("true_x_m")).any():
-        raise InvalidValue(
-            f"{log.path}: line 2: no truth in this log (true_x_m is missing): only logs of "
-            f"lockstep flights hold it (perchctl simulate --only SEED --log-dir DIR); --collect a "
-            f"session of a real vehicle"
-        )
-    header: dict[str, Any] = log.header
-    try:
-        profile = Profile.model_validate(header["profile"])
-        scenario = draw_scenario(profile, int(header["seed"]))
-    except (KeyError, TypeError, ValueError, ValidationError):
-        raise InvalidValue(
-            f"{log.path}: line 1: the profile and seed of the header do not give the scenario"
-        ) from None
-    return scenario, profile.camera.start_latency_s - scenario.camera_latency_s
-
-
-def _poses(log: FlightLog, short: str) -> Array:
-    return np.stack(
-        [log.column(f"{short}{axis}_{unit}") for axis, unit in zip(AXES, UNITS, strict=True)],
-        axis=1,
-    )
-
-
-def _actual(log: FlightLog, scenario: Scenario, t_s: Array, at_s: Array) -> Array:
-    """The target relative to the gear in the level frame at the frames' times, (n, 4)."""
-    known = np.isfinite(log.column("true_x_m")) & np.isfinite(log.column("roll_rad"))
-    when = np.where(np.isfinite(at_s), at_s, t_s)
-
-    def at_frame(key: str) -> Array:
-        values = log.column(key)[known]
-        if key == "yaw_rad":
-            values = np.unwrap(values)
-        return np.interp(when, t_s[known], values, left=math.nan, right=math.nan)
-
-    body = np.stack([at_frame(f"true_{axis}_m") for axis in "xyz"], axis=1)
-    roll, pitch, yaw = (at_frame(key) for key in ("roll_rad", "pitch_rad", "yaw_rad"))
-    target = np.array([*scenario.target_xy_m, scenario.ceiling_z_m])
-    gear = np.asarray(scenario.gear_body_m)
-    actual = np.full((len(t_s), 4), math.nan)
-    for row in np.flatnonzero(np.isfinite(at_s) & np.isfinite(body).all(axis=1)):
-        c, s = math.cos(yaw[row]), math.sin(yaw[row])
-        x, y, z = target - body[row]
-        level = np.array([c * x + s * y, -s * x + c * y, z])
-        tilt = rotation_from_rpy(float(roll[row]), float(pitch[row]), 0.0)
-        actual[row, :3] = level - tilt @ gear
-        actual[row, 3] = wrap(scenario.target_yaw_rad - yaw[row])
-    return actual
+def _wrapped(text: str) -> str:
+    return textwrap.fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)

@@ -20,7 +20,6 @@ from perchctl.vision import CameraModel, Frame, project, rotation_vector, square
 from perchctl.weights.collect import (
     MarkerReader,
     SessionFile,
-    collecting_pipeline,
     fault_of,
     rows_of,
 )
@@ -68,9 +67,9 @@ class SimulatedStand:
     ) -> None:
         """Append so many positions to the session; `advance` is called with each frame.
         Errors: InvalidValue."""
-        setup = collecting_pipeline(self._profile, self._camera)
         for position in range(session.next_position, session.next_position + positions):
-            place, reader, readings = self.place(position), MarkerReader(setup), []
+            place, readings = self.place(position), []
+            reader = MarkerReader(self._profile, self._camera)
             for frame in self.frames(position, place, frames):
                 readings.append(reader.read(frame))
                 advance()
@@ -123,13 +122,7 @@ class SimulatedStand:
     def _in_picture(self, place: Place) -> bool:
         T_world_marker = self._renderer.T_world_target @ make_T(R_MARKER_TARGET, (0.0, 0.0, 0.0))
         T_cam_marker = invert_T(place.T_world_cam) @ T_world_marker
-        corners = project(
-            self._corners, rotation_vector(T_cam_marker[:3, :3]), T_cam_marker[:3, 3], self._camera
-        )
-        width, height = self._camera.size_px
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        return bool(
-            (low > MARGIN_PX).all()
-            and high[0] < width - 1 - MARGIN_PX
-            and high[1] < height - 1 - MARGIN_PX
-        )
+        rvec, tvec = rotation_vector(T_cam_marker[:3, :3]), T_cam_marker[:3, 3]
+        corners = project(self._corners, rvec, tvec, self._camera)
+        highest = np.array(self._camera.size_px) - 1 - MARGIN_PX
+        return bool((corners > MARGIN_PX).all() and (corners < highest).all())

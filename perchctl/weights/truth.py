@@ -11,19 +11,11 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Any, Protocol
 
 import numpy as np
 
-from perchctl.errors import (
-    ConnectionFailed,
-    InvalidValue,
-    NotFound,
-    PerchError,
-    TimedOut,
-    no_motion_capture,
-)
+from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, PerchError, TimedOut
 from perchctl.geometry import Array, rot_z, rotation_from_rpy, rpy_from_rotation, wrap_rad
 from perchctl.positioning import BodyPose, CaptureFrame, Placed, open_capture
 from perchctl.profile import PositioningConfig
@@ -36,6 +28,8 @@ MOVED_M, MOVED_RAD = 0.003, math.radians(1.0)
 """A body that moved farther than this while its frames were taken was not held still."""
 
 Ask = Callable[[str], str]
+Sample = tuple[Any, tuple[float, float, float]]
+"""A body in the world: position (3,), m, and roll, pitch, yaw, rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +41,8 @@ class Actual:
 
 
 class Truth(Protocol):
+    """A source of actual poses."""
+
     def actual(self, ask: Ask) -> Actual:
         """The pose now; may ask the person. Errors: InvalidValue for an answer that is none."""
 
@@ -57,31 +53,47 @@ class Truth(Protocol):
         """Whether a second reading shows that the body moved."""
 
 
-def relative(
-    position_m: Array, rpy_rad: tuple[float, float, float], target: Array, gear_body_m: Array
-) -> Actual:
+def moved(before: Actual, after: Actual) -> str | None:
+    """One sentence if the body moved in between."""
+    way_m = float(np.linalg.norm(after.pose[:3] - before.pose[:3]))
+    turn_rad = abs(wrap_rad(float(after.pose[3] - before.pose[3])))
+    if way_m <= MOVED_M and turn_rad <= MOVED_RAD:
+        return None
+    return (
+        f"shaken: the vehicle moved by {way_m * 1e3:.1f} mm and {math.degrees(turn_rad):.1f} deg "
+        f"while the frames were taken; hold still"
+    )
+
+
+def four_numbers(text: str, length_m: float = 1.0) -> Array:
+    """``x y z yaw`` as typed: lengths in units of `length_m`, the angle in degrees.
+
+    Errors: InvalidValue."""
+    try:
+        x, y, z, yaw = (float(cell) for cell in text.replace(",", " ").split())
+    except ValueError:
+        x = y = z = yaw = math.nan
+    if not math.isfinite(x + y + z + yaw):
+        raise InvalidValue(
+            f"{text.strip()!r} is not a pose: four numbers are needed, x y z and yaw"
+        )
+    return np.array([x * length_m, y * length_m, z * length_m, wrap_rad(math.radians(yaw))])
+
+
+def _median(samples: list[Sample]) -> Sample:
+    position = np.median(np.array([p for p, _ in samples]), axis=0)
+    angles = np.unwrap(np.array([a for _, a in samples]), axis=0)
+    roll, pitch, yaw = (float(a) for a in np.median(angles, axis=0))
+    return position, (roll, pitch, wrap_rad(yaw))
+
+
+def _relative(body: Sample, target: Array, gear_body_m: Array) -> Actual:
     """The target (x, y, z, yaw in the world) relative to the gear of a body in the world."""
-    roll, pitch, yaw = rpy_rad
+    position_m, (roll, pitch, yaw) = body
     level = rot_z(-yaw) @ (target[:3] - position_m)
     e_m = level - rotation_from_rpy(roll, pitch, 0.0) @ gear_body_m
     attitude = Attitude(0.0, roll, pitch, yaw, (position_m[0], position_m[1], position_m[2]))
     return Actual(np.array([*e_m, wrap_rad(float(target[3]) - yaw)]), attitude)
-
-
-def four_numbers(text: str, scale: tuple[float, float]) -> Array:
-    """``x y z yaw`` as typed; lengths times scale[0], the angle times scale[1].
-
-    Errors: InvalidValue."""
-    cells = text.replace(",", " ").split()
-    try:
-        values = [float(cell) for cell in cells]
-    except ValueError:
-        values = []
-    if len(values) != 4 or not all(math.isfinite(v) for v in values):
-        raise InvalidValue(
-            f"{text.strip()!r} is not a pose: four numbers are needed, x y z and yaw"
-        )
-    return np.array([*(v * scale[0] for v in values[:3]), wrap_rad(values[3] * scale[1])])
 
 
 class TypedTruth:
@@ -91,20 +103,28 @@ class TypedTruth:
 
     def actual(self, ask: Ask) -> Actual:
         text = ask("actual pose of the target from the gear, x y z [cm] and yaw [deg]: ")
-        return Actual(four_numbers(text, (0.01, math.pi / 180.0)))
+        return Actual(four_numbers(text, 0.01))
 
     def close(self) -> None:
         return None
 
 
-class Frames(Protocol):
-    """The part of `perchctl.positioning.CaptureSource` that is needed here."""
+class CapturedFrames(Protocol):
+    """The part of a motion capture that is needed here."""
 
     def frames(self) -> list[CaptureFrame]: ...
 
     def problem(self, now_s: float) -> str | None: ...
 
     def close(self) -> None: ...
+
+
+def open_named(system: str, body: str) -> CapturedFrames:
+    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
+    kind, _, host = system.partition(":")
+    # Unchecked, since `open_capture` has the sentence for a kind that is none.
+    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
+    return open_capture(PositioningConfig.model_construct(connect_timeout_s=10.0, **named))
 
 
 class MocapTruth:
@@ -121,7 +141,7 @@ class MocapTruth:
 
     def __init__(
         self,
-        capture: Frames,
+        capture: CapturedFrames,
         system: str,
         body: str,
         target: str | Array,
@@ -132,55 +152,44 @@ class MocapTruth:
     ) -> None:
         self._capture, self._system = capture, system
         self._body, self._target, self._gear = body, target, gear_body_m
-        self._mounted = mounted or _AS_IT_IS
-        self._clock, self._wait = now, wait
-
-    @classmethod
-    def open(
-        cls, system: str, body: str, target: str | Array, gear_body_m: Array,
-        mounted: PositioningConfig | None = None,
-    ) -> MocapTruth:  # fmt: skip
-        """Connect to the motion capture. Errors: InvalidValue, UsageError, ConnectionFailed."""
-        capture = open_named(system, body, "--truth mocap")
-        return cls(capture, system, body, target, gear_body_m, mounted)
+        self._mounted = mounted or PositioningConfig()
+        self._now, self._wait = now, wait
 
     def actual(self, ask: Ask) -> Actual:
         """Errors: ConnectionFailed, NotFound."""
-        self._capture.frames()  # those of before are gone
-        poses: dict[str, list[BodyPose]] = {}
-        wanted = [self._body] + ([self._target] if isinstance(self._target, str) else [])
+        self._capture.frames()  # older ones do not count
+        target = self._target
+        named = [self._body] + ([target] if isinstance(target, str) else [])
+        poses: dict[str, list[BodyPose]] = {name: [] for name in named}
         seen: set[str] = set()
-        until_s = self._clock() + WITHIN_S
-        while min(len(poses.get(name, [])) for name in wanted) < SAMPLES:
+        until_s = self._now() + WITHIN_S
+        while missing := [name for name in named if len(poses[name]) < SAMPLES]:
             frames = self._capture.frames()
             for frame in frames:
                 seen |= set(frame.bodies)
-                for name in wanted:
+                for name in named:
                     if name in frame.bodies:
-                        poses.setdefault(name, []).append(frame.bodies[name])
-            if self._clock() > until_s:
-                missing = next(name for name in wanted if len(poses.get(name, [])) < SAMPLES)
-                raise self._unseen(missing, seen)
+                        poses[name].append(frame.bodies[name])
+            if self._now() > until_s:
+                raise self._unseen(missing[0], seen)
             if not frames:
                 self._wait(0.01)
-        for name in wanted:
+        for name in named:
             if len(set(poses[name])) == 1:
                 raise NotFound(
                     f"motion capture at {self._system} has {name!r} frozen: {SAMPLES} times the "
                     f"same numbers, and a measured pose has noise"
                 )
-        position, rpy = _median([_measured(pose, self._mounted) for pose in poses[self._body]])
-        target = self._target
         if isinstance(target, str):
-            place, turned = _median([_measured(pose, _AS_IT_IS) for pose in poses[target]])
+            place, turned = _captured(poses[target], PositioningConfig())
             target = np.array([*place, turned[2]])
-        return relative(position, rpy, target, self._gear)
+        return _relative(_captured(poses[self._body], self._mounted), target, self._gear)
 
     def close(self) -> None:
         self._capture.close()
 
     def _unseen(self, missing: str, seen: set[str]) -> PerchError:
-        problem = self._capture.problem(self._clock())
+        problem = self._capture.problem(self._now())
         if problem is not None:
             return ConnectionFailed(problem)
         return NotFound(
@@ -189,33 +198,9 @@ class MocapTruth:
         )
 
 
-_AS_IT_IS = PositioningConfig()
-
-
-def open_named(system: str, body: str, needed_by: str, timeout_s: float = 10.0) -> Frames:
-    """`system`: ``TYPE:HOST``, as in ``vicon:192.168.1.2``. Errors: those of `open_capture`."""
-    kind, _, host = system.partition(":")
-    if find_spec("motioncapture") is None:
-        raise no_motion_capture(needed_by)
-    # Unchecked, since `check_reachable` has the sentence for a kind that is none.
-    named: dict[str, Any] = {"by": "mocap", "system": kind, "host": host, "body": body}
-    return open_capture(PositioningConfig.model_construct(connect_timeout_s=timeout_s, **named))
-
-
-def _measured(
-    pose: BodyPose, mounted: PositioningConfig
-) -> tuple[Array, tuple[float, float, float]]:
-    placed = Placed.of(pose, mounted)
-    return placed.position_m, rpy_from_rotation(placed.R)
-
-
-def _median(
-    samples: list[tuple[Array, tuple[float, float, float]]],
-) -> tuple[Array, tuple[float, float, float]]:
-    position = np.median(np.array([p for p, _ in samples]), axis=0)
-    angles = np.unwrap(np.array([a for _, a in samples]), axis=0)
-    roll, pitch, yaw = (float(a) for a in np.median(angles, axis=0))
-    return position, (roll, pitch, wrap_rad(yaw))
+def _captured(poses: list[BodyPose], mounted: PositioningConfig) -> Sample:
+    placed = [Placed.of(pose, mounted) for pose in poses]
+    return _median([(each.position_m, rpy_from_rotation(each.R)) for each in placed])
 
 
 class EstimateTruth:
@@ -236,23 +221,23 @@ class EstimateTruth:
         wait: Callable[[float], None] = time.sleep,
     ) -> None:
         self._telemetry, self._target, self._gear = telemetry, target, gear_body_m
-        self._close, self._wait = close, wait
+        self.close, self._wait = close, wait
 
     def actual(self, ask: Ask) -> Actual:
+        """Errors: TimedOut."""
         if self._target is None:
             ask(
                 "hold the gear's tip to the target's centre, nose along the target's x axis, "
                 "then press Enter: "
             )
-            position, rpy = self._now()
+            position, rpy = self._body()
             tip = position + rotation_from_rpy(*rpy) @ self._gear
             self._target = np.array([*tip, rpy[2]])
             ask("the target's place is measured; now put the vehicle in place and press Enter: ")
-        position, rpy = self._now()
-        return relative(position, rpy, self._target, self._gear)
+        return _relative(self._body(), self._target, self._gear)
 
-    def _now(self) -> tuple[Array, tuple[float, float, float]]:
-        self._telemetry()
+    def _body(self) -> Sample:
+        self._telemetry()  # older samples do not count
         samples: list[Telemetry] = []
         waited_s = 0.0
         while len(samples) < SAMPLES:
@@ -261,21 +246,4 @@ class EstimateTruth:
             self._wait(0.02)
             waited_s += 0.02
             samples += self._telemetry()
-        return _median(
-            [(np.asarray(s.position_m), (s.roll_rad, s.pitch_rad, s.yaw_rad)) for s in samples]
-        )
-
-    def close(self) -> None:
-        self._close()
-
-
-def moved(before: Actual, after: Actual) -> str | None:
-    """One sentence if the body moved in between."""
-    way_m = float(np.linalg.norm(after.pose[:3] - before.pose[:3]))
-    turn_rad = abs(wrap_rad(float(after.pose[3] - before.pose[3])))
-    if way_m <= MOVED_M and turn_rad <= MOVED_RAD:
-        return None
-    return (
-        f"shaken: the vehicle moved by {way_m * 1e3:.1f} mm and {math.degrees(turn_rad):.1f} deg "
-        f"while the frames were taken; hold still"
-    )
+        return _median([(s.position_m, (s.roll_rad, s.pitch_rad, s.yaw_rad)) for s in samples])

@@ -20,7 +20,7 @@ def elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """Logs and the table cache stay out of the user's folders; the ranges come at once."""
-    from perchctl.check import camera
+    from perchctl.target import design
     from perchctl.target.design import Ranges
 
     monkeypatch.chdir(tmp_path)
@@ -28,7 +28,7 @@ def elsewhere(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
     # By trial, for a second or two; tests/target has them.
     ranges = Ranges(3.0, 0.5, 0.16, 0.12, 0.03, 20.0, 20.0, 380.0)
-    monkeypatch.setattr(camera, "design_ranges", lambda *_: ranges)
+    monkeypatch.setattr(design, "design_ranges", lambda *_: ranges)
 
 
 @pytest.fixture(scope="module")

@@ -30,8 +30,8 @@ from perchctl.link import MockLink
 from perchctl.profile import load_profile
 from perchctl.sim import Scenario, SimulatedVehicle
 from perchctl.target import Optics, make_design
-from perchctl.target.blind import Blind, Mounted
 from perchctl.target.design import GearRanges, Ranges
+from perchctl.target.sight import Blind, Mounted
 from perchctl.vision import make_pipeline
 from tests.helpers.mission import target_at
 
@@ -290,7 +290,7 @@ def test_the_ranges_are_those_of_these_pictures(monkeypatch: pytest.MonkeyPatch)
         asked.append(optics)
         return RANGES
 
-    monkeypatch.setattr(camera, "design_ranges", ranges)
+    monkeypatch.setattr("perchctl.target.design.design_ranges", ranges)
     done = altered(target=target_at(1.0, (0.0, 0.0, 2.2), (0.0, 0.0, 0.0)), height_m=0.0)
     optical = Optical(noise=9.3, blur=Blur(1.4, 1.6))
     design = camera.design_of(done, optical, PIPELINE, PROFILE)
@@ -300,7 +300,7 @@ def test_the_ranges_are_those_of_these_pictures(monkeypatch: pytest.MonkeyPatch)
 
 def test_an_unknown_height_says_nothing_of_the_ceiling(monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen from 1 m, and without telemetry: that is no ceiling at 1 m."""
-    monkeypatch.setattr(camera, "design_ranges", lambda *_: RANGES)
+    monkeypatch.setattr("perchctl.target.design.design_ranges", lambda *_: RANGES)
     near = target_at(1.0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     optical = Optical(noise=4.0, blur=Blur(1.0, 1.0))
     design = camera.design_of(altered(target=near, height_m=None), optical, PIPELINE, PROFILE)

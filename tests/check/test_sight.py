@@ -80,7 +80,7 @@ def test_where_to_put_it_is_told() -> None:
     absent = rows_of(rehearsed(found=0, target=None))["in view"]
     assert "at most 3.2 m above the camera" in absent.advice
     assert "forward" in rows_of(rehearsed(1.3))["in view"].advice
-    assert "--suggest" in rows_of(rehearsed(z=3.4))["sight range"].advice
+    assert "make-target suggest" in rows_of(rehearsed(z=3.4))["sight range"].advice
 
 
 def test_a_range_by_a_guessed_blur_is_no_pass() -> None:

@@ -12,7 +12,7 @@ from perchctl.calibration.board.adjust import pixel_grid
 from perchctl.camera import Grey
 from perchctl.geometry import Array
 from perchctl.target import Board, parse_board
-from perchctl.target.sheets import black_squares
+from perchctl.target.boards import black_squares
 from perchctl.vision import CameraModel, project, undistort
 
 CHARUCO = parse_board("charuco:10x7:25mm:18mm:DICT_5X5_100")

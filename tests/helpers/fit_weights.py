@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typer.testing import CliRunner, Result
 
 from perchctl.commands import app
-from perchctl.weights.table import NEEDED
+from perchctl.weights.data import NEEDED
 
 
 def run(*words: object, stdin: str | None = None) -> Result:
@@ -82,7 +82,7 @@ BAD: dict[str, tuple[Edit, str]] = {
     "one position": (_column("position", lambda r: "1"), "line 2: all rows with both"),
     "never seen": (_unseen("small"), "lines 2 to 201: the small marker is never seen"),
     "nan": (_cell(100, "large_x_m", "NaN"), "line 100: large_x_m: NaN is not a measurement"),
-    "infinite": (_cell(9, "large_x_m", "1e999"), "line 9: large_x_m: the number is beyond"),
+    "infinite": (_cell(9, "large_x_m", "1e999"), "line 9: large_x_m: 1e999 is not"),
     "a word": (_cell(100, "large_x_m", "abc"), "line 100: large_x_m: 'abc' is not a number"),
     "half a pose": (_cell(50, "small_y_m", ""), "line 50: small_y_m: the cell is empty"),
     "no truth": (_cell(51, "actual_z_m", ""), "line 51: actual_z_m: the cell is empty"),

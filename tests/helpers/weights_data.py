@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from perchctl.geometry import Array
-from perchctl.weights.table import NEEDED, row_text
-from perchctl.weights.types import Measurements, wrap
+from perchctl.weights.data import NEEDED, Measurements, row_text, wrap
 
 BEST = np.array([0.275, 0.306, 0.728, 0.469])
 """The weights that `known` data are made with."""
@@ -66,7 +65,7 @@ def measured(
         large=turned(actual + a),
         small=turned(actual + b),
         actual=turned(actual),
-        joint=None,
+        joint=np.full((n, 4), np.nan),
         line=np.arange(n) + 2,
     )
 

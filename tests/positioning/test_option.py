@@ -17,7 +17,7 @@ from perchctl.commands.positioning import positioned
 from perchctl.errors import InvalidValue
 from perchctl.profile import PositioningConfig, Profile
 from perchctl.startup import failure_record
-from perchctl.weights.truth import open_named
+from perchctl.weights import open_named
 
 REAL = ("-u", "udp://127.0.0.1:1", "--source", "http://127.0.0.1:1/x", "--yes")
 
@@ -109,7 +109,7 @@ def test_a_host_that_is_none_is_refused_in_the_profile(tmp_path: Path, host: str
     assert f"host is NAME or NAME:PORT (1 to 65535), found '{host}'" in done.stderr
     pytest.importorskip("motioncapture")
     with pytest.raises(InvalidValue, match="NAME:PORT"):
-        open_named(f"vrpn:{host}", "cf", "--truth mocap")
+        open_named(f"vrpn:{host}", "cf")
 
 
 def test_a_flight_that_is_refused_on_the_ground_is_one_of_the_benchmark_s(

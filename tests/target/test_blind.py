@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from perchctl.profile import CameraConfig, Mounting, Profile, TargetConfig
 from perchctl.profile.vision import VehicleConfig
-from perchctl.target import blind_lines, mounted_camera
-from perchctl.target.blind import Mounted, blind_record
-from perchctl.vision import CameraModel
+from perchctl.target import mounted_camera
+from perchctl.target.sight import Mounted
+from tests.target.rig import camera_of
 
-CAMERA = CameraModel(
-    (640, 480),
-    np.array([[380.0, 0.0, 319.5], [0.0, 380.0, 239.5], [0.0, 0.0, 1.0]]),
-    np.zeros(5),
-)
+CAMERA = camera_of()
 SMALL_M = 0.0125  # its half side
 WIDE, HIGH = 317 / 380, 237 / 380  # of the picture, from the axis, less the margin
 
@@ -59,21 +54,21 @@ def test_the_gear_along_the_picture_s_height_is_advised_against() -> None:
     mount = of((0.0, 0.03, 0.02))
     assert mount.turned_rpy_deg == (0.0, 0.0, 90.0)
     assert mount.turned == of((0.0, 0.03, 0.02), yaw_deg=90.0).blind
-    first, advice = blind_lines(mount)
+    first, advice = mount.lines()
     assert "by whole markers alone: blind from 48 mm" in first
     assert "turn the camera by 90 degrees" in advice
     assert "camera.mount.rpy_deg: [0, 0, 90]" in advice
-    assert blind_record(mount)["turned_rpy_deg"] == (0.0, 0.0, 90.0)
+    assert mount.record()["turned_rpy_deg"] == (0.0, 0.0, 90.0)
 
 
 @pytest.mark.parametrize("gear_m", [(0.03, 0.0, 0.02), (0.0, 0.0, 0.0)])
 def test_a_good_mounting_needs_no_advice(gear_m: tuple[float, float, float]) -> None:
     mount = of(gear_m)
     assert mount.turned is None
-    assert len(blind_lines(mount)) == 1
+    assert len(mount.lines()) == 1
 
 
 def test_a_gear_far_aside_is_never_seen() -> None:
     mount = of((0.28, 0.0, 0.0))
     assert mount.blind.whole_m is None
-    assert "blind in all of the last 10 cm" in blind_lines(mount)[0]
+    assert "blind in all of the last 10 cm" in mount.lines()[0]

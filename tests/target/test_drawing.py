@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target import draw_target, ink_coverage
-from perchctl.target.drawing import black_rectangles, draw_bitmap, marker_cells
+from perchctl.target import draw_target
+from perchctl.target.drawing import marker_cells
 
 targets = st.builds(
     lambda large_id, small_id, large_m, ratio: TargetConfig(
@@ -29,9 +29,9 @@ targets = st.builds(
 def test_the_papers_target_in_millimetres() -> None:
     drawing = draw_target(TargetConfig())
     assert drawing.sheet_side_m == pytest.approx(0.200)
-    bitmap = draw_bitmap(drawing, 1000.0)
-    assert bitmap.image.shape == (200, 200)
-    black = bitmap.image < 128
+    image = drawing.bitmap(1000.0)
+    assert image.shape == (200, 200)
+    black = image < 128
     assert not black[:25].any()
     assert black[25:175, 25:50].all(), "left border"
     centre = black[75:125, 75:125]
@@ -44,7 +44,7 @@ def test_the_papers_target_in_millimetres() -> None:
 @given(targets)
 def test_rectangles_are_disjoint_and_have_the_area_of_the_raster(target: TargetConfig) -> None:
     drawing = draw_target(target)
-    rectangles = black_rectangles(drawing)
+    rectangles = drawing.rectangles()
     widths = np.diff(drawing.edges_m)
     area = float(widths @ drawing.black @ widths)
     assert sum((r.x1_m - r.x0_m) * (r.y1_m - r.y0_m) for r in rectangles) == pytest.approx(area)
@@ -62,7 +62,7 @@ def test_coverage_keeps_the_area_at_any_resolution(target: TargetConfig, px_per_
     widths = np.diff(drawing.edges_m)
     area = float(widths @ drawing.black @ widths)
     for window_px in (1.0, 2.0):
-        ink = ink_coverage(drawing, px_per_m, size, window_px)
+        ink = drawing.ink_coverage(px_per_m, size, window_px)
         assert ink.min() >= -1e-12
         assert ink.max() <= 1.0 + 1e-12
         assert ink.sum() / px_per_m**2 == pytest.approx(area)
@@ -70,20 +70,21 @@ def test_coverage_keeps_the_area_at_any_resolution(target: TargetConfig, px_per_
 
 def test_rectangles_lie_where_the_bitmap_is_black() -> None:
     drawing = draw_target(TargetConfig())
-    bitmap = draw_bitmap(drawing, 2800.0)  # whole pixels for both markers' cells
-    painted = np.full(bitmap.image.shape, 255, np.uint8)
-    for r in black_rectangles(drawing):
-        cols = np.rint(np.array([r.x0_m, r.x1_m]) * 2800.0 + bitmap.center_px + 0.5).astype(int)
-        rows = np.rint(bitmap.center_px + 0.5 - np.array([r.y1_m, r.y0_m]) * 2800.0).astype(int)
+    image = drawing.bitmap(2800.0)  # whole pixels for both markers' cells
+    center_px = (len(image) - 1) / 2
+    painted = np.full(image.shape, 255, np.uint8)
+    for r in drawing.rectangles():
+        cols = np.rint(np.array([r.x0_m, r.x1_m]) * 2800.0 + center_px + 0.5).astype(int)
+        rows = np.rint(center_px + 0.5 - np.array([r.y1_m, r.y0_m]) * 2800.0).astype(int)
         painted[slice(*rows), slice(*cols)] = 0
-    assert np.array_equal(painted, bitmap.image)
+    assert np.array_equal(painted, image)
 
 
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(targets)
 def test_any_two_ids_are_both_read_from_the_bitmap(target: TargetConfig) -> None:
     """The white ring leaves the large marker readable and makes the small one so."""
-    image = draw_bitmap(draw_target(target), 480.0 / target.large.side_m).image
+    image = draw_target(target).bitmap(480.0 / target.large.side_m)
     read = {}
     for marker in (target.large, target.small):
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, marker.dictionary))

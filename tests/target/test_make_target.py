@@ -41,7 +41,7 @@ def test_the_plain_call_writes_the_pdf_alone_and_twice_the_same() -> None:
 
 
 def test_a_board() -> None:
-    out, _ = call("--board", "chessboard:9x6:25mm", "-o", "board.pdf", "--json")
+    out, _ = call("board", "chessboard:9x6:25mm", "-o", "board.pdf", "--json")
     assert json.loads(out) == {"files": ["board.pdf"], "board": "chessboard:9x6:25mm"}
 
 
@@ -55,10 +55,10 @@ def test_the_profile_s_own_date_is_on_the_sheet() -> None:
 
 @pytest.mark.long
 def test_the_design_and_its_plot() -> None:
-    out, _ = call("--camera", CAMERA, "--ceiling", "2.4", "--blur", "2.0", "-o", "t.pdf")
+    out, _ = call("design", CAMERA, "--ceiling", "2.4", "--blur", "2.0")
     assert "z1" in out
-    assert files() == {"design.png", "t.pdf"}
-    out, _ = call("--camera", CAMERA, "--blur", "2", "--suggest", "--plot", "s.png", "--json")
+    assert files() == {"design.png"}
+    out, _ = call("suggest", "--blur", "2", "--plot", "s.png", "--json")
     assert json.loads(out)["command"].startswith("perchctl make-target --large ")
     assert "s.png" in files()
 
@@ -75,33 +75,22 @@ REFUSALS = [
     (["--page", "a9"], 30, "allowed are a4, letter, a3"),
     (["-o", "target.txt"], 2, "must end in .pdf"),
     (["-o", "/dev/null/target.pdf"], 30, "/dev/null is a file, not a folder"),
-    (["--camera", CAMERA, "--plot", "design.pdf"], 30, "must end in .png"),
     (["-p", "nothing"], 20, "profile 'nothing' not found"),
-    (["--board", "chessboard:9x6"], 30, "COLUMNSxROWS:SQUARE"),
-    (["--board", "chessboard:9x6:25mm", "--camera", CAMERA], 2, "different tasks"),
-    (["--camera", "nothing.yaml"], 20, "not found"),
-    (["--camera", CAMERA, "--blur", "-1"], 30, "--blur -1: allowed are 0 to 20 px"),
-    (["--camera", CAMERA, "--ceiling", "nan"], 30, "--ceiling"),
-    (["--camera", CAMERA, "--suggest", "--ceiling", "1"], 30, "below the highest search position"),
-    (["--camera", CAMERA, "--suggest", "-o", "t.pdf"], 2, "prints a command"),
-    (["--ceiling", "2.4"], 2, "--ceiling needs --camera"),
-    (["--suggest"], 2, "--suggest needs --camera"),
-    (["--blur", "3"], 2, "--blur needs --camera"),
-    (["--noise", "3"], 2, "--noise needs --camera"),
-    (["--plot", "d.png"], 2, "--plot needs --camera"),
-    (["--board", "chessboard:9x6:25mm", "--large", "15cm"], 2, "--large does not go with --board"),
-    (["--board", "chessboard:9x6:25mm", "-p", "sim"], 2, "takes -o, --page, --tile"),
-    (["--board", "chessboard:9x6:25mm", "--blur", "3"], 2, "--blur does not go with --board"),
-    (["--camera", CAMERA, "--page", "a3"], 2, "--page is for the sheet"),
-    (["--camera", CAMERA, "--magnet", "6cm"], 2, "prints with -o only"),
-    (["--camera", CAMERA, "--suggest", "--small", "2cm"], 2, "proposes both markers"),
-    (["--measured-large", "149.6", "-p", "m.yaml", "--tile", "a4"], 2, "--tile does not go with"),
-    (["--measured-large", "149.6"], 2, "name the profile"),
-    (["--measured-large", "149.6", "-p", "crazyflie"], 2, "-p crazyflie -o my_vehicle.yaml"),
-    (["--measured-large", "0.1496", "-p", "m.yaml"], 30, "measure the black square, in mm"),
-    (["--measured-large", "150in", "-p", "m.yaml"], 30, "unit 'in'"),
-    (["--measured-large", "149.6", "-o", "m.pdf"], 2, "a .yaml file"),
-]
+    (["board", "chessboard:9x6"], 30, "COLUMNSxROWS:SQUARE"),
+    (["board", "chessboard:9x6:25mm:measured=249x174mm"], 2, "leave out :measured="),
+    (["board", "chessboard:9x6:25mm", "-o", "board.txt"], 2, "must end in .pdf"),
+    (["design", CAMERA, "--plot", "design.pdf"], 30, "must end in .png"),
+    (["design", "nothing.yaml"], 20, "not found"),
+    (["suggest", CAMERA, "--ceiling", "1"], 30, "below the highest search position"),
+    (["measured", "-p", "m.yaml"], 2, "nothing was measured"),
+    (["measured", "--measured-large", "149.6"], 2, "name the profile"),
+    (["measured", "--measured-large", "149.6", "-p", "crazyflie"], 2,
+     "-p crazyflie -o my_vehicle.yaml"),
+    (["measured", "--measured-large", "0.1496", "-p", "m.yaml"], 30,
+     "measure the black square, in mm"),
+    (["measured", "--measured-large", "150in", "-p", "m.yaml"], 30, "unit 'in'"),
+    (["measured", "--measured-large", "149.6", "-o", "m.pdf"], 2, "a .yaml file"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "code", "said"), REFUSALS)
@@ -111,6 +100,16 @@ def test_a_refusal_is_one_sentence_and_leaves_nothing(
     _, err = call(*words, code=code)
     assert said in err
     assert err.count("\n") == 1
+    assert files() == set()
+
+
+@pytest.mark.parametrize("words", [
+    ("design", "--blur", "-1"), ("design", "--noise", "nan"), ("suggest", "--ceiling", "nan"),
+    ("sheet", "--ceiling", "2.4"), ("board", "chessboard:9x6:25mm", "--large", "15cm"),
+    ("suggest", "--small", "2cm"), ("measured", "--tile", "a4"), ("board",),
+])  # fmt: skip
+def test_options_of_another_task_and_out_of_range_are_wrong_usage(words: tuple[str, ...]) -> None:
+    call(*words, code=2)
     assert files() == set()
 
 
@@ -128,9 +127,11 @@ def test_a_full_disk_leaves_nothing() -> None:
     assert files() == set()
 
 
+MEASURED = ("--measured-large", "149.6", "--measured-small", "24.9mm")
+
+
 def test_measured_sizes_make_a_small_profile() -> None:
-    out, _ = call("-p", "crazyflie", "--measured-large", "149.6", "--measured-small", "24.9",
-                  "-o", "mine.yaml")  # fmt: skip
+    out, _ = call("measured", "-p", "crazyflie", *MEASURED, "-o", "mine.yaml")
     assert "-0.27 %" in out
     assert "small against large: -0.13 %" in out
     found = load_profile("./mine.yaml")
@@ -142,7 +143,7 @@ def test_measured_sizes_make_a_small_profile() -> None:
 
 
 def test_a_new_file_named_by_p_extends_the_real_vehicle_s_profile() -> None:
-    out, _ = call("-p", "new.yaml", "--measured-small", "25.1")
+    out, _ = call("measured", "-p", "new.yaml", "--measured-small", "25.1")
     assert "measure both markers" in out
     assert load_profile("./new.yaml").target.size_sigma == 0.005
     assert load_profile("./new.yaml").target.small.side_m == 0.0251
@@ -168,7 +169,7 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     path = Path("mine.yaml")
     path.write_text(PROFILES[name])
     before = load_profile("./mine.yaml")
-    words = ("-p", "mine.yaml", "--measured-large", "149.6", "--measured-small", "24.9mm")
+    words = ("measured", "-p", "mine.yaml", *MEASURED)
     _, err = call(*words, code=30)
     assert "--force" in err
     assert path.read_text() == PROFILES[name]
@@ -179,15 +180,25 @@ def test_an_existing_profile_is_changed_in_place_with_force_only(name: str) -> N
     assert after.target.large.id == before.target.large.id
     assert after.model_copy(update={"target": before.target}) == before
     assert "keep" in path.read_text()
-    assert files() == {"mine.yaml"}
+    assert files() == {"mine.yaml", "mine.yaml.bak"}
+    assert Path("mine.yaml.bak").read_text() == PROFILES[name]
 
 
 def test_a_small_profile_of_a_file_in_another_folder_finds_it() -> None:
     Path("base").mkdir()
     Path("base/mine.yaml").write_text("extends: crazyflie\nlog: {plot: false}\n")
-    call("-p", "base/mine.yaml", "--measured-large", "149.6", "-o", "measured.yaml")
+    call("measured", "-p", "base/mine.yaml", "--measured-large", "149.6", "-o", "measured.yaml")
     assert load_profile("./measured.yaml").log.plot is False
-    _, err = call("-p", "base/mine.yaml", "--measured-large", "150", "-o", "measured.yaml", code=30)
+    _, err = call(
+        "measured",
+        "-p",
+        "base/mine.yaml",
+        "--measured-large",
+        "150",
+        "-o",
+        "measured.yaml",
+        code=30,
+    )
     assert "measured.yaml exists" in err
 
 
@@ -197,14 +208,17 @@ def test_a_side_that_stands_elsewhere_in_the_file_is_not_changed_there() -> None
         "target:\n  large: {side_m: *side}\n"
     )
     Path("mine.yaml").write_text(text)
-    _, err = call("-p", "mine.yaml", "--measured-large", "149.6", "--force", code=30)
-    assert "edit target by hand" in err
+    _, err = call("measured", "-p", "mine.yaml", "--measured-large", "149.6", "--force", code=30)
+    assert "write them yourself: " in err
+    assert "target.large.side_m: 0.1496" in err
     assert Path("mine.yaml").read_text() == text
     assert files() == {"mine.yaml"}
 
 
 def test_a_scaled_page_is_noticed() -> None:
-    out, _ = call("-p", "m.yaml", "--measured-large", "145.5", "--measured-small", "24.25")
+    out, _ = call(
+        "measured", "-p", "m.yaml", "--measured-large", "145.5", "--measured-small", "24.25"
+    )
     assert "was the page scaled" in out
 
 
@@ -212,9 +226,9 @@ def test_a_scaled_page_is_noticed() -> None:
 def test_both_ways_say_from_where_on_the_mounting_is_blind() -> None:
     out, _ = call("-p", "sim")
     assert "example_640x480.yaml: never blind (by whole markers alone: blind from 20 mm" in out
-    out, _ = call("--camera", CAMERA)
+    out, _ = call("design", CAMERA)
     assert "mounting  never blind" in out
-    out, _ = call("--camera", CAMERA, "--json", "--force")
+    out, _ = call("design", CAMERA, "--json", "--force")
     assert json.loads(out)["blind"]["left_m"] == 0.0
 
 

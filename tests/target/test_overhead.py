@@ -11,24 +11,20 @@ from hypothesis import strategies as st
 from perchctl.geometry import Array, rot_z
 from perchctl.profile import Mounting, TargetConfig
 from perchctl.target import (
-    FieldOfView,
     edge_margin,
     offset_text,
     overhead_view,
     reach_at,
     sight_from,
 )
-from perchctl.target.overhead import SURE_PX, least_side_px
-from perchctl.vision import CameraModel, project, square_corners
+from perchctl.target.sight import SURE_PX, least_side_px
+from perchctl.vision import project, square_corners
+from tests.target.rig import camera_of
 
 TARGET = TargetConfig()
 SIDE_M = TARGET.large.side_m
 F = 380.0
-CAMERA = CameraModel(
-    (640, 480), np.array([[F, 0.0, 319.5], [0.0, F, 239.5], [0.0, 0.0, 1.0]]),
-    np.array([-0.05, 0.01, 0.0, 0.0, 0.0]),
-)  # fmt: skip
-FIELD = FieldOfView(CAMERA)
+CAMERA = camera_of(F, (-0.05, 0.01, 0.0, 0.0, 0.0))
 angles = st.floats(-math.pi, math.pi)
 leans = st.floats(-25.0, 25.0)
 mounts = st.builds(
@@ -52,7 +48,7 @@ def in_picture(mount: Mounting, centre_m: Array, yaw_rad: float) -> bool:
 def test_within_the_reach_the_marker_is_whole_at_any_turn(
     mount: Mounting, height_m: float, towards: float, yaw_rad: float, share: float
 ) -> None:
-    reach = reach_at(SIDE_M, FIELD, mount, height_m)
+    reach = reach_at(SIDE_M, CAMERA, mount, height_m)
     if reach is None:
         return
     away_m = share * reach.radius_m
@@ -64,7 +60,7 @@ def test_within_the_reach_the_marker_is_whole_at_any_turn(
 @settings(max_examples=30, deadline=None)
 @given(mounts, st.floats(0.6, 3.0))
 def test_beyond_the_reach_some_marker_is_cut(mount: Mounting, height_m: float) -> None:
-    reach = reach_at(SIDE_M, FIELD, mount, height_m)
+    reach = reach_at(SIDE_M, CAMERA, mount, height_m)
     if reach is None:
         return
     x, y = reach.axis_xy_m

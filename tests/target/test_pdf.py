@@ -9,36 +9,38 @@ import re
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from perchctl.errors import InvalidValue
-from perchctl.profile import MarkerConfig, TargetConfig
-from perchctl.target import (
-    Board,
+from perchctl.profile import TargetConfig
+from perchctl.target import Board, parse_board
+from perchctl.target.page import (
+    OVERLAP,
+    PAGES_MM,
+    UNPRINTABLE,
+    Circle,
+    Filled,
+    Item,
+    Line,
     Page,
-    board_page,
-    parse_board,
+    Polygon,
+    Text,
     parse_page,
     pdf_bytes,
-    target_pages,
+    tile_page,
 )
-from perchctl.target.limits import PlainReader
-from perchctl.target.page import Circle, Filled, Item, Line, Polygon, Text
 from perchctl.target.page import text_width as width_of
-from perchctl.target.sheets import fitting_page
+from perchctl.target.reading import PlainReader
+from perchctl.target.sheets import board_page, fitting_page, target_pages
 from tests.helpers.raster import PX_PER_MM, black_runs_mm, page_picture
+from tests.target.rig import sized, target_of
 
 TARGET = TargetConfig()
 MAGNET_M = 0.05
 TOLERANCE_MM = 0.05
 PAGES = ("a4", "letter", "220x240mm")
-
-
-def target_of(large_mm: float, small_mm: float) -> TargetConfig:
-    return TargetConfig(
-        large=TARGET.large.model_copy(update={"side_m": large_mm / 1e3}),
-        small=TARGET.small.model_copy(update={"side_m": small_mm / 1e3}),
-    )
 
 
 def pages_of(target: TargetConfig, page: str) -> tuple[Page, Page]:
@@ -179,7 +181,7 @@ LAYOUTS = [
 def test_nothing_overlaps_and_all_is_printable(
     large: float, small: float, page: str, side: int
 ) -> None:
-    sheet = pages_of(target_of(large, small), page)[side]
+    sheet = pages_of(sized(large, small), page)[side]
     texts = [box for item in sheet.items if isinstance(item, Text) for box in box_of(item)]
     marks = [box for item in sheet.items if not isinstance(item, Text) for box in box_of(item)]
     for text in texts:
@@ -197,7 +199,7 @@ def test_nothing_overlaps_and_all_is_printable(
 @pytest.mark.parametrize(("large", "small", "page"), LAYOUTS)
 def test_marks_lie_outside_of_the_quiet_zone(large: float, small: float, page: str) -> None:
     """At least half a cell of white on every side of the large marker."""
-    front, _ = pages_of(target_of(large, small), page)
+    front, _ = pages_of(sized(large, small), page)
     reach = large / 2.0 + large / 12.0
     for item in front.items:
         if isinstance(item, Filled):
@@ -210,7 +212,7 @@ def test_marks_lie_outside_of_the_quiet_zone(large: float, small: float, page: s
 
 @pytest.mark.parametrize(("large", "page"), [(150.0, "150x150mm"), (300.0, "a4"), (60.0, "a7mm")])
 def test_a_page_too_small_is_refused_with_the_one_that_fits(large: float, page: str) -> None:
-    target = target_of(large, 25.0)
+    target = sized(large, 25.0)
     with pytest.raises(InvalidValue) as refused:
         pages_of(target, page)
     named = re.search(r"--page (\S+) holds it", str(refused.value))
@@ -275,9 +277,58 @@ def test_a_board_too_large_for_the_page_is_refused_with_one_that_holds_it() -> N
 
 
 def test_markers_of_other_dictionaries_are_printed_too() -> None:
-    target = TargetConfig(
-        large=MarkerConfig(dictionary="DICT_4X4_50", id=16, side_m=0.12),
-        small=MarkerConfig(dictionary="DICT_5X5_50", id=7, side_m=0.02),
-    )
+    target = target_of(("DICT_4X4_50", 16, 120.0), ("DICT_5X5_50", 7, 20.0))
     picture = page_picture(pdf_bytes(pages_of(target, "a4"), "target"), 0, 200)
     assert set(PlainReader(target).read(picture)) == {"large", "small"}
+
+
+# --- A page on several sheets: together they show all of it, and each seam twice ---------------
+
+
+sizes = st.floats(60.0, 1500.0)
+
+
+def shown_on(sheets: list[Page], size: tuple[float, float]) -> list[Circle]:
+    """The circles in what a printer prints."""
+    width, height = size
+    assert all({page.width, page.height} == {width, height} for page in sheets)
+    return [
+        item
+        for page in sheets
+        for item in page.items
+        if isinstance(item, Circle)
+        and UNPRINTABLE - 1e-6 <= item.x <= page.width - UNPRINTABLE + 1e-6
+        and UNPRINTABLE - 1e-6 <= item.y <= page.height - UNPRINTABLE + 1e-6
+    ]
+
+
+@given(sizes, sizes, st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.sampled_from(["a4", "a3"]))
+def test_whatever_is_on_the_page_is_on_a_sheet(
+    width: float, height: float, across: float, down: float, name: str
+) -> None:
+    """`radius` marks the spot: it is in view of one to four sheets."""
+    spot = Circle(across * width, down * height, 1.0)
+    whole = Page(width, height, (spot,))
+    sheets = tile_page(whole, PAGES_MM[name])
+    if sheets == [whole]:
+        assert min(width, height) <= min(PAGES_MM[name])
+        return
+    assert 1 <= len(shown_on(sheets, PAGES_MM[name])) <= 4
+
+
+def test_a_page_that_fits_stays_as_it_is() -> None:
+    page = Page(297.0, 210.0, ())
+    assert tile_page(page, PAGES_MM["a4"]) == [page]
+
+
+def test_neighbours_share_the_seam_and_its_mark() -> None:
+    page = Page(500.0, 250.0, (Text(250.0, 120.0, "x"),))
+    left, right = tile_page(page, PAGES_MM["a3"])
+    for sheet in (left, right):
+        assert len([i for i in sheet.items if isinstance(i, Line)]) == 2
+    (mark, _), (same, _) = (
+        [i for i in sheet.items if isinstance(i, Line)] for sheet in (left, right)
+    )
+    assert mark.x0 - (left.width - UNPRINTABLE) == -OVERLAP / 2
+    assert same.x0 - UNPRINTABLE == OVERLAP / 2
+    assert mark.x0 - same.x0 == left.width - 2 * UNPRINTABLE - OVERLAP

@@ -198,4 +198,4 @@ def test_a_print_error_is_named(video: Path, capsys: pytest.CaptureFixture[str])
     track_source(dataclasses.replace(options, profile=wrong), io.StringIO())
     said = capsys.readouterr().err
     assert "print error: the small marker is 0.16" in said
-    assert "make-target --measured-large" in said
+    assert "make-target measured --measured-large" in said

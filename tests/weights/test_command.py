@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 from perchctl.commands import app
 from perchctl.errors import InvalidValue
 from perchctl.profile import load_profile
-from perchctl.weights.report import figure
 from tests.helpers.fit_weights import run
 from tests.helpers.weights_data import BEST, independent, known, write
 
@@ -129,14 +128,6 @@ def test_the_report_fits_a_terminal_with_the_verdict_first_and_notes_last(tmp_pa
         assert notes in ([], [len(paragraphs) - 1])
     assert paragraphs[1].startswith("not recommended")
     assert notes  # of few positions
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(-0.0643, "-0.06"), (-0.001, "0.00"), (8.126, "8.13"), (99.96, "100"), (5.16e5, "516k")],
-)
-def test_figures_have_three_digits_and_no_exponent(value: float, text: str) -> None:
-    assert figure(value) == text
 
 
 @pytest.mark.long

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from perchctl.weights.table import read_csv
+from perchctl.weights.data import read_csv
 from tests.helpers.fit_weights import BAD, run
 from tests.helpers.weights_data import independent, known, write
 
@@ -18,8 +18,8 @@ def test_the_same_rows_twice_are_refused(session: Path, tmp_path: Path) -> None:
     text = session.read_text()
     header, rows = text.split("\n", 1)
     for arguments, content, said in (
-        ((session, session), text, "named twice"),
-        ((session, copy), text, "hold the same data"),
+        ((session, session), text, "line 2: this row stands in line 2 of"),
+        ((session, copy), text, "line 2: this row stands in line 2 of"),
         ((session, copy), text.rsplit("\n", 2)[0] + "\n", "line 2: this row stands in line 2 of"),
         ((copy,), f"{header}\n{rows}{rows}", "line 1002: this row stands in line 2 of"),
         ((session, "--test", copy), text, "--test judges by other data"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,15 +11,14 @@ import numpy as np
 import pytest
 
 from perchctl.calibration import load_calibration
-from perchctl.commands.fit_weights_collect import _truth
-from perchctl.commands.fit_weights_request import CollectRequest
+from perchctl.commands.fit_weights import _open_truth
 from perchctl.errors import ConnectionFailed, InvalidValue, NotFound, UsageError
 from perchctl.geometry import rot_z
 from perchctl.positioning import BodyPose, CaptureFrame, capture
 from perchctl.profile import PositioningConfig, find_calibration, load_profile
 from perchctl.weights import SessionFile, truth
-from perchctl.weights.collect import MarkerReader, collecting_pipeline, fault_of
-from perchctl.weights.table import HEADER, NEEDED, read_csv
+from perchctl.weights.collect import MarkerReader, fault_of
+from perchctl.weights.data import HEADER, NEEDED, read_csv
 from tests.helpers.fit_weights import run
 
 
@@ -29,8 +27,8 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of four simulated positions; the last one was stopped in a line."""
     path = tmp_path_factory.mktemp("sim") / "session.csv"
     pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
-    options = ("--collect", path, "--truth", "sim", "--frames", 12, "--positions", 4)
-    done = run(*options, "--json")
+    options = ("collect", path, "--truth", "sim", "--frames", 12, "--positions", 4)
+    done = run(*options)
     assert done.exit_code == 0, done.output
     return path
 
@@ -40,12 +38,11 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
     data = read_csv(simulated)
     assert np.unique(data.position).tolist() == [1, 2, 3, 4]
     assert len(data) == 48
-    assert data.joint is not None
     for pose in (data.large, data.small, data.joint):
         assert np.abs((pose - data.actual)[:, :3]).max() < 2e-3
     torn = simulated.with_name("torn.csv")
     torn.write_bytes(whole[: len(whole) - 700])  # within position 4
-    done = run("--collect", torn, "--truth", "sim", "--frames", 12, "--positions", 4)
+    done = run("collect", torn, "--truth", "sim", "--frames", 12, "--positions", 4)
     assert done.exit_code == 0, done.output
     assert "an unfinished end was taken off" in done.stderr
     assert torn.read_bytes() == whole
@@ -53,7 +50,7 @@ def test_the_simulated_experiment_is_continued_where_it_stopped(simulated: Path)
 
 def test_a_file_that_is_no_session_is_left_alone(session: Path) -> None:
     before = session.read_bytes()
-    done = run("--collect", session, "--truth", "sim")
+    done = run("collect", session, "--truth", "sim")
     assert done.exit_code == 30
     assert "nothing is appended" in done.stderr
     assert session.read_bytes() == before
@@ -66,7 +63,7 @@ def test_shaken_and_half_seen_positions_are_refused() -> None:
     camera = load_calibration(find_calibration(profile.camera.calibration))
     stand = SimulatedStand(profile, camera, 2, 0, 4.0, 1.0)
     place = stand.place(1)
-    reader = MarkerReader(collecting_pipeline(profile, camera))
+    reader = MarkerReader(profile, camera)
     good = [reader.read(frame) for frame in stand.frames(1, place, 6)]
     assert fault_of(good) is None
     moved = place.T_world_cam.copy()
@@ -97,7 +94,7 @@ def test_the_dialogue_asks_refuses_and_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "session.csv"
     # No pose; a wrong one, taken back; a right one; enough for today.
     answers = ["12 x", "0 0 60 0", "", "n", typed[1], "", "q"]
-    words = ("--collect", path, "--frames", 10, "--positions", 2, "--source", f"images:{pictures}")
+    words = ("collect", path, "--frames", 10, "--positions", 2, "--source", f"images:{pictures}")
     done = run(*words, stdin="\n".join(answers) + "\n")
     assert done.exit_code == 130, done.output
     assert "is not a pose: four numbers are needed" in done.stderr
@@ -191,39 +188,46 @@ def test_motion_capture_gives_the_median_or_names_the_bodies() -> None:
 
 
 def test_motion_capture_is_asked_for_with_its_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    profile = load_profile("sim")
     for mocap in (None, "vicon", "vicon: "):
         with pytest.raises(UsageError, match="--mocap TYPE:HOST"):
-            _truth(CollectRequest(truth="mocap", mocap=mocap), load_profile("sim"), lambda: 0.0)
+            _open_truth("mocap", profile, mocap=mocap)
     monkeypatch.setattr(capture, "find_spec", lambda name: object())
-    monkeypatch.setattr(truth, "find_spec", lambda name: object())
     with pytest.raises(InvalidValue, match="'nokov' is unknown; allowed are vicon, optitrack"):
-        _truth(CollectRequest(truth="mocap", mocap="nokov:h"), load_profile("sim"), lambda: 0.0)
-    monkeypatch.setattr(truth, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match="--truth mocap needs the library motioncapture"):
-        _truth(CollectRequest(truth="mocap", mocap="vicon:h"), load_profile("sim"), lambda: 0.0)
+        _open_truth("mocap", profile, mocap="nokov:h")
+    monkeypatch.setattr(capture, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match="needs the library motioncapture"):
+        _open_truth("mocap", profile, mocap="vicon:h")
 
 
+OWN = PositioningConfig(by="mocap", system="qualisys", host="lab:22223", body="cf2")
+
+
+@pytest.mark.parametrize(
+    ("options", "positioning", "expected"),
+    [
+        ({}, OWN, ("qualisys:lab:22223", "cf2")),
+        ({"mocap": "vicon:h"}, OWN, ("vicon:h", "cf2")),
+        ({"bodies": "cf7,board"}, OWN, ("qualisys:lab:22223", "cf7")),
+        ({"mocap": "vicon:h"}, PositioningConfig(), ("vicon:h", "cf")),
+    ],
+)
 def test_motion_capture_is_the_profile_s_where_no_option_names_it(
+    options: dict[str, str],
+    positioning: PositioningConfig,
+    expected: tuple[str, str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[str, str]] = []
 
-    def opened(system: str, body: str, needed_by: str) -> Recorded:
+    def opened(system: str, body: str) -> Recorded:
         asked.append((system, body))
         return Recorded()
 
-    monkeypatch.setattr(truth, "open_named", opened)
-    own = PositioningConfig(by="mocap", system="qualisys", host="lab:22223", body="cf2")
-    plain = load_profile("sim")
-    lab = plain.model_copy(update={"positioning": own})
-    for request, profile, expected in (
-        (CollectRequest(), lab, ("qualisys:lab:22223", "cf2")),
-        (CollectRequest(mocap="vicon:h"), lab, ("vicon:h", "cf2")),
-        (CollectRequest(bodies="cf7,board"), lab, ("qualisys:lab:22223", "cf7")),
-        (CollectRequest(mocap="vicon:h"), plain, ("vicon:h", "cf")),
-    ):
-        _truth(replace(request, truth="mocap"), profile, lambda: 0.0)
-        assert asked[-1] == expected
+    monkeypatch.setattr("perchctl.commands.fit_weights.open_named", opened)
+    profile = load_profile("sim").model_copy(update={"positioning": positioning})
+    _open_truth("mocap", profile, **options)
+    assert asked == [expected]
 
 
 def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path) -> None:
@@ -236,6 +240,6 @@ def test_a_session_of_another_header_and_the_shipped_header_agree(tmp_path: Path
 def test_the_readers_of_nothing_are_told(tmp_path: Path) -> None:
     done = run()
     assert done.exit_code == 2
-    assert "--collect" in done.stderr
+    assert "fit-weights collect" in done.stderr
     assert run(tmp_path / "none.csv").exit_code == 20
     assert run("x.csv", "--method", "magic").exit_code == 30

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from perchctl.calibration.board.tags import find_tags
 from perchctl.camera import Grey
 from perchctl.geometry import Array
-from perchctl.target import TAG_BORDER_CELLS, Board, BoardKind, tag_cells
+from perchctl.target import TAG_BORDER_CELLS, Board, tag_cells
 from perchctl.vision import field_picture, is_combed
 
 MIN_CORNERS = 6
@@ -177,7 +177,7 @@ def _chessboard(image: Grey, board: Board) -> tuple[NDArray[np.intp], Array] | s
     return np.arange(size[0] * size[1]), np.asarray(corners, np.float64).reshape(-1, 2)
 
 
-_FINDERS: dict[BoardKind, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
+_FINDERS: dict[str, Callable[[Grey, Board], tuple[NDArray[np.intp], Array] | str]] = {
     "chessboard": _chessboard,
     "charuco": _charuco,
     "aprilgrid": _aprilgrid,
@@ -302,10 +302,10 @@ def _sample(
 ) -> tuple[Array, NDArray[np.bool_]]:
     places = centre[:, None] + offsets
     h, w = image.shape
-    inside = ((places >= 0) & (places <= (w - 1, h - 1))).all(axis=2)
+    inside = np.all((places >= 0) & (places <= (w - 1, h - 1)), axis=2)
     xy = places.astype(np.float32)
     grey = cv2.remap(image.astype(np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR)
-    return np.asarray(grey, dtype=np.float64), inside
+    return np.asarray(grey, dtype=np.float64), np.asarray(inside)
 
 
 def _white_quadrants(grey: Array, uv: Array) -> NDArray[np.bool_]:

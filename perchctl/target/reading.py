@@ -1,0 +1,322 @@
+"""What a plain detector reads of a target: of its drawing, before ink is spent, and of small
+pictures through blur and noise.
+
+The smallest side that is read is found by trial: a formula would hold for one id and one
+detector; a few hundred small pictures through the detector itself take a second and hold for the
+target at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from perchctl.errors import InvalidValue
+from perchctl.profile import MarkerConfig, TargetConfig, aruco_dictionary, dictionary_size
+from perchctl.target.drawing import (
+    RING_MIN_PER_LARGE_SIDE,
+    TargetDrawing,
+    draw_target,
+    marker_cells,
+    mm_text,
+)
+from perchctl.vision import MARKERS, MarkerName
+
+
+class PlainReader:
+    """cv2.aruco with its default parameters, and for each marker a dictionary of just
+    its id (the other ids of a nested dictionary are not searched)."""
+
+    def __init__(self, target: TargetConfig) -> None:
+        dictionaries = [_own(target.large), _own(target.small)]
+        self._detector: Any = cv2.aruco.ArucoDetector(dictionaries, cv2.aruco.DetectorParameters())
+
+    def read(self, image: NDArray[np.uint8]) -> dict[MarkerName, NDArray[np.float32]]:
+        """Corners (4, 2) px of the markers in a grey picture (TL TR BR BL)."""
+        corners, ids, _, which = self._detector.detectMarkersMultiDict(image)
+        if ids is None or len(corners) == 0:
+            return {}
+        return {
+            MARKERS[int(dictionary)]: np.asarray(quad, np.float32).reshape(4, 2)
+            for quad, dictionary in zip(corners, np.asarray(which).ravel(), strict=True)
+        }
+
+
+def _own(marker: MarkerConfig) -> Any:
+    source = aruco_dictionary(marker.dictionary)
+    return cv2.aruco.Dictionary(
+        np.ascontiguousarray(source.bytesList[marker.id : marker.id + 1]), source.markerSize, 0
+    )
+
+
+# --- The smallest side that is read through blur and noise ---------------------------------------
+
+
+FOUND_RATE = 0.9
+TRIALS = 24
+STEP = 1.04
+"""Ratio of neighbouring sides that are tried."""
+SIDE_RANGE_PX = (6.0, 400.0)
+_STREAM = 801
+_PAPER, _INK, _CEILING = 225.0, 30.0, 140.0
+_MIN_PICTURE_PX = 64
+_PERIMETER_RATE = 0.03  # cv2.aruco's least perimeter, per side of the picture
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What the picture suffers: `blur_px` is the sigma of lens, focus and link together,
+    `noise` the sigma of the grey levels (0..255)."""
+
+    blur_px: float = 1.0
+    noise: float = 5.0
+
+
+@cache
+def smallest_side_px(
+    target: TargetConfig,
+    marker: MarkerName,
+    optics: Optics,
+    picture_px: int,
+    trials: int = TRIALS,
+) -> float | None:
+    """Side in px from which on the marker, seen straight on at any turn, is found in
+    `FOUND_RATE` of the pictures; None where even `SIDE_RANGE_PX[1]` is not.
+
+    `picture_px` is the larger side of the camera's picture; `trials` are the pictures of a side.
+    """
+    drawing, reader = draw_target(target), PlainReader(target)
+    count = math.ceil(math.log(SIDE_RANGE_PX[1] / SIDE_RANGE_PX[0]) / math.log(STEP))
+
+    @cache
+    def rate(i: int) -> float:
+        return _rate(
+            drawing, reader, marker, SIDE_RANGE_PX[0] * STEP**i, optics, picture_px, trials
+        )
+
+    def found(i: int) -> bool:
+        # Three neighbours together: between 0.8 and 1 the rate rises slowly.
+        return (rate(i - 1) + rate(i) + rate(i + 1)) / 3.0 >= FOUND_RATE
+
+    # Trying the largest sides first would be slow: large pictures. Upwards by doubling,
+    # then bisection.
+    low, high, stride = -1, 0, 4
+    while not found(high):
+        low, high, stride = high, high + stride, min(2 * stride, 16)
+        if high > count:
+            return None
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if found(middle) else (middle, high)
+    return float(SIDE_RANGE_PX[0] * STEP**high)
+
+
+def _rate(
+    drawing: TargetDrawing,
+    reader: PlainReader,
+    marker: MarkerName,
+    side_px: float,
+    optics: Optics,
+    picture_px: int,
+    trials: int,
+) -> float:
+    side_m = drawing.large_side_m if marker == "large" else drawing.small_side_m
+    pictures = sample_pictures(drawing, side_px / side_m, side_px, optics, trials)
+    least_px = _PERIMETER_RATE * picture_px
+    hits = 0
+    for picture in pictures:
+        quad = reader.read(picture).get(marker)
+        if quad is not None and cv2.arcLength(quad, True) >= least_px:
+            hits += 1
+    return hits / trials
+
+
+def sample_pictures(
+    drawing: TargetDrawing, px_per_m: float, side_px: float, optics: Optics, count: int
+) -> list[NDArray[np.uint8]]:
+    """`count` pictures around the target's centre, 3 times `side_px` wide, at any turn and
+    any place between the pixels."""
+    fine = 2 if optics.blur_px >= 1.0 else 4
+    size = max(_MIN_PICTURE_PX, math.ceil(3.0 * side_px))
+    n = size * fine
+    ink = drawing.ink_coverage(px_per_m * fine, n)
+    sheet = drawing.sheet_coverage(px_per_m * fine, n)
+    flat = (_CEILING * (1.0 - sheet) + _PAPER * (sheet - ink) + _INK * ink).astype(np.float32)
+    rng = np.random.default_rng([_STREAM, round(1e3 * side_px)])
+    pictures = []
+    for _ in range(count):
+        shift = rng.uniform(-0.5, 0.5, 2)
+        turn = cv2.getRotationMatrix2D(((n - 1) / 2.0, (n - 1) / 2.0), rng.uniform(0.0, 360.0), 1.0)
+        turn = np.asarray(turn, np.float64) + np.outer(shift * fine, (0.0, 0.0, 1.0))
+        turned = cv2.warpAffine(flat, turn, (n, n), borderMode=cv2.BORDER_REPLICATE)
+        if optics.blur_px > 0.05:
+            turned = cv2.GaussianBlur(turned, (0, 0), optics.blur_px * fine)
+        picture = cv2.resize(turned, (size, size), interpolation=cv2.INTER_AREA)
+        noisy = np.asarray(picture, np.float64) + rng.normal(0.0, optics.noise, picture.shape)
+        pictures.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    return pictures
+
+
+# --- What is checked before ink is spent ---------------------------------------------------------
+
+
+RING_RANGE_PER_LARGE_SIDE = (RING_MIN_PER_LARGE_SIDE, 9.0 / 150.0)
+"""White ring around the small marker, per side of the large one, where the large one's
+own centre is not white (measured: at 0 mm of 150 the small marker is never found, from
+10 mm on the large one fails)."""
+MIN_DISTANCE = 3
+"""Cells in which two patterns of one size must differ: one more than the wrong bits that
+are corrected in both."""
+LISTED_IDS = 6
+_READ_SIDE_PX = 480.0
+
+
+@dataclass(frozen=True)
+class TargetCheck:
+    """What the checks found: `ring_m` of white around the small marker, whether the large
+    marker's centre is white by itself, and the ids of its dictionary of which that is so."""
+
+    ring_m: float
+    white_centre: bool
+    white_ids: tuple[int, ...]
+
+    def text(self, target: TargetConfig) -> str:
+        if self.white_centre:
+            white = f"id {target.large.id} is white in the middle"
+        else:
+            white = f"a ring of {self.ring_m * 1e3:.1f} mm is white around the small marker"
+        return f"{white}; both markers are read from the drawing"
+
+
+def check_target(target: TargetConfig, magnet_m: float) -> TargetCheck:
+    """Raises InvalidValue, in one sentence, for the first thing that is wrong."""
+    _check_magnet(target, magnet_m)
+    large, small = target.large, target.small
+    for name, marker in (("large", large), ("small", small)):
+        if _turns_onto_itself(marker):
+            raise InvalidValue(
+                f"{name} marker: id {marker.id} of {marker.dictionary} looks the same when turned, "
+                f"so that its heading is ambiguous: take another id"
+            )
+    white_ids = white_centre_ids(large.dictionary, small.side_m / large.side_m)
+    check = TargetCheck(draw_target(target).ring_m, large.id in white_ids, white_ids)
+    if not check.white_centre:
+        low, high = (r * large.side_m for r in RING_RANGE_PER_LARGE_SIDE)
+        if not low - 1e-9 <= check.ring_m <= high + 1e-9:
+            raise InvalidValue(
+                f"the white ring around the small marker would be {check.ring_m * 1e3:.1f} mm, "
+                f"and {low * 1e3:.1f} to {high * 1e3:.1f} mm are needed: "
+                f"{_white_hint(target, white_ids)}"
+            )
+    _check_reading(target, white_ids)
+    return check
+
+
+def white_centre_ids(dictionary: str, ratio: float) -> tuple[int, ...]:
+    """Ids whose cells under a small marker of `ratio` times the side, with the least ring
+    of white around it, are all white."""
+    source = aruco_dictionary(dictionary)
+    n = int(source.markerSize)
+    reach = (ratio / 2.0 + RING_MIN_PER_LARGE_SIDE) * (n + 2)  # cells from the centre
+    edges = np.arange(-n / 2.0, n / 2.0 + 0.5)
+    under = (edges[:-1] < reach - 1e-9) & (edges[1:] > -reach + 1e-9)
+    if reach > n / 2.0:
+        return ()
+    bits = all_bits(dictionary)
+    return tuple(int(i) for i in np.flatnonzero(bits[:, under][:, :, under].all(axis=(1, 2))))
+
+
+def all_bits(dictionary: str) -> NDArray[np.bool_]:
+    """Inner bits of every id, True is white, (ids, n, n)."""
+    source = aruco_dictionary(dictionary)
+    n = int(source.markerSize)
+    rows = [
+        cv2.aruco.Dictionary.getBitsFromByteList(
+            np.ascontiguousarray(source.bytesList[i : i + 1]), n
+        )
+        for i in range(dictionary_size(dictionary))
+    ]
+    return np.array(rows, dtype=np.uint8) > 0
+
+
+def _check_magnet(target: TargetConfig, magnet_m: float) -> None:
+    if magnet_m > target.large.side_m:
+        raise InvalidValue(
+            f"the magnet ({mm_text(magnet_m)} mm) does not fit behind the large marker "
+            f"({mm_text(target.large.side_m)} mm): take a smaller one (--magnet)"
+        )
+    diagonal = math.sqrt(2.0) * target.small.side_m
+    if diagonal > magnet_m:
+        raise InvalidValue(
+            f"the small marker's diagonal ({diagonal * 1e3:.1f} mm) is not inside the magnet "
+            f"({mm_text(magnet_m)} mm), so the gear could touch where no magnet is: at most "
+            f"--small {math.floor(magnet_m * 1e4 / math.sqrt(2.0)) / 10:g}mm, or a larger --magnet"
+        )
+
+
+def _turns_onto_itself(marker: MarkerConfig) -> bool:
+    cells = marker_cells(marker)
+    return any(np.array_equal(cells, np.rot90(cells, turn)) for turn in (1, 2, 3))
+
+
+def _check_reading(target: TargetConfig, white_ids: tuple[int, ...]) -> None:
+    """Reads the drawing: both markers must be found, and each whole dictionary must find
+    nothing else in it."""
+    large, small = target.large, target.small
+    if _distance(large, small) < MIN_DISTANCE:
+        raise InvalidValue(
+            f"id {large.id} of {large.dictionary} and id {small.id} of {small.dictionary} are "
+            f"nearly the same pattern, so one marker would be taken for the other: take another "
+            f"id for one of them"
+        )
+    image = draw_target(target).bitmap(_READ_SIDE_PX / large.side_m)
+    seen = PlainReader(target).read(image)
+    for name in MARKERS:
+        if name not in seen:
+            raise InvalidValue(
+                f"the {name} marker cannot be read from this drawing: "
+                f"{_white_hint(target, white_ids)}"
+            )
+    same_size = (
+        aruco_dictionary(large.dictionary).markerSize
+        == aruco_dictionary(small.dictionary).markerSize
+    )
+    for marker, other in ((large, small), (small, large)):
+        ids = {marker.id, other.id} if same_size else {marker.id}
+        extra = _ids_read(image, aruco_dictionary(marker.dictionary)) - ids
+        if extra:
+            raise InvalidValue(
+                f"{marker.dictionary} also reads id {min(extra)} from this drawing, so the two "
+                f"dictionaries would be confused: take another id or dictionary"
+            )
+
+
+def _ids_read(image: NDArray[np.uint8], dictionary: Any) -> set[int]:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerDistanceRate = 0.01
+    _, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    return set() if ids is None else {int(i) for i in np.asarray(ids).ravel()}
+
+
+def _distance(a: MarkerConfig, b: MarkerConfig) -> int:
+    """Fewest cells in which one, in any turn, differs from the other; patterns of another
+    size differ in all."""
+    first, second = marker_cells(a), marker_cells(b)
+    if first.shape != second.shape:
+        return first.size
+    return min(int((np.rot90(first, turn) != second).sum()) for turn in range(4))
+
+
+def _white_hint(target: TargetConfig, white_ids: tuple[int, ...]) -> str:
+    small = "take a smaller --small"
+    if not white_ids or target.large.id in white_ids:
+        return small
+    listed = ", ".join(str(i) for i in white_ids[:LISTED_IDS])
+    dictionary = target.large.dictionary
+    return f"{small}, or a --large-id that is white in the middle ({dictionary}: {listed})"

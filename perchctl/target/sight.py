@@ -1,0 +1,374 @@
+"""What of the ceiling a camera has in its picture: from the ground, and as the gear comes near.
+
+The vehicle stands or flies level. Directions are the vehicle's: forward and left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from perchctl.geometry import R_MARKER_TARGET, Array, rot_z, rpy_from_rotation
+from perchctl.profile import DetectorConfig, Mounting, Profile, TargetConfig
+from perchctl.vision import (
+    CameraModel,
+    RigidPose,
+    make_aruco_detector,
+    shows_enough_of_target,
+    square_corners,
+    undistort,
+)
+
+MARGIN_PX = 3.0
+"""cv2.aruco drops markers nearer than this to the picture's edge."""
+NEAREST_M, FARTHEST_M = 1e-3, 50.0
+_EDGE_POINTS = 200
+
+
+class FieldOfView:
+    """The picture's edge in view rays, as a distance from the axis in every direction."""
+
+    def __init__(self, camera: CameraModel, margin_px: float = MARGIN_PX) -> None:
+        low = margin_px - 0.5
+        right, bottom = (size - 0.5 - margin_px for size in camera.size_px)
+        corners = np.array([[low, low], [right, low], [right, bottom], [low, bottom]])
+        s = np.linspace(0.0, 1.0, _EDGE_POINTS, endpoint=False)[:, None]
+        ways = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        rays = undistort(np.concatenate([a + s * (b - a) for a, b in ways]), camera)
+        rays = rays[np.isfinite(rays).all(axis=1)]
+        angle = np.arctan2(rays[:, 1], rays[:, 0])
+        order = np.argsort(angle)
+        self._angle, self._reach = angle[order], np.hypot(*rays.T)[order]
+
+    def holds(self, points_cam_m: Array) -> bool:
+        """Whether all points (n, 3) of the camera frame are in the picture."""
+        x, y, z = points_cam_m.T
+        if (z <= 0.0).any():
+            return False
+        reach = np.interp(np.arctan2(y, x), self._angle, self._reach, period=2.0 * math.pi)
+        return bool((np.hypot(x, y) <= reach * z).all())
+
+    def nearest_m(self, outline_m: Array, R: Array, offset_m: Array) -> float | None:
+        """The shortest distance d at which ``R (x, y, d) + offset`` is in the picture for
+        all points (x, y) of `outline_m` (n, 2) and from there on; None if for no distance."""
+
+        def seen(d: float) -> bool:
+            return self.holds(raised(outline_m, d) @ R.T + offset_m)
+
+        low, high = NEAREST_M, FARTHEST_M
+        if not seen(high):
+            return None
+        if seen(low):
+            return low
+        while high / low > 1.0005:
+            middle = math.sqrt(low * high)
+            low, high = (low, middle) if seen(middle) else (middle, high)
+        return high
+
+
+def square_outline(side_m: float) -> Array:
+    """Points along an upright square, (n, 2)."""
+    s = np.linspace(-0.5, 0.5, 21) * side_m
+    h = np.full_like(s, side_m / 2.0)
+    return np.concatenate([np.column_stack(pair) for pair in ((s, h), (s, -h), (h, s), (-h, s))])
+
+
+def turned_outline(side_m: float) -> Array:
+    """The circle through the corners: the square at any turn, (n, 2)."""
+    a = np.linspace(0.0, 2.0 * math.pi, 180, endpoint=False)
+    return np.asarray(side_m / math.sqrt(2.0) * np.column_stack([np.cos(a), np.sin(a)]))
+
+
+def raised(outline_m: Array, height_m: float) -> Array:
+    """The outline's points at that height, (n, 3)."""
+    return np.column_stack([outline_m, np.full(len(outline_m), height_m)])
+
+
+# --- From the ground: where the target is the vehicle's positioning system, it has to be seen ----
+
+
+SURE_PX = 18.0
+"""A search finds sides of 13 px in 7 of 8 pictures, those of 15 px and more in all, at a blur of
+0.6 px and noise of 4 to 8, by rendered pictures at any turn: with a fifth to spare."""
+BLURRED = 1.15
+"""Times the least side that a plain search reads through a measured blur."""
+STRAIGHT_DEG = 2.0
+"""No eye sees such a lean."""
+LEAST_UP = 0.2
+"""Of the view's upward part: a camera that looks farther aside sees no target over it."""
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What is seen of one height above the camera: the large marker at any turn whose centre is
+    within `radius_m` of where the camera's axis goes, `axis_xy_m` from the camera."""
+
+    height_m: float
+    axis_xy_m: tuple[float, float]
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Overhead:
+    """Where the large marker is surely found: at most `highest_m` above the camera, and within
+    `reaches`, at some heights. `lean_deg` of the camera's axis: forward, left."""
+
+    highest_m: float
+    lean_deg: tuple[float, float]
+    reaches: tuple[Reach, ...]
+
+    @property
+    def words(self) -> str:
+        """Where the target has to be, for people."""
+        lean = _directions(self.lean_deg, STRAIGHT_DEG, ".0f", "deg")
+        axis = f"leans {lean}" if lean else "points straight up"
+        if not self.reaches:
+            return f"in the picture of a camera that looks up, not {axis}"
+        within = ", ".join(
+            f"{r.radius_m:.2g} m at {r.height_m:.2g} m above it" for r in self.reaches
+        )
+        return (
+            f"at most {self.highest_m:.1f} m above the camera, and its centre no farther from the "
+            f"camera's axis than {within}; the axis {axis}"
+        )
+
+
+def least_side_px(plain_px: float | None = None) -> float:
+    """The side from which on the ground's search finds the large marker surely. `plain_px`: what a
+    plain one reads through the camera's own blur, where that was measured."""
+    return SURE_PX if plain_px is None else max(SURE_PX, BLURRED * plain_px)
+
+
+def overhead_view(
+    target: TargetConfig, camera: CameraModel, mount: Mounting, plain_px: float | None = None
+) -> Overhead:
+    """From where on the ground the large marker is surely found; `plain_px` as in
+    `least_side_px`."""
+    side_m, view = target.large.side_m, mount.T_body_cam[:3, 2]
+    highest_m = float(math.sqrt(camera.K[0, 0] * camera.K[1, 1])) * side_m / least_side_px(plain_px)
+    lean = math.degrees(math.atan2(view[0], view[2])), math.degrees(math.atan2(view[1], view[2]))
+    heights_m = sorted({min(h, highest_m) for h in (1.0, 2.0)})
+    reaches = (reach_at(side_m, camera, mount, h) for h in heights_m)
+    return Overhead(highest_m, lean, tuple(r for r in reaches if r is not None))
+
+
+def reach_at(side_m: float, camera: CameraModel, mount: Mounting, height_m: float) -> Reach | None:
+    """None where not even a marker on the camera's axis is wholly in the picture, or the camera
+    does not look up."""
+    R = mount.T_body_cam[:3, :3]
+    view, field = R[:, 2], FieldOfView(camera)
+    if view[2] < LEAST_UP:
+        return None
+    axis = height_m / view[2] * view
+
+    def seen(radius_m: float) -> bool:
+        around = turned_outline(math.sqrt(2.0) * radius_m + side_m)
+        return field.holds((raised(around, 0.0) + axis) @ R)
+
+    if not seen(0.0):
+        return None
+    low_m, high_m = 0.0, 10.0 * height_m
+    while high_m - low_m > 1e-3:
+        middle_m = (low_m + high_m) / 2.0
+        low_m, high_m = (middle_m, high_m) if seen(middle_m) else (low_m, middle_m)
+    return Reach(height_m, (float(axis[0]), float(axis[1])), low_m)
+
+
+@dataclass(frozen=True)
+class TargetFromBody:
+    """A target as a level body at some place has it.
+
+    Attributes:
+        whole: whether one of its markers is wholly in the picture.
+        height_m: above the camera.
+        aside_m: from the camera's axis, forward and left; NaN for a camera that does not look up.
+    """
+
+    whole: bool
+    height_m: float
+    aside_m: tuple[float, float]
+
+
+def sight_from(
+    body_m: Array,
+    body_yaw_rad: float,
+    target_m: Array,
+    target_yaw_rad: float,
+    target: TargetConfig,
+    camera: CameraModel,
+    mount: Mounting,
+) -> TargetFromBody:
+    """Positions (3,) and headings in one world, z up; the body level, the target too."""
+    T, field = mount.T_body_cam, FieldOfView(camera)
+    R, camera_m = T[:3, :3], T[:3, 3]
+    centre = rot_z(body_yaw_rad).T @ (target_m - body_m) - camera_m
+    turn = rot_z(target_yaw_rad - body_yaw_rad)
+    large, small = (
+        field.holds((square_corners(side_m) @ turn.T + centre) @ R)
+        for side_m in (target.large.side_m, target.small.side_m)
+    )
+    # The small marker by its size alone.
+    readable = float(camera.K[0, 0]) * target.small.side_m >= SURE_PX * float(centre[2])
+    view = R[:, 2]
+    aside = centre - centre[2] / view[2] * view if view[2] >= LEAST_UP else np.full(3, math.nan)
+    return TargetFromBody(
+        whole=large or (small and readable),
+        height_m=float(centre[2]),
+        aside_m=(float(aside[0]), float(aside[1])),
+    )
+
+
+def edge_margin(points_px: Array, size_px: tuple[int, int]) -> float:
+    """The least way of points (n, 2) px to the picture's edge, a share of its larger side."""
+    size = np.array(size_px, dtype=np.float64)
+    least_px = np.minimum(points_px + 0.5, size - 0.5 - points_px).min()
+    return float(least_px) / max(size_px)
+
+
+def offset_text(aside_m: tuple[float, float]) -> str:
+    """``0.31 m forward and 0.12 m to the right``."""
+    return _directions(aside_m, 0.01, ".2f", "m") or "less than 1 cm"
+
+
+def _directions(values: tuple[float, float], least: float, figures: str, unit: str) -> str:
+    """Forward and left in words, without what is less than `least`."""
+    names = (("forward", "back"), ("to the left", "to the right"))
+    return " and ".join(
+        f"{abs(value):{figures}} {unit} {ahead if value > 0.0 else behind}"
+        for value, (ahead, behind) in zip(values, names, strict=True)
+        if abs(value) >= least
+    )
+
+
+# --- Near the target: from where on a mounting is blind ------------------------------------------
+# With the gear under the target's centre, the vehicle level and its heading the target's, as in
+# an ascent: so the outline of the markers is upright in body axes. A camera beside the gear sees
+# the target aside of its axis, and its picture is wider than high: with the offset along the
+# picture's width it loses the target later.
+
+
+FROM_M = 0.10
+"""The last stretch that is looked at, from gear to target."""
+_STEP_M, _FINE_M = 0.005, 0.0005
+_WORTH_M = 0.002  # less is no reason to turn a camera
+_OWN_AXES = np.diag([1.0, -1.0, -1.0])  # of a marker's own coordinates, in its axes
+
+
+@dataclass(frozen=True)
+class Blind:
+    """Ranges from the gear's tip to the target from which on nothing is measured any more, m: by
+    whole markers, and by what is left of their drawing. 0: down to contact; None: all of the
+    last 10 cm."""
+
+    whole_m: float | None
+    left_m: float | None
+
+    def words(self) -> str:
+        """Both ranges, for people."""
+        left, whole = (_blind_words(range_m) for range_m in (self.left_m, self.whole_m))
+        return f"{left} (by whole markers alone: {whole})"
+
+
+def _blind_words(nearest_m: float | None) -> str:
+    if nearest_m is None:
+        return f"blind in all of the last {1e2 * FROM_M:g} cm"
+    return "never blind" if nearest_m == 0.0 else f"blind from {1e3 * nearest_m:.0f} mm to contact"
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """A mounting's blind range, and, where the camera should rather be turned by 90 degrees about
+    its view, its mounting's `rpy_deg` and blind range then."""
+
+    blind: Blind
+    turned: Blind | None = None
+    turned_rpy_deg: tuple[float, float, float] | None = None
+
+    def lines(self) -> list[str]:
+        """For people, a line or two."""
+        lines = [f"{self.blind.words()}, the gear under the target's centre"]
+        if self.turned is not None and self.turned_rpy_deg is not None:
+            turn = ", ".join(f"{a:g}" for a in self.turned_rpy_deg)
+            lines.append(
+                "turn the camera by 90 degrees about its view, so that the gear is beside it along "
+                f"the picture's width (camera.mount.rpy_deg: [{turn}]): {self.turned.words()}"
+            )
+        return lines
+
+    def record(self) -> dict[str, object]:
+        """For machines; m."""
+        return {
+            "whole_m": self.blind.whole_m,
+            "left_m": self.blind.left_m,
+            "turned_left_m": None if self.turned is None else self.turned.left_m,
+            "turned_rpy_deg": self.turned_rpy_deg,
+        }
+
+
+def mounted_camera(target: TargetConfig, camera: CameraModel, profile: Profile) -> Mounted:
+    """From where on the profile's `camera.mount` and `vehicle.gear_body_m` see too little."""
+    T_body_cam = profile.camera.mount.T_body_cam
+    gear_m = np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3]
+    here = _blind(target, camera, T_body_cam[:3, :3], gear_m)
+    R_turned = T_body_cam[:3, :3] @ rot_z(math.pi / 2.0)
+    turned = _blind(target, camera, R_turned, gear_m)
+    gain_m, whole_gain_m = (
+        (FROM_M if old is None else old) - (FROM_M if new is None else new)
+        for old, new in ((here.left_m, turned.left_m), (here.whole_m, turned.whole_m))
+    )
+    # A whole marker is the surer sight.
+    if gain_m >= _WORTH_M or (gain_m >= 0.0 and whole_gain_m >= _WORTH_M):
+        roll, pitch, yaw = (round(math.degrees(a), 1) + 0.0 for a in rpy_from_rotation(R_turned))
+        return Mounted(here, turned, (roll, pitch, yaw))
+    return Mounted(here)
+
+
+def sees_small_marker(camera: CameraModel, profile: Profile, range_m: float) -> bool:
+    """Whether the whole small marker is in the picture with the gear's tip so far under it."""
+    R, gear = gear_from_camera(profile)
+    outline = raised(square_outline(profile.target.small.side_m), range_m)
+    return FieldOfView(camera).holds(outline @ R.T + gear)
+
+
+def gear_from_camera(profile: Profile) -> tuple[Array, Array]:
+    """The rotation from body to camera axes, and the gear's tip in the camera's, m."""
+    T_body_cam = profile.camera.mount.T_body_cam
+    R = T_body_cam[:3, :3].T
+    return R, R @ (np.asarray(profile.vehicle.gear_body_m) - T_body_cam[:3, 3])
+
+
+def _blind(target: TargetConfig, camera: CameraModel, R_body_cam: Array, gear_m: Array) -> Blind:
+    """`gear_m` is the gear from the camera, body axes."""
+    R, offset = R_body_cam.T, R_body_cam.T @ gear_m
+    view, patterns = FieldOfView(camera), make_aruco_detector(DetectorConfig(), target).patterns
+    outlines = [square_outline(marker.side_m) for marker in (target.large, target.small)]
+
+    def whole(range_m: float) -> bool:
+        return any(view.holds(raised(each, range_m) @ R.T + offset) for each in outlines)
+
+    def left(range_m: float) -> bool:
+        centre = R @ np.array([0.0, 0.0, range_m]) + offset
+        half_m = target.large.side_m / 2.0
+        pose = RigidPose(R @ R_MARKER_TARGET @ _OWN_AXES, centre / half_m)
+        return whole(range_m) or shows_enough_of_target(pose, patterns, camera)
+
+    return Blind(_lost_at_m(whole), _lost_at_m(left))
+
+
+def _lost_at_m(seen: Callable[[float], bool]) -> float | None:
+    """The range down to which the target is seen from `FROM_M` on."""
+    low = FROM_M
+    for step_m in (_STEP_M, _FINE_M):
+        for k in range(round(FROM_M / step_m) + 1):
+            range_m = low - k * step_m
+            if range_m < 0.5 * _FINE_M:
+                return 0.0
+            if not seen(range_m):
+                if range_m == FROM_M:
+                    return None
+                low = range_m + step_m
+                break
+    return low
