@@ -12,7 +12,6 @@ from pydantic import BaseModel, ValidationError
 
 import perchctl
 from perchctl.calibration import load_calibration
-from perchctl.commands.profile import run
 from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
 from perchctl.profile import Profile, file_names, find_calibration, load_profile
 
@@ -359,17 +358,3 @@ def test_bad_calibrations_are_refused(tmp_path: Path, text: str, expected: str) 
     path.write_text(text)
     with pytest.raises(InvalidValue, match=expected):
         load_calibration(path)
-
-
-@pytest.mark.parametrize("as_json", [True, False])
-def test_the_command_shows_no_password(
-    as_json: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "own.yaml"
-    path.write_text(
-        'description: "at http://me:secret@h/s"\ncamera: {source: "http://me:secret@h/s"}\n'
-    )
-    assert run(str(path), False, as_json) == 0
-    shown = capsys.readouterr()
-    assert "http://h/s" in shown.out
-    assert "secret" not in shown.out + shown.err
