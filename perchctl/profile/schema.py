@@ -8,7 +8,8 @@ larger sections.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
+import operator
+import re
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -102,8 +103,8 @@ class Profile(Section):
 
 
 # --- Keys that must fit each other: what no flight could end well with is refused at load ------
-# `Limit` says that one side stays below the other; `IMPOSSIBLE` is the list that a profile is held
-# to. What is only doubtful is told by `perchctl.check.profile`.
+# `IMPOSSIBLE` is the list that a profile is held to. What is only doubtful is in
+# `perchctl.check.profile`.
 
 
 REACHED_SHARE = 0.8
@@ -111,137 +112,141 @@ REACHED_SHARE = 0.8
 OVERDUE_SHARE = 0.5
 """Of the landing's time: so long it goes by setpoints, and then by the vehicle's own landing."""
 
-
-def _sum(*parts: float) -> float:
-    return sum(parts)
+_OPERATORS = {"+": operator.add, "*": operator.mul, "/": operator.truediv}
+_OPERATOR = re.compile(r" ([+*/]) ")
 
 
 @dataclass(frozen=True)
 class Limit:
-    """`of` the values of `left`, their sum, must be below the value of `right`.
+    """A relation between keys that a profile must hold.
 
     Attributes:
-        left, right: a key's dotted path, or a number that stands for itself.
+        relation: as in ``kalman.k1 + 0.1 < kalman.k2``, or with ``<=``. The left side holds keys
+            by their dotted paths and numbers, with +, * and / between; it is worked out from
+            left to right. The right side is one key or number.
         because: what happens otherwise.
-        words: of what is no sum, what it is: {0}, {1}, ... stand for the parts of `left`.
-        equal: both sides may be equal.
+        words: of a left side that is no sum, what it is: {0}, {1}, ... stand for its keys.
     """
 
-    left: tuple[str | float, ...]
-    right: str | float
+    relation: str
     because: str
-    of: Callable[..., float] = _sum
     words: str = ""
-    equal: bool = False
+
+    @property
+    def _sides(self) -> tuple[str, str, str]:
+        """Left, the relation's sign, right."""
+        left, sign, right = re.split(" (<=?) ", self.relation)
+        return left, sign, right
 
     @property
     def keys(self) -> tuple[str, ...]:
-        return tuple(side for side in (*self.left, self.right) if isinstance(side, str))
+        left, _, right = self._sides
+        sides = (*_OPERATOR.split(left)[::2], right)
+        return tuple(side for side in sides if side[0].isalpha())
 
     def holds(self, profile: Any) -> bool:
         """Also where a key has no number to compare."""
-        values = self._values(profile)
-        if values is None:
-            return True
-        left, right = values
-        return left < right or (self.equal and left <= right)
+        left, sign, right = self._sides
+        found, most = _evaluate(left, profile), _evaluate(right, profile)
+        return found is None or most is None or found < most or (sign == "<=" and found == most)
 
     def sentence(self, profile: Any) -> str:
         """What is found, and what must hold."""
-        relation = "must not exceed" if self.equal else "must be less than"
-        found, right = self._found(profile), _named(profile, self.right, units=bool(self.words))
-        return f"{found} {relation} {right}: {self.because}"
+        left, sign, right = self._sides
+        relation = "must not exceed" if sign == "<=" else "must be less than"
+        limit = _named(profile, right, units=bool(self.words))
+        return f"{self._found(left, right, profile)} {relation} {limit}: {self.because}"
 
-    def _found(self, profile: Any) -> str:
+    def _found(self, left: str, right: str, profile: Any) -> str:
         """The left side, and what it comes to where it has parts."""
-        values = self._values(profile)
-        names = [_named(profile, side, units=bool(self.words)) for side in self.left]
-        named = self.words.format(*names) if self.words else " + ".join(names)
-        if values is None or len(names) == 1:
-            return named
-        if not self.words:
-            return f"{named}, together {values[0]:.3g},"
-        unit = key_unit(self.right) if isinstance(self.right, str) else ""
-        return f"{named} is {f'{values[0]:.3g} {unit}'.strip()}, and"
+        parts, value = _OPERATOR.split(left)[::2], _evaluate(left, profile)
+        if self.words:
+            named = [_named(profile, part, units=True) for part in parts if part[0].isalpha()]
+            result = f"{value:.3g} {key_unit(right)}".strip()
+            return f"{self.words.format(*named)} is {result}, and"
+        total = " + ".join(_named(profile, part) for part in parts)
+        return total if len(parts) == 1 else f"{total}, together {value:.3g},"
 
-    def _values(self, profile: Any) -> tuple[float, float] | None:
-        values = [_value(profile, side) for side in (*self.left, self.right)]
-        if not all(isinstance(value, (int, float)) for value in values):
+
+def _evaluate(side: str, profile: Any) -> float | None:
+    first, *rest = _OPERATOR.split(side)
+    value = _value(profile, first)
+    for sign, part in zip(rest[::2], rest[1::2], strict=True):
+        other = _value(profile, part)
+        if value is None or other is None:
             return None
-        return self.of(*values[:-1]), values[-1]
+        value = _OPERATORS[sign](value, other)
+    return value
 
 
-def _value(profile: Any, side: str | float) -> Any:
-    if side == "camera.latency_s":
-        return profile.camera.start_latency_s
-    return reduce(getattr, side.split("."), profile) if isinstance(side, str) else side
+def _value(profile: Any, part: str) -> float | None:
+    """The number that stands there, or that the profile has at that key; None where it has none."""
+    if part == "camera.latency_s":
+        part = "camera.start_latency_s"
+    value = reduce(getattr, part.split("."), profile) if part[0].isalpha() else float(part)
+    return value if isinstance(value, (int, float)) else None
 
 
-def _named(profile: Any, side: str | float, units: bool = False) -> str:
-    if not isinstance(side, str):
-        return f"{side:g}"
-    unit = key_unit(side) if units else ""
-    return f"{side} ({f'{_value(profile, side):g} {unit}'.strip()})"
+def _named(profile: Any, part: str, units: bool = False) -> str:
+    value = _value(profile, part)
+    if not part[0].isalpha():
+        return f"{value:g}"
+    return f"{part} ({f'{value:g} {key_unit(part) if units else str()}'.strip()})"
 
 
 IMPOSSIBLE: tuple[Limit, ...] = (
     Limit(
-        ("planner.search.max_height_m",), "safety.max_height_m",
-        "the search would climb to where it has to land", equal=True,
+        "planner.search.max_height_m <= safety.max_height_m",
+        "the search would climb to where it has to land",
     ),
     Limit(
-        ("planner.takeoff_height_m",), "planner.search.max_height_m",
-        "the take-off would end above where the search ends", equal=True,
+        "planner.takeoff_height_m <= planner.search.max_height_m",
+        "the take-off would end above where the search ends",
     ),
     Limit(
-        ("planner.takeoff_height_m", "planner.takeoff_speed_mps"), "planner.approach_timeout_s",
+        f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
+        " < planner.approach_timeout_s",
         "the take-off takes longer than it is waited for",
-        of=lambda height_m, speed_mps: REACHED_SHARE * height_m / speed_mps,
         words=f"the climb to {REACHED_SHARE:g} of {{0}} at {{1}}",
     ),
     Limit(
-        ("camera.latency_s",), "safety.max_frame_age_s",
-        "every picture would be too old to measure by",
+        "camera.latency_s < safety.max_frame_age_s", "every picture would be too old to measure by"
     ),
     Limit(
-        ("link.telemetry_period_s",), "safety.proof_age_s",
+        "link.telemetry_period_s < safety.proof_age_s",
         "telemetry would be too old to prove a contact or a landing",
     ),
     Limit(
-        ("link.telemetry_period_s",), "safety.telemetry_hold_s",
+        "link.telemetry_period_s < safety.telemetry_hold_s",
         "telemetry would always be old, and the vehicle held",
     ),
     Limit(
-        ("link.telemetry_period_s",), "safety.telemetry_land_s",
+        "link.telemetry_period_s < safety.telemetry_land_s",
         "telemetry would always be old, and the vehicle landed",
     ),
     Limit(
-        ("planner.estimate.dwell_s",), "planner.estimate.timeout_s",
-        "no pose could be steady in time",
+        "planner.estimate.dwell_s < planner.estimate.timeout_s", "no pose could be steady in time"
     ),
+    Limit("planner.align.dwell_s < planner.align.timeout_s", "nothing could be aligned in time"),
     Limit(
-        ("planner.align.dwell_s",), "planner.align.timeout_s", "nothing could be aligned in time"
-    ),
-    Limit(
-        ("planner.ascend.settle_dwell_s",), "planner.ascend.settle_timeout_s",
+        "planner.ascend.settle_dwell_s < planner.ascend.settle_timeout_s",
         "it could not settle in time",
     ),
     Limit(
-        ("planner.ascend.settle_dwell_s",), "planner.ascend.timeout_s",
-        "it could not settle in time",
+        "planner.ascend.settle_dwell_s < planner.ascend.timeout_s", "it could not settle in time"
     ),
     Limit(
-        ("planner.perch.contact_dwell_s",), "planner.perch.timeout_s",
+        "planner.perch.contact_dwell_s < planner.perch.timeout_s",
         "no contact could be proven in time",
     ),
     Limit(
-        (
-            "planner.complete.hold_dwell_s", "planner.complete.ramp_s", "planner.complete.hang_s",
-        ), "planner.complete.release_timeout_s", "the thrust could not be released in time",
+        "planner.complete.hold_dwell_s + planner.complete.ramp_s + planner.complete.hang_s"
+        " < planner.complete.release_timeout_s",
+        "the thrust could not be released in time",
     ),
     Limit(
-        ("planner.recover.dwell_s",), "planner.recover.timeout_s",
+        "planner.recover.dwell_s < planner.recover.timeout_s",
         "after a miss it could not become steady in time",
     ),
-)  # fmt: skip
+)
 """Every flight with such a profile comes to nothing."""

@@ -12,8 +12,9 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Row, Verdict, camera, compared, gone, session
-from perchctl.check.row import failed, passed, skipped, warned
+from perchctl.check import CheckScope, Row, Verdict, camera, session
+from perchctl.check.capture import CAPTURE, COMPARED
+from perchctl.check.vehicle import GONE
 from perchctl.commands import app
 from perchctl.commands import check as command
 from perchctl.commands.check import CheckRequest, exit_code, run, table
@@ -121,13 +122,18 @@ def test_only_yes_is_a_yes(
 
 
 ROWS = [
-    passed("address", "sim:// answers"),
-    warned("lost frames", "22 %, longest gap 111 ms " + "and more " * 12, "bring it nearer " * 8),
-    failed("battery", "the battery rests at 3.50 V", "charge it"),
-    skipped("print", "both markers must be in view", "hold it nearer"),
-    skipped("radio", "none in sim://"),
-    skipped("signal", "the vehicle does not answer"),
-    skipped("packets", "the vehicle does not answer"),
+    Row("address", Verdict.PASS, "sim:// answers"),
+    Row(
+        "lost frames",
+        Verdict.WARN,
+        "22 %, longest gap 111 ms " + "and more " * 12,
+        "bring it nearer " * 8,
+    ),
+    Row("battery", Verdict.FAIL, "the battery rests at 3.50 V", "charge it"),
+    Row("print", Verdict.SKIPPED, "both markers must be in view", "hold it nearer"),
+    Row("radio", Verdict.SKIPPED, "none in sim://"),
+    Row("signal", Verdict.SKIPPED, "the vehicle does not answer"),
+    Row("packets", Verdict.SKIPPED, "the vehicle does not answer"),
 ]
 
 
@@ -145,9 +151,9 @@ def test_the_table_fits_80_columns_and_says_what_to_do() -> None:
 @pytest.mark.parametrize(("rows", "code"), [
     (ROWS[:2], 0),
     (ROWS, 52),
-    ([failed("address", "", "")], 10),
-    ([failed("camera", "", ""), failed("battery", "", "")], 20),
-    ([skipped("address", "")], 0),
+    ([Row("address", Verdict.FAIL, "")], 10),
+    ([Row("camera", Verdict.FAIL, ""), Row("battery", Verdict.FAIL, "")], 20),
+    ([Row("address", Verdict.SKIPPED, "")], 0),
 ])  # fmt: skip
 def test_the_exit_code_is_the_first_failing_row_s(rows: list[Row], code: int) -> None:
     assert exit_code(rows) == code
@@ -181,5 +187,20 @@ def test_a_flight_says_what_its_profile_makes_doubtful(tmp_path: Path) -> None:
 
 def test_every_row_is_on_its_page() -> None:
     page = (ROOT / "docs" / "check.md").read_text(encoding="utf-8")
-    for name in (*VEHICLE, compared.NAME, gone.NAME, *camera.NAMES, "loop", "disk", "log folder"):
+    for name in (
+        *VEHICLE,
+        *CAPTURE,
+        COMPARED,
+        GONE,
+        *camera.PICTURES,
+        *camera.DESIGN,
+        *camera.SIGHT,
+        "capture",
+        "body",
+        "camera",
+        "size",
+        "loop",
+        "disk",
+        "log folder",
+    ):
         assert f"`{name}`" in page, name

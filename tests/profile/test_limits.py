@@ -73,7 +73,7 @@ def test_a_measured_latency_counts_as_where_the_flight_begins() -> None:
 
 @pytest.mark.parametrize(
     "limit",
-    [limit for limits in (IMPOSSIBLE, *DOUBTFUL.values()) for limit in limits if limit.left[1:]],
+    [limit for limits in (IMPOSSIBLE, *DOUBTFUL.values()) for limit in limits if limit.keys[2:]],
     ids=lambda limit: limit.because,
 )
 def test_only_a_sum_is_told_as_one(limit: Limit) -> None:
