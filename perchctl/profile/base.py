@@ -22,6 +22,12 @@ _OnBody = Annotated[float, Field(ge=-FARTHEST_ON_BODY_M, le=FARTHEST_ON_BODY_M)]
 BodyVector3 = tuple[_OnBody, _OnBody, _OnBody]
 
 
+def key(default: Any, meaning: str, **constraints: Any) -> Any:
+    """A key of a section: pydantic's `Field`, with the meaning that people read about it. The
+    default ... means that the key must be given."""
+    return Field(default, description=meaning, **constraints)
+
+
 def ordered(pair: tuple[float, float]) -> tuple[float, float]:
     """The pair, lowest first. Raises ValueError where it is not."""
     if pair[0] > pair[1]:

@@ -4,41 +4,35 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, model_validator
 
-from perchctl.profile.base import Section
+from perchctl.profile.base import Section, key
 
 
 class WeightsConfig(Section):
     """The paper's weights: the large marker's share in each axis and in yaw."""
 
-    x: float = Field(
-        0.275, ge=0, le=1, description="the large marker's share; the small one has the rest"
-    )
-    y: float = Field(0.306, ge=0, le=1, description="as x")
-    z: float = Field(0.728, ge=0, le=1, description="as x")
-    yaw: float = Field(0.469, ge=0, le=1, description="as x")
+    x: float = key(0.275, "the large marker's share; the small one has the rest", ge=0, le=1)
+    y: float = key(0.306, "as x", ge=0, le=1)
+    z: float = key(0.728, "as x", ge=0, le=1)
+    yaw: float = key(0.469, "as x", ge=0, le=1)
 
 
 class MergeConfig(Section):
     """The profile's `merge`: how the two markers become one estimate."""
 
-    method: Literal["weights", "joint"] = Field(
-        "joint", description="the paper's weights, or both markers solved as one"
+    method: Literal["weights", "joint"] = key(
+        "joint", "the paper's weights, or both markers solved as one"
     )
     weights: WeightsConfig = WeightsConfig()
-    weights_file: str | None = Field(
-        None, description="of `perchctl fit-weights`; replaces `weights`"
+    weights_file: str | None = key(None, "of `perchctl fit-weights`; replaces `weights`")
+    stages: Literal["seen", "range"] = key(
+        "seen", "merge what is seen, or by distance as equations 4, 6, 11"
     )
-    stages: Literal["seen", "range"] = Field(
-        "seen", description="merge what is seen, or by distance as equations 4, 6, 11"
-    )
-    z2_m: float = Field(0.25, gt=0, description="farthest range of the small marker")
-    z3_m: float = Field(0.12, gt=0, description="nearest range of the whole large marker")
-    disagreement_m: float = Field(
-        0.03, gt=0, description="farther apart than this the markers contradict"
-    )
-    disagreement_frames: int = Field(15, ge=1, description="so many in a row, and it lands")
+    z2_m: float = key(0.25, "farthest range of the small marker", gt=0)
+    z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)
+    disagreement_m: float = key(0.03, "farther apart than this the markers contradict", gt=0)
+    disagreement_frames: int = key(15, "so many in a row, and it lands", ge=1)
 
     @model_validator(mode="after")
     def _ranges_in_order(self) -> MergeConfig:

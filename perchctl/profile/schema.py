@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import Field, model_validator
 
-from perchctl.profile.base import Section
+from perchctl.profile.base import Section, key
 from perchctl.profile.dictionaries import check_marker_id
 from perchctl.profile.keys import key_unit
 from perchctl.profile.merge import MergeConfig
@@ -37,31 +37,29 @@ from perchctl.profile.vision import (
 class LinkConfig(Section):
     """The profile's `link`: URI, telemetry and firmware parameters."""
 
-    uri: str = Field("sim://", description="`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
-    connect_timeout_s: float = Field(15.0, gt=0, le=120, description="for both tries together")
+    uri: str = key("sim://", "`sim://`, `radio://...`, `usb://0`, `udp://HOST:PORT`")
+    connect_timeout_s: float = key(15.0, "for both tries together", gt=0, le=120)
     parameters: dict[str, int | float] = Field(
         default_factory=dict, description="firmware parameters, set and read back before the flight"
     )
-    telemetry_period_s: float = Field(0.01, ge=0.01, le=0.1, description="of position and attitude")
-    loop_hz: float = Field(50.0, ge=5, le=200, description="turns of the flight loop")
+    telemetry_period_s: float = key(0.01, "of position and attitude", ge=0.01, le=0.1)
+    loop_hz: float = key(50.0, "turns of the flight loop", ge=5, le=200)
 
 
 class LogConfig(Section):
-    directory: str = Field("perchctl-logs", description="for the log and its plot")
-    plot: bool = Field(True, description="draw the flight after it")
-    max_mb: float = Field(
-        2000.0, gt=0, le=1e6, description="no more pictures are recorded into a larger recording"
+    directory: str = key("perchctl-logs", "for the log and its plot")
+    plot: bool = key(True, "draw the flight after it")
+    max_mb: float = key(
+        2000.0, "no more pictures are recorded into a larger recording", gt=0, le=1e6
     )
 
 
 class Profile(Section):
     """One flight's resolved configuration."""
 
-    name: str = Field("unnamed", description="of the profile; else its file's")
-    description: str = Field("", description="one sentence for people")
-    date: datetime.date | None = Field(
-        None, description="of the measurements in it; printed on the target"
-    )
+    name: str = key("unnamed", "of the profile; else its file's")
+    description: str = key("", "one sentence for people")
+    date: datetime.date | None = key(None, "of the measurements in it; printed on the target")
     camera: CameraConfig = CameraConfig()
     vehicle: VehicleConfig = VehicleConfig()
     target: TargetConfig = TargetConfig()
