@@ -49,6 +49,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     (
         "perchctl.geometry",
         "perchctl.files",
+        "perchctl.places",
+        "perchctl.plain_yaml",
         "perchctl.vehicle",
         "perchctl.values",
         "perchctl.children",
@@ -93,7 +95,7 @@ MOST_NAMES = {
     "log": 42,
     "mission": 60,
     "positioning": 15,
-    "profile": 55,
+    "profile": 38,
     "replay": 15,
     "report": 15,
     "sim": 31,

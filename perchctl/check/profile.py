@@ -28,14 +28,8 @@ from perchctl.check.row import (
 )
 from perchctl.errors import PerchError, SafetyAbort
 from perchctl.flight import FlyOptions
-from perchctl.profile import (
-    OVERDUE_SHARE,
-    REACHED_SHARE,
-    Limit,
-    Profile,
-    data_folder,
-    find_calibration,
-)
+from perchctl.places import data_folder
+from perchctl.profile import DOUBTFUL, Profile, find_calibration
 from perchctl.target import check_target, mm_text, overhead_view, sees_small_marker
 from perchctl.vision import CameraModel
 
@@ -282,97 +276,3 @@ def _marker_size(plan: _Plan) -> Finding:
     if plan.simulated and ceiling_m - mount.position_m[2] > highest_m:
         return warned(f"{found}; simulated ceilings are up to {ceiling_m:g} m high", LARGER)
     return passed(found)
-
-
-# --- A profile's limits that are allowed and doubtful: they hardly work together ---------------
-# Those that no flight could end well with are refused when the profile is read
-# (`perchctl.profile.schema.IMPOSSIBLE`).
-
-DOUBTFUL: dict[str, tuple[Limit, ...]] = {
-    "heights": (
-        # A climb passes its setpoint by 0.1 m (docs/firmware.md, "Position take-off").
-        Limit(
-            "0.1 + planner.search.max_height_m <= safety.max_height_m",
-            "a climb overshoots by as much, and lands for it",
-        ),
-        Limit(
-            "safety.ground_tolerance_m <= 0.45",
-            "a vehicle that hangs would be taken for one on the ground",
-        ),
-    ),
-    "fence": (Limit("0.3 <= safety.fence_radius_m", "a draught carries it so far"),),
-    "battery limits": (
-        Limit("safety.min_load_v < safety.min_rest_v", "it would land as soon as it lifts"),
-        # What a full battery has left under a light vehicle (docs/firmware.md, "Thrust to PWM").
-        Limit(
-            "safety.min_load_v < 3.7",
-            "hovering takes a full battery down to it: it would land as soon as it lifts",
-        ),
-        Limit("safety.min_rest_v < 4.35", "no battery rests so high: no flight would begin"),
-        Limit(
-            "10 <= safety.battery_stale_s",
-            "a reading may well stand still for so long",
-        ),
-    ),
-    "time limits": (
-        Limit(
-            f"{REACHED_SHARE:g} * planner.takeoff_height_m / planner.takeoff_speed_mps"
-            " + planner.estimate.dwell_s + planner.align.dwell_s + planner.ascend.settle_dwell_s"
-            " + planner.perch.contact_dwell_s < planner.perching_time_s",
-            "the perching time is over before a contact",
-            words="the least time for {0} at {1}, with {2}, {3}, {4} and {5}",
-        ),
-        Limit(
-            "planner.search.attempts * planner.search.wait_s < planner.perching_time_s",
-            "the perching time is over before the search",
-            words="{0} times {1}",
-        ),
-        Limit(
-            f"safety.max_height_m / planner.landing.speed_mps / {OVERDUE_SHARE:g}"
-            " < planner.landing.timeout_s",
-            "from there it is not down by setpoints when half of that is over, and is left to its "
-            "own landing",
-            words="twice the time that landing from {0} takes at {1}",
-        ),
-        Limit("safety.camera_hold_s < safety.camera_land_s", "it lands before it was held"),
-        Limit("safety.telemetry_hold_s < safety.telemetry_land_s", "it lands before it was held"),
-        Limit("safety.loop_late_hold_s < safety.loop_late_land_s", "it lands before it was held"),
-    ),
-    "thresholds": (
-        Limit(
-            "planner.align.xy_m <= planner.ascend.cone_base_m",
-            "near the target it goes back and forth between ALIGN and ASCEND",
-        ),
-        Limit(
-            "planner.perch.contact_z_m < planner.ascend.standoff_m",
-            "where it settles it is as near as at a contact already",
-        ),
-        Limit(
-            "planner.ascend.near_speed_mps <= planner.ascend.speed_mps",
-            "it climbs faster near the target than far from it",
-        ),
-        # The hover thrust of 30 g (docs/firmware.md, "Thrust to PWM").
-        Limit("40200 <= planner.perch.thrust", "so little raw thrust does not press"),
-        Limit(
-            "safety.start_tilt_deg < safety.max_tilt_deg",
-            "it may start at a tilt that cuts the motors",
-        ),
-        Limit(
-            "20 <= safety.max_tilt_deg",
-            "a gust tilts it so far, and cuts the motors",
-        ),
-        Limit(
-            "safety.jump_deg < safety.heading_lost_deg",
-            "each jump of the heading would take it down by thrust alone",
-        ),
-        Limit(
-            "safety.estimator_variance_m2 <= safety.flight_variance_m2",
-            "it may start with an estimate that it lands for",
-        ),
-        Limit(
-            "link.telemetry_period_s + link.telemetry_period_s <= safety.proof_age_s",
-            "one lost packet, and nothing is proven",
-        ),
-    ),
-}
-"""By the name of their row."""

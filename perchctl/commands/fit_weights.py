@@ -11,7 +11,8 @@ from perchctl.commands.output import print_record, say
 from perchctl.commands.progress import count_bar
 from perchctl.errors import Interrupted, InvalidValue, NotFound, PerchError, UsageError
 from perchctl.files import check_output, same_file, write_files
-from perchctl.profile import Profile, data_folder, find_weights, load_profile, user_config_folder
+from perchctl.places import data_folder, user_config_folder
+from perchctl.profile import Profile, find_weights, load_profile
 from perchctl.weights import (
     FITTED,
     LmsOptions,

@@ -42,22 +42,22 @@ from perchctl.commands.command_line import (
     reporting,
 )
 from perchctl.commands.output import print_record, say, tell
+from perchctl.commands.picture_edges import (
+    PICTURE_EDGES,
+    edges_beside,
+    mount_from_edges,
+    picture_edges,
+)
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import check_output, write_files
 from perchctl.link import check_uri
 from perchctl.profile import (
-    FARTHEST_ON_BODY_M,
-    OVERDUE_SHARE,
-    PICTURE_EDGES,
     Profile,
-    edges_beside,
     editor_schema,
     find_calibration,
     find_profile,
     first_invalid_key,
     load_profile,
-    mount_from_edges,
-    picture_edges,
     profile_text,
     profile_value,
 )
@@ -447,7 +447,7 @@ def _latency(text: str, _answers: Texts) -> float:
 
 def _place(text: str, _answers: Texts) -> tuple[float, ...]:
     """Metres from millimetres."""
-    values, most = _numbers(text, "mm", 3), FARTHEST_ON_BODY_M * 1e3
+    values, most = _numbers(text, "mm", 3), 300.0  # as the profile allows
     if any(values) and all(abs(value) < 1 for value in values):
         meant = " ".join(f"{value * 1e3:g}" for value in values)
         raise InvalidValue(
@@ -562,7 +562,7 @@ def profile_keys(texts: Texts, output: Path) -> dict[str, Any]:
     search_m = round(max(low_m, ceiling_m - FAR_SIGHT_M), 2)
     most_m = round(ceiling_m + OVER_THE_CEILING_M, 2)
     landing = default.planner.landing
-    down_s = most_m / landing.speed_mps / OVERDUE_SHARE
+    down_s = most_m / landing.speed_mps * landing.timeout_s / landing.overdue_s
     keys = {
         "description": f"a vehicle at {uri}, with its camera at {without_password(source)}",
         "camera.source": source,

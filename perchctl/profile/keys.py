@@ -1,7 +1,7 @@
-"""The profile's keys one by one: path, unit, default, what is allowed, what it means.
+"""What people read about a profile's keys: path, unit, default, what is allowed, what it means.
 
-What people read about a key comes from here: the table of docs/profiles.md, the comments of a
-profile that perchctl writes, the schema for editors.
+From here are the table of docs/profiles.md, the comments of a profile that perchctl writes, and
+the schema for editors.
 """
 
 from __future__ import annotations

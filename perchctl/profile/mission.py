@@ -132,6 +132,10 @@ class RecoverConfig(Section):
     timeout_s: float = key(6.0, "then it lands", gt=0, le=60)
 
 
+OVERDUE_SHARE = 0.5
+"""Of the landing's time: so long it goes by setpoints, and then by the vehicle's own landing."""
+
+
 class LandingConfig(Section):
     """Down by position setpoints at `speed_mps` to `handover_m`, the rest by the vehicle's
     own landing, which goes to `undershoot_m` below the ground of the estimate, and by
@@ -144,6 +148,11 @@ class LandingConfig(Section):
     undershoot_m: float = key(0.05, "the landing aims so far below the ground", ge=0, le=1)
     drift_mps: float = key(0.012, "of the estimate's height: the aim sinks so fast", ge=0, le=0.1)
     timeout_s: float = key(30.0, "for which a landing is waited for", gt=0, le=120)
+
+    @property
+    def overdue_s(self) -> float:
+        """For so long the landing goes by setpoints; then the vehicle lands by itself."""
+        return OVERDUE_SHARE * self.timeout_s
 
 
 class PlannerConfig(Section):

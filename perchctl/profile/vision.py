@@ -11,9 +11,9 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from perchctl.geometry import Array, make_T, rotation_from_rpy
+from perchctl.plain_yaml import clip_text
 from perchctl.profile.base import BodyVector3, Section, Vector3, key
 from perchctl.profile.dictionaries import check_marker_id, is_one_pattern
-from perchctl.profile.plain_yaml import clip_text
 
 _FORMAT = "^[A-Z0-9]{3,4}$"
 
@@ -310,3 +310,35 @@ class KalmanConfig(Section):
         0.05, "an unmeasured target moves in the estimate's world at most so fast", ge=0, le=1
     )
     gate: bool = key(True, "a pose that contradicts the target's track is not taken")
+
+
+class WeightsConfig(Section):
+    """The paper's weights: the large marker's share in each axis and in yaw."""
+
+    x: float = key(0.275, "the large marker's share; the small one has the rest", ge=0, le=1)
+    y: float = key(0.306, "as x", ge=0, le=1)
+    z: float = key(0.728, "as x", ge=0, le=1)
+    yaw: float = key(0.469, "as x", ge=0, le=1)
+
+
+class MergeConfig(Section):
+    """The profile's `merge`: how the two markers become one estimate."""
+
+    method: Literal["weights", "joint"] = key(
+        "joint", "the paper's weights, or both markers solved as one"
+    )
+    weights: WeightsConfig = WeightsConfig()
+    weights_file: str | None = key(None, "of `perchctl fit-weights`; replaces `weights`")
+    stages: Literal["seen", "range"] = key(
+        "seen", "merge what is seen, or by distance as equations 4, 6, 11"
+    )
+    z2_m: float = key(0.25, "farthest range of the small marker", gt=0)
+    z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)
+    disagreement_m: float = key(0.03, "farther apart than this the markers contradict", gt=0)
+    disagreement_frames: int = key(15, "so many in a row, and it lands", ge=1)
+
+    @model_validator(mode="after")
+    def _ranges_in_order(self) -> MergeConfig:
+        if not self.z3_m < self.z2_m:
+            raise ValueError("z3_m < z2_m must hold (metres)")
+        return self

@@ -28,7 +28,8 @@ import numpy as np
 
 from perchctl.errors import InvalidValue, NotFound
 from perchctl.geometry import Array
-from perchctl.profile import dictionary_size, parse_yaml
+from perchctl.plain_yaml import parse_yaml
+from perchctl.profile import dictionary_size
 from perchctl.target.lengths import mm_text, parse_length
 
 BoardKind = Literal["chessboard", "charuco", "aprilgrid"]

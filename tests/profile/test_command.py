@@ -17,16 +17,11 @@ from typer.testing import CliRunner
 
 from perchctl.check import Verdict, profile_rows
 from perchctl.commands import app
+from perchctl.commands.picture_edges import PICTURE_EDGES, edges_beside, picture_edges
 from perchctl.commands.profile import QUESTIONS, completed, profile_keys, write_new_profile
 from perchctl.errors import Interrupted, InvalidValue, PerchError, UsageError
 from perchctl.files import mode_of
-from perchctl.profile import (
-    PICTURE_EDGES,
-    edges_beside,
-    find_calibration,
-    load_profile,
-    picture_edges,
-)
+from perchctl.profile import find_calibration, load_profile
 from perchctl.profile.keys import keys
 from tests.profile.test_written import uncommented
 

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from perchctl.check.profile import DOUBTFUL
-from perchctl.profile import Limit, Profile
-from perchctl.profile.schema import IMPOSSIBLE
+from perchctl.profile import DOUBTFUL, Profile
+from perchctl.profile.limits import IMPOSSIBLE, Limit
 from tests.helpers.flights import short_profile
 
 BROKEN: tuple[Mapping[str, Any], ...] = (

@@ -13,7 +13,8 @@ from pydantic import BaseModel, ValidationError
 import perchctl
 from perchctl.calibration import load_calibration
 from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
-from perchctl.profile import Profile, file_names, find_calibration, load_profile
+from perchctl.places import file_names
+from perchctl.profile import Profile, find_calibration, load_profile
 
 
 @pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"])

@@ -21,7 +21,7 @@ import cv2
 from perchctl.calibration import load_calibration
 from perchctl.children import Channel, connect_back
 from perchctl.errors import PerchError
-from perchctl.profile import data_file
+from perchctl.places import data_file
 from perchctl.sim.capture.natnet import COMMAND_PORT
 from perchctl.sim.capture.settings import CaptureFault, CaptureSettings
 from perchctl.sim.process.host import VehicleHost
