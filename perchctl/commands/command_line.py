@@ -62,7 +62,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Find the target in a camera, video or pictures, without a vehicle.",
     ),
     "check": (
-        "cli.check",
+        "check",
         "Look at vehicle, camera, computer and profile on the ground, and say what is not fit to "
         "fly.",
     ),

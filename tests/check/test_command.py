@@ -12,15 +12,14 @@ from typer.testing import CliRunner
 
 pytest.importorskip("mujoco", reason="the simulator needs the extra [sim]")
 
-from perchctl.check import CheckScope, Row, Verdict, camera, session
+from perchctl.check import CheckScope, Row, Verdict, camera, check, session
 from perchctl.check.capture import CAPTURE, COMPARED
 from perchctl.check.vehicle import GONE
 from perchctl.commands import app
 from perchctl.commands import check as command
-from perchctl.commands.check import CheckRequest, exit_code, run, table
-from perchctl.errors import UsageError
+from perchctl.commands.check import confirm_motors, exit_code, report, table
 from perchctl.sim import SimProcess
-from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed
+from tests.helpers.checks import NOWHERE, QUICK, VEHICLE, Borrowed, options
 from tests.helpers.flights import ROOT
 
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -35,7 +34,7 @@ def invoke(*words: str) -> Any:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "_wanted", lambda request: CheckScope(**QUICK))
+    monkeypatch.setattr(command, "CheckScope", lambda **_: CheckScope(**QUICK))
 
 
 def test_json_is_a_list_of_rows(quick: None) -> None:
@@ -93,18 +92,14 @@ def test_ctrl_c_ends_with_what_was_found(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(session, "simulated_vehicle", lambda *_: Borrowed(sim))
-    code = run(CheckRequest(), CheckScope(**QUICK, tell=tell))
+    rows = check(options("sim://", "sim:"), CheckScope(**QUICK, tell=tell))
+    code = report(rows, as_json=False)
     printed = capsys.readouterr()
     assert code == 130
     assert "Ctrl-C" in printed.err
     assert ("supervisor" in printed.out) is (stage == "opening")
     assert not printed.out or "not finished" in printed.out
     assert "nothing fails" not in printed.out
-
-
-def test_a_motor_test_needs_somebody_to_ask() -> None:
-    with pytest.raises(UsageError, match="add --yes"):
-        run(CheckRequest(prop_test=True))
 
 
 @pytest.mark.parametrize(("answer", "leave"), [("y", True), ("yes", True), ("", False),
@@ -118,7 +113,7 @@ def test_only_yes_is_a_yes(
         return answer
 
     monkeypatch.setattr("builtins.input", typed)
-    assert command._confirmed() is leave
+    assert confirm_motors() is leave
 
 
 ROWS = [
