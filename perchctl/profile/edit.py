@@ -51,6 +51,9 @@ def changed_profile(profile: Profile, settings: Iterable[str], option: str = "--
         except ValueError as error:
             raise InvalidValue(f"{option} {clip_text(f'{key}={text}')}: {error}") from None
     try:
+        _, notes = with_present_keys(values, Profile)
+        if notes:
+            raise InvalidValue(f"{option}: {notes[0]}")
         return Profile.model_validate(values)
     except ValidationError as error:
         key, why = first_invalid_key(error)
@@ -178,7 +181,7 @@ def _values_of(text: str) -> dict[str, Any]:
     values = parse_yaml(text)
     if not isinstance(values, dict):
         raise ValueError("holds no keys and values")
-    return with_present_keys(values)[0]
+    return with_present_keys(values, Profile)[0]
 
 
 def _with_value(text: str, keys: list[str], value: Value) -> str:

@@ -13,7 +13,7 @@ from functools import reduce
 from typing import Any
 
 from perchctl.profile.keys import key_unit
-from perchctl.profile.mission import OVERDUE_SHARE
+from perchctl.profile.mission import OVERDUE_SHARE, AscendConfig
 
 REACHED_SHARE = 0.8
 """Of the take-off height: from here on it counts as reached (`Condition.AT_TAKEOFF_HEIGHT`)."""
@@ -208,7 +208,7 @@ DOUBTFUL: dict[str, tuple[Limit, ...]] = {
     ),
     "thresholds": (
         Limit(
-            "planner.align.xy_m <= planner.ascend.cone_base_m",
+            f"planner.align.xy_m <= {AscendConfig.cone_base_m:g}",
             "near the target it goes back and forth between ALIGN and ASCEND",
         ),
         Limit(

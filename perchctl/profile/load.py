@@ -167,7 +167,7 @@ def _resolved(path: Path, own: dict[str, Any], seen: tuple[Path, ...]) -> dict[s
 
 def _with_present_keys(values: dict[str, Any], path: Path) -> dict[str, Any]:
     try:
-        values, notes = with_present_keys(values)
+        values, notes = with_present_keys(values, Profile)
     except ValueError as error:
         raise InvalidValue(f"{path}: {error}") from None
     for note in notes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from perchctl.profile.base import Section, key
 
@@ -17,14 +17,16 @@ class SearchConfig(Section):
     yaw_step_deg: float = key(
         60.0, "turned each time: the picture is wider than high", ge=0, le=180
     )
-    confirm_frames: int = key(3, "in a row with the target", ge=1, le=100)
+    confirm_frames: ClassVar[int] = 3
+    """In a row with the target."""
 
 
 class EstimateConfig(Section):
     """Phase 3. The pose must stay within `spread_m` for `dwell_s`."""
 
     dwell_s: float = key(0.4, "for which the pose must be steady", ge=0, le=10)
-    spread_m: float = key(0.05, "within which it must stay", gt=0, le=1)
+    spread_m: ClassVar[float] = 0.05
+    """Within which it must stay."""
     timeout_s: float = key(4.0, "then back to search", gt=0, le=60)
 
 
@@ -36,7 +38,8 @@ class AlignConfig(Section):
     dwell_s: float = key(0.4, "for which both must hold", ge=0, le=10)
     timeout_s: float = key(20.0, "then the attempt counts as failed", gt=0, le=120)
     speed_mps: float = key(0.4, "of the setpoint, sideways", gt=0, le=2)
-    yaw_rate_dps: float = key(60.0, "of the setpoint", gt=0, le=360)
+    yaw_rate_dps: ClassVar[float] = 60.0
+    """Of the setpoint."""
 
 
 class AscendConfig(Section):
@@ -49,15 +52,20 @@ class AscendConfig(Section):
     """
 
     speed_mps: float = key(0.25, "climb, far below", gt=0, le=1)
-    near_speed_mps: float = key(0.12, "climb, nearer than `near_m`", gt=0, le=1)
-    near_m: float = key(0.35, "from here on it climbs slowly", gt=0, le=2)
-    cone_base_m: float = key(0.05, "the cone's radius at the target", gt=0, le=1)
-    cone_slope: float = key(0.2, "the cone's radius grows by it a metre below", ge=0, le=2)
+    near_speed_mps: float = key(0.12, "climb, nearer than 0.35 m", gt=0, le=1)
+    near_m: ClassVar[float] = 0.35
+    """From here on it climbs slowly."""
+    cone_base_m: ClassVar[float] = 0.05
+    """The cone's radius at the target."""
+    cone_slope: ClassVar[float] = 0.2
+    """The cone's radius grows by it a metre below."""
     standoff_m: float = key(0.08, "between gear and target where it settles", gt=0.01, le=0.5)
     settle_xy_m: float = key(0.004, "settled: distance from the axis", gt=0, le=0.1)
     settle_z_m: float = key(0.02, "settled: at most so far below the stand-off", gt=0, le=0.1)
-    settle_yaw_deg: float = key(3.0, "settled: heading", gt=0, le=90)
-    settle_speed_mps: float = key(0.04, "settled: speed", gt=0, le=1)
+    settle_yaw_deg: ClassVar[float] = 3.0
+    """Settled: heading."""
+    settle_speed_mps: ClassVar[float] = 0.04
+    """Settled: speed."""
     settle_dwell_s: float = key(0.3, "for which all must hold", ge=0, le=10)
     settle_timeout_s: float = key(10.0, "at the stand-off", gt=0, le=60)
     fresh_s: float = key(
@@ -101,8 +109,10 @@ class CompleteConfig(Section):
     """
 
     steps: int = key(5, "of the release", ge=1, le=50)
-    release_s: float = key(0.8, "over which the thrust is released", gt=0, le=10)
-    release_drop_m: float = key(0.25, "the setpoint's last step lies below the contact", gt=0, le=1)
+    release_s: ClassVar[float] = 0.8
+    """Over which the thrust is released."""
+    release_drop_m: ClassVar[float] = 0.25
+    """The setpoint's last step lies below the contact."""
     hold_ratio: float = key(0.6, "thrust over the hover thrust that proves the magnet", gt=0, lt=1)
     hold_dwell_s: float = key(0.3, "for which it must prove it", ge=0, le=5)
     ramp_s: float = key(
@@ -128,7 +138,8 @@ class RecoverConfig(Section):
 
     descend_m: float = key(0.10, "below where the attempt ended", gt=0, le=1)
     dwell_s: float = key(0.5, "for which it must be steady", ge=0, le=10)
-    steady_mps: float = key(0.1, "steady: speed", gt=0, le=1)
+    steady_mps: ClassVar[float] = 0.1
+    """Steady: speed."""
     timeout_s: float = key(6.0, "then it lands", gt=0, le=60)
 
 
@@ -173,7 +184,8 @@ class PlannerConfig(Section):
     attempts: int = key(5, "perching attempts in all", ge=1, le=50)
     perching_time_s: float = key(120.0, "then it lands", gt=0, le=1200)
     integral_per_s: float = key(0.4, "gain of the integral of the horizontal error", ge=0, le=5)
-    integral_limit_m: float = key(0.08, "of that integral", ge=0, le=0.5)
+    integral_limit_m: ClassVar[float] = 0.08
+    """Of that integral."""
 
 
 class SafetyConfig(Section):

@@ -74,7 +74,7 @@ class Profile(Section):
     @classmethod
     def _present_keys(cls, values: Any) -> Any:
         """Logs of earlier versions hold profiles with old keys."""
-        return with_present_keys(values)[0] if isinstance(values, dict) else values
+        return with_present_keys(values, cls)[0] if isinstance(values, dict) else values
 
     @model_validator(mode="after")
     def _neighbours_can_be_printed(self) -> Profile:

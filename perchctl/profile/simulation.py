@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -124,11 +124,11 @@ class SimulationConfig(Section):
     estimate_tilt_bias_xy_deg: tuple[float, float] | None = key(
         None, "of roll and pitch, instead of what `estimate_tilt_bias_deg` draws"
     )
-    first_contact_share: Shares = key(
-        (0.0, 0.6), "of the weight, that a first contact carries which does not hold"
-    )
+    first_contact_share: ClassVar[tuple[float, float]] = (0.0, 0.6)
+    """Of the weight, that a first contact carries which does not hold."""
     gust_mps: Amounts = key((0.0, 0.0), "peak of single gusts beside the draught")
-    gust_every_s: float = key(8.0, "on average", gt=0, le=1000)
+    gust_every_s: ClassVar[float] = 8.0
+    """On average."""
     ceiling_suction: Shares = key(
         (0.1, 0.1), "share of thrust gained with the rotors at the ceiling"
     )
@@ -143,8 +143,10 @@ class SimulationConfig(Section):
     gloss: Amounts = key(
         (0.0, 0.0), "brightest of the lamp's reflection in the print, in paper whites"
     )
-    lamp_aside_m: Amounts = key((0.1, 0.6), "of the lamp, from under the target")
-    lamp_z_m: Amounts = key((0.0, 1.2), "of the lamp, over the floor")
+    lamp_aside_m: ClassVar[tuple[float, float]] = (0.1, 0.6)
+    """Of the lamp, from under the target."""
+    lamp_z_m: ClassVar[tuple[float, float]] = (0.0, 1.2)
+    """Of the lamp, over the floor."""
     flow_noise_radps: Amounts = key(
         (0.0, 0.0), "of each reading of the flow sensor; times the height it is a speed"
     )
@@ -157,7 +159,8 @@ class SimulationConfig(Section):
     bare_floor_m: Amounts = key(
         (0.0, 0.0), "radius of a patch of floor without texture, where flow is blind"
     )
-    bare_floor_aside_m: Amounts = key((0.0, 0.6), "of it, from under the target")
+    bare_floor_aside_m: ClassVar[tuple[float, float]] = (0.0, 0.6)
+    """Of it, from under the target."""
     radio_loss: Losses = key((0.0, 0.0), "share of the time in which no packet passes")
     radio_burst_s: Bursts = key((0.1, 0.1), "mean length of such a time")
     capture_hole_s: Amounts = key(

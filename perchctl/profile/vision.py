@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -248,7 +248,8 @@ class DetectorConfig(Section):
         "line", "of corners: lines fitted to the sides, OpenCV's sub-pixel, or none"
     )
     window: bool = key(True, "look around the last pose first")
-    blurred: bool = key(True, "look once more where blur may hide the target")
+    blurred: ClassVar[bool] = True
+    """Look once more where blur may hide the target."""
     blurred_every: int = key(
         4, "... so in every Nth picture of a stream without it, not for a sharp one", ge=1, le=100
     )
@@ -298,10 +299,10 @@ class KalmanConfig(Section):
     noise: Literal["fixed", "measured"] = key(
         "measured", "k1 and k2 for every frame, or each pose's own covariance and accelerations"
     )
-    acceleration_mps2: float = key(
-        3.0, "of camera or target in the level frame, with `noise: measured`", gt=0, le=100
-    )
-    turn_radps2: float = key(3.0, "of the camera's attitude and heading, likewise", gt=0, le=1000)
+    acceleration_mps2: ClassVar[float] = 3.0
+    """Of camera or target in the level frame, with `noise: measured`."""
+    turn_radps2: ClassVar[float] = 3.0
+    """Of the camera's attitude and heading, likewise."""
     drift_mps2: float = key(
         0.1, "of the state estimate's drift, for tracks in the world, likewise", gt=0, le=100
     )
@@ -334,7 +335,8 @@ class MergeConfig(Section):
     )
     z2_m: float = key(0.25, "farthest range of the small marker", gt=0)
     z3_m: float = key(0.12, "nearest range of the whole large marker", gt=0)
-    disagreement_m: float = key(0.03, "farther apart than this the markers contradict", gt=0)
+    disagreement_m: ClassVar[float] = 0.03
+    """Farther apart than this the markers contradict."""
     disagreement_frames: int = key(15, "so many in a row, and it lands", ge=1)
 
     @model_validator(mode="after")

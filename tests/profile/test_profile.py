@@ -14,7 +14,7 @@ import perchctl
 from perchctl.calibration import load_calibration
 from perchctl.errors import InvalidValue, NotFound, PerchError, ProfileNote
 from perchctl.places import file_names
-from perchctl.profile import Profile, find_calibration, load_profile
+from perchctl.profile import Profile, changed_profile, find_calibration, load_profile
 
 
 @pytest.mark.parametrize("name", ["sim", "paper", "crazyflie", "fpv", "aideck", "rough", "extreme"])
@@ -216,7 +216,7 @@ def test_a_profile_round_trips_through_its_own_dump() -> None:
 OLD = """
 extends: sim
 camera: {T_body_cam: {position_m: [0.01, 0.02, 0.03]}}
-planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}}
+planner: {trim_per_s: 0.3, recover: {speed_mps: 0.2}, ascend: {near_m: 0.5}}
 merge: {z1_m: 1.2}
 """
 
@@ -238,9 +238,17 @@ def test_old_keys_are_read_and_said(tmp_path: Path) -> None:
     assert said == [
         f"{path}: camera.T_body_cam was read as mount, its present name: rename it",
         f"{path}: merge.z1_m is no longer used: remove it",
+        f"{path}: planner.ascend.near_m is no longer a key: it is 0.35 for every profile; "
+        "remove it",
         f"{path}: planner.recover.speed_mps is no longer used: remove it",
         f"{path}: planner.trim_per_s was read as integral_per_s, its present name: rename it",
     ]
+
+
+@pytest.mark.parametrize("setting", ["planner.ascend.near_m=0.5", "merge.z1_m=1.0"])
+def test_an_old_key_is_not_set_without_effect(setting: str) -> None:
+    with pytest.raises(InvalidValue, match=f"--set: {setting.partition('=')[0]} is no longer"):
+        changed_profile(load_profile("sim"), [setting])
 
 
 def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
@@ -252,6 +260,7 @@ def test_a_profile_in_an_old_log_is_read() -> None:
     values = load_profile("sim").model_dump(mode="json")
     values["camera"]["T_body_cam"] = values["camera"].pop("mount")
     values["merge"]["z1_m"] = 1.15
+    values["planner"]["ascend"]["near_m"] = 0.35
     assert Profile.model_validate(values) == load_profile("sim")
 
 
