@@ -1,3 +1,4 @@
+from .base import key_unit as key_unit
 from .dictionaries import aruco_dictionary as aruco_dictionary
 from .dictionaries import check_marker_id as check_marker_id
 from .dictionaries import dictionary_size as dictionary_size
@@ -5,7 +6,9 @@ from .edit import changed_profile as changed_profile
 from .edit import profile_value as profile_value
 from .edit import writable_profile as writable_profile
 from .edit import write_profile_values as write_profile_values
-from .keys import key_unit as key_unit
+from .keys import editor_schema as editor_schema
+from .keys import profile_text as profile_text
+from .keys import scalar_text as scalar_text
 from .limits import DOUBTFUL as DOUBTFUL
 from .load import find_profile as find_profile
 from .load import find_weights as find_weights
@@ -33,6 +36,3 @@ from .vision import Mounting as Mounting
 from .vision import PoseConfig as PoseConfig
 from .vision import TargetConfig as TargetConfig
 from .vision import WeightsConfig as WeightsConfig
-from .written import editor_schema as editor_schema
-from .written import profile_text as profile_text
-from .written import scalar_text as scalar_text

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
-from perchctl.profile.keys import key_unit
+from perchctl.profile.base import key_unit
 from perchctl.profile.mission import OVERDUE_SHARE, AscendConfig
 
 REACHED_SHARE = 0.8

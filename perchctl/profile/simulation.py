@@ -4,27 +4,19 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from perchctl.profile.base import Range, Section, Vector3, key, ordered
+from perchctl.profile.base import Ordered, Range, Section, Vector3, key
 
 MarkerId = Annotated[int, Field(ge=0)]
-_Positive = Annotated[float, Field(ge=0)]
-_Share = Annotated[float, Field(ge=0, le=1)]
-_Tilt = Annotated[float, Field(ge=0, le=20)]
-_Ohm = Annotated[float, Field(ge=0, le=1)]
-_Charge = Annotated[float, Field(ge=0.05, le=1)]
-_Knee = Annotated[float, Field(ge=0.01, le=0.9)]
-_Loss = Annotated[float, Field(ge=0, le=0.5)]
-_Burst = Annotated[float, Field(ge=0.01, le=10)]
-Amounts = Annotated[tuple[_Positive, _Positive], AfterValidator(ordered)]
-Shares = Annotated[tuple[_Share, _Share], AfterValidator(ordered)]
-Tilts = Annotated[tuple[_Tilt, _Tilt], AfterValidator(ordered)]
-Ohms = Annotated[tuple[_Ohm, _Ohm], AfterValidator(ordered)]
-Charges = Annotated[tuple[_Charge, _Charge], AfterValidator(ordered)]
-Knees = Annotated[tuple[_Knee, _Knee], AfterValidator(ordered)]
-Losses = Annotated[tuple[_Loss, _Loss], AfterValidator(ordered)]
-Bursts = Annotated[tuple[_Burst, _Burst], AfterValidator(ordered)]
+Amounts = Ordered[Annotated[float, Field(ge=0)]]
+Shares = Ordered[Annotated[float, Field(ge=0, le=1)]]
+Tilts = Ordered[Annotated[float, Field(ge=0, le=20)]]
+Ohms = Ordered[Annotated[float, Field(ge=0, le=1)]]
+Charges = Ordered[Annotated[float, Field(ge=0.05, le=1)]]
+Knees = Ordered[Annotated[float, Field(ge=0.01, le=0.9)]]
+Losses = Ordered[Annotated[float, Field(ge=0, le=0.5)]]
+Bursts = Ordered[Annotated[float, Field(ge=0.01, le=10)]]
 
 
 class SimulationConfig(Section):
