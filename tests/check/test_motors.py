@@ -198,6 +198,13 @@ def test_an_earlier_test_s_result_is_not_taken_for_this_one_s() -> None:
     assert motors(rig)["propellers"].found == vehicle.NO_RESULT
 
 
+def test_a_result_counts_only_once_the_test_has_finished() -> None:
+    rig = Lockstep()
+    read = rig.variables
+    rig.variables = lambda names: read(names) | {vehicle.PASS: 0.0}  # type: ignore[method-assign]
+    assert motors(rig)["propellers"].found == vehicle.NO_RESULT
+
+
 def test_after_a_test_without_a_result_no_other_begins() -> None:
     """At rest and fresh as its reports may be: while it is pending, they are frozen."""
     rig = Lockstep()
